@@ -1,0 +1,58 @@
+"""What a benchmark hands on: a measured figure beside its bar and beside a reference of the same run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One measured figure.
+
+    Attributes
+    ----------
+    name : str
+        What was measured.
+    value : float
+        The figure, in `unit`.
+    unit : str
+        Unit of `value` and `bar`.
+    bar : float or None
+        The figure wanted; None where none was set.
+    reference_name, reference_value
+        What ran beside it in the same process, and its figure in the same unit, so that the ratio
+        of the two does not depend on the machine.
+    larger_is_better : bool
+        True for speed-ups; False for times, sizes and errors.
+    """
+
+    name: str
+    value: float
+    unit: str
+    bar: float | None = None
+    reference_name: str = ""
+    reference_value: float | None = None
+    larger_is_better: bool = False
+
+    @property
+    def reached(self) -> bool | None:
+        """Whether the bar is reached; None without a bar."""
+        if self.bar is None:
+            return None
+        return self.value >= self.bar if self.larger_is_better else self.value <= self.bar
+
+
+def median_seconds(function: Callable[[], object], *, repeats: int = 15, inner: int = 1) -> float:
+    """Return the median wall-clock time of one call in seconds, over `repeats` batches of `inner` calls."""
+    function()
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        for _ in range(inner):
+            function()
+        times.append((time.perf_counter() - begin) / inner)
+    return float(np.median(times))

@@ -1,0 +1,1 @@
+"""Lab experiments to the posterior of the digital state."""

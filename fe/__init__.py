@@ -1,0 +1,1 @@
+"""The wing: design, mesh, operators, responses, and the reduced model."""

@@ -1,0 +1,1 @@
+"""What to run: scenario and binding files, shipped as package data."""

@@ -1,0 +1,1 @@
+"""The twin: graphical model, planner and mission loop over FMI assets."""
