@@ -1,1 +1,1 @@
-"""The wing: design, mesh, operators, responses, and the reduced model."""
+"""The wing by finite elements: design, mesh, operators, responses and the reduced model."""

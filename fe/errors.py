@@ -1,0 +1,29 @@
+"""Errors of the wing model, named by cause (standard library only: this file also runs inside the FMU)."""
+
+
+class FiniteElementError(Exception):
+    """Any error that the wing model raises on purpose."""
+
+
+class InvalidStateError(FiniteElementError, ValueError):
+    """A digital state holds a value that no wing can have."""
+
+
+class InvalidDesignError(FiniteElementError, ValueError):
+    """A wing design cannot be built; the sentence names the place in the design."""
+
+
+class DesignFileError(InvalidDesignError):
+    """A design file cannot be read or is not TOML."""
+
+
+class MeshError(FiniteElementError, RuntimeError):
+    """The mesh does not hold what the design asked for."""
+
+
+class OutsideModelError(FiniteElementError, ValueError):
+    """A value lies outside the range for which the model was made."""
+
+
+class SolutionError(FiniteElementError, RuntimeError):
+    """A linear or eigenvalue solution did not reach the accuracy that was asked for."""

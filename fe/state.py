@@ -1,0 +1,101 @@
+"""The digital state of the wing: Kapteyn et al. 2021, eq. (5).
+
+Standard library only, relative imports only: this file is copied into the FMU.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+from .errors import InvalidStateError
+
+STIFFNESS_LOSS_NAMES: tuple[str, str] = ("z1", "z2")
+"""Names of the stiffness losses of the two defect regions, in the order of `DigitalState.stiffness_loss`."""
+
+
+def _require_positive(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0.0):
+        raise InvalidStateError(f"{name} must be a positive finite number, but {value!r} was given.")
+
+
+def _require_not_negative(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value >= 0.0):
+        raise InvalidStateError(f"{name} must be zero or a positive finite number, but {value!r} was given.")
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Planform of the half-wing, as built.
+
+    Attributes
+    ----------
+    semi_span : float
+        Distance from the root to the tip [m].
+    root_chord, tip_chord : float
+        Chords at the root and at the tip [m].
+
+    Raises
+    ------
+    InvalidStateError
+        If a length is not positive and finite.
+    """
+
+    semi_span: float = 1.828
+    root_chord: float = 0.433
+    tip_chord: float = 0.260
+
+    def __post_init__(self) -> None:
+        for name in ("semi_span", "root_chord", "tip_chord"):
+            _require_positive(f"geometry.{name}", getattr(self, name))
+
+
+@dataclass(frozen=True)
+class DigitalState:
+    """A point value of d = (g, e, m, alpha, beta, z), Kapteyn et al. 2021, eq. (5).
+
+    Attributes
+    ----------
+    geometry : Geometry
+        g, the planform [m].
+    young_modulus_factor : float
+        e, the factor on Young's modulus of the skin [1].
+    servo_mass : float
+        Mass of each of the two servos [kg].
+    pitot_mass : float
+        Mass of the pitot tube [kg].
+    damping_alpha : float
+        Mass-proportional Rayleigh coefficient, eq. (17) [1/s].
+    damping_beta : float
+        Stiffness-proportional Rayleigh coefficient, eq. (17) [s].
+    stiffness_loss : tuple of float
+        (z1, z2), the fractions of stiffness that the two defect regions have lost [1]; 0 is healthy,
+        1 would be no stiffness at all and is refused.
+
+    Raises
+    ------
+    InvalidStateError
+        If a value is not finite or lies where no wing can be.
+    """
+
+    geometry: Geometry = field(default_factory=Geometry)
+    young_modulus_factor: float = 1.0
+    servo_mass: float = 0.169
+    pitot_mass: float = 0.134
+    damping_alpha: float = 1.0735
+    damping_beta: float = 7.3124e-4
+    stiffness_loss: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        _require_positive("young_modulus_factor", self.young_modulus_factor)
+        for name in ("servo_mass", "pitot_mass", "damping_alpha", "damping_beta"):
+            _require_not_negative(name, getattr(self, name))
+        if len(self.stiffness_loss) != len(STIFFNESS_LOSS_NAMES):
+            raise InvalidStateError(
+                f"stiffness_loss must hold {len(STIFFNESS_LOSS_NAMES)} fractions, one for each of "
+                f"{', '.join(STIFFNESS_LOSS_NAMES)}, but {len(self.stiffness_loss)} were given."
+            )
+        for name, loss in zip(STIFFNESS_LOSS_NAMES, self.stiffness_loss, strict=True):
+            if not (math.isfinite(loss) and 0.0 <= loss < 1.0):
+                raise InvalidStateError(
+                    f"stiffness_loss {name} must be a fraction from 0 to below 1 (not percent), "
+                    f"but {loss!r} was given."
+                )
