@@ -1,0 +1,184 @@
+"""One publication style for every figure of the project, and reproducible bytes from a figure.
+
+Figures are made with `new_figure` inside ``with publication_style():`` and never through pyplot, so that
+nothing global is left behind. Equal data give equal bytes: ids are salted, dates and program names left out.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from reporting.errors import InvalidFigureError
+
+# Okabe and Ito's palette for colour-blind readers; each colour has one meaning everywhere.
+OBSERVED: Final = "#595959"
+"""Measurements (small grey dots)."""
+PAST: Final = "#0072B2"
+"""Estimates of past steps, given all observations (blue, full line)."""
+PRESENT: Final = "#009E73"
+"""The estimate of the present step, or the running filtered estimate (green, diamond)."""
+PREDICTION: Final = "#D55E00"
+"""Predicted steps (vermilion, dashed or open marks)."""
+TRUTH: Final = "#000000"
+"""What is really so (black, thin dash-dot line); the twin does not know it."""
+DECISION: Final = "#CC79A7"
+"""Controls and policies (purple)."""
+REFERENCE: Final = "#999999"
+"""Limits, reference lines and other things to read against (light grey)."""
+LEVELS: Final = "cividis"
+"""Colour map of magnitudes: perceptually even and safe for colour-blind readers."""
+
+BAND_OPACITY: Final = 0.22
+FULL_WIDTH: Final = 7.2
+"""Width of a figure over two columns of a journal, in inches."""
+PNG_RESOLUTION: Final = 200.0
+
+_STYLE: Final[dict[Any, Any]] = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 8.0,
+    "axes.titlesize": 8.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.titlepad": 5.0,
+    "axes.labelsize": 8.0,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.grid": False,
+    "axes.unicode_minus": True,
+    "grid.color": "#e3e3e3",
+    "grid.linewidth": 0.6,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "xtick.major.size": 3.0,
+    "ytick.major.size": 3.0,
+    "lines.linewidth": 1.5,
+    "lines.markersize": 4.0,
+    "patch.linewidth": 0.7,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "legend.handlelength": 1.9,
+    "legend.columnspacing": 1.4,
+    "figure.facecolor": "white",
+    "axes.facecolor": "white",
+    "savefig.facecolor": "white",
+    "figure.dpi": 100.0,
+    "mathtext.fontset": "dejavusans",
+    "svg.fonttype": "path",
+    "svg.hashsalt": "uav-twin",
+    "svg.image_inline": True,
+    "path.simplify": True,
+    "text.usetex": False,
+    "text.parse_math": True,
+}
+
+
+@contextmanager
+def publication_style() -> Iterator[None]:
+    """Draw in the style of the project whatever the user's own settings are, and restore these after."""
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(_STYLE)
+        yield
+
+
+def new_figure(height: float, width: float = FULL_WIDTH) -> Figure:
+    """Return an empty figure of the given size in inches, drawn by Agg and unknown to pyplot.
+
+    Raises
+    ------
+    InvalidFigureError
+        A size is not positive.
+    """
+    if not (height > 0.0 and width > 0.0):
+        raise InvalidFigureError(f"A figure needs a positive size in inches, not {width} by {height}.")
+    figure = Figure(figsize=(width, height))
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def panel_label(axes: Axes, label: str, title: str = "", *, offset: float = 0.0) -> None:
+    """Put a panel's letter and short title above its upper left corner.
+
+    Parameters
+    ----------
+    axes
+        The panel.
+    label
+        Its letter, such as ``a``.
+    title
+        A few words beside the letter.
+    offset
+        How far left of the axes the text begins, as a fraction of the axes' width.
+    """
+    text = axes.set_title(f"{label}  {title}" if title else label, loc="left")
+    if offset:
+        text.set_x(-offset)
+
+
+def to_svg(figure: Figure) -> bytes:
+    """Return the figure as SVG: text as outlines, deterministic ids, no date, no program name, no DTD."""
+    buffer = io.BytesIO()
+    with publication_style():
+        # All four must be left out for the block of metadata, with its addresses, to vanish.
+        figure.savefig(
+            buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None}
+        )
+    text = buffer.getvalue().decode("utf-8")
+    text = re.sub(r"<!DOCTYPE[^>]*>\s*", "", text, count=1)
+    return text.encode("utf-8")
+
+
+def to_png(figure: Figure, resolution: float = PNG_RESOLUTION) -> bytes:
+    """Return the figure as PNG at `resolution` dots per inch, without program name."""
+    buffer = io.BytesIO()
+    with publication_style():
+        figure.savefig(buffer, format="png", dpi=resolution, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+_IDENTIFIER = re.compile(r'\bid="([^"]+)"')
+_REFERENCE = re.compile(r'(href="#|url\(#)([^")]+)')
+
+
+def inline_svg(svg: bytes, prefix: str, description: str) -> str:
+    """Return an SVG ready to stand inside an HTML page.
+
+    The XML heading goes, every id and every reference to one get `prefix` (ids must be unique in a page), the
+    size follows the page, and a description is there for those who cannot see it.
+
+    Raises
+    ------
+    InvalidFigureError
+        The bytes are not an SVG.
+    """
+    text = svg.decode("utf-8", errors="replace")
+    start = text.find("<svg")
+    end = text.find(">", start)
+    if start < 0 or end < 0:
+        raise InvalidFigureError("A figure for a page must be an SVG; the bytes given have no <svg> element.")
+    opening, body = text[start:end], text[end:].rstrip()
+    view_box = re.search(r'viewBox="([^"]+)"', opening)
+    if view_box is None:
+        raise InvalidFigureError("A figure for a page must have a viewBox, or it could not be scaled.")
+    body = _IDENTIFIER.sub(rf'id="{prefix}-\1"', body)
+    body = _REFERENCE.sub(rf"\1{prefix}-\2", body)
+    # Inside HTML the parser knows the namespaces; `href` without the xlink prefix is the current standard.
+    body = body.replace("xlink:href=", "href=")
+    escaped = (
+        description.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace('"', "&quot;")
+    )
+    return f'<svg viewBox="{view_box.group(1)}" role="img" aria-label="{escaped}"{body}'

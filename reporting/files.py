@@ -1,0 +1,235 @@
+"""Files that are either whole or not there: atomic writes and reproducible archives.
+
+Everything is written under a temporary name in the folder of its destination, flushed to the disk and
+moved into place in one step. A kill, a full disk or a refused permission leaves the previous file as it was.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import itertools
+import os
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy_format
+from numpy.typing import NDArray
+
+from reporting.errors import DamagedFileError, DiskFullError, FileNotWrittenError
+
+TEMPORARY_SUFFIX = ".partial"
+"""Ending of the temporary names, so that a leftover of a killed process is recognisable."""
+
+_NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_REFUSED = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
+_temporary_count = itertools.count()
+_ARCHIVE_DATE = (1980, 1, 1, 0, 0, 0)  # the first date that the zip format can hold
+
+
+def write_error(error: OSError, path: Path) -> FileNotWrittenError:
+    """Return the exception with one clear sentence for an operating-system error met while writing `path`."""
+    if error.errno in _NO_SPACE:
+        return DiskFullError(
+            f"No space is left on the disk to write {path}: free some space and repeat; "
+            "what was there before is unchanged."
+        )
+    if error.errno in _REFUSED:
+        return FileNotWrittenError(
+            f"Writing {path} is not permitted: choose another place or change the permissions of its folder."
+        )
+    if error.errno in (errno.ENOENT, errno.ENOTDIR) and not path.parent.is_dir():
+        return FileNotWrittenError(
+            f"{path} cannot be written because its folder {path.parent} does not exist."
+        )
+    return FileNotWrittenError(f"{path} could not be written: {error.strerror or error}.")
+
+
+def _destination(path: Path) -> Path:
+    """Return the file behind `path` (links followed); refuse a folder and a device."""
+    target = Path(os.path.realpath(path))
+    if target.exists() and not target.is_file():
+        kind = "a folder" if target.is_dir() else "not an ordinary file"
+        raise FileNotWrittenError(f"{path} cannot be written because it is {kind}: choose another name.")
+    return target
+
+
+def _synchronise(path: Path) -> None:
+    """Flush a file or a folder to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        # Some file systems cannot flush a folder; the move itself is atomic there all the same.
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EBADF):
+            raise
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def atomic_file(path: str | os.PathLike[str], *, make_folder: bool = True) -> Iterator[Path]:
+    """Give a temporary path to write to, and move it to `path` when the block ends without an exception.
+
+    For writers that want a file name (NetCDF, zip, VTU). The temporary file lies in the same folder and has
+    the same ending as `path`. If the block raises, the temporary file is removed and `path` is unchanged.
+
+    Parameters
+    ----------
+    path
+        Destination; replaced if it exists. A symbolic link is followed.
+    make_folder
+        Create the folder of `path` if it is missing.
+
+    Raises
+    ------
+    DiskFullError
+        No space is left.
+    FileNotWrittenError
+        The folder is missing or read-only, or `path` is a folder or a device.
+    """
+    requested = Path(path)
+    target = _destination(requested)
+    label = f"{os.getpid()}-{next(_temporary_count)}"
+    temporary = target.with_name(f".{target.stem}.{label}{TEMPORARY_SUFFIX}{target.suffix}")
+    try:
+        if make_folder:
+            target.parent.mkdir(parents=True, exist_ok=True)
+        # Created here, with the permissions of the user's umask and not those of a private temporary file.
+        os.close(os.open(temporary, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, 0o666))
+        yield temporary
+        _synchronise(temporary)
+        temporary.replace(target)
+        _synchronise(target.parent)
+    except OSError as error:
+        raise write_error(error, requested) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def atomic_write_bytes(path: str | os.PathLike[str], data: bytes, *, make_folder: bool = True) -> Path:
+    """Write bytes to `path` in one step; return the path.
+
+    Raises
+    ------
+    DiskFullError, FileNotWrittenError
+        As `atomic_file`.
+    """
+    with atomic_file(path, make_folder=make_folder) as temporary:
+        temporary.write_bytes(data)
+    return Path(path)
+
+
+def atomic_write_text(path: str | os.PathLike[str], text: str, *, make_folder: bool = True) -> Path:
+    """Write text to `path` in UTF-8 with the line ends as given, in one step; return the path.
+
+    Raises
+    ------
+    DiskFullError, FileNotWrittenError
+        As `atomic_file`.
+    """
+    return atomic_write_bytes(path, text.encode("utf-8"), make_folder=make_folder)
+
+
+def remove_leftovers(folder: str | os.PathLike[str]) -> int:
+    """Remove the temporary files that killed processes left in `folder`; return how many there were.
+
+    Only for a folder that no other process writes to at this moment.
+    """
+    leftovers = [path for path in Path(folder).glob(f".*{TEMPORARY_SUFFIX}*") if path.is_file()]
+    for path in leftovers:
+        path.unlink(missing_ok=True)
+    return len(leftovers)
+
+
+def npz_bytes(arrays: Mapping[str, Any], *, compressed: bool = False) -> bytes:
+    """Return the bytes of an ``.npz`` archive that depend on nothing but the arrays.
+
+    Fixed dates, members in the order of their names, C order, little-endian or single-byte data, no pickles.
+    ``numpy.load`` reads it.
+
+    Parameters
+    ----------
+    arrays
+        Name -> array of numbers, booleans or fixed-width text.
+    compressed
+        Deflate the members. The bytes then also depend on the version of zlib.
+
+    Raises
+    ------
+    ValueError
+        A name is empty or holds a slash, or an array holds Python objects.
+    """
+    buffer = io.BytesIO()
+    method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+    with zipfile.ZipFile(buffer, "w", method) as archive:
+        for name in sorted(arrays):
+            if not name or "/" in name or "\\" in name:
+                raise ValueError(f"An array in an archive needs a name without slashes, not {name!r}.")
+            member = zipfile.ZipInfo(f"{name}.npy", date_time=_ARCHIVE_DATE)
+            member.compress_type = method
+            member.create_system = 3  # the same on every platform
+            member.external_attr = 0o644 << 16
+            archive.writestr(member, _npy_bytes(name, arrays[name]))
+    return buffer.getvalue()
+
+
+def _npy_bytes(name: str, values: Any) -> bytes:
+    array = np.asarray(values)
+    if array.dtype.hasobject:
+        raise ValueError(
+            f"The array {name!r} holds Python objects; only numbers, booleans and text can be saved."
+        )
+    # `asarray` keeps a scalar a scalar, which `ascontiguousarray` would not.
+    array = np.asarray(array, dtype=array.dtype.newbyteorder("<"), order="C")
+    buffer = io.BytesIO()
+    npy_format.write_array(buffer, array, version=(1, 0), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], *, compressed: bool = False) -> Path:
+    """Write `npz_bytes` of the arrays to `path` in one step; return the path.
+
+    Raises
+    ------
+    ValueError
+        As `npz_bytes`.
+    DiskFullError, FileNotWrittenError
+        As `atomic_file`.
+    """
+    return atomic_write_bytes(path, npz_bytes(arrays, compressed=compressed))
+
+
+def read_npz(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
+    """Read all arrays of an ``.npz`` archive; no pickles.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is no such file.
+    DamagedFileError
+        The file is not a whole archive of arrays.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise FileNotFoundError(f"There is no file {source}.")
+    try:
+        with zipfile.ZipFile(source) as archive:
+            members = [name for name in archive.namelist() if name.endswith(".npy")]
+            arrays = {}
+            for member in members:
+                with archive.open(member) as stream:
+                    array = npy_format.read_array(stream, allow_pickle=False)
+                    if stream.read(1):
+                        raise ValueError("bytes follow the array")
+                arrays[member.removesuffix(".npy")] = np.asarray(array)
+    except (zipfile.BadZipFile, ValueError, EOFError, OSError) as error:
+        raise DamagedFileError(
+            f"{source} is not a whole archive of arrays ({error}): make it again."
+        ) from error
+    return arrays

@@ -1,0 +1,185 @@
+"""Files are whole or not there, and archives are reproducible."""
+
+import errno
+import io
+import os
+import stat
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from reporting import files
+from reporting.errors import DamagedFileError, DiskFullError, FileNotWrittenError
+
+
+def test_bytes_and_text_arrive_and_nothing_else_is_left(tmp_path: Path) -> None:
+    target = tmp_path / "new" / "data.bin"
+    assert files.atomic_write_bytes(target, b"\x00first") == target
+    files.atomic_write_bytes(target, b"second")
+    assert target.read_bytes() == b"second"
+    files.atomic_write_text(tmp_path / "text.csv", "ä\nb\r\n")
+    assert (tmp_path / "text.csv").read_bytes() == "ä\nb\r\n".encode()
+    assert [path.name for path in target.parent.iterdir()] == ["data.bin"]
+
+
+def test_permissions_follow_the_umask(tmp_path: Path) -> None:
+    previous = os.umask(0o027)
+    try:
+        files.atomic_write_bytes(tmp_path / "data", b"x")
+    finally:
+        os.umask(previous)
+    assert stat.S_IMODE((tmp_path / "data").stat().st_mode) == 0o640
+
+
+def test_an_exception_in_the_block_leaves_the_old_file(tmp_path: Path) -> None:
+    target = tmp_path / "data"
+    files.atomic_write_bytes(target, b"old")
+
+    def write_half() -> None:
+        with files.atomic_file(target) as temporary:
+            temporary.write_bytes(b"half")
+            raise KeyError("writer failed")
+
+    with pytest.raises(KeyError):
+        write_half()
+    assert target.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize(
+    ("number", "expected", "words"),
+    [
+        (errno.ENOSPC, DiskFullError, "No space is left"),
+        (errno.EDQUOT, DiskFullError, "No space is left"),
+        (errno.EACCES, FileNotWrittenError, "not permitted"),
+        (errno.EROFS, FileNotWrittenError, "not permitted"),
+        (errno.EIO, FileNotWrittenError, "could not be written"),
+    ],
+)
+def test_a_failing_disk_gives_one_sentence_and_keeps_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, expected: type[Exception], words: str
+) -> None:
+    target = tmp_path / "data"
+    files.atomic_write_bytes(target, b"old")
+
+    def fail(descriptor: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(expected, match=words) as caught:
+        files.atomic_write_bytes(target, b"new")
+    assert "\n" not in str(caught.value)
+    assert str(target) in str(caught.value)
+    assert target.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_folders_and_devices_are_never_replaced(tmp_path: Path) -> None:
+    with pytest.raises(FileNotWrittenError, match="a folder"):
+        files.atomic_write_bytes(tmp_path, b"x")
+    with pytest.raises(FileNotWrittenError, match="not an ordinary file"):
+        files.atomic_write_bytes(os.devnull, b"x")
+    with pytest.raises(FileNotWrittenError, match="does not exist"):
+        files.atomic_write_bytes(tmp_path / "no" / "file", b"x", make_folder=False)
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(FileNotWrittenError):
+        files.atomic_write_bytes(tmp_path / "file" / "below", b"x")
+
+
+def test_a_link_is_followed(tmp_path: Path) -> None:
+    (tmp_path / "real").write_bytes(b"old")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    files.atomic_write_bytes(tmp_path / "link", b"new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real").read_bytes() == b"new"
+
+
+def test_a_kill_at_any_moment_leaves_a_whole_file(tmp_path: Path) -> None:
+    target = tmp_path / "state"
+    script = (
+        "import sys; from reporting.files import atomic_write_bytes\n"
+        "number = 0\n"
+        "while True:\n"
+        "    atomic_write_bytes(sys.argv[1], bytes([number % 256]) * 200_000); number += 1\n"
+    )
+    for delay in (0.0, 0.013, 0.031):
+        process = subprocess.Popen([sys.executable, "-c", script, str(target)])
+        while not target.exists():
+            time.sleep(0.01)
+        time.sleep(delay)
+        process.kill()
+        process.wait()
+        content = target.read_bytes()
+        assert len(content) == 200_000
+        assert len(set(content)) == 1
+        files.remove_leftovers(tmp_path)
+        assert list(tmp_path.iterdir()) == [target]
+        target.unlink()
+
+
+def test_leftovers_are_counted_and_other_files_stay(tmp_path: Path) -> None:
+    (tmp_path / f".run.1-0{files.TEMPORARY_SUFFIX}.nc").write_bytes(b"half")
+    (tmp_path / ".hidden").write_bytes(b"mine")
+    (tmp_path / "run.nc").write_bytes(b"whole")
+    assert files.remove_leftovers(tmp_path) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".hidden", "run.nc"]
+
+
+@given(
+    hnp.arrays(
+        dtype=st.sampled_from([np.float64, np.float32, np.int64, np.uint8, np.bool_, np.dtype("U3")]),
+        shape=hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
+    )
+)
+def test_archives_give_back_what_they_were_given(values: np.ndarray) -> None:
+    data = files.npz_bytes({"values": values, "text": np.array("µ"), "number": 3.5})
+    loaded = np.load(io.BytesIO(data), allow_pickle=False)
+    np.testing.assert_array_equal(loaded["values"], values)
+    assert loaded["values"].shape == values.shape
+    assert loaded["values"].dtype.newbyteorder("=") == values.dtype.newbyteorder("=")
+    assert str(loaded["text"]) == "µ"
+    assert loaded["number"].shape == ()
+
+
+def test_archive_bytes_depend_on_the_arrays_only() -> None:
+    values = np.arange(6.0).reshape(2, 3)
+    first = files.npz_bytes({"a": values, "b": values[0]})
+    assert first == files.npz_bytes({"b": values[0].copy(), "a": np.asfortranarray(values)})
+    assert first == files.npz_bytes({"b": values[0].astype(">f8"), "a": values})
+    assert first != files.npz_bytes({"a": values, "b": values[1]})
+    with zipfile.ZipFile(io.BytesIO(first)) as archive:
+        assert archive.namelist() == ["a.npy", "b.npy"]
+        assert {member.date_time for member in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+
+
+def test_objects_and_odd_names_are_refused() -> None:
+    with pytest.raises(ValueError, match="Python objects"):
+        files.npz_bytes({"bad": np.array([object()])})
+    with pytest.raises(ValueError, match="without slashes"):
+        files.npz_bytes({"a/b": 1.0})
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_reading_back_and_every_truncation_is_noticed(tmp_path: Path, compressed: bool) -> None:
+    path = files.write_npz(tmp_path / "x.npz", {"a": np.arange(5)}, compressed=compressed)
+    np.testing.assert_array_equal(files.read_npz(path)["a"], np.arange(5))
+    whole = path.read_bytes()
+    for length in range(0, len(whole), 7):
+        path.write_bytes(whole[:length])
+        with pytest.raises(DamagedFileError, match="make it again"):
+            files.read_npz(path)
+    damaged = bytearray(whole)
+    damaged[60] ^= 0xFF
+    path.write_bytes(bytes(damaged))
+    with pytest.raises(DamagedFileError):
+        files.read_npz(path)
+    with pytest.raises(FileNotFoundError):
+        files.read_npz(tmp_path / "none.npz")

@@ -1,0 +1,62 @@
+"""Provenance names what made a result and nothing else."""
+
+import hashlib
+import json
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reporting import provenance
+
+
+def test_versions_of_the_stack() -> None:
+    versions = provenance.stack_versions(["numpy", "no-such-distribution"])
+    assert versions["numpy"] == np.__version__
+    assert versions["no-such-distribution"] == "not installed"
+    assert versions["python"].count(".") == 2
+
+
+def test_a_record_is_plain_and_names_no_machine() -> None:
+    record = provenance.collect_provenance(7, input_hashes={"z": "1", "a": "2"})
+    assert record == provenance.collect_provenance(7, input_hashes={"a": "2", "z": "1"})
+    text = json.dumps(record.as_dict())
+    assert json.loads(text)["seed"] == 7
+    assert list(record.as_dict()["input_hashes"]) == ["a", "z"]
+    assert "/" not in text
+    assert socket.gethostname() not in text
+
+
+def test_hash_of_a_tree_sees_names_and_contents_but_not_line_ends(tmp_path: Path) -> None:
+    def hashed(**files: bytes) -> str:
+        for path in tmp_path.iterdir():
+            path.unlink()
+        for name, content in files.items():
+            (tmp_path / f"{name}.py").write_bytes(content)
+        (tmp_path / "ignored.pyc").write_bytes(b"cache")
+        return provenance.hash_tree(tmp_path, suffixes=[".py"])
+
+    reference = hashed(a=b"x\n", b=b"y\n")
+    assert reference == hashed(b=b"y\n", a=b"x\r\n")
+    assert reference != hashed(a=b"x\n", c=b"y\n")
+    assert reference != hashed(a=b"x\ny\n", b=b"")
+    assert hashed(a=b"x", b=b"y") != hashed(a=b"xy", b=b"")
+
+
+def test_hash_of_a_package() -> None:
+    assert len(provenance.source_hash("reporting")) == 64
+    assert provenance.source_hash("reporting") != provenance.source_hash("scenarios")
+    with pytest.raises(ValueError, match="no package"):
+        provenance.source_hash("no_such_package")
+
+
+def test_hash_of_a_record_and_a_file(tmp_path: Path) -> None:
+    assert provenance.hash_record({"a": 1, "b": [1.5, "µ"]}) == provenance.hash_record(
+        {"b": [1.5, "µ"], "a": 1}
+    )
+    with pytest.raises(ValueError, match=r"[Oo]ut of range|not JSON"):
+        provenance.hash_record({"a": float("nan")})
+    (tmp_path / "f").write_bytes(b"abc")
+    assert provenance.hash_file(tmp_path / "f") == hashlib.sha256(b"abc").hexdigest()
+    assert provenance.hash_bytes(b"abc") == hashlib.sha256(b"abc").hexdigest()
