@@ -27,3 +27,11 @@ class OutsideModelError(FiniteElementError, ValueError):
 
 class SolutionError(FiniteElementError, RuntimeError):
     """A linear or eigenvalue solution did not reach the accuracy that was asked for."""
+
+
+class ReducedModelFileError(FiniteElementError, RuntimeError):
+    """A stored reduced model is damaged, incomplete or of another format."""
+
+
+class ReductionError(FiniteElementError, RuntimeError):
+    """The reduced model did not reach the accuracy that was asked for."""
