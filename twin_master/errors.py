@@ -1,0 +1,67 @@
+"""What can go wrong in the twin, by cause."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+__all__ = [
+    "ImpossibleObservation",
+    "InvalidDistributionError",
+    "InvalidModelError",
+    "InvalidObservationError",
+    "InvalidStrainLibraryError",
+    "PlanningError",
+    "TwinMasterError",
+]
+
+
+class TwinMasterError(Exception):
+    """Any failure of `twin_master` that has a cause which the user can act upon."""
+
+
+class InvalidModelError(TwinMasterError, ValueError):
+    """State space, controls, sensors or rewards do not fit together."""
+
+
+class InvalidDistributionError(TwinMasterError, ValueError):
+    """A row of a stochastic matrix, or a belief, is no probability distribution."""
+
+
+class InvalidObservationError(TwinMasterError, ValueError):
+    """An observation has the wrong shape or holds an infinite value."""
+
+
+class InvalidStrainLibraryError(TwinMasterError, ValueError):
+    """A strain library file is missing, damaged or incomplete."""
+
+
+class PlanningError(TwinMasterError, RuntimeError):
+    """Value iteration was given no solvable problem, or did not converge."""
+
+
+class ImpossibleObservation(TwinMasterError, RuntimeError):  # noqa: N818 - the name says it all
+    """The observation has probability zero in every state that the belief still allows.
+
+    Attributes
+    ----------
+    twin : str
+        Name of the twin.
+    step : int
+        Step (turn) of the observation.
+    worst_residuals : dict of str to float
+        The sensors that fit worst, with their standardised residuals; empty if unknown.
+    """
+
+    def __init__(self, twin: str, step: int, worst_residuals: Mapping[str, float] | None = None) -> None:
+        self.twin = twin
+        self.step = step
+        self.worst_residuals = dict(worst_residuals or {})
+        worst = ", ".join(f"{name}: {value:+.3g} sd" for name, value in self.worst_residuals.items())
+        super().__init__(
+            f"twin {twin!r}, step {step}: the observation has probability zero in every state that the "
+            f"belief still allows{f' (worst residuals {worst})' if worst else ''}; "
+            "check these sensors, or the transitions and the prior that rule out the true state"
+        )
+
+    def __reduce__(self) -> tuple[type[ImpossibleObservation], tuple[str, int, dict[str, float]]]:
+        return type(self), (self.twin, self.step, self.worst_residuals)

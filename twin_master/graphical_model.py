@@ -1,0 +1,394 @@
+"""State space, controls, transitions and policies of the dynamic decision network.
+
+The factors (2)-(4) and (28)-(29) of Kapteyn et al. 2021 as arrays. Every stochastic matrix of the twin
+passes `stochastic_matrix`, which checks it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twin_master.errors import InvalidDistributionError, InvalidModelError
+
+__all__ = [
+    "ROW_SUM_TOLERANCE",
+    "Factor",
+    "GraphicalModel",
+    "SparseTransition",
+    "StateSpace",
+    "TransitionModel",
+    "deterministic_policy",
+    "distribution",
+    "stochastic_matrix",
+    "worsening_table",
+]
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+ROW_SUM_TOLERANCE = 1e-12
+"""Largest departure of the sum of a probability distribution from one."""
+
+
+def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
+    """Return `rows` as a checked, read-only array of probability distributions along the last axis.
+
+    Parameters
+    ----------
+    rows : (..., n) dimensionless
+        Finite, non-negative, each row summing to one within `ROW_SUM_TOLERANCE`.
+    name : str
+        What the matrix is, for the error message.
+
+    Raises
+    ------
+    InvalidDistributionError
+        With the index of the first row that is no distribution.
+    """
+    matrix = np.array(rows, dtype=np.float64, order="C")
+    if matrix.ndim == 0 or matrix.size == 0:
+        raise InvalidDistributionError(
+            f"{name}: expected rows of probabilities, got an array of shape {matrix.shape}"
+        )
+    for bad, reason in (
+        (~np.isfinite(matrix).all(axis=-1), "holds a value that is not finite"),
+        ((matrix < 0.0).any(axis=-1), "holds a negative probability"),
+        (np.abs(matrix.sum(axis=-1) - 1.0) > ROW_SUM_TOLERANCE, "does not sum to one"),
+    ):
+        if np.any(bad):
+            where = tuple(int(i) for i in np.argwhere(np.atleast_1d(bad))[0]) if matrix.ndim > 1 else ()
+            row = matrix[where]
+            label = f"row {where[0] if len(where) == 1 else where}" if where else "the distribution"
+            raise InvalidDistributionError(
+                f"{name}: {label} {reason} (sum {row.sum():.15g}, smallest {row.min():.6g}); "
+                "every row must be non-negative and sum to one within 1e-12"
+            )
+    matrix.setflags(write=False)
+    return matrix
+
+
+def distribution(probabilities: ArrayLike, *, size: int, name: str) -> Float:
+    """Return one checked, read-only probability distribution of length `size`.
+
+    Raises
+    ------
+    InvalidDistributionError
+        If it has another shape, or does not pass `stochastic_matrix`.
+    """
+    vector = stochastic_matrix(probabilities, name=name)
+    if vector.shape != (size,):
+        raise InvalidDistributionError(f"{name}: expected shape ({size},), got {vector.shape}")
+    return vector
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One named component of the state and the levels that it can take.
+
+    Attributes
+    ----------
+    name : str
+        For example the name of a region of the asset.
+    levels : tuple of float
+        Strictly increasing values, SI (a stiffness loss is a fraction).
+    """
+
+    name: str
+    levels: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        levels = tuple(float(level) for level in self.levels)
+        object.__setattr__(self, "levels", levels)
+        if not self.name:
+            raise InvalidModelError("a factor of the state space needs a name, got an empty one")
+        if not levels or not np.all(np.isfinite(levels)) or np.any(np.diff(levels) <= 0.0):
+            raise InvalidModelError(
+                f"factor {self.name!r}: expected one or more finite, strictly increasing levels, got {levels}"
+            )
+
+
+@dataclass(frozen=True)
+class StateSpace:
+    """Joint state of named factors, flattened in C order (the last factor varies fastest).
+
+    Attributes
+    ----------
+    factors : tuple of Factor
+        At least one, with different names.
+    """
+
+    factors: tuple[Factor, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "factors", tuple(self.factors))
+        names = [factor.name for factor in self.factors]
+        if not names or len(set(names)) != len(names):
+            raise InvalidModelError(
+                f"a state space needs one or more factors with different names, got {names}"
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the factors."""
+        return tuple(factor.name for factor in self.factors)
+
+    @cached_property
+    def shape(self) -> tuple[int, ...]:
+        """Number of levels of each factor."""
+        return tuple(len(factor.levels) for factor in self.factors)
+
+    @cached_property
+    def size(self) -> int:
+        """Number S of joint states."""
+        return int(np.prod(self.shape))
+
+    @cached_property
+    def coordinates(self) -> Float:
+        """Levels of each joint state: (S, factors)."""
+        grids = np.meshgrid(*(factor.levels for factor in self.factors), indexing="ij")
+        table: Float = np.stack([grid.ravel() for grid in grids], axis=-1).astype(np.float64)
+        table.setflags(write=False)
+        return table
+
+    def index(self, levels: Sequence[float]) -> int:
+        """Return the joint index of the given levels, one per factor (matched to 1e-9).
+
+        Raises
+        ------
+        InvalidModelError
+            If a value is no level of its factor.
+        """
+        if len(levels) != len(self.factors):
+            raise InvalidModelError(f"expected one level for each of {self.names}, got {tuple(levels)}")
+        indices = []
+        for factor, value in zip(self.factors, levels, strict=True):
+            distance = np.abs(np.asarray(factor.levels) - value)
+            best = int(distance.argmin())
+            if not distance[best] <= 1e-9:
+                raise InvalidModelError(
+                    f"{value} is no level of factor {factor.name!r}; its levels are {factor.levels}"
+                )
+            indices.append(best)
+        return int(np.ravel_multi_index(indices, self.shape))
+
+    def certain(self, levels: Sequence[float]) -> Float:
+        """Return the distribution (S,) that is certain of the given levels."""
+        belief = np.zeros(self.size)
+        belief[self.index(levels)] = 1.0
+        return belief
+
+    def mean(self, belief: ArrayLike) -> Float:
+        """Return the mean of each factor: (..., S) -> (..., factors)."""
+        result: Float = np.asarray(belief, dtype=np.float64) @ self.coordinates
+        return result
+
+    def standard_deviation(self, belief: ArrayLike) -> Float:
+        """Return the standard deviation of each factor: (..., S) -> (..., factors)."""
+        belief = np.asarray(belief, dtype=np.float64)
+        deviation = self.coordinates - self.mean(belief)[..., None, :]
+        result: Float = np.sqrt(np.einsum("...s,...sf->...f", belief, deviation**2))
+        return result
+
+    def marginal(self, belief: ArrayLike, name: str) -> Float:
+        """Return the marginal of the factor `name`: (..., S) -> (..., levels of that factor).
+
+        Raises
+        ------
+        InvalidModelError
+            If there is no such factor.
+        """
+        if name not in self.names:
+            raise InvalidModelError(f"no factor is named {name!r}; there are {', '.join(self.names)}")
+        belief = np.asarray(belief, dtype=np.float64)
+        joint = belief.reshape(*belief.shape[:-1], *self.shape)
+        keep = self.names.index(name)
+        others = tuple(axis - len(self.shape) for axis in range(len(self.shape)) if axis != keep)
+        result: Float = joint.sum(axis=others)
+        return result
+
+
+@dataclass(frozen=True)
+class SparseTransition:
+    """The non-zero transitions as predecessor lists.
+
+    Row ``control * S + state`` lists the states from which `state` is reached under `control`. The arrays
+    are for the compiled loops, which never write to them.
+
+    Attributes
+    ----------
+    start : (U * S + 1,)
+        Where each row begins.
+    source : (non-zeros,)
+        The predecessor.
+    probability, log_probability : (non-zeros,) dimensionless
+        Of the transition from it.
+    """
+
+    start: Index
+    source: Index
+    probability: Float
+    log_probability: Float
+
+    @classmethod
+    def from_matrix(cls, matrix: Float) -> SparseTransition:
+        """Build the lists from a transition array (U, S, S)."""
+        rows = matrix.transpose(0, 2, 1).reshape(-1, matrix.shape[2])
+        row, source = np.nonzero(rows)
+        start = np.zeros(len(rows) + 1, dtype=np.int64)
+        np.cumsum(np.bincount(row, minlength=len(rows)), out=start[1:])
+        probability = rows[row, source]
+        return cls(start, source.astype(np.int64), probability, np.log(probability))
+
+
+@dataclass(frozen=True)
+class TransitionModel:
+    """p(D_t | D_{t-1}, U_{t-1}): one row-stochastic matrix for each control, eqs. (28)-(29).
+
+    Attributes
+    ----------
+    matrix : (U, S, S) dimensionless
+        ``matrix[u, i, j]`` is the probability to go from state i to state j under control u.
+    """
+
+    matrix: Float
+
+    def __post_init__(self) -> None:
+        matrix = stochastic_matrix(self.matrix, name="transition[control, state]")
+        if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2]:
+            raise InvalidModelError(
+                f"transition: expected shape (controls, states, states), got {matrix.shape}"
+            )
+        object.__setattr__(self, "matrix", matrix)
+
+    @classmethod
+    def from_factors(cls, tables: Sequence[Sequence[ArrayLike]]) -> TransitionModel:
+        """Build the joint transition of factors that change independently, given the control.
+
+        Parameters
+        ----------
+        tables : for each control, for each factor, (levels, levels)
+            Row-stochastic; the joint matrix is their Kronecker product in the order of the factors.
+        """
+        joint = []
+        for control, factor_tables in enumerate(tables):
+            checked = [
+                stochastic_matrix(table, name=f"transition of control {control}, factor {factor}")
+                for factor, table in enumerate(factor_tables)
+            ]
+            if not checked or any(t.ndim != 2 or t.shape[0] != t.shape[1] for t in checked):
+                raise InvalidModelError(
+                    f"control {control}: expected a square table for each factor, "
+                    f"got shapes {[table.shape for table in checked]}"
+                )
+            product: Float = checked[0]
+            for table in checked[1:]:
+                product = np.asarray(np.kron(product, table), dtype=np.float64)
+            joint.append(product)
+        if len({matrix.shape for matrix in joint}) != 1:
+            raise InvalidModelError(
+                f"every control needs the same states, got shapes {[m.shape for m in joint]}"
+            )
+        return cls(np.stack(joint))
+
+    @cached_property
+    def sparse(self) -> SparseTransition:
+        """The non-zero transitions as lists."""
+        return SparseTransition.from_matrix(self.matrix)
+
+
+@dataclass(frozen=True)
+class GraphicalModel:
+    """States, controls, prior and transitions: what inference needs beside the log-likelihoods.
+
+    Attributes
+    ----------
+    states : StateSpace
+        S joint states.
+    controls : tuple of str
+        Names of the U controls.
+    prior : (S,) dimensionless
+        p(D_0).
+    transition : TransitionModel
+        (U, S, S).
+    """
+
+    states: StateSpace
+    controls: tuple[str, ...]
+    prior: Float
+    transition: TransitionModel
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "controls", tuple(self.controls))
+        if not self.controls or len(set(self.controls)) != len(self.controls):
+            raise InvalidModelError(
+                f"expected one or more controls with different names, got {self.controls}"
+            )
+        size = self.states.size
+        object.__setattr__(self, "prior", distribution(self.prior, size=size, name="prior"))
+        expected = (len(self.controls), size, size)
+        if self.transition.matrix.shape != expected:
+            raise InvalidModelError(
+                f"transition: expected shape {expected} for {len(self.controls)} controls and {size} states, "
+                f"got {self.transition.matrix.shape}"
+            )
+
+    @cached_property
+    def log_prior(self) -> Float:
+        """Log of the prior (S,), minus infinity where it is zero."""
+        with np.errstate(divide="ignore"):
+            result: Float = np.log(self.prior)
+        return result
+
+    def policy(self, rows: ArrayLike) -> Float:
+        """Return a checked policy p(U | D): (S, U), read-only, row-stochastic.
+
+        Raises
+        ------
+        InvalidDistributionError, InvalidModelError
+            If a row is no distribution, or the shape is another one.
+        """
+        policy = stochastic_matrix(rows, name="policy[state]")
+        expected = (self.states.size, len(self.controls))
+        if policy.shape != expected:
+            raise InvalidModelError(
+                f"policy: expected shape {expected} (states, controls), got {policy.shape}"
+            )
+        return policy
+
+
+def worsening_table(level_count: int, probability: float) -> Float:
+    """Return the transitions (n, n) of a factor that stays or worsens by one level.
+
+    The last level absorbs: the row at the limit sums to one, where the authors' published table leaves
+    the rows at a damage limit without the lost mass.
+
+    Parameters
+    ----------
+    level_count : int
+        Number n of levels.
+    probability : float
+        Probability to worsen by one level in one step, in [0, 1].
+    """
+    if level_count < 1 or not 0.0 <= probability <= 1.0:
+        raise InvalidModelError(
+            f"expected one or more levels and a probability in [0, 1], got {level_count} and {probability}"
+        )
+    table = np.diag(np.full(level_count, 1.0 - probability))
+    table += np.diag(np.full(level_count - 1, probability), 1)
+    table[-1, -1] = 1.0
+    return stochastic_matrix(table, name="worsening table")
+
+
+def deterministic_policy(control_index: ArrayLike, control_count: int) -> Float:
+    """Return the policy (S, U) that gives each state the control of its index (S,)."""
+    index = np.asarray(control_index)
+    if index.ndim != 1 or index.dtype.kind not in "iu" or np.any((index < 0) | (index >= control_count)):
+        raise InvalidModelError(
+            f"expected one control index between 0 and {control_count - 1} for each state, got {index}"
+        )
+    return stochastic_matrix(np.eye(control_count)[index], name="policy[state]")

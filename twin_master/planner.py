@@ -1,0 +1,149 @@
+"""Planning: value iteration on the Bellman equation, Kapteyn et al. 2021, eq. (36)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twin_master.errors import PlanningError
+from twin_master.graphical_model import deterministic_policy, stochastic_matrix
+
+__all__ = ["PlannedPolicy", "evaluate_policy", "value_iteration"]
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class PlannedPolicy:
+    """A planned policy.
+
+    Attributes
+    ----------
+    value : (S,)
+        Expected discounted reward from each state.
+    action_value : (S, U)
+        The same, if the given control is taken first.
+    control_index : (S,)
+        The control to take in each state.
+    policy : (S, U)
+        The same as a row-stochastic matrix p(U | D).
+    iterations : int
+        Sweeps until convergence.
+    """
+
+    value: Float
+    action_value: Float
+    control_index: Index
+    policy: Float
+    iterations: int
+
+
+def _checked(transition: ArrayLike, reward: ArrayLike, discount: float) -> tuple[Float, Float]:
+    """Return transition (U, S, S) and reward (S, U)."""
+    matrix = stochastic_matrix(transition, name="transition[control, state]")
+    rewards = np.array(reward, dtype=np.float64)
+    if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2] or rewards.shape != matrix.shape[1::-1]:
+        raise PlanningError(
+            "expected transitions of shape (controls, states, states) and rewards of shape "
+            f"(states, controls), got {matrix.shape} and {rewards.shape}"
+        )
+    if not np.all(np.isfinite(rewards)):
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(rewards))[0])
+        raise PlanningError(
+            f"reward at (state, control) {where} is {rewards[where]}; expected finite rewards"
+        )
+    if not 0.0 <= discount < 1.0:
+        raise PlanningError(f"expected a discount factor in [0, 1), got {discount}")
+    return matrix, rewards
+
+
+def value_iteration(
+    transition: ArrayLike,
+    reward: ArrayLike,
+    discount: float,
+    *,
+    tolerance: float = 1e-12,
+    max_iterations: int = 100_000,
+) -> PlannedPolicy:
+    """Iterate the Bellman equation (36) until the value is known to `tolerance`.
+
+    Parameters
+    ----------
+    transition : (U, S, S) dimensionless
+        Row-stochastic.
+    reward : (S, U)
+        Expected reward of one step.
+    discount : float
+        gamma, in [0, 1).
+    tolerance : float
+        Largest error of the value, relative to the largest reward (bounded from the last change of the value
+        by the contraction; rounding adds about 1e-16 / (1 - discount)).
+    max_iterations : int
+        Sweeps after which to give up.
+
+    Returns
+    -------
+    PlannedPolicy
+        Where several controls are as good to the tolerance, the first of them.
+
+    Raises
+    ------
+    PlanningError
+        If shapes do not fit, a reward is not finite, the discount is outside [0, 1), or it did not converge.
+    InvalidDistributionError
+        If a row of the transition does not sum to one.
+    """
+    matrix, rewards = _checked(transition, reward, discount)
+    controls, states, _ = matrix.shape
+    scale = float(np.abs(rewards).max()) or 1.0
+    discounted = (discount * matrix).reshape(controls * states, states)
+    flat_rewards = np.ascontiguousarray(rewards.T).reshape(-1)
+    # |V_k - V*| <= gamma / (1 - gamma) |V_k - V_{k-1}|; below rounding nothing changes any more.
+    limit = max(tolerance * scale * (1.0 - discount), 4e-16 * scale / (1.0 - discount))
+    value = np.zeros(states)
+    iterations = 0
+    change = np.inf
+    while change > limit:
+        if iterations == max_iterations:
+            raise PlanningError(
+                f"value iteration still changes by {change:.3g} after {max_iterations} sweeps with discount "
+                f"{discount}; allow more sweeps or a larger tolerance"
+            )
+        iterations += 1
+        action_value = (flat_rewards + discounted @ value).reshape(controls, states)
+        improved = action_value.max(axis=0)
+        change = float(np.abs(improved - value).max())
+        value = improved
+    action_value = (flat_rewards + discounted @ value).reshape(controls, states)
+    tie = 2.0 * max(tolerance * scale, limit / (1.0 - discount))
+    control_index = np.argmax(action_value >= action_value.max(axis=0) - tie, axis=0).astype(np.int64)
+    return PlannedPolicy(
+        value=value,
+        action_value=np.ascontiguousarray(action_value.T),
+        control_index=control_index,
+        policy=deterministic_policy(control_index, controls),
+        iterations=iterations,
+    )
+
+
+def evaluate_policy(transition: ArrayLike, reward: ArrayLike, discount: float, policy: ArrayLike) -> Float:
+    """Return the exact value (S,) of a policy by one linear solve.
+
+    Parameters
+    ----------
+    transition, reward, discount
+        As `value_iteration`.
+    policy : (S, U)
+        p(U | D), row-stochastic.
+    """
+    matrix, rewards = _checked(transition, reward, discount)
+    rows = stochastic_matrix(policy, name="policy[state]")
+    if rows.shape != rewards.shape:
+        raise PlanningError(f"expected a policy of shape {rewards.shape}, got {rows.shape}")
+    closed_loop = np.einsum("su,ust->st", rows, matrix)
+    expected = np.einsum("su,su->s", rows, rewards)
+    result: Float = np.linalg.solve(np.eye(len(expected)) - discount * closed_loop, expected)
+    return result

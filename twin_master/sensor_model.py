@@ -1,0 +1,269 @@
+"""Gaussian sensors: likelihood of what they show, residuals, and the posterior predictive check.
+
+Kapteyn et al. 2021, eqs. (30) and (32).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
+
+from twin_master.compilation import compiled
+from twin_master.errors import InvalidModelError, InvalidObservationError
+from twin_master.quantity import QuantityModel
+
+__all__ = ["GaussianSensorModel", "PredictiveCheck"]
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+LOG_ROOT_TWO_PI = 0.5 * float(np.log(2.0 * np.pi))
+
+
+@compiled
+def _log_mean_exp(exponent: Float, log_weight: Float) -> float:
+    """Return log sum_e exp(log_weight_e + exponent_e)."""
+    largest = -np.inf
+    for e in range(len(exponent)):
+        exponent[e] += log_weight[e]
+        largest = max(largest, exponent[e])
+    if largest == -np.inf:
+        return largest
+    total = 0.0
+    for e in range(len(exponent)):
+        total += np.exp(exponent[e] - largest)
+    return float(largest + np.log(total))
+
+
+@compiled
+def _log_likelihood(
+    observation: Float,
+    control: Index,
+    value: Float,
+    inverse_deviation: Float,
+    log_weight: Float,
+    inside: bool,
+    result: Float,
+) -> None:
+    """Fill result (T, S); value is (U, S, G, E) so that the loop over the draws is contiguous."""
+    steps, sensors = observation.shape
+    states, draws = value.shape[1], value.shape[3]
+    exponent = np.empty(draws)
+    for t in range(steps):
+        constant = 0.0
+        observed = 0
+        for g in range(sensors):
+            if not np.isnan(observation[t, g]):
+                constant += np.log(inverse_deviation[g]) - LOG_ROOT_TWO_PI
+                observed += 1
+        for s in range(states):
+            if observed == 0:
+                result[t, s] = 0.0
+                continue
+            total = constant
+            exponent[:] = 0.0
+            for g in range(sensors):
+                seen = observation[t, g]
+                if np.isnan(seen):
+                    continue
+                for e in range(draws):
+                    residual = (seen - value[control[t], s, g, e]) * inverse_deviation[g]
+                    exponent[e] -= 0.5 * residual * residual
+                if inside:
+                    total += _log_mean_exp(exponent, log_weight)
+                    exponent[:] = 0.0
+            if not inside:
+                total += _log_mean_exp(exponent, log_weight)
+            result[t, s] = total
+
+
+@dataclass(frozen=True)
+class PredictiveCheck:
+    """What a belief says about an observation, beside the observation.
+
+    Attributes
+    ----------
+    mean, standard_deviation : (..., G)
+        Of p(o_g), sensor noise included, SI.
+    residual : (..., G) dimensionless
+        (observation - mean) / standard deviation; NaN where the sensor is lost.
+    probability_integral_transform : (..., G) dimensionless
+        p(o_g <= observation): uniform in [0, 1] if the model holds; NaN where the sensor is lost.
+    """
+
+    mean: Float
+    standard_deviation: Float
+    residual: Float
+    probability_integral_transform: Float
+
+    def coverage(self, probability: float = 0.95) -> Float:
+        """Return for each sensor the share of observations inside the central interval: (..., G) -> (G,).
+
+        A sensor that never reports gets NaN.
+        """
+        transform = self.probability_integral_transform.reshape(-1, self.mean.shape[-1])
+        seen = ~np.isnan(transform)
+        inside = np.abs(transform - 0.5) <= 0.5 * probability
+        count = seen.sum(axis=0)
+        result: Float = np.where(count > 0, inside.sum(axis=0) / np.maximum(count, 1), np.nan)
+        return result
+
+
+class GaussianSensorModel(QuantityModel):
+    """Sensors that show a value plus independent Gaussian noise.
+
+    Parameters
+    ----------
+    strain_per_draw : (E, S, U, G)
+        Noise-free value for each draw e of the uncertain parameters, state, control and sensor, SI.
+    standard_deviation : float or (G,)
+        Of the noise that the twin assumes, SI, positive.
+    draw_weight : (E,), optional
+        Probability of each draw; equal by default.
+    average : {"outside", "inside"}
+        Where the average over the draws stands. "outside", the default, is the integral (30):
+        mean over e of the product over sensors. "inside" is eq. (32) as printed: the product over sensors of
+        the mean over e, as if each sensor had parameters of its own.
+
+    Raises
+    ------
+    InvalidModelError, InvalidDistributionError
+        If shapes do not fit, a value is not finite or a standard deviation not positive.
+    """
+
+    def __init__(
+        self,
+        strain_per_draw: ArrayLike,
+        standard_deviation: ArrayLike,
+        draw_weight: ArrayLike | None = None,
+        average: Literal["outside", "inside"] = "outside",
+    ) -> None:
+        super().__init__(strain_per_draw, draw_weight)
+        deviation = np.array(standard_deviation, dtype=np.float64)
+        if deviation.shape not in ((), (self.sensor_count,)) or not np.all(
+            np.isfinite(deviation) & (deviation > 0.0)
+        ):
+            raise InvalidModelError(
+                f"expected one positive noise standard deviation, or one for each of {self.sensor_count} "
+                f"sensors, got {deviation}"
+            )
+        if average not in ("outside", "inside"):
+            raise InvalidModelError(f"expected average 'outside' or 'inside', got {average!r}")
+        self._deviation: Float = np.broadcast_to(deviation, (self.sensor_count,)).copy()
+        self._inside = average == "inside"
+        with np.errstate(divide="ignore"):
+            self._log_weight: Float = np.log(self.draw_weight)
+        self._by_control = np.ascontiguousarray(self.value_per_draw.transpose(2, 1, 3, 0))
+
+    @property
+    def standard_deviation(self) -> Float:
+        """Noise standard deviation of each sensor (G,), SI."""
+        return self._deviation.copy()
+
+    def _checked(self, observation: ArrayLike) -> Float:
+        """Return observations (..., G) in which NaN stands for a lost sensor."""
+        observation = np.array(observation, dtype=np.float64, order="C")
+        if observation.ndim == 0 or observation.shape[-1] != self.sensor_count:
+            raise InvalidObservationError(
+                f"expected {self.sensor_count} sensor values, got an array of shape {observation.shape}"
+            )
+        if np.any(np.isinf(observation)):
+            where = tuple(int(i) for i in np.argwhere(np.isinf(observation))[0])
+            raise InvalidObservationError(
+                f"sensor value at {where} is infinite; expected a number, or NaN for a lost sensor"
+            )
+        return observation
+
+    def log_likelihood(self, observation: ArrayLike, control_index: int) -> Float:
+        """Return log p(o | D, u) for each state, eq. (30) or (32).
+
+        Parameters
+        ----------
+        observation : (G,)
+            SI; NaN where the sensor is lost. If all are lost the result is zero: see `observed_count`.
+        control_index : int
+            Control in force.
+
+        Returns
+        -------
+        (S,)
+            Density in SI.
+
+        Raises
+        ------
+        InvalidObservationError, InvalidModelError
+            If the shape is another one or a value is infinite; if there is no such control.
+        """
+        rows = self.log_likelihood_sequence(self._checked(observation)[None], [control_index])
+        result: Float = rows[0]
+        return result
+
+    def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
+        """Return log p(o_t | D_t, u_t) for a sequence: (T, G) and (T,) -> (T, S).
+
+        Raises
+        ------
+        InvalidObservationError, InvalidModelError
+            As `log_likelihood`.
+        """
+        observations = self._checked(observations)
+        control = np.array(control_index, dtype=np.int64)
+        if observations.ndim != 2 or control.shape != observations.shape[:1]:
+            raise InvalidModelError(
+                "expected observations of shape (steps, sensors) and controls of shape (steps,), "
+                f"got {observations.shape} and {control.shape}"
+            )
+        if control.size and (control.min() < 0 or control.max() >= self.control_count):
+            raise InvalidModelError(f"expected control indices between 0 and {self.control_count - 1}")
+        result = np.empty((len(observations), self.state_count))
+        _log_likelihood(
+            observations,
+            control,
+            self._by_control,
+            1.0 / self._deviation,
+            self._log_weight,
+            self._inside,
+            result,
+        )
+        return result
+
+    def observed_count(self, observations: ArrayLike) -> Index:
+        """Return how many sensors report: (..., G) -> (...). Zero flags a step that follows the dynamics."""
+        result: Index = np.sum(~np.isnan(self._checked(observations)), axis=-1)
+        return result
+
+    def predictive_check(self, joint: ArrayLike, observation: ArrayLike) -> PredictiveCheck:
+        """Compare observations with what beliefs predict for them.
+
+        Parameters
+        ----------
+        joint : (..., S, U)
+            p(D, U); for an honest check the belief before the observation (`forecast`).
+        observation : (..., G)
+            SI; NaN where the sensor is lost.
+        """
+        observation = self._checked(observation)
+        mean, spread = self.moments(joint)
+        if mean.shape != observation.shape:
+            raise InvalidModelError(
+                f"expected one belief for each observation, "
+                f"got {mean.shape[:-1]} and {observation.shape[:-1]}"
+            )
+        deviation = np.sqrt(spread**2 + self._deviation**2)
+        weights = self._weights(joint).reshape(-1, self.state_count, self.control_count)
+        rows = observation.reshape(-1, self.sensor_count)
+        transform = np.empty_like(rows)
+        for row, (weight, seen) in enumerate(zip(weights, rows, strict=True)):
+            state, control = np.nonzero(weight)
+            below = ndtr((seen - self.value_per_draw[:, state, control]) / self._deviation)
+            transform[row] = np.einsum("e,p,epg->g", self.draw_weight, weight[state, control], below)
+        return PredictiveCheck(
+            mean=mean,
+            standard_deviation=deviation,
+            residual=(observation - mean) / deviation,
+            probability_integral_transform=transform.reshape(observation.shape),
+        )
