@@ -1,0 +1,360 @@
+"""Packing a reduced model as the wing FMU: FMI 2.0 co-simulation through pythonfmu, reproducible to the byte.
+
+The slave base class and the binaries are pythonfmu's. The archive is packed here and not by its builder,
+which stamps times, a random GUID and module names that two FMUs in one process would share.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import io
+import json
+import os
+import zipfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, distribution, version
+from importlib.resources import files
+from pathlib import Path
+
+from fe.reduced import RUNTIME_FILES, ReducedModel
+from fe.state import STIFFNESS_LOSS_NAMES, DigitalState
+from reporting.files import atomic_write_bytes
+
+from .description import documentation_page, model_description
+from .errors import FmuBuildError
+from .variables import FmuVariable, variable_table
+
+PYTHONFMU_VERSION = "0.7.0"
+"""The only version whose wrapper these FMUs were tried with; its conventions are not a public interface."""
+
+MODE_COUNT = 6
+"""Number of modes of which frequency and damping ratio are outputs, if the model has as many."""
+
+DESCRIPTION = (
+    "Structure of a UAV half-wing: strains, tip displacement and modes from a reduced finite element model "
+    "under load factor and tip force, with two regions that can lose stiffness."
+)
+
+_OWN_FILES = ("behaviour.py", "slave.py", "variables.py")
+_PLACEHOLDER = "0_content_0_"
+_TAG_LENGTH = len(_PLACEHOLDER)
+_DATE = (1980, 1, 1, 0, 0, 0)
+_TEXT_SUFFIXES = (".py", ".xml", ".txt", ".html", ".json")
+
+_SCRIPT = '''"""Loaded by the FMI wrapper; everything is in the package beside it."""
+from uav_wing_0_content_0__runtime.entry import Fmi2Slave, WingSlave, keep_alive
+
+# The wrapper runs this file once for each instance and drops one reference to its globals too many.
+keep_alive(globals())
+
+
+class UavWing_0_content_0_(WingSlave, Fmi2Slave):
+    """The wing."""
+
+    content_tag = "0_content_0_"
+'''
+
+_ENTRY = '''"""Joins the slave, the reduced model and pythonfmu's base class."""
+import json
+
+from .behaviour import Physics, WingBehaviour
+from .fe.damping import rayleigh_damping_ratio
+from .fe.reduced import ReducedModel
+from .fe.transient import ModalIntegrator, TransientState
+from .pythonfmu.fmi2slave import Fmi2Slave
+from .slave import Contents
+from .slave import WingSlave as _WingSlave
+from .variables import variable_table
+
+__all__ = ["Fmi2Slave", "WingSlave", "keep_alive"]
+
+_kept = []
+_contents = []
+
+
+def keep_alive(thing):
+    """Hold one more reference for ever."""
+    _kept.append(thing)
+
+
+def load_contents(resources):
+    """Read the model once in a process: this package's name is a hash of its content."""
+    if not _contents:
+        model = ReducedModel.load(resources / "reduced_model.npz")
+        setting = json.loads((resources / "start.json").read_text(encoding="utf-8"))
+        table = variable_table(
+            gauge_count=model.gauge_count,
+            mode_count=setting["mode_count"],
+            validity=model.validity,
+            start=setting["start"],
+        )
+        physics = Physics(model, ModalIntegrator, TransientState, rayleigh_damping_ratio)
+        _contents.append(Contents(table, lambda: WingBehaviour(physics, setting["mode_count"])))
+    return _contents[0]
+
+
+class WingSlave(_WingSlave):
+    """The slave with its resources."""
+
+    load_contents = staticmethod(load_contents)
+'''
+
+
+@dataclass(frozen=True)
+class FmuInfo:
+    """An FMU that was built.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    guid, content_hash, model_identifier : str
+        GUID (from the content hash), SHA-256 of the content, stem of the binary.
+    design_hash : str
+        Hash of the design that made the reduced model.
+    size : int
+        Bytes of the file.
+    """
+
+    path: Path
+    guid: str
+    content_hash: str
+    model_identifier: str
+    design_hash: str
+    size: int
+
+
+def build_fmu(
+    model: ReducedModel,
+    path: str | os.PathLike[str],
+    *,
+    state: DigitalState | None = None,
+    replace: bool = False,
+) -> FmuInfo:
+    """Pack a reduced model as an FMU; equal input gives equal bytes.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        The wing.
+    path : path-like
+        Where to write, with the suffix .fmu.
+    state : DigitalState, optional
+        Start values of parameters and health; the digital state's defaults if absent.
+    replace : bool
+        Whether an existing file may be replaced.
+
+    Returns
+    -------
+    FmuInfo
+        What was built.
+
+    Raises
+    ------
+    FmuBuildError
+        If the file exists, the suffix is wrong, a start value lies outside the model's validity box, or
+        the wrong pythonfmu is installed.
+    """
+    target = Path(path)
+    if target.suffix != ".fmu":
+        raise FmuBuildError(f"An FMU must have the suffix .fmu, but {target} was given.")
+    if target.exists() and not replace:
+        raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
+    content, content_hash = fmu_bytes(model, state)
+    atomic_write_bytes(target, content)
+    tag = content_hash[:_TAG_LENGTH]
+    return FmuInfo(
+        path=target,
+        guid=_guid(content_hash),
+        content_hash=content_hash,
+        model_identifier=f"uav_wing_{tag}",
+        design_hash=model.design_hash,
+        size=len(content),
+    )
+
+
+def fmu_bytes(model: ReducedModel, state: DigitalState | None = None) -> tuple[bytes, str]:
+    """Return the archive and its content hash; see `build_fmu`."""
+    start = start_values(state or DigitalState())
+    mode_count = min(MODE_COUNT, model.mode_count)
+    table = variable_table(
+        gauge_count=model.gauge_count, mode_count=mode_count, validity=model.validity, start=start
+    )
+    _check_start(table)
+    template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start})
+    content_hash = _hash(template)
+    members = {
+        _named(name, content_hash): _filled(name, data, content_hash) for name, data in template.items()
+    }
+    return _archive(members), content_hash
+
+
+def start_values(state: DigitalState) -> dict[str, float]:
+    """Return the start values of the FMU's variables that a digital state gives, by variable name."""
+    losses = zip(STIFFNESS_LOSS_NAMES, state.stiffness_loss, strict=True)
+    return {
+        "young_modulus_factor": float(state.young_modulus_factor),
+        "damping.alpha": float(state.damping_alpha),
+        "damping.beta": float(state.damping_beta),
+        "mass.servo": float(state.servo_mass),
+        "mass.pitot": float(state.pitot_mass),
+        **{f"health.{name}": float(loss) for name, loss in losses},
+    }
+
+
+def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
+    """Return the GUID that an FMU of ours declares, and the GUID that its content has today.
+
+    The two differ when the file was changed after it was built.
+
+    Parameters
+    ----------
+    path : path-like
+        A wing FMU.
+
+    Returns
+    -------
+    declared, actual : str
+        GUIDs.
+    """
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    tag = members["resources/slavemodule.txt"].decode("ascii").strip().removeprefix("uav_wing_")
+    root = members["modelDescription.xml"].decode("utf-8")
+    declared = root.split('guid="', 1)[1].split('"', 1)[0]
+    template = {
+        name.replace(tag, _PLACEHOLDER): _emptied(name, data, tag, declared) for name, data in members.items()
+    }
+    return declared, _guid(_hash(template))
+
+
+def _check_start(table: Iterable[FmuVariable]) -> None:
+    for row in table:
+        if row.start is None:
+            continue
+        low = -float("inf") if row.minimum is None else row.minimum
+        high = float("inf") if row.maximum is None else row.maximum
+        if not low <= row.start <= high:
+            raise FmuBuildError(
+                f"The start value {row.start:g} of {row.name} lies outside {low:g} to {high:g}, the range of the "
+                "reduced model; give another state or build a model with a wider range."
+            )
+
+
+def _members(model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str, object]) -> dict[str, bytes]:
+    """Return the files of the archive, with the placeholder wherever the content hash will stand."""
+    try:
+        installed = version("pythonfmu")
+    except PackageNotFoundError as error:
+        raise FmuBuildError("Building an FMU needs pythonfmu; install the project's requirements.") from error
+    if installed != PYTHONFMU_VERSION:
+        raise FmuBuildError(
+            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed} is installed."
+        )
+    wrapper, own, wing = files("pythonfmu"), files("fmu_asset"), files("fe")
+    module = f"uav_wing_{_PLACEHOLDER}"
+    runtime = f"resources/{module}_runtime"
+    members = {
+        "modelDescription.xml": model_description(
+            identifier=module,
+            guid=_PLACEHOLDER,
+            table=table,
+            description=DESCRIPTION,
+            version=version("uav-twin"),
+            generation_tool=f"uav-twin with PythonFMU {installed}",
+        ),
+        f"binaries/linux64/{module}.so": (
+            wrapper / "resources/binaries/linux64/libpythonfmu-export.so"
+        ).read_bytes(),
+        f"binaries/win64/{module}.dll": (
+            wrapper / "resources/binaries/win64/pythonfmu-export.dll"
+        ).read_bytes(),
+        "documentation/index.html": documentation_page(table, DESCRIPTION),
+        "documentation/licenses/pythonfmu.txt": _licence("pythonfmu"),
+        "resources/reduced_model.npz": model,
+        "resources/start.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode(),
+        "resources/slavemodule.txt": module.encode(),
+        f"resources/{module}.py": _SCRIPT.encode(),
+        f"{runtime}/__init__.py": b'"""The wing FMU."""\n',
+        f"{runtime}/entry.py": _ENTRY.encode(),
+        f"{runtime}/fe/__init__.py": b'"""The reduced model, evaluated with NumPy alone."""\n',
+        f"{runtime}/pythonfmu/__init__.py": b'"""The base class of pythonfmu."""\n',
+    }
+    members |= {f"{runtime}/{name}": (own / name).read_bytes() for name in _OWN_FILES}
+    members |= {f"{runtime}/fe/{name}": (wing / name).read_bytes() for name in RUNTIME_FILES}
+    folder = Path(str(wrapper))
+    members |= {
+        f"{runtime}/pythonfmu/{name}": (folder / name).read_bytes()
+        for name in relative_imports(folder, ["fmi2slave.py"])
+    }
+    return members
+
+
+def relative_imports(folder: Path, names: Iterable[str]) -> list[str]:
+    """Return files of a package together with all files that they import relatively, sorted."""
+    found: set[str] = set()
+    pending = list(names)
+    while pending:
+        name = pending.pop()
+        if name in found:
+            continue
+        found.add(name)
+        for node in ast.walk(ast.parse((folder / name).read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.level == 1 and node.module:
+                pending.append(f"{node.module}.py")
+    return sorted(found)
+
+
+def _licence(package: str) -> bytes:
+    found = [entry for entry in distribution(package).files or () if entry.name == "LICENSE"]
+    if not found:
+        raise FmuBuildError(f"The licence of {package} is missing from its installation; install it again.")
+    return Path(str(found[0].locate())).read_bytes()
+
+
+def _hash(template: Mapping[str, bytes]) -> str:
+    """Return the SHA-256 over names and contents, the placeholder standing for the hash itself."""
+    digest = hashlib.sha256()
+    for name in sorted(template):
+        digest.update(f"{name}\0{len(template[name])}\0".encode())
+        digest.update(template[name])
+    return digest.hexdigest()
+
+
+def _guid(content_hash: str) -> str:
+    h = content_hash
+    return f"{{{h[:8]}-{h[8:12]}-{h[12:16]}-{h[16:20]}-{h[20:32]}}}"
+
+
+def _named(name: str, content_hash: str) -> str:
+    return name.replace(_PLACEHOLDER, content_hash[:_TAG_LENGTH])
+
+
+def _filled(name: str, data: bytes, content_hash: str) -> bytes:
+    if not name.endswith(_TEXT_SUFFIXES):
+        return data
+    if name == "modelDescription.xml":
+        data = data.replace(f'guid="{_PLACEHOLDER}"'.encode(), f'guid="{_guid(content_hash)}"'.encode())
+    return data.replace(_PLACEHOLDER.encode(), content_hash[:_TAG_LENGTH].encode())
+
+
+def _emptied(name: str, data: bytes, tag: str, guid: str) -> bytes:
+    if not name.endswith(_TEXT_SUFFIXES):
+        return data
+    if name == "modelDescription.xml":
+        data = data.replace(f'guid="{guid}"'.encode(), f'guid="{_PLACEHOLDER}"'.encode())
+    return data.replace(tag.encode(), _PLACEHOLDER.encode())
+
+
+def _archive(members: Mapping[str, bytes]) -> bytes:
+    """Return a zip archive with fixed dates and order; stored, since compression differs between versions."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name in sorted(members, key=lambda name: (name != "modelDescription.xml", name)):
+            entry = zipfile.ZipInfo(name, date_time=_DATE)
+            entry.create_system = 3
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, members[name])
+    return buffer.getvalue()

@@ -1,0 +1,168 @@
+"""The model description (modelDescription.xml) and the documentation page, both from the table of variables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+from .variables import ENUMERATIONS, UNITS, FmuVariable
+
+LOG_CATEGORIES = {
+    "logStatusWarning": "Log messages with fmi2Warning status.",
+    "logStatusDiscard": "Log messages with fmi2Discard status.",
+    "logStatusError": "Log messages with fmi2Error status.",
+    "logStatusFatal": "Log messages with fmi2Fatal status.",
+    "logAll": "Log all messages.",
+}
+
+
+def number(value: float) -> str:
+    """Return a float as the shortest text that reads back to the same bits."""
+    return repr(float(value))
+
+
+def model_description(
+    *,
+    identifier: str,
+    guid: str,
+    table: Sequence[FmuVariable],
+    description: str,
+    version: str,
+    generation_tool: str,
+) -> bytes:
+    """Return modelDescription.xml of an FMI 2.0 co-simulation FMU.
+
+    Parameters
+    ----------
+    identifier : str
+        Model identifier: the stem of the binary.
+    guid : str
+        Globally unique identifier, here a hash of the content.
+    table : sequence of FmuVariable
+        The variables, in order of their value reference.
+    description, version, generation_tool : str
+        Attributes of the root element. There is no generation date: equal content gives equal bytes.
+
+    Returns
+    -------
+    bytes
+        UTF-8 XML.
+    """
+    root = Element(
+        "fmiModelDescription",
+        fmiVersion="2.0",
+        modelName="uav_wing",
+        guid=guid,
+        description=description,
+        version=version,
+        generationTool=generation_tool,
+        variableNamingConvention="structured",
+        numberOfEventIndicators="0",
+    )
+    SubElement(
+        root,
+        "CoSimulation",
+        modelIdentifier=identifier,
+        needsExecutionTool="true",
+        canHandleVariableCommunicationStepSize="true",
+        canInterpolateInputs="false",
+        canBeInstantiatedOnlyOncePerProcess="false",
+        canNotUseMemoryManagementFunctions="true",
+        canGetAndSetFMUstate="true",
+        canSerializeFMUstate="true",
+    )
+    units = SubElement(root, "UnitDefinitions")
+    for unit in UNITS:
+        element = SubElement(units, "Unit", name=unit.name)
+        SubElement(element, "BaseUnit", {symbol: str(power) for symbol, power in unit.exponents})
+        for name, factor in unit.displays:
+            SubElement(element, "DisplayUnit", name=name, factor=number(factor))
+    types = SubElement(root, "TypeDefinitions")
+    for enumeration in ENUMERATIONS:
+        simple = SubElement(types, "SimpleType", name=enumeration.name, description=enumeration.description)
+        items = SubElement(simple, "Enumeration")
+        for name, value, text in enumeration.items:
+            SubElement(items, "Item", name=name, value=str(value), description=text)
+    categories = SubElement(root, "LogCategories")
+    for name, text in LOG_CATEGORIES.items():
+        SubElement(categories, "Category", name=name, description=text)
+    SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="50.0", stepSize="1.0")
+    variables = SubElement(root, "ModelVariables")
+    for row in table:
+        variables.append(_scalar_variable(row))
+    structure = SubElement(root, "ModelStructure")
+    for name in ("Outputs", "InitialUnknowns"):
+        unknowns = SubElement(structure, name)
+        for row in table:
+            if row.causality == "output":
+                SubElement(unknowns, "Unknown", index=str(row.reference + 1))
+    indent(root)
+    return bytes(tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
+
+
+def _scalar_variable(row: FmuVariable) -> Element:
+    attributes = {
+        "name": row.name,
+        "valueReference": str(row.reference),
+        "description": row.description,
+        "causality": row.causality,
+        "variability": row.variability,
+    }
+    if row.causality != "input":
+        attributes["initial"] = "exact" if row.causality == "parameter" else "calculated"
+    element = Element("ScalarVariable", attributes)
+    write = number if row.kind == "Real" else lambda value: str(int(value))
+    inner: dict[str, str] = {}
+    if row.enumeration is not None:
+        inner["declaredType"] = row.enumeration
+    if row.unit is not None:
+        inner["unit"] = row.unit
+    if row.display_unit is not None:
+        inner["displayUnit"] = row.display_unit
+    # An enumeration's range is its items.
+    if row.enumeration is None:
+        for name, value in (("min", row.minimum), ("max", row.maximum)):
+            if value is not None:
+                inner[name] = number(value)
+    if row.start is not None:
+        inner["start"] = write(row.start)
+    SubElement(element, row.kind, inner)
+    return element
+
+
+def documentation_page(table: Sequence[FmuVariable], description: str) -> bytes:
+    """Return documentation/index.html: what the FMU is and its variables, as UTF-8 without any request."""
+    rows = []
+    for row in table:
+        limits = "".join(
+            f"{sign} {value:g} "
+            for sign, value in (("≥", row.minimum), ("≤", row.maximum))
+            if value is not None
+        )
+        cells = (row.name, row.causality, row.unit or "", limits, row.start, row.description)
+        rows.append("<tr>" + "".join(f"<td>{escape(_text(cell))}</td>" for cell in cells) + "</tr>")
+    statuses = "".join(
+        f"<li>{enumeration.name} {value} ({name}): {escape(text)}</li>"
+        for enumeration in ENUMERATIONS
+        for name, value, text in enumeration.items
+    )
+    body = "\n".join(rows)
+    page = f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>uav_wing</title>
+<style>body{{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}}
+td,th{{text-align:left;padding:.2em .8em .2em 0;border-bottom:1px solid #ddd}}</style></head><body>
+<h1>uav_wing</h1><p>{escape(description)}</p>
+<p>FMI 2.0 co-simulation. It runs in a Python host that has NumPy. A call that is refused logs why, sets
+<code>status</code> and leaves state and outputs as they were; a refused step returns fmi2Discard.</p>
+<table><tr><th>variable</th><th>causality</th><th>unit</th><th>range</th><th>start</th><th>meaning</th></tr>
+{body}
+</table><h2>Enumerations</h2><ul>{statuses}</ul></body></html>
+"""
+    return page.encode("utf-8")
+
+
+def _text(cell: object) -> str:
+    if cell is None:
+        return ""
+    return f"{cell:g}" if isinstance(cell, float) else str(cell)

@@ -1,0 +1,65 @@
+"""Errors of the FMUs and of their one door, named by cause."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class FmuError(Exception):
+    """Any error that this package raises on purpose.
+
+    Attributes
+    ----------
+    messages : tuple of str
+        What the FMU itself had logged since the last call that succeeded, oldest first.
+    """
+
+    def __init__(self, sentence: str, messages: Sequence[str] = ()) -> None:
+        self.messages = tuple(messages)
+        self.sentence = sentence
+        log = "".join(f"\n  the FMU says: {message}" for message in self.messages)
+        super().__init__(sentence + log)
+
+    def __reduce__(self) -> tuple[type[FmuError], tuple[str, tuple[str, ...]]]:
+        """Pickle as the sentence and the messages."""
+        return type(self), (self.sentence, self.messages)
+
+
+class FmuBuildError(FmuError, ValueError):
+    """An FMU cannot be made from what was given."""
+
+
+class FmuFileError(FmuError, ValueError):
+    """An FMU file is missing, damaged or unsafe to extract."""
+
+
+class FmuUnsupportedError(FmuError, ValueError):
+    """An FMU is sound but of a kind that cannot be flown: version, interface or platform."""
+
+
+class BindingError(FmuError, ValueError):
+    """A binding file is wrong, or does not fit the FMU or the call."""
+
+
+class FmuInputError(FmuError, ValueError):
+    """A value was refused before it was sent to the FMU: outside its range, or not finite."""
+
+
+class FmuCallError(FmuError, RuntimeError):
+    """An FMI function did not return OK."""
+
+
+class FmuOutputError(FmuError, RuntimeError):
+    """The FMU gave an output that is not finite."""
+
+
+class FmuStateError(FmuError, RuntimeError):
+    """A saved state cannot be made or restored, or a call came in the wrong phase."""
+
+
+class FmuWorkerError(FmuError, RuntimeError):
+    """The worker process of an FMU died, or its instance was lost to a fatal error."""
+
+
+class FmuTimeoutError(FmuError, TimeoutError):
+    """An FMI call took longer than the wall-clock limit; the worker was stopped."""
