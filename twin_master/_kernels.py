@@ -116,7 +116,7 @@ def backward_pass(
     """Fill the smoothed rows from the last to the first with p(D_t | D_{t+1}, o_0..o_t).
 
     A smoothed probability that underflows never matters again: every entry of an earlier step is a weighted
-    mean of entries of the later one. So only the weights need care, where the forecast underflows.
+    mean of entries of the later one. So only the weights need care, where what they are made of underflows.
     """
     steps, size = filtered.shape
     if steps:
@@ -132,13 +132,20 @@ def backward_pass(
                 forecast = 0.0
                 for k in range(begin, end):
                     forecast += filtered[t, source[k]] * probability[k]
-                if forecast >= SAFE:
+                linear = forecast >= SAFE
+                if linear:
                     scale = later / forecast
-                    for k in range(begin, end):
-                        smoothed[t, source[k]] += filtered[t, source[k]] * probability[k] * scale
+                    log_forecast = np.nan  # formed when the first predecessor needs it
                 else:
+                    scale = 0.0
                     log_forecast = _log_forecast(begin, end, source, log_probability, log_filtered[t])
-                    for k in range(begin, end):
+                for k in range(begin, end):
+                    before = filtered[t, source[k]]
+                    if linear and before >= SAFE:
+                        smoothed[t, source[k]] += before * probability[k] * scale
+                    else:
+                        if np.isnan(log_forecast):
+                            log_forecast = np.log(forecast)
                         weight = _exp(log_filtered[t, source[k]] + log_probability[k] - log_forecast)
                         smoothed[t, source[k]] += weight * later
         total = 0.0
