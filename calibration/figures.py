@@ -43,7 +43,7 @@ def residual_figure(result: StaticCalibration) -> Figure:
     """Draw the residuals run by run, and the posterior under other assumptions."""
     with publication_style():
         figure = new_figure(height=2.6)
-        grid = figure.add_gridspec(1, 2, width_ratios=(1.0, 0.9), wspace=0.62)
+        grid = figure.add_gridspec(1, 2, width_ratios=(1.0, 0.9), wspace=0.45)
         figure.subplots_adjust(left=0.075, right=0.985, bottom=0.165, top=0.90)
         _draw_residuals(figure.add_subplot(grid[0, 0]), result)
         _draw_alternatives(figure.add_subplot(grid[0, 1]), result)
@@ -110,10 +110,7 @@ def _draw_factor(axes: Axes, result: StaticCalibration) -> None:
         )  # fmt: skip
     axes.plot(grid, prior.density(grid), color=REFERENCE, lw=1.8, label="prior")
     axes.plot(exact.grid, exact.density, color=PAST, lw=1.6, label="posterior, exact")
-    axes.plot(
-        particle.posterior.grid, particle.posterior.density, color=PRESENT, lw=1.3, ls=(0, (4, 2)),
-        label="posterior, particles",
-    )  # fmt: skip
+    _draw_bars(axes, particle.posterior, 1.0)
     axes.axvline(PAPER_MEAN, color=REFERENCE, lw=0.7, ls=":", label="mean in the paper")
     axes.set_xlim(grid[0], grid[-1])
     axes.set_ylim(0.0, 1.12 * float(exact.density.max()))
@@ -132,10 +129,7 @@ def _draw_stiffness(axes: Axes, result: StaticCalibration) -> None:
     )
     axes.plot(*_curve(result.tip_stiffness_prior, scale), color=REFERENCE, lw=1.8, label="prior")
     axes.plot(*_curve(posterior, scale), color=PAST, lw=1.6, label="posterior, exact")
-    axes.plot(
-        *_curve(result.tip_stiffness_particle, scale), color=PRESENT, lw=1.3, ls=(0, (4, 2)),
-        label="posterior, particles",
-    )  # fmt: skip
+    _draw_bars(axes, result.tip_stiffness_particle, scale)
     axes.set_xlim(
         (result.tip_stiffness_prior.mean - reach) * scale, (result.tip_stiffness_prior.mean + reach) * scale
     )
@@ -143,19 +137,23 @@ def _draw_stiffness(axes: Axes, result: StaticCalibration) -> None:
     axes.set_xlabel("tip stiffness $k$ (N/mm)")
     axes.set_ylabel("probability density (mm/N)")
     axes.legend(loc="upper left", fontsize=6.8, handlelength=1.6, borderaxespad=0.1, labelspacing=0.35)
-    lower, upper = posterior.interval(0.95)
     axes.text(
-        0.985,
-        0.70,
-        f"$k$ = {posterior.mean * scale:.4f} ± {posterior.standard_deviation * scale:.4f} \n"
-        f"95 %: {lower * scale:.4f} to {upper * scale:.4f}",
+        0.99,
+        0.60,
+        f"{posterior.mean * scale:.4f} ± {posterior.standard_deviation * scale:.4f} N/mm",
         transform=axes.transAxes,
+        color=PAST,
         ha="right",
-        va="top",
         fontsize=6.8,
-        linespacing=1.4,
     )
     panel_label(axes, "c", "Quantity of interest")
+
+
+def _draw_bars(axes: Axes, posterior: ScalarPosterior, scale: float) -> None:
+    """Draw a posterior of particles as a histogram."""
+    edges = posterior.mean + posterior.standard_deviation * np.linspace(-4.0, 4.0, 33)
+    density = np.diff(posterior.cumulative(edges)) / np.diff(edges)
+    axes.stairs(density / scale, edges * scale, color=PRESENT, lw=0.9, label="posterior, particles")
 
 
 def _curve(posterior: ScalarPosterior, scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -189,7 +187,7 @@ def _draw_residuals(axes: Axes, result: StaticCalibration) -> None:
             mew=0.9,
             elinewidth=0.8,
             capsize=1.8,
-            label=f"run {index + 1}, mean {run.offset * 1e3:+.2f} mm".replace("-", "−"),
+            label=f"run {index + 1} ({run.offset * 1e3:+.2f} mm)".replace("-", "−"),
         )
         line.lines[0].set_zorder(3 + number)
         axes.axhline(run.offset * 1e3, color=OBSERVED, lw=0.8, ls=_RUN_LINES[1 + number % 3])
@@ -202,7 +200,7 @@ def _draw_residuals(axes: Axes, result: StaticCalibration) -> None:
 
 
 def _draw_alternatives(axes: Axes, result: StaticCalibration) -> None:
-    short = ("flat in the true load", "ratio of the readings", "zero offset of each run")
+    short = ("flat in load", "ratio", "zero offsets")
     rows = [
         ("paper", PAPER_MEAN, PAPER_STANDARD_DEVIATION, REFERENCE),
         ("particle filter", result.particle.mean, result.particle.standard_deviation, PRESENT),

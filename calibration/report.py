@@ -83,7 +83,8 @@ def _page(result: StaticCalibration, drawings: dict[str, bytes]) -> Page:
         drawings["residuals"],
         "(a) Displacement less load over calibrated stiffness, with 95 % intervals of the readings; "
         "the broken lines are the means of the runs. (b) Mean and 95 % interval of e: in the paper, by the "
-        "particle filter, and exactly; exactly with a prior flat in the true load instead of the true displacement; with "
+        "particle filter, and exactly; exactly with a prior flat in the true load instead of the "
+        "true displacement; with "
         "the density of the ratio, which the paper's filter takes for the likelihood; and with a zero offset "
         "that all readings of a run share, by which they tell less.",
         title="Residuals, and the posterior under other assumptions",
@@ -98,7 +99,8 @@ def _page(result: StaticCalibration, drawings: dict[str, bytes]) -> Page:
         + f"The experiment took {result.reward.uncertainty_reduction:.0%} of the prior's standard deviation "
         f"away and brought {result.reward.information_gain:.2f} nat of information. The mean absolute error "
         "of the displacement, in half-widths of its 95 % interval, was "
-        f"{-result.reward.prior_error:.2f} at the prior mean and is {-result.reward.posterior_error:.2f} at the posterior mean."
+        f"{-result.reward.prior_error:.2f} at the prior mean and is "
+        f"{-result.reward.posterior_error:.2f} at the posterior mean."
     )
     _add_pairs(page, result)
     page.add_section("Method")
