@@ -58,7 +58,7 @@ class Table:
         for number, row in enumerate(self.rows):
             if len(row) != len(self.columns):
                 raise InvalidFigureError(
-                    f"Row {number} of a table has {len(row)} cells; the table has {len(self.columns)} columns."
+                    f"Row {number} of a table has {len(row)} cells; {len(self.columns)} are needed."
                 )
 
 

@@ -1,0 +1,295 @@
+"""The report of a run: one self-contained page and its figures, from nothing but the run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from reporting.figures import to_png, to_svg
+from reporting.files import atomic_write_bytes, atomic_write_text
+from reporting.page import Column, Page, Table
+from twin_master.report_belief import belief_figure, policy_figure
+from twin_master.report_check import check_figure, predictive_check
+from twin_master.report_data import RunRecord, read_run
+from twin_master.report_mission import mission_figure
+from twin_master.report_network import network_figure
+from twin_master.report_text import (
+    belief_caption,
+    check_caption,
+    lost_ranges,
+    mission_caption,
+    network_caption,
+    number,
+    policy_caption,
+    turn_ranges,
+)
+from twin_master.report_view import choose_sensors, default_now, sensor_word
+from twin_master.run_errors import RunFolderError
+
+REPORT_NAME = "report.html"
+FIGURE_FOLDER = "figures"
+MAIN_FIGURE = "mission_now"
+"""The figure that is also written as PNG."""
+
+_SOURCES = (
+    "M. G. Kapteyn, J. V. R. Pretorius, K. E. Willcox: A probabilistic graphical model foundation for "
+    "enabling predictive digital twins at scale. Nature Computational Science 1 (2021) 337-347; arXiv:2012.05841. "
+    "Equation numbers in the captions are those of this paper.",
+    "Colours: M. Okabe, K. Ito, Color Universal Design (2008).",
+)
+
+
+@dataclass(frozen=True)
+class ReportFigure:
+    """A figure ready for the page.
+
+    Attributes
+    ----------
+    name
+        Name of its file, without ending.
+    figure
+        The drawing.
+    title, caption
+        Below it.
+    """
+
+    name: str
+    figure: Figure
+    title: str
+    caption: str
+
+
+def write_report(run_folder: Path, *, now: int | None = None) -> Path:
+    """Write ``report.html`` and ``figures/`` of a run; return the path of the page.
+
+    Equal run folders give equal bytes. Wall-clock figures appear if ``timing.json`` is there already.
+
+    Parameters
+    ----------
+    run_folder
+        Holds ``run.nc`` and, where they exist, ``config.json``, ``summary.json`` and ``timing.json``.
+    now
+        The present turn of the first figure; by default shortly before the control first changes.
+
+    Raises
+    ------
+    RunFolderError
+        There is no run, it is damaged or of another layout, or `now` is no turn of it.
+    FileNotWrittenError
+        The disk is full or the folder cannot be written.
+    """
+    record = read_run(Path(run_folder))
+    present = default_now(record) if now is None else now
+    figures = {figure.name: figure for figure in report_figures(record, present)}
+    drawings = {name: to_svg(figure.figure) for name, figure in figures.items()}
+    folder = Path(run_folder) / FIGURE_FOLDER
+    for name, drawing in drawings.items():
+        atomic_write_bytes(folder / f"{name}.svg", drawing)
+    atomic_write_bytes(folder / f"{MAIN_FIGURE}.png", to_png(figures[MAIN_FIGURE].figure))
+    return atomic_write_text(Path(run_folder) / REPORT_NAME, render_page(record, figures, drawings))
+
+
+def report_figures(record: RunRecord, now: int) -> list[ReportFigure]:
+    """Draw every figure for which the run has data.
+
+    Raises
+    ------
+    RunFolderError
+        `now` is no turn of the run.
+    """
+    sensors = choose_sensors(record)
+    last = record.step_count - 1
+    if not 0 <= now <= last:
+        raise RunFolderError(f"The present turn of the report must lie in 0..{last}, and {now} came.")
+    drawing = mission_figure(record, now, sensors)
+    title = f"The mission as the twin sees it at turn {now}"
+    figures = [ReportFigure(MAIN_FIGURE, drawing, title, mission_caption(record, now))]
+    if now != last:
+        drawing = mission_figure(record, last, sensors)
+        title = "The whole mission, seen from its last turn"
+        figures.append(ReportFigure("mission_whole", drawing, title, mission_caption(record, last)))
+    figures.append(
+        ReportFigure("belief", belief_figure(record), "The belief about the state", belief_caption(record))
+    )
+    policy = policy_figure(record)
+    if policy is not None:
+        figures.append(ReportFigure("policy", policy, "The policy", policy_caption(record)))
+    check = predictive_check(record)
+    if check is not None:
+        drawing = check_figure(record, check)
+        figures.append(
+            ReportFigure("check", drawing, "Posterior predictive check", check_caption(record, check))
+        )
+    figures.append(
+        ReportFigure(
+            "network", network_figure(), "The dynamic decision network for a few turns", network_caption()
+        )
+    )
+    return figures
+
+
+def render_page(record: RunRecord, figures: Mapping[str, ReportFigure], drawings: Mapping[str, bytes]) -> str:
+    """Return the page: outcome, mission, belief, decision, check, model and run."""
+    mission = record.scenario.get("mission")
+    mission = mission if isinstance(mission, Mapping) else {}
+    name = str(mission.get("name") or record.attributes.get("scenario") or "run")
+    page = Page(
+        title=str(mission.get("title") or name),
+        subtitle=f"Scenario {name}, {record.step_count} turns, seed {_seed(record)}",
+        footer=_SOURCES,
+    )
+    page.add_section("Outcome")
+    _add_outcome(page, record)
+    for title, names in (
+        ("The mission", (MAIN_FIGURE, "mission_whole")),
+        ("What the twin believes", ("belief",)),
+        ("What the twin decides", ("policy",)),
+        ("Whether the data agree", ("check",)),
+        ("The model", ("network",)),
+    ):
+        present = [figures[key] for key in names if key in figures]
+        if present:
+            page.add_section(title)
+        for figure in present:
+            page.add_figure(drawings[figure.name], figure.caption, title=figure.title)
+    page.add_section("The run")
+    _add_run(page, record)
+    return page.render()
+
+
+def _seed(record: RunRecord) -> str:
+    seed = record.config.get("seed", record.attributes.get("seed"))
+    return "unknown" if seed is None else str(seed)
+
+
+def _summary_figures(record: RunRecord) -> list[Mapping[str, Any]]:
+    figures = record.summary.get("figures", [])
+    return [figure for figure in figures if isinstance(figure, Mapping)] if isinstance(figures, list) else []
+
+
+def _add_outcome(page: Page, record: RunRecord) -> None:
+    page.add_highlights(_highlights(record))
+    for text in _notices(record):
+        page.add_notice(text)
+    rows = [
+        (
+            str(figure.get("title", figure.get("key", ""))),
+            number(figure.get("value")),
+            str(figure.get("unit") or ""),
+            "" if figure.get("reference") is None else number(figure["reference"]),
+            str(figure.get("reference_source") or ""),
+        )
+        for figure in _summary_figures(record)
+    ]
+    if rows:
+        columns = (
+            Column("figure"),
+            Column("this run", numeric=True),
+            Column("unit"),
+            Column("reference", numeric=True),
+            Column("source of the reference"),
+        )
+        page.add_table(
+            Table(columns, rows),
+            "Points are percentage points of stiffness loss. A dash means that it did not happen.",
+            title="Figures of the run, beside published ones where there are any",
+        )
+
+
+def _highlights(record: RunRecord) -> list[tuple[str, str]]:
+    items = []
+    final = record.filtered
+    for factor, title in enumerate(record.state_titles):
+        mean, deviation = 100.0 * final.mean[-1, factor], 100.0 * final.standard_deviation[-1, factor]
+        truth = (
+            "" if record.truth_state is None else f" (truth {100.0 * record.truth_state[-1, factor]:.0f} %)"
+        )
+        items.append((f"{mean:.0f} ± {deviation:.0f} %", f"{title} at the end{truth}"))
+    changes = np.flatnonzero(np.diff(record.control_index)) + 1
+    if len(changes):
+        first = int(changes[0])
+        before, after = (record.controls[record.control_index[turn]] for turn in (first - 1, first))
+        items.append((f"turn {first}", f"first change of control, from {before} to {after}"))
+    else:
+        items.append((record.controls[record.control_index[0]], "control of every turn"))
+    check = predictive_check(record)
+    if check is not None and np.isfinite(check.overall_coverage):
+        items.append(
+            (f"{100.0 * check.overall_coverage:.0f} %", "of the observations within their 95 % intervals")
+        )
+    return items
+
+
+def _notices(record: RunRecord) -> list[str]:
+    if record.observation is None:
+        return ["The run holds no observations, so the figures show the twin's beliefs only."]
+    lost = np.isnan(record.observation)
+    if not lost.any():
+        return []
+    word = sensor_word(record).lower()
+    notices = [f"Observations lost ({100.0 * lost.mean():.1f} %): {lost_ranges(record)}."]
+    blind = np.flatnonzero(lost.all(axis=1))
+    if len(blind):
+        notices.append(
+            f"No {word} reported at {turn_ranges(blind)}: there the belief followed the dynamics alone."
+        )
+    return notices
+
+
+def _add_run(page: Page, record: RunRecord) -> None:
+    rows: list[tuple[str, str]] = [
+        ("turns flown", str(record.step_count)),
+        ("turns predicted", str(record.horizon)),
+        ("states", f"{len(record.coordinates)} ({' × '.join(str(len(level)) for level in record.levels)})"),
+        ("controls", ", ".join(record.controls)),
+        (f"{sensor_word(record).lower()}s", str(len(record.sensors))),
+        ("seed", _seed(record)),
+    ]
+    if record.log_evidence is not None:
+        rows.append(("log evidence of all observations", f"{float(np.sum(record.log_evidence)):.2f}"))
+    for name, values in record.monitors.items():
+        scale, unit = (1.0e6, " µε") if name == "strain_error_bound" else (1.0, "")
+        rows.append((f"largest {name.replace('_', ' ')}", f"{scale * float(np.nanmax(values)):.3g}{unit}"))
+    page.add_table(
+        Table((Column("item"), Column("value")), rows), "From run.nc and config.json.", title="Run"
+    )
+    timing = list(_flat(record.timing))
+    if timing:
+        page.add_table(
+            Table((Column("item"), Column("value", numeric=True)), timing),
+            "Wall-clock figures of this machine, from timing.json.",
+            title="Times",
+        )
+    else:
+        page.add_paragraph("Wall-clock times stand in timing.json, so that equal runs give equal reports.")
+    origin = [*_flat(_provenance(record))]
+    if origin:
+        page.add_table(
+            Table((Column("item"), Column("value")), origin),
+            "Versions of the software and SHA-256 of sources and inputs.",
+            title="Provenance",
+        )
+
+
+def _provenance(record: RunRecord) -> dict[str, Any]:
+    """Return versions and hashes as the configuration keeps them."""
+    known = record.config.get("provenance", record.config)
+    if not isinstance(known, Mapping):
+        return {}
+    return {key: value for key, value in known.items() if "version" in key or "hash" in key}
+
+
+def _flat(record: Mapping[str, Any], prefix: str = "") -> Sequence[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
+    for key, value in record.items():
+        name = f"{prefix}{str(key).replace('_', ' ')}"
+        if isinstance(value, Mapping):
+            rows += _flat(value, f"{name}: ")
+        elif isinstance(value, str | int | float) or value is None:
+            rows.append((name, number(value)))
+    return rows

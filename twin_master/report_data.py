@@ -1,0 +1,392 @@
+"""The stored run as the report sees it: plain arrays with checked shapes, missing parts as None."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from twin_master.run_errors import RunFolderError
+from twin_master.scenario import Scenario
+from twin_master.twin import build_graphical_model
+
+Float = NDArray[np.floating[Any]]
+Index = NDArray[np.int64]
+
+NORMAL_95 = 1.959963984540054
+"""Half-width of a 95 % interval of the normal distribution, in standard deviations."""
+
+
+@dataclass(frozen=True)
+class Uncertain:
+    """Mean and 95 % interval of quantities that the twin is not certain of.
+
+    Attributes
+    ----------
+    mean, lower, upper : (..., n)
+    """
+
+    mean: Float
+    lower: Float
+    upper: Float
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the twin believes at each step, or at each step about each coming step.
+
+    The leading axes are (T,) for estimates and (T, H) for predictions. A part that was not stored is None.
+
+    Attributes
+    ----------
+    probability : (..., S)
+        Belief over the joint states.
+    mean, standard_deviation : (..., K)
+        Of each factor of the state, SI.
+    quantity : (..., G) or None
+        Noise-free observation of each sensor, SI.
+    quantity_standard_deviation : (..., G) or None
+        Of the same.
+    reward : (..., R) or None
+        Each reward, dimensionless.
+    """
+
+    probability: Float
+    mean: Float
+    standard_deviation: Float
+    quantity: Uncertain | None
+    quantity_standard_deviation: Float | None
+    reward: Uncertain | None
+
+
+@dataclass(frozen=True)
+class PolicyTable:
+    """The policy that was flown.
+
+    Attributes
+    ----------
+    control_index : (S,)
+        Control chosen in each state.
+    action_value : (S, U) or None
+        Q of eq. (36).
+    """
+
+    control_index: Index
+    action_value: Float | None
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """One run: T steps, S joint states of K factors, G sensors, U controls, R rewards, H predicted steps.
+
+    Attributes
+    ----------
+    state_names, state_titles : tuple of str
+        The K factors.
+    levels : tuple of (L_k,)
+        Levels of each factor, SI.
+    coordinates : (S, K)
+        Levels of each joint state.
+    sensors : (G,)
+        Numbers of the sensors as printed, from 1.
+    controls, rewards : tuple of str
+    observation : (T, G) or None
+        As measured, SI; NaN where a sensor was lost.
+    observation_name, observation_unit : str
+        What is observed and its stored unit; strain is dimensionless and shown in microstrain.
+    control_index : (T,)
+    filtered, smoothed, predicted : Estimate or None
+        p(D_t | o_0..o_t), p(D_t | o_0..o_{T-1}), p(D_{t+h} | o_0..o_t).
+    control_probability : (T, H, U) or None
+        p(U_{t+h} | o_0..o_t).
+    log_evidence : (T,) or None
+        log p(o_t | o_0..o_{t-1}).
+    policy : PolicyTable or None
+    truth_state : (T, K) or None
+    truth_observation : (T, G) or None
+        Noise-free.
+    monitors : mapping of (T,)
+        What the asset reported of itself, such as a certified error bound, SI.
+    attributes : mapping
+        Root attributes of ``run.nc``.
+    config, summary, timing : mapping
+        The JSON files of the run folder; empty if there is none.
+    """
+
+    state_names: tuple[str, ...]
+    state_titles: tuple[str, ...]
+    levels: tuple[Float, ...]
+    coordinates: Float
+    sensors: Index
+    controls: tuple[str, ...]
+    rewards: tuple[str, ...]
+    observation: Float | None
+    observation_name: str
+    observation_unit: str
+    control_index: Index
+    filtered: Estimate
+    smoothed: Estimate | None
+    predicted: Estimate | None
+    control_probability: Float | None
+    log_evidence: Float | None
+    policy: PolicyTable | None
+    truth_state: Float | None
+    truth_observation: Float | None
+    monitors: Mapping[str, Float]
+    attributes: Mapping[str, Any]
+    config: Mapping[str, Any]
+    summary: Mapping[str, Any]
+    timing: Mapping[str, Any]
+
+    @property
+    def step_count(self) -> int:
+        """Number T of steps."""
+        return len(self.control_index)
+
+    @property
+    def horizon(self) -> int:
+        """Number H of predicted steps; 0 without predictions."""
+        return 0 if self.predicted is None else int(self.predicted.mean.shape[1])
+
+    @cached_property
+    def transition(self) -> Float | None:
+        """p(D_{t+1} | D_t, u) of the scenario: (U, S, S); None if the folder does not hold it."""
+        if not self.scenario:
+            return None
+        try:
+            model = build_graphical_model(Scenario.model_validate(self.scenario))
+        except ValueError:
+            return None
+        fits = model.states.names == self.state_names and model.controls == self.controls
+        return model.transition.matrix if fits else None
+
+    @property
+    def scenario(self) -> Mapping[str, Any]:
+        """The resolved scenario, SI; empty if the folder does not hold it."""
+        scenario = self.config.get("scenario", {})
+        return scenario if isinstance(scenario, Mapping) else {}
+
+
+def smoothed_until(record: RunRecord, now: int) -> Float | None:
+    """Return p(D_t | o_0..o_now) for t = 0..now, (now + 1, S), from the filtered beliefs and the transitions.
+
+    The backward recursion of the smoother needs nothing else: with f the filtered belief and T the
+    transition under u_t, s_t = f_t * T (s_{t+1} / (f_t T)). None without transitions.
+    """
+    transition = record.transition
+    if transition is None:
+        return None
+    filtered = record.filtered.probability
+    smoothed = filtered[: now + 1].copy()
+    for step in range(now - 1, -1, -1):
+        table = transition[record.control_index[step]]
+        forecast = filtered[step] @ table
+        ratio = np.divide(smoothed[step + 1], forecast, out=np.zeros_like(forecast), where=forecast > 0.0)
+        smoothed[step] = filtered[step] * (table @ ratio)
+        smoothed[step] /= smoothed[step].sum()
+    return smoothed
+
+
+def moments(probability: Float, coordinates: Float) -> tuple[Float, Float]:
+    """Return mean and standard deviation of each factor under beliefs: (..., S) -> two of (..., K)."""
+    mean = probability @ coordinates
+    variance = np.einsum("...s,...sk->...k", probability, (coordinates - mean[..., None, :]) ** 2)
+    return mean, np.sqrt(variance)
+
+
+def read_run(folder: Path) -> RunRecord:
+    """Read a run folder.
+
+    Raises
+    ------
+    RunFolderError
+        There is no ``run.nc``, it is damaged, or it has another layout.
+    """
+    path = folder / "run.nc"
+    if not path.is_file():
+        raise RunFolderError(
+            f"{folder} holds no run.nc, so there is no run to report: fly or resume the run first."
+        )
+    groups, attributes = _read_groups(path)
+    try:
+        return _record(groups, attributes, folder)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        reason = error.args[0] if error.args else error
+        raise RunFolderError(
+            f"{path} does not have the layout of a run of this version ({reason}): fly the run again."
+        ) from error
+
+
+def _read_groups(path: Path) -> tuple[dict[str, xr.Dataset], dict[str, Any]]:
+    try:
+        with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as tree:
+            groups = {name: tree[name].to_dataset().load() for name in tree.children}
+            attributes = {str(name): value for name, value in tree.attrs.items()}
+    except (OSError, ValueError, KeyError, RuntimeError, AttributeError) as error:
+        raise RunFolderError(f"{path} is damaged and cannot be read ({error}): fly the run again.") from error
+    return groups, attributes
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f"{path} is damaged and cannot be read ({error}): fly the run again.") from error
+    if not isinstance(content, dict):
+        raise RunFolderError(f"{path} must hold one JSON object: fly the run again.")
+    return content
+
+
+def _array(dataset: xr.Dataset | None, name: str, *dimensions: str) -> Float | None:
+    """Return a variable with its axes in the order given, or None if it was not stored."""
+    if dataset is None or name not in dataset:
+        return None
+    variable = dataset[name]
+    if set(variable.dims) != set(dimensions):
+        raise ValueError(f"{name} has the axes {variable.dims} and not {dimensions}")
+    return np.asarray(variable.transpose(*dimensions).values, dtype=np.float64)
+
+
+def _needed(dataset: xr.Dataset | None, group: str, name: str, *dimensions: str) -> Float:
+    values = _array(dataset, name, *dimensions)
+    if values is None:
+        raise ValueError(f"the variable {group}/{name} is missing")
+    return values
+
+
+def _names(groups: Mapping[str, xr.Dataset], dimension: str, fallback: int) -> tuple[str, ...]:
+    for dataset in groups.values():
+        if dimension in dataset.coords and dataset.coords[dimension].dims == (dimension,):
+            return tuple(_text(value) for value in dataset.coords[dimension].values)
+    return tuple(str(index + 1) for index in range(fallback))
+
+
+def _text(value: Any) -> str:
+    return value.decode("utf-8") if isinstance(value, bytes) else str(value)
+
+
+def _estimate(dataset: xr.Dataset | None, group: str, coordinates: Float, *lead: str) -> Estimate | None:
+    if dataset is None or "probability" not in dataset:
+        return None
+    probability = _needed(dataset, group, "probability", *lead, "state")
+    mean, deviation = moments(probability, coordinates)
+    stored_mean = _array(dataset, "mean", *lead, "region")
+    stored_deviation = _array(dataset, "standard_deviation", *lead, "region")
+    return Estimate(
+        probability=probability,
+        mean=mean if stored_mean is None else stored_mean,
+        standard_deviation=deviation if stored_deviation is None else stored_deviation,
+        quantity=_uncertain(dataset, "quantity", *lead, "sensor"),
+        quantity_standard_deviation=_array(dataset, "quantity_standard_deviation", *lead, "sensor"),
+        reward=_uncertain(dataset, "reward", *lead, "reward"),
+    )
+
+
+def _uncertain(dataset: xr.Dataset, name: str, *dimensions: str) -> Uncertain | None:
+    """Read mean and 95 % interval; without stored bounds they are those of a normal distribution."""
+    mean, lower, upper, deviation = (
+        _array(dataset, f"{name}_{part}", *dimensions)
+        for part in ("mean", "lower", "upper", "standard_deviation")
+    )
+    if mean is None:
+        return None
+    half = np.zeros_like(mean) if deviation is None else NORMAL_95 * deviation
+    return Uncertain(mean, mean - half if lower is None else lower, mean + half if upper is None else upper)
+
+
+def _coordinates(groups: Mapping[str, xr.Dataset], names: tuple[str, ...]) -> Float:
+    for dataset in groups.values():
+        if all(name in dataset.coords and dataset.coords[name].dims == ("state",) for name in names):
+            return np.stack([np.asarray(dataset.coords[name].values, dtype=float) for name in names], axis=-1)
+    raise ValueError(f"the states have no coordinates {', '.join(names)}")
+
+
+def _record(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], folder: Path) -> RunRecord:
+    config = _read_json(folder / "config.json")
+    observed, filtered_group, predicted_group = (
+        groups.get(name) for name in ("observed", "filtered", "predicted")
+    )
+    control_index = _needed(observed, "observed", "control_index", "step").astype(np.int64)
+    role = _role(observed, config)
+    observation = _array(observed, role, "step", "sensor")
+    names = _names(groups, "region", 0)
+    if not names or not len(control_index):
+        raise ValueError("the axis `region` has no names" if not names else "it holds no step")
+    coordinates = _coordinates(groups, names)
+    filtered = _estimate(filtered_group, "filtered", coordinates, "step")
+    if filtered is None:
+        raise ValueError("the variable filtered/probability is missing")
+    policy_group, truth = groups.get("policy"), groups.get("truth")
+    chosen = _array(policy_group, "control_index", "state")
+    policy = None
+    if chosen is not None:
+        policy = PolicyTable(
+            chosen.astype(np.int64), _array(policy_group, "action_value", "state", "control")
+        )
+    sensor_count = 0 if observation is None else observation.shape[1]
+    sensors = np.asarray([int(name) for name in _names(groups, "sensor", sensor_count)], dtype=np.int64)
+    unit = "1" if observed is None or role not in observed else str(observed[role].attrs.get("units", "1"))
+    control_count = int(control_index.max()) + 1
+    return RunRecord(
+        state_names=names,
+        state_titles=_titles(config, names),
+        levels=tuple(np.unique(coordinates[:, k]) for k in range(len(names))),
+        coordinates=coordinates,
+        sensors=sensors,
+        controls=_names(groups, "control", control_count),
+        rewards=_names(groups, "reward", 0),
+        observation=observation,
+        observation_name=role,
+        observation_unit=unit,
+        control_index=control_index,
+        filtered=filtered,
+        smoothed=_estimate(groups.get("smoothed"), "smoothed", coordinates, "step"),
+        predicted=_estimate(predicted_group, "predicted", coordinates, "step", "horizon"),
+        control_probability=_array(predicted_group, "control_probability", "step", "horizon", "control"),
+        log_evidence=_array(filtered_group, "log_evidence", "step"),
+        policy=policy,
+        truth_state=_array(truth, "state", "step", "region"),
+        truth_observation=_array(truth, role, "step", "sensor"),
+        monitors=_monitors(truth),
+        attributes=attributes,
+        config=config,
+        summary=_read_json(folder / "summary.json"),
+        timing=_read_json(folder / "timing.json"),
+    )
+
+
+def _monitors(truth: xr.Dataset | None) -> dict[str, Float]:
+    """Return the variables of `truth` with one value a step."""
+    if truth is None:
+        return {}
+    return {
+        str(name): np.asarray(variable.values, dtype=np.float64)
+        for name, variable in truth.data_vars.items()
+        if variable.dims == ("step",) and variable.dtype.kind == "f"
+    }
+
+
+def _role(observed: xr.Dataset | None, config: Mapping[str, Any]) -> str:
+    """Return the name of the observed variable: as the scenario has it, else the only one of each sensor."""
+    scenario = config.get("scenario")
+    section = scenario.get("observation") if isinstance(scenario, Mapping) else None
+    if isinstance(section, Mapping) and "role" in section:
+        return str(section["role"])
+    names = [] if observed is None else [str(n) for n, v in observed.data_vars.items() if "sensor" in v.dims]
+    return names[0] if names else "strain"
+
+
+def _titles(config: Mapping[str, Any], names: tuple[str, ...]) -> tuple[str, ...]:
+    scenario = config.get("scenario")
+    factors = scenario.get("state", []) if isinstance(scenario, Mapping) else []
+    titles = {f.get("name"): f.get("title") for f in factors if isinstance(f, Mapping)} if factors else {}
+    return tuple(str(titles.get(name) or name) for name in names)

@@ -1,0 +1,145 @@
+"""Captions and phrases of the report."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from twin_master.report_check import PredictiveCheck, assumed_noise
+from twin_master.report_data import RunRecord
+from twin_master.report_view import observation_scale, sensor_word, symbol
+
+
+def number(value: Any) -> str:
+    """Return a figure as printed: text as it is, four significant digits, a dash for none."""
+    if value is None:
+        return "—"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}".replace("-", "−")
+    return str(value)
+
+
+def turn_ranges(turns: ArrayLike) -> str:
+    """Return increasing turns in words: ``turns 3–4, 12–18``."""
+    values = np.asarray(turns, dtype=int)
+    if not len(values):
+        return "no turn"
+    parts = np.split(values, np.flatnonzero(np.diff(values) > 1) + 1)
+    words = [f"{part[0]}" if len(part) == 1 else f"{part[0]}–{part[-1]}" for part in parts]
+    return f"turn {words[0]}" if len(values) == 1 else f"turns {', '.join(words)}"
+
+
+def lost_ranges(record: RunRecord) -> str:
+    """Return which sensors were lost when, those lost together in one phrase."""
+    if record.observation is None:
+        return ""
+    lost = np.isnan(record.observation)
+    blind = lost.all(axis=1)
+    together: dict[tuple[int, ...], list[str]] = {}
+    for sensor, label in enumerate(record.sensors):
+        turns = tuple(int(turn) for turn in np.flatnonzero(lost[:, sensor] & ~blind))
+        if turns:
+            together.setdefault(turns, []).append(str(label))
+    word = sensor_word(record).lower()
+    phrases = [
+        f"{word}{'s' if len(labels) > 1 else ''} {', '.join(labels)} at {turn_ranges(turns)}"
+        for turns, labels in together.items()
+    ]
+    if blind.any():
+        phrases.append(f"all {word}s at {turn_ranges(np.flatnonzero(blind))}")
+    return "; ".join(phrases)
+
+
+def mission_caption(record: RunRecord, now: int) -> str:
+    """Return the caption of the mission seen from turn `now`."""
+    names = ", ".join(symbol(name) for name in record.state_names)
+    _, unit = observation_scale(record)
+    last = now == record.step_count - 1
+    given = "all observations" if last else f"the observations up to turn {now}"
+    past = "in hindsight" if last else "as seen at the time"
+    hollow = "" if last else f"hollow: not yet made at turn {now}; "
+    sentences = [
+        f"{names}: mean and two standard deviations (within the range of levels) in percent; the past given "
+        f"{given} (blue), as seen at the time (thin green), and at the present turn {now} (diamond)."
+    ]
+    if record.horizon:
+        sentences.append(
+            f"The {record.horizon} turns to come are predicted through the policy, eqs. (37)–(39) "
+            "(vermilion, dashed)."
+        )
+    sentences.append(
+        f"{sensor_word(record)}s: {record.observation_name} without noise at the control flown ({unit}) with "
+        f"95 % intervals, {past}, and observations (dots; {hollow}crosses: lost)."
+    )
+    later = "" if last else "; triangles: flown later"
+    sentences.append(f"Control: flown (full bars) and predicted probability (height of the bars{later}).")
+    if record.filtered.reward is not None:
+        sentences.append(f"Rewards: eqs. (9)–(11), dimensionless, with 95 % intervals, {past}.")
+    if record.truth_state is not None:
+        sentences.append("The black line is the truth, which the twin never sees.")
+    return " ".join(sentences)
+
+
+def belief_caption(record: RunRecord) -> str:
+    """Return the caption of the belief."""
+    if len(record.state_names) != 2:
+        return (
+            "Marginal belief about each factor (percent) given the observations up to each turn."
+            + _truth_clause(record)
+        )
+    first, second = (symbol(name) for name in record.state_names)
+    ring = "; ring: truth" if record.truth_state is not None else ""
+    return (
+        f"Joint probability of {first} and {second} (percent) given the observations up to the turn named; "
+        f"diamond: mean{ring}. Source: filtered/probability in run.nc."
+    )
+
+
+def policy_caption(record: RunRecord) -> str:
+    """Return the caption of the policy."""
+    text = (
+        "a: control that value iteration, eq. (36), chooses in each state, and the way of the estimated mean "
+        "through the states during the mission, beginning at the white dot"
+    )
+    text += " (black: truth)." if record.truth_state is not None else "."
+    if len(record.controls) == 2:
+        worse, better = record.controls
+        text += f" b: how much more {better} is worth than {worse} (action values, dimensionless)."
+    else:
+        text += " b: how much more the chosen control is worth than the next best (dimensionless)."
+    return text
+
+
+def check_caption(record: RunRecord, check: PredictiveCheck) -> str:
+    """Return the caption of the predictive check."""
+    scale, unit = observation_scale(record)
+    noise = assumed_noise(record)
+    word = sensor_word(record).lower()
+    sentences = [
+        "a: observation less its expectation at the same turn, in standard deviations of what the twin expects "
+        "(noise and uncertainty of the state); grey: lost.",
+        f"b: share of each {word}'s observations within the 95 % interval.",
+        f"c: probability integral transform of all {len(check.transform)} observations.",
+        "Grey bands: where 95 % of such figures lie if the twin is right.",
+        f"The root mean square of the residuals is {check.standard_deviation:.2f}, and "
+        f"{100.0 * check.overall_coverage:.1f} % of all observations lie within their intervals.",
+        "A root mean square above 1 means that the noise is larger than assumed, or the model is off.",
+    ]
+    if noise is not None:
+        sentences.append(f"The twin assumes a noise of {scale * noise:.4g} {unit}.")
+    return " ".join(sentences)
+
+
+def network_caption() -> str:
+    """Return the caption of the network."""
+    return (
+        "Circles are random variables, squares controls, diamonds rewards; grey ones are known at the present "
+        "turn. A digital state D follows the one before under the control U in force, eqs. (28)–(29), and is "
+        "updated by the observation O, eq. (30); it gives the quantities of interest Q, and these the "
+        "rewards R, eqs. (9)–(11). From the present on, controls follow the policy. The physical state S is "
+        "never seen. Arrows show how information flows; the joint distribution is that of eqs. (1)–(4)."
+    )

@@ -1,0 +1,183 @@
+"""What the report shows of a run: which turn, which sensors, and the lines and bands drawn of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin_master.report_data import Estimate, RunRecord, Uncertain, moments, smoothed_until
+
+Float = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True)
+class Band:
+    """A line with a band around it.
+
+    Attributes
+    ----------
+    step, center, lower, upper : (n,)
+    """
+
+    step: Float
+    center: Float
+    lower: Float
+    upper: Float
+
+
+def sensor_word(record: RunRecord) -> str:
+    """Return what one sensor is called."""
+    return "Gauge" if record.observation_name == "strain" else "Sensor"
+
+
+def default_now(record: RunRecord) -> int:
+    """Return the turn that shows most: a few turns before the flown control first changes.
+
+    Without a change, two thirds into the mission.
+    """
+    changes = np.flatnonzero(np.diff(record.control_index)) + 1
+    last = record.step_count - 1
+    if len(changes):
+        return int(np.clip(changes[0] - 3, 0, last))
+    return int(np.clip(round(2 * last / 3), 0, last))
+
+
+def observation_scale(record: RunRecord) -> tuple[float, str]:
+    """Return the factor from the stored unit of the observations to the printed one, and its name."""
+    if record.observation_name == "strain" and record.observation_unit in {"1", ""}:
+        return 1.0e6, "µε"
+    return 1.0, record.observation_unit
+
+
+def choose_sensors(record: RunRecord, count: int = 4) -> list[int]:
+    """Return indices of sensors worth a panel: the one strained most, the first, and one for each factor.
+
+    The sensor of a factor is the one whose expected value answers most to it: the largest coefficient of a
+    least-squares fit of its logarithm to the means of the factors, apart for each control.
+    """
+    if record.observation is None or not len(record.sensors):
+        return []
+    quantity = None if record.filtered.quantity is None else record.filtered.quantity.mean
+    reference = np.abs(record.observation if quantity is None else quantity)
+    level = np.nanmax(np.where(np.isfinite(reference), reference, 0.0), axis=0)
+    chosen = [int(np.argmax(level))]
+    if 0 not in chosen:
+        chosen.append(0)
+    if quantity is not None and bool(np.all(quantity > 0.0)):
+        columns = [record.filtered.mean, np.eye(len(record.controls))[record.control_index]]
+        coefficient = np.linalg.lstsq(np.concatenate(columns, axis=1), np.log(quantity), rcond=None)[0]
+        for factor in range(len(record.state_names)):
+            order = np.argsort(-coefficient[factor], kind="stable")
+            fresh = [int(sensor) for sensor in order if int(sensor) not in chosen]
+            if fresh and coefficient[factor, fresh[0]] > 1e-3:
+                chosen.append(fresh[0])
+    return chosen[:count]
+
+
+@dataclass(frozen=True)
+class Course:
+    """One quantity as seen at one turn.
+
+    Attributes
+    ----------
+    past : Band or None
+        Turns 0..now.
+    predicted : Band or None
+        Turns now + 1..now + H.
+    truth : (n,) or None
+        Turns 0..n-1, at most to the last predicted one.
+    """
+
+    past: Band | None
+    predicted: Band | None
+    truth: Float | None
+
+
+def state_course(record: RunRecord, factor: int, now: int) -> Course:
+    """Return one factor of the state, percent: mean and two standard deviations, within the levels.
+
+    The past is p(D_t | o_0..o_now), the prediction p(D_{now+h} | o_0..o_now).
+    """
+    mean, deviation = record.filtered.mean[: now + 1], record.filtered.standard_deviation[: now + 1]
+    if now == record.step_count - 1 and record.smoothed is not None:
+        mean, deviation = record.smoothed.mean, record.smoothed.standard_deviation
+    else:
+        belief = smoothed_until(record, now)
+        if belief is not None:
+            mean, deviation = moments(belief, record.coordinates)
+    low, high = float(record.levels[factor][0]), float(record.levels[factor][-1])
+
+    def band(first: int, mean: Float, deviation: Float) -> Band:
+        lower, upper = (np.clip(mean + sign * deviation, low, high) for sign in (-2.0, 2.0))
+        return Band(np.arange(float(first), first + len(mean)), 100.0 * mean, 100.0 * lower, 100.0 * upper)
+
+    predicted = None
+    if record.predicted is not None and record.horizon:
+        coming = record.predicted
+        predicted = band(now + 1, coming.mean[now, :, factor], coming.standard_deviation[now, :, factor])
+    truth = None if record.truth_state is None else 100.0 * record.truth_state[: _end(record, now), factor]
+    return Course(band(0, mean[:, factor], deviation[:, factor]), predicted, truth)
+
+
+def sensor_course(record: RunRecord, sensor: int, now: int) -> Course:
+    """Return the noise-free observation of one sensor in its printed unit, with 95 % intervals.
+
+    The past is seen in hindsight at the last turn and as seen at the time before that.
+    """
+    scale, _ = observation_scale(record)
+    past = _past(record, now).quantity
+    predicted = None if record.predicted is None else record.predicted.quantity
+    truth = record.truth_observation
+    return Course(
+        None if past is None else _band(past, sensor, scale, 0, slice(0, now + 1)),
+        None if predicted is None else _band(predicted, sensor, scale, now + 1, now),
+        None if truth is None else scale * truth[: _end(record, now), sensor],
+    )
+
+
+def reward_course(record: RunRecord, reward: int, now: int) -> Course:
+    """Return one reward with 95 % intervals; the past as in `sensor_course`."""
+    past = _past(record, now).reward
+    predicted = None if record.predicted is None else record.predicted.reward
+    return Course(
+        None if past is None else _band(past, reward, 1.0, 0, slice(0, now + 1)),
+        None if predicted is None else _band(predicted, reward, 1.0, now + 1, now),
+        None,
+    )
+
+
+def _end(record: RunRecord, now: int) -> int:
+    return min(now + 1 + record.horizon, record.step_count)
+
+
+def _past(record: RunRecord, now: int) -> Estimate:
+    last = now == record.step_count - 1
+    return record.smoothed if last and record.smoothed is not None else record.filtered
+
+
+def _band(values: Uncertain, index: int, scale: float, first: int, part: int | slice) -> Band | None:
+    """Return the part (a range of turns, or the predictions of one turn) of one quantity; None if unknown."""
+    center, lower, upper = (
+        scale * array[part][..., index] for array in (values.mean, values.lower, values.upper)
+    )
+    known = np.isfinite(center)
+    if not known.any():
+        return None
+    return Band(
+        np.arange(float(first), first + len(center))[known], center[known], lower[known], upper[known]
+    )
+
+
+def symbol(name: str) -> str:
+    """Return the name with its trailing digits as a subscript: ``z1`` -> z₁."""
+    stem = name.rstrip("0123456789")
+    digits = name[len(stem) :]
+    return stem + digits.translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")) if stem else name
+
+
+def capital(text: str) -> str:
+    """Return the text with its first letter capital."""
+    return text[:1].upper() + text[1:]
