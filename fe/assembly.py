@@ -30,7 +30,9 @@ def gauss_points(order: int, dimensions: int = 3) -> tuple[FloatArray, FloatArra
     line, weight = 0.5 * (line + 1.0), 0.5 * weight
     grids = np.meshgrid(*([line] * dimensions), indexing="ij")
     weights = np.meshgrid(*([weight] * dimensions), indexing="ij")
-    return np.stack([g.ravel() for g in grids], axis=1), np.prod([w.ravel() for w in weights], axis=0)
+    return np.stack([g.ravel() for g in grids], axis=1), np.asarray(
+        np.prod([w.ravel() for w in weights], axis=0)
+    )
 
 
 def shape_functions(local: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -75,7 +77,7 @@ def global_gradients(corners: FloatArray, local: FloatArray) -> tuple[FloatArray
     """Gradients (n, q, 20, 3) of the shape functions in space and Jacobian determinants (n, q)."""
     jacobian = jacobians(corners, local)
     _, gradients = shape_functions(local)
-    return np.asarray(gradients[None] @ np.linalg.inv(jacobian)), np.linalg.det(jacobian)
+    return np.asarray(gradients[None] @ np.linalg.inv(jacobian)), np.asarray(np.linalg.det(jacobian))
 
 
 def strain_matrix(gradients: FloatArray) -> FloatArray:
@@ -96,7 +98,7 @@ def orthotropic_elasticity(
     compliance[:3, :3] = -poisson_ratio / young_modulus
     compliance[range(3), range(3)] = 1.0 / young_modulus
     compliance[range(3, 6), range(3, 6)] = 1.0 / shear_23, 1.0 / shear_13, 1.0 / shear_12
-    return np.linalg.inv(compliance)
+    return np.asarray(np.linalg.inv(compliance), dtype=np.float64)
 
 
 def isotropic_elasticity(young_modulus: float, poisson_ratio: float) -> FloatArray:

@@ -6,6 +6,7 @@ semi-span, chordwise places are fractions of the local chord measured from the l
 """
 
 import hashlib
+import itertools
 import json
 import math
 import tomllib
@@ -147,11 +148,12 @@ class Masses(_Part):
 class Gauges(_Part):
     """Strain gauges on the upper skin, along the span.
 
-    Positions are (distance from the root [m], chord fraction); a gauge reads the strain averaged over
-    `averaging_length` [m] chordwise.
+    Positions are (distance from the root [m], chord fraction); a gauge reads the strain averaged over a
+    patch of `averaging_chordwise` by `averaging_spanwise` [m].
     """
 
-    averaging_length: float = Field(ge=0.0, lt=1.0, description="m")
+    averaging_chordwise: float = Field(ge=0.0, lt=1.0, description="m")
+    averaging_spanwise: float = Field(default=0.0, ge=0.0, lt=1.0, description="m")
     positions: tuple[tuple[float, float], ...] = Field(min_length=1)
 
 
@@ -280,7 +282,7 @@ class WingDesign(_Part):
 
 def _check_webs(design: WingDesign) -> None:
     smallest = min(design.planform.root_chord, design.planform.tip_chord)
-    for index, (before, after) in enumerate(zip(design.webs, design.webs[1:], strict=False), start=1):
+    for index, (before, after) in enumerate(itertools.pairwise(design.webs), start=1):
         room = (after.chord - before.chord) * smallest - before.thickness - after.thickness
         if room <= 0.0:
             raise ValueError(
@@ -293,8 +295,8 @@ def _check_webs(design: WingDesign) -> None:
         half = float(four_digit_half_thickness(web.chord, design.airfoil.thickness_ratio)) * smallest
         if half <= 1.5 * design.skin.thickness:
             raise ValueError(
-                f"the skin of {design.skin.thickness:g} m does not fit into the section at chord {web.chord:g}, "
-                f"whose half height is {half:.2g} m at the smallest chord"
+                f"the skin of {design.skin.thickness:g} m does not fit into the section at chord "
+                f"{web.chord:g}, whose half height is {half:.2g} m at the smallest chord"
             )
     for index, rod in enumerate(design.rods):
         if rod.web >= len(design.webs):
@@ -305,7 +307,7 @@ def _check_webs(design: WingDesign) -> None:
 
 def _check_ribs(design: WingDesign) -> None:
     intervals = sorted((*rib_interval(design, index), index) for index in range(len(design.ribs)))
-    for (_, end, first), (start, _, second) in zip(intervals, intervals[1:], strict=False):
+    for (_, end, first), (start, _, second) in itertools.pairwise(intervals):
         if start < end:
             raise ValueError(f"ribs[{first}] and ribs[{second}] overlap at {start:.4g} m from the root")
 
@@ -320,8 +322,8 @@ def _check_regions(design: WingDesign) -> None:
             raise ValueError(f"{where} ends {defect.span_end:g} m from the root, off the wing of {span:g} m")
         if defect.chord_start < design.front_chord or defect.chord_end > design.rear_chord:
             raise ValueError(
-                f"{where} covers chord {defect.chord_start:g} to {defect.chord_end:g}, outside the skin of the "
-                f"box from {design.front_chord:g} to {design.rear_chord:g}"
+                f"{where} covers chord {defect.chord_start:g} to {defect.chord_end:g}, outside the skin of "
+                f"the box from {design.front_chord:g} to {design.rear_chord:g}"
             )
     one, two = design.defects
     if min(one.span_end, two.span_end) > max(one.span_start, two.span_start) and min(
@@ -335,17 +337,22 @@ def _check_regions(design: WingDesign) -> None:
 
 def _check_gauges(design: WingDesign) -> None:
     span = design.planform.semi_span
+    along, across = 0.5 * design.gauges.averaging_spanwise, 0.5 * design.gauges.averaging_chordwise
     for index, (distance, chord) in enumerate(design.gauges.positions):
-        if not 0.0 <= distance <= span:
+        if not along <= distance <= span - along:
             raise ValueError(
-                f"gauges.positions[{index}] is {distance:g} m from the root, off the wing of {span:g} m"
+                f"gauges.positions[{index}] is {distance:g} m from the root, with its averaging length off "
+                f"the wing of {span:g} m"
             )
-        half = 0.5 * design.gauges.averaging_length / design.planform.chord(distance / span)
-        if chord - half < design.front_chord or chord + half > design.rear_chord:
-            raise ValueError(
-                f"gauges.positions[{index}] at chord {chord:g} does not lie, with its averaging length, on the "
-                f"skin of the box from chord {design.front_chord:g} to {design.rear_chord:g}"
-            )
+        for end in (distance - along, distance + along):
+            local = design.planform.chord(end / span)
+            middle = chord * design.planform.chord(distance / span)
+            reach = [(middle - across) / local, (middle + across) / local]
+            if reach[0] < design.front_chord or reach[1] > design.rear_chord:
+                raise ValueError(
+                    f"gauges.positions[{index}] at chord {chord:g} does not lie, with its averaging length, "
+                    f"on the skin of the box from chord {design.front_chord:g} to {design.rear_chord:g}"
+                )
 
 
 def _check_places(design: WingDesign) -> None:

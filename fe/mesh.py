@@ -6,6 +6,7 @@ them lie the webs, the ribs and the wall that closes the leading edge. Local axe
 and its Jacobian is positive.
 """
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -161,8 +162,8 @@ class WingMesh:
             and -tolerance <= span_local <= 1.0 + tolerance
         ):
             raise MeshError(
-                f"the point {distance:.4g} m from the root and {behind_leading_edge:.4g} m behind the leading edge "
-                f"does not lie on the skin, which reaches from {places[0]:.4g} m to {places[-1]:.4g} m there."
+                f"the point {distance:.4g} m from the root and {behind_leading_edge:.4g} m behind the leading "
+                f"edge does not lie on the skin, which reaches from {places[0]:.4g} m to {places[-1]:.4g} m there."
             )
         i = int(np.clip(np.searchsorted(places, behind_leading_edge, side="right") - 1, 0, len(places) - 2))
         chord_local = (behind_leading_edge - places[i]) / (places[i + 1] - places[i])
@@ -196,8 +197,8 @@ def _merge_lines(wanted: list[tuple[float, str]], what: str) -> list[float]:
             continue
         if kept and place - kept[-1][0] < SMALLEST_GAP:
             raise MeshError(
-                f"{label} at {place:.5f} m and {kept[-1][1]} at {kept[-1][0]:.5f} m from the {what} are closer than "
-                f"{SMALLEST_GAP * 1e3:g} mm; move one of them or put them on the same line."
+                f"{label} at {place:.5f} m and {kept[-1][1]} at {kept[-1][0]:.5f} m from the {what} are closer "
+                f"than {SMALLEST_GAP * 1e3:g} mm; move one of them or put them on the same line."
             )
         kept.append((place, label))
     return [place for place, _ in kept]
@@ -205,7 +206,7 @@ def _merge_lines(wanted: list[tuple[float, str]], what: str) -> list[float]:
 
 def _subdivide(lines: list[float], size: float) -> list[float]:
     filled = [lines[0]]
-    for start, end in zip(lines, lines[1:], strict=False):
+    for start, end in itertools.pairwise(lines):
         count = max(1, int(np.ceil((end - start) / size - 1e-9)))
         filled.extend(start + (end - start) * (n + 1) / count for n in range(count - 1))
         filled.append(end)
@@ -284,7 +285,7 @@ def chord_lines(design: WingDesign) -> tuple[ChordLine, ...]:
         firm.append(line)
     lines = [firm[0]]
     size = design.mesh.chord_size / design.mesh.refinement * root
-    for start, end in zip(firm, firm[1:], strict=False):
+    for start, end in itertools.pairwise(firm):
         width = end.behind_leading_edge(root) - start.behind_leading_edge(root)
         count = max(1, int(np.ceil(width / size - 1e-9)))
         for n in range(1, count):
@@ -361,15 +362,15 @@ def build_mesh(design: WingDesign) -> WingMesh:
     is_skin = (k == 0) | (k == shape[2] - 1)
     wall = wall_column[i]
     kept = is_skin | wall | (web_column[i] >= 0) | (rib_row[j] >= 0)
-    index = np.stack([i[kept], j[kept], k[kept]], axis=1)
+    cell_index = np.stack([i[kept], j[kept], k[kept]], axis=1)
     is_skin, wall = is_skin[kept], wall[kept]
     shell = is_skin | wall
-    web = np.where(shell, -1, web_column[index[:, 0]])
-    rib = np.where(shell | (web >= 0), -1, rib_row[index[:, 1]])
+    web = np.where(shell, -1, web_column[cell_index[:, 0]])
+    rib = np.where(shell | (web >= 0), -1, rib_row[cell_index[:, 1]])
     region = np.select([web >= 0, rib >= 0], [WEBS, RIBS], SKIN)
-    _mark_defects(design, across, along, index, region)
+    _mark_defects(design, across, along, cell_index, region)
 
-    corner = index[:, None, :] + _CORNERS
+    corner = cell_index[:, None, :] + _CORNERS
     flat = np.ravel_multi_index(tuple(np.moveaxis(corner, 2, 0)), grid.shape[:3])
     used, cells = np.unique(flat, return_inverse=True)
     mesh = WingMesh(
@@ -378,7 +379,7 @@ def build_mesh(design: WingDesign) -> WingMesh:
         chord_lines=along,
         points=grid.reshape(-1, 3)[used],
         cells=cells.reshape(flat.shape).astype(np.int64),
-        grid_index=index,
+        grid_index=cell_index,
         region=region,
         web=web,
         rib=rib,
@@ -417,8 +418,8 @@ def _check_nothing_vanished(mesh: WingMesh) -> None:
         found = float(np.diff(mesh.span_lines)[rows].sum())
         if abs(found - rib.thickness) > 1e-6 * rib.thickness:
             raise MeshError(
-                f"ribs[{index}] at {rib.station:g} of the span should be {rib.thickness:g} m thick, but the mesh "
-                f"holds {found:.3g} m of it; move it away from the mesh lines or refine the mesh."
+                f"ribs[{index}] at {rib.station:g} of the span should be {rib.thickness:g} m thick, but the "
+                f"mesh holds {found:.3g} m of it; move it away from the mesh lines or refine the mesh."
             )
     for index in range(len(design.webs)):
         if not np.any(mesh.web == index):
@@ -430,6 +431,6 @@ def _check_nothing_vanished(mesh: WingMesh) -> None:
         length = float(thickness[inside].sum() / max(1, len(np.unique(mesh.grid_index[inside, 0]))))
         if abs(length - (defect.span_end - defect.span_start)) > 1e-6:
             raise MeshError(
-                f"defects[{number - 1}] should be {defect.span_end - defect.span_start:g} m long, but the mesh holds "
-                f"{length:.4g} m of it."
+                f"defects[{number - 1}] should be {defect.span_end - defect.span_start:g} m long, but the mesh "
+                f"holds {length:.4g} m of it."
             )

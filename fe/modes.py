@@ -92,7 +92,7 @@ def cantilever_bending_shapes(operators: AffineOperators, count: int = 2) -> Flo
 
 
 def flapwise_bending_modes(operators: AffineOperators, shapes: FloatArray, mass: sparse.sparray) -> IntArray:
-    """Indices (2,) of the first and second flapwise bending mode among shapes (n, m).
+    """Find the first and second flapwise bending mode among shapes (n, m): indices (2,).
 
     They are the modes whose modal assurance with the bending shapes of a cantilever is the greatest.
     """

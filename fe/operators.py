@@ -259,28 +259,39 @@ def _upward(weights: FloatArray) -> FloatArray:
     return full
 
 
+def _pieces(middle: float, length: float, lines: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gauss points and weights of the mean over a length, piece by piece between mesh lines."""
+    if length == 0.0:
+        return np.array([middle]), np.array([1.0])
+    start, end = middle - 0.5 * length, middle + 0.5 * length
+    breaks = np.array([start, *lines[(lines > start) & (lines < end)], end])
+    line, weight = np.polynomial.legendre.leggauss(3)
+    pieces = np.diff(breaks)[:, None]
+    points = breaks[:-1, None] + 0.5 * (1.0 + line) * pieces
+    return points.ravel(), (0.5 * weight * pieces / length).ravel()
+
+
 def gauge_output(mesh: WingMesh, discretisation: Discretisation) -> sparse.csr_array:
     """Strain of each gauge, csr (gauges, full) [1/m]: eq. (15) at the true gauge points.
 
-    The strain along the span on the outer surface of the upper skin, averaged chordwise piece by piece
-    between the mesh lines, positive in compression.
+    The strain along the span on the outer surface of the upper skin, averaged over the gauge's patch piece
+    by piece between the mesh lines, positive in compression.
     """
     design = mesh.design
-    half = 0.5 * design.gauges.averaging_length
-    line, weight = np.polynomial.legendre.leggauss(3)
-    output = np.zeros((len(design.gauges.positions), discretisation.unknowns))
-    for gauge, (distance, chord_fraction) in enumerate(design.gauges.positions):
-        middle = chord_fraction * design.planform.chord(distance / design.planform.semi_span)
-        _, _, places = mesh.upper_skin_lines(distance)
-        inside = places[(places > middle - half) & (places < middle + half)]
-        breaks = np.array([middle - half, *inside, middle + half])
-        lengths = np.diff(breaks)
-        share = lengths / lengths.sum() if half > 0.0 else np.array([1.0])
-        for start, length, part in zip(breaks[:-1], lengths, share, strict=True):
-            for abscissa, factor in zip(line, weight, strict=True):
-                point = mesh.skin_point(distance, start + 0.5 * (1.0 + abscissa) * length)
-                dofs, weights = _span_strain(mesh, discretisation, point)
-                output[gauge, dofs] -= 0.5 * factor * part * weights
+    gauges, plan = design.gauges, design.planform
+    output = np.zeros((len(gauges.positions), discretisation.unknowns))
+    for gauge, (distance, chord_fraction) in enumerate(gauges.positions):
+        # The patch is a rectangle: the same distances fore and aft of the gauge's own chord line.
+        middle = (chord_fraction - plan.straight_chord_line) * plan.chord(distance / plan.semi_span)
+        for place, span_weight in zip(
+            *_pieces(distance, gauges.averaging_spanwise, mesh.span_lines), strict=True
+        ):
+            lead = plan.straight_chord_line * plan.chord(place / plan.semi_span)
+            _, _, lines = mesh.upper_skin_lines(place)
+            behind = _pieces(middle + lead, gauges.averaging_chordwise, lines)
+            for chordwise, chord_weight in zip(*behind, strict=True):
+                dofs, weights = _span_strain(mesh, discretisation, mesh.skin_point(place, chordwise))
+                output[gauge, dofs] -= span_weight * chord_weight * weights
     return sparse.csr_array(output)
 
 

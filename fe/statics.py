@@ -71,9 +71,9 @@ class Factorisation:
         change = float(np.linalg.norm(correction)) / max(float(np.linalg.norm(solution)), 1e-300)
         if not (error <= BACKWARD_ERROR_LIMIT and change <= CORRECTION_LIMIT):
             raise SolutionError(
-                f"The static solution has a backward error of {error:.2g} and is accurate to {change:.2g}, but "
-                f"{BACKWARD_ERROR_LIMIT:g} and {CORRECTION_LIMIT:g} are needed; the stiffness matrix is nearly "
-                "singular, some part of the structure is hardly held."
+                f"The static solution has a backward error of {error:.2g} and is accurate to "
+                f"{change:.2g}, but {BACKWARD_ERROR_LIMIT:g} and {CORRECTION_LIMIT:g} are needed; the stiffness "
+                "matrix is nearly singular, some part of the structure is hardly held."
             )
         return solution
 
@@ -111,7 +111,7 @@ def solve_static(
     load_factor: float = 1.0,
     tip_force: float = 0.0,
 ) -> StaticSolution:
-    """Static response K(e, z) u = f, Kapteyn et al. 2021, eq. (13), and the gauge strains, eq. (15).
+    """Solve K(e, z) u = f, Kapteyn et al. 2021, eq. (13), and evaluate the gauge strains, eq. (15).
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def solve_static(
 
 
 def static_outputs(operators: AffineOperators, displacement: FloatArray) -> StaticSolution:
-    """Outputs of a displacement (n,) of the free unknowns."""
+    """Evaluate the outputs of a displacement (n,) of the free unknowns."""
     return StaticSolution(
         displacement=displacement,
         strain=np.asarray(operators.gauge_output @ displacement),
