@@ -1,1 +1,19 @@
 """What to run: scenario and binding files, shipped as package data."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+SCENARIO_FOLDER = Path(str(resources.files(__name__)))
+BINDING_FOLDER = SCENARIO_FOLDER / "bindings"
+
+
+def scenario_files() -> dict[str, Path]:
+    """Return the shipped scenarios by name, in alphabetical order."""
+    return {path.stem: path for path in sorted(SCENARIO_FOLDER.glob("*.toml"))}
+
+
+def binding_files() -> dict[str, Path]:
+    """Return the shipped bindings by name, in alphabetical order."""
+    return {path.stem: path for path in sorted(BINDING_FOLDER.glob("*.toml"))}

@@ -1,0 +1,78 @@
+"""What the mission can fly: one protocol, and the assets that need no FMU.
+
+An asset is told the control and its true health, and returns the noise-free observation. It is driven by the
+`Plant`; the twin never meets it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AssetReading:
+    """What an asset returns for one step.
+
+    Attributes
+    ----------
+    values : (G,)
+        Noise-free observation in its SI unit.
+    monitors : dict of str to float
+        Further figures that the asset reports of itself, such as a certified error bound.
+    """
+
+    values: Float
+    monitors: Mapping[str, float] = field(default_factory=dict)
+
+
+class Asset(Protocol):
+    """An asset under control."""
+
+    def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        """Fly one step with the given control inputs and true health (SI)."""
+
+    def save_state(self) -> bytes:
+        """Return the state as bytes; empty if the asset has none."""
+
+    def restore_state(self, state: bytes) -> None:
+        """Continue from a saved state, also in another process."""
+
+    def close(self) -> None:
+        """Let go of what the asset holds."""
+
+
+ObservationFunction = Callable[[Mapping[str, float], Mapping[str, float]], AssetReading]
+
+
+class StatelessAsset:
+    """An asset whose observation depends on nothing but the control and the health of the step.
+
+    Parameters
+    ----------
+    observe
+        Returns the reading for control inputs and health.
+    """
+
+    def __init__(self, observe: ObservationFunction) -> None:
+        self._observe = observe
+
+    def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        """Return the observation under the given control inputs and health."""
+        return self._observe(control, health)
+
+    def save_state(self) -> bytes:
+        """Return nothing: there is no state."""
+        return b""
+
+    def restore_state(self, state: bytes) -> None:
+        """Accept that there is no state."""
+
+    def close(self) -> None:
+        """Hold nothing."""

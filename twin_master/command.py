@@ -1,0 +1,146 @@
+"""The command that flies a scenario: `uav-twin run`, and `python -m twin_master` as the master script."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from twin_master.summary import Figure
+    from twin_master.workflow import RunOutcome
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+
+def run(
+    scenario: Annotated[
+        str | None,
+        typer.Argument(help="A shipped scenario (see `uav-twin scenarios`) or the path of a TOML file."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="The run folder to make.", show_default="runs/SCENARIO")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of the run; by default that of the scenario.")
+    ] = None,
+    resume: Annotated[Path | None, typer.Option(help="Continue the interrupted run in this folder.")] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the run folder if it exists.")] = False,
+    fmu: Annotated[Path | None, typer.Option(help="Fly this FMU instead of the one of the design.")] = None,
+    binding: Annotated[Path | None, typer.Option(help="Which variable of the FMU plays which role.")] = None,
+    strain_library: Annotated[
+        Path | None,
+        typer.Option(
+            help="Fly the authors' strain library (UAVconfig.json or its folder) as model and asset."
+        ),
+    ] = None,
+    in_process: Annotated[
+        bool, typer.Option("--in-process", help="Run the FMU in this process instead of a worker.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress and no summary.")] = False,
+) -> None:
+    """Fly a scenario: model, reduce, pack, calibrate, fly, report."""
+    from reporting.progress import RichProgress, SilentProgress
+    from twin_master.scenario_file import load_scenario
+    from twin_master.workflow import Overrides, new_run, resume_run
+
+    overrides = Overrides(seed, fmu, binding, strain_library, in_process)
+    progress = SilentProgress() if quiet else RichProgress()
+    if resume is not None:
+        if out is not None or replace or overrides != Overrides():
+            raise typer.BadParameter(
+                "a run is continued with what its folder holds: give nothing but SCENARIO and --quiet beside it.",
+                param_hint="--resume",
+            )
+        loaded = None if scenario is None else load_scenario(scenario)
+        outcome = _interruptible(lambda: resume_run(resume, loaded, progress=progress), resume)
+    else:
+        if scenario is None:
+            raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
+        loaded = load_scenario(scenario)
+        folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
+        outcome = _interruptible(
+            lambda: new_run(loaded, folder, overrides, replace=replace, progress=progress), folder
+        )
+    if not quiet:
+        show_outcome(outcome)
+
+
+def _interruptible(fly: Callable[[], RunOutcome], folder: Path) -> RunOutcome:
+    try:
+        return fly()
+    except KeyboardInterrupt:
+        typer.secho(
+            f"Interrupted; nothing is lost: continue with `uav-twin run --resume {folder}`.",
+            fg="red",
+            err=True,
+        )
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def show_outcome(outcome: RunOutcome) -> None:
+    """Print the figures of a run beside the published ones, and where the report is."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    table = Table("figure", "this run", "published", "by")
+    for figure in outcome.figures:
+        table.add_row(
+            figure.title,
+            _shown(figure.value, figure),
+            _shown(figure.reference, figure),
+            figure.reference_source,
+        )
+    for title, key in (
+        ("asset, per turn", "asset"),
+        ("twin, per turn", "twin"),
+        ("checkpoint, per turn", "checkpoint"),
+    ):
+        entry = outcome.timing.get(f"{key}_seconds")
+        if entry:
+            table.add_row(
+                title, f"{1e3 * entry['median']:.3g} ms (largest {1e3 * entry['largest']:.3g} ms)", "", ""
+            )
+    table.add_row("whole run", f"{outcome.timing['total_seconds']:.3g} s", "", "")
+    console.print(table)
+    console.print(f"Report: {outcome.report}", soft_wrap=True)
+
+
+def _shown(value: float | int | str | None, figure: Figure) -> str:
+    if value is None:
+        return "" if figure.reference_source or not figure.key.endswith("step") else "none"
+    text = value if isinstance(value, str) else f"{value:.4g}" if isinstance(value, float) else str(value)
+    return f"{text} {figure.unit}".strip() if not isinstance(value, str) else text
+
+
+def guarded(application: Callable[[], None]) -> None:
+    """Run a command line; an error of this project's packages becomes one sentence and exit code 1."""
+    try:
+        application()
+    except Exception as error:
+        if not _is_ours(error):
+            raise
+        typer.secho(str(error), fg="red", err=True)
+        raise SystemExit(1) from None
+
+
+def _is_ours(error: Exception) -> bool:
+    from calibration.errors import CalibrationError
+    from fe.errors import FiniteElementError
+    from fmu_asset.errors import FmuError
+    from reporting.errors import ReportingError
+    from twin_master.errors import TwinMasterError
+
+    ours = (TwinMasterError, FmuError, FiniteElementError, CalibrationError, ReportingError)
+    return isinstance(error, ours)
+
+
+def main() -> None:
+    """Run `python -m twin_master`."""
+    application = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    application.command()(run)
+    guarded(lambda: application(prog_name="python -m twin_master"))

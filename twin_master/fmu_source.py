@@ -1,0 +1,191 @@
+"""An FMU as the asset of a mission: packed from a wing design, or any FMU with a binding."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from fe.cache import reduced_model
+from numpy.typing import NDArray
+
+from fe.design import load_design
+from fe.reduced import ReducedModel
+from fmu_asset.binding import load_binding
+from fmu_asset.build import build_fmu
+from fmu_asset.session import FmiAsset
+from reporting.files import atomic_write_bytes
+from reporting.progress import Progress
+from reporting.provenance import hash_file
+from twin_master.asset_source import wing_observation_table
+from twin_master.assets import Asset, AssetReading
+from twin_master.graphical_model import GraphicalModel
+from twin_master.parameter import ParameterDraws, draw_parameter
+from twin_master.run_errors import MissionInputError
+from twin_master.scenario import Scenario
+
+Float = NDArray[np.float64]
+
+INPUT_FOLDER = "asset"
+"""Folder inside the run folder that holds copies of what is flown, so that a run can be resumed anywhere."""
+
+
+class FmuAsset:
+    """An FMU behind its one door, as the mission flies it.
+
+    Parameters
+    ----------
+    session : FmiAsset
+        The door, at its start.
+    observation : slice
+        Where the observed quantity stands among the observations of the binding.
+    load : mapping of str to float
+        Load inputs, the same in every step.
+    """
+
+    def __init__(self, session: FmiAsset, observation: slice, load: Mapping[str, float]) -> None:
+        self._session = session
+        self._observation = observation
+        self._load = dict(load)
+
+    def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        """Make one communication step."""
+        observation = self._session.step(control, health, self._load)
+        return AssetReading(observation.values[self._observation], observation.extra)
+
+    def save_state(self) -> bytes:
+        """Return the state of the FMU."""
+        return self._session.save_state()
+
+    def restore_state(self, state: bytes) -> None:
+        """Bring the FMU to a saved state."""
+        self._session.restore_state(state)
+
+    def close(self) -> None:
+        """End the worker."""
+        self._session.close()
+
+
+class FmuSource:
+    """An FMU from a wing design or from a file.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        What is flown.
+    binding : Path
+        Binding file.
+    design : Path or None
+        Wing design: the twin's model, and what is packed where no FMU is given.
+    fmu : Path or None
+        The FMU to fly.
+    """
+
+    def __init__(self, scenario: Scenario, binding: Path, design: Path | None, fmu: Path | None) -> None:
+        self._scenario = scenario
+        self._given = {"binding.toml": binding, "design.toml": design, "asset.fmu": fmu}
+        self._folder: Path | None = None
+        self._wing: ReducedModel | None = None
+
+    @property
+    def wing(self) -> ReducedModel | None:
+        """The reduced model of the design, once prepared."""
+        return self._wing
+
+    def _path(self, name: str) -> Path:
+        if self._folder is None:
+            raise MissionInputError("the asset was not prepared: call `prepare` first.")
+        return self._folder / INPUT_FOLDER / name
+
+    def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
+        """Copy what is given into the run folder, reduce the design and pack the FMU; return the hashes.
+
+        Raises
+        ------
+        MissionInputError
+            A file cannot be read.
+        InvalidDesignError, FmuError
+            A design, binding or FMU is wrong.
+        """
+        self._folder = folder
+        for name, path in self._given.items():
+            if path is not None and not self._path(name).exists():
+                atomic_write_bytes(self._path(name), _content(path))
+        load_binding(self._path("binding.toml"))
+        hashes = {"binding": hash_file(self._path("binding.toml"))}
+        if self._given["design.toml"] is not None:
+            design = load_design(self._path("design.toml"))
+            self._wing = reduced_model(design, progress=progress)
+            hashes["design"] = self._wing.design_hash
+            if self._given["asset.fmu"] is None:
+                with progress.stage("Packing the FMU"):
+                    build_fmu(self._wing, self._path("asset.fmu"), replace=True)
+        hashes["fmu"] = hash_file(self._path("asset.fmu"))
+        return hashes
+
+    def draws(self, seed: int) -> ParameterDraws:
+        """Return draws of the calibrated parameter."""
+        return draw_parameter(self._scenario.calibration, seed, self._wing)
+
+    def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
+        """Return the predicted observations (E, S, U, G), from the design's model or from the FMU itself."""
+        if self._scenario.asset.observation_model == "asset" or self._wing is None:
+            return self._tabulate(draws, model)
+        return wing_observation_table(self._wing, self._scenario, draws, model)
+
+    def _tabulate(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
+        """Ask the FMU for its observation at every draw, state and control: for assets without memory."""
+        scenario = self._scenario
+        states, controls = model.states.coordinates, scenario.control
+        table = np.empty((len(draws.values), len(states), len(controls), scenario.observation.count))
+        with self._session() as session:
+            chosen = session.binding.observation_slice(scenario.observation.role)
+            for row, value in enumerate(draws.values):
+                session.reset({**scenario.asset.parameters, draws.name: float(value)})
+                for state, levels in enumerate(states):
+                    health = dict(zip(scenario.state_names, levels.tolist(), strict=True))
+                    for index, control in enumerate(controls):
+                        reading = session.step(control.values, health, scenario.asset.load)
+                        table[row, state, index] = reading.values[chosen]
+        return table
+
+    def _session(self) -> FmiAsset:
+        asset = self._scenario.asset
+        return FmiAsset(
+            self._path("asset.fmu"),
+            self._path("binding.toml"),
+            isolated=asset.isolated,
+            step_timeout=asset.step_timeout,
+            parameters=asset.parameters,
+        )
+
+    def open(self) -> Asset:
+        """Return the FMU at its start, with the parameters of the scenario.
+
+        Raises
+        ------
+        FmuError
+            The FMU cannot be flown, or the binding does not fit it.
+        MissionInputError
+            The FMU observes another number of values than the scenario.
+        """
+        session = self._session()
+        chosen = session.binding.observation_slice(self._scenario.observation.role)
+        if chosen.stop - chosen.start != self._scenario.observation.count:
+            raise MissionInputError(
+                f"the binding {session.binding.name} observes {chosen.stop - chosen.start} values of "
+                f"`{self._scenario.observation.role}`, and the scenario expects {self._scenario.observation.count}."
+            )
+        try:
+            session.reset()
+        except BaseException:
+            session.close()
+            raise
+        return FmuAsset(session, chosen, self._scenario.asset.load)
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise MissionInputError(f"{path} cannot be read: {error.strerror or error}.") from error

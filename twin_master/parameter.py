@@ -1,0 +1,109 @@
+"""Draws of the uncertain parameter of the model, from a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from calibration.stiffness import PUBLISHED_LINE, calibrate_static, stiffness_curve_of
+from calibration.stiffness_curve import StiffnessCurve, TipStiffnessModel
+from twin_master.run_errors import MissingObservationModelError
+from twin_master.scenario import Calibration
+from twin_master.seeds import generator, seed_sequence
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ParameterDraws:
+    """Equally weighted draws of one parameter of the asset's model.
+
+    Attributes
+    ----------
+    name : str
+        Parameter.
+    values : (E,)
+        Draws, SI.
+    mean, standard_deviation : float
+        Of the distribution that was drawn from.
+    source : str
+        Where the distribution comes from.
+    record : mapping or None
+        The whole calibration, ready for JSON.
+    """
+
+    name: str
+    values: Float
+    mean: float
+    standard_deviation: float
+    source: str
+    record: Mapping[str, Any] | None = None
+
+
+def draw_parameter(
+    calibration: Calibration, seed: int, model: TipStiffnessModel | None = None
+) -> ParameterDraws:
+    """Return draws of the calibrated parameter: Kapteyn et al. 2021, calibration step 2.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Section of the scenario.
+    seed : int
+        Seed of the run.
+    model : TipStiffnessModel, optional
+        The structural model, where its own stiffness curve is to be used.
+
+    Raises
+    ------
+    MissingObservationModelError
+        The scenario asks for the stiffness curve of a design and there is none.
+    CalibrationError
+        The measurements do not fit the model.
+    """
+    if calibration.source == "fixed":
+        assert calibration.mean is not None  # the schema asks for it
+        return ParameterDraws(
+            calibration.parameter,
+            np.array([calibration.mean]),
+            calibration.mean,
+            0.0,
+            "fixed in the scenario",
+        )
+    if calibration.source == "normal":
+        assert calibration.mean is not None
+        assert calibration.standard_deviation is not None
+        random = generator(seed, "calibration")
+        strata = (np.arange(calibration.draws) + random.random(calibration.draws)) / calibration.draws
+        values = calibration.mean + calibration.standard_deviation * ndtri(strata)
+        return ParameterDraws(
+            calibration.parameter,
+            random.permutation(values),
+            calibration.mean,
+            calibration.standard_deviation,
+            "normal distribution of the scenario",
+        )
+    curve: StiffnessCurve = PUBLISHED_LINE
+    if calibration.curve == "design":
+        if model is None:
+            raise MissingObservationModelError(
+                "`calibration.curve` asks for the stiffness curve of a design, and the asset has none: "
+                "give `asset.design`, or set `calibration.curve` to `published`."
+            )
+        curve = stiffness_curve_of(model)
+    sequence = seed_sequence(seed, "calibration")
+    found = calibrate_static(curve, seed=int(sequence.generate_state(1)[0]))
+    posterior = found.exact if calibration.method == "exact" else found.particle.posterior
+    return ParameterDraws(
+        name=calibration.parameter,
+        values=posterior.samples(sequence, calibration.draws, stratified=True),
+        mean=posterior.mean,
+        standard_deviation=posterior.standard_deviation,
+        source=f"static test of the wing, {calibration.method.replace('_', ' ')}, {curve.name}",
+        record=found.to_dict(),
+    )

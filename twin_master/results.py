@@ -1,0 +1,277 @@
+"""A flown mission as labelled arrays: what was observed, believed, predicted and decided, and what was true."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from twin_master.graphical_model import GraphicalModel
+from twin_master.inference import known_control
+from twin_master.mission import Flight
+from twin_master.planner import PlannedPolicy
+from twin_master.rewards import REWARD_NAMES, RewardModel
+from twin_master.scenario import Scenario
+from twin_master.sensor_model import GaussianSensorModel
+from twin_master.truth import Truth
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MissionResult:
+    """Everything that a mission made, before it is stored.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        What was flown.
+    model : GraphicalModel
+        S states, U controls.
+    sensor_model : GaussianSensorModel
+        The twin's predicted observations for each draw of the parameter, and their noise.
+    draws : (E,)
+        Draws of the uncertain parameter.
+    rewards : RewardModel
+        Rewards by state and control.
+    plan : PlannedPolicy
+        Value iteration.
+    truth : Truth
+        What the sensors really did.
+    flight : Flight
+        The mission.
+    """
+
+    scenario: Scenario
+    model: GraphicalModel
+    sensor_model: GaussianSensorModel
+    draws: Float
+    rewards: RewardModel
+    plan: PlannedPolicy
+    truth: Truth
+    flight: Flight
+
+
+def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.DataTree:
+    """Return the groups of `run.nc`; every variable carries its unit and a description.
+
+    Parameters
+    ----------
+    result
+        The mission.
+    attributes
+        Attributes of the root: seed, versions, hashes.
+    """
+    labels = _Labels(result)
+    groups = {
+        "observed": _observed(result, labels),
+        "filtered": _filtered(result, labels),
+        "smoothed": _smoothed(result, labels),
+        "predicted": _predicted(result, labels),
+        "policy": _policy(result, labels),
+        "calibration": labels.dataset(
+            {
+                "draw_value": (
+                    ("draw",),
+                    result.draws,
+                    "1",
+                    "draws of the uncertain parameter, equally weighted",
+                )
+            }
+        ).assign_attrs(parameter=result.scenario.calibration.parameter),
+        "truth": _truth(result, labels),
+    }
+    return xr.DataTree.from_dict({"/": xr.Dataset(attrs=dict(attributes)), **groups})
+
+
+Variable = tuple[tuple[str, ...], NDArray[Any], str, str]
+
+
+class _Labels:
+    """Coordinates of every dimension, and datasets that carry those which they use."""
+
+    def __init__(self, result: MissionResult) -> None:
+        scenario, model = result.scenario, result.model
+        names = scenario.state_names
+        self.coordinates: dict[str, xr.Variable] = {
+            "step": xr.Variable(
+                "step", np.arange(scenario.mission.steps), {"long_name": "step", "units": "1"}
+            ),
+            "sensor": xr.Variable(
+                "sensor", np.arange(1, scenario.observation.count + 1), {"long_name": "sensor", "units": "1"}
+            ),
+            "region": xr.Variable("region", np.array(names), {"long_name": "factor of the state"}),
+            "control": xr.Variable("control", np.array(scenario.control_names), {"long_name": "control"}),
+            "horizon": xr.Variable(
+                "horizon",
+                np.arange(1, scenario.mission.prediction_steps + 1),
+                {"long_name": "steps ahead", "units": "1"},
+            ),
+            "reward": xr.Variable("reward", np.array(REWARD_NAMES), {"long_name": "reward"}),
+            "draw": xr.Variable(
+                "draw", np.arange(len(result.draws)), {"long_name": "draw of the parameter", "units": "1"}
+            ),
+        }
+        self.states = {
+            name: xr.Variable("state", model.states.coordinates[:, index], {"long_name": name, "units": "1"})
+            for index, name in enumerate(names)
+        }
+
+    def dataset(self, variables: Mapping[str, Variable]) -> xr.Dataset:
+        dimensions = {name for variable in variables.values() for name in variable[0]}
+        coordinates: dict[str, xr.Variable] = {
+            name: variable for name, variable in self.coordinates.items() if name in dimensions
+        }
+        if "state" in dimensions:
+            coordinates |= self.states
+        return xr.Dataset(
+            {
+                name: (dims, values, {"units": unit, "long_name": text})
+                for name, (dims, values, unit, text) in variables.items()
+            },
+            coords=coordinates,
+        )
+
+
+def _observed(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    flight, scenario = result.flight, result.scenario
+    role = scenario.observation.role
+    variables: dict[str, Variable] = {
+        role: (("step", "sensor"), flight.observed, "1", f"{role} as received; NaN where a sensor is lost"),
+        "control_index": (("step",), flight.control_index, "1", "control in force"),
+    }
+    for name in scenario.control[0].values:
+        values = np.array([control.values[name] for control in scenario.control])[flight.control_index]
+        variables[name] = (("step",), values, "1", f"{name} in force")
+    return labels.dataset(variables)
+
+
+def _belief(
+    result: MissionResult, lead: tuple[str, ...], probability: Float, joint: Float, given: str
+) -> dict[str, Variable]:
+    """Return belief, its moments and the quantities of interest; `given` says what the belief is given."""
+    states = result.model.states
+    mean, deviation = result.sensor_model.moments(joint)
+    quantiles = result.sensor_model.quantiles(joint, (0.025, 0.975))
+    role = result.scenario.observation.role
+    sensor = (*lead, "sensor")
+    return {
+        "probability": ((*lead, "state"), probability, "1", f"p(state | {given})"),
+        "mean": ((*lead, "region"), states.mean(probability), "1", f"mean of each factor given {given}"),
+        "standard_deviation": (
+            (*lead, "region"),
+            states.standard_deviation(probability),
+            "1",
+            f"standard deviation of each factor given {given}",
+        ),
+        "quantity_mean": (sensor, mean, "1", f"mean of the noise-free {role} given {given}"),
+        "quantity_standard_deviation": (
+            sensor,
+            deviation,
+            "1",
+            f"standard deviation of the noise-free {role} given {given}",
+        ),
+        "quantity_lower": (sensor, quantiles[..., 0, :], "1", f"2.5 % quantile of the noise-free {role}"),
+        "quantity_upper": (sensor, quantiles[..., 1, :], "1", f"97.5 % quantile of the noise-free {role}"),
+    }
+
+
+def _rewards(
+    result: MissionResult, lead: tuple[str, ...], joint: Float, observed: Float | None
+) -> dict[str, Variable]:
+    expected = result.rewards.expectation(joint, observed)
+    dims = (*lead, "reward")
+    return {
+        "reward_mean": (dims, expected.mean, "1", "mean of each reward, eqs. (9)-(11)"),
+        "reward_standard_deviation": (
+            dims,
+            expected.standard_deviation,
+            "1",
+            "standard deviation of each reward",
+        ),
+    }
+
+
+def _filtered(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    flight = result.flight
+    joint = known_control(flight.filtered, flight.control_index, len(result.model.controls))
+    variables = _belief(result, ("step",), flight.filtered, joint, "observations up to the step")
+    variables |= _rewards(result, ("step",), joint, flight.observed)
+    deviation = result.scenario.observation.standard_deviation
+    residual = (flight.observed - variables["quantity_mean"][1]) / deviation
+    variables |= {
+        "log_evidence": (("step",), flight.log_evidence, "1", "log p(observation | earlier observations)"),
+        "residual": (
+            ("step", "sensor"),
+            residual,
+            "1",
+            "observation less its filtered mean, in the standard deviations that the twin assumes",
+        ),
+        "sensors_received": (
+            ("step",),
+            np.isfinite(flight.observed).sum(axis=1),
+            "1",
+            "sensors received; with none the belief follows the dynamics",
+        ),
+    }
+    return labels.dataset(variables)
+
+
+def _smoothed(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    flight = result.flight
+    joint = known_control(flight.smoothed, flight.control_index, len(result.model.controls))
+    variables = _belief(result, ("step",), flight.smoothed, joint, "all observations")
+    variables |= _rewards(result, ("step",), joint, flight.observed)
+    return labels.dataset(variables)
+
+
+def _predicted(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    flight = result.flight
+    lead = ("step", "horizon")
+    variables = _belief(
+        result,
+        lead,
+        flight.predicted,
+        flight.predicted_joint,
+        "observations up to the step, through the policy",
+    )
+    variables |= _rewards(result, lead, flight.predicted_joint, None)
+    variables["control_probability"] = (
+        (*lead, "control"),
+        flight.predicted_joint.sum(axis=-2),
+        "1",
+        "p(control | observations up to the step)",
+    )
+    return labels.dataset(variables)
+
+
+def _policy(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    plan = result.plan
+    return labels.dataset(
+        {
+            "control_index": (("state",), plan.control_index, "1", "control of the policy in each state"),
+            "action_value": (("state", "control"), plan.action_value, "1", "Q of value iteration, eq. (36)"),
+            "value": (("state",), plan.value, "1", "value of each state"),
+        }
+    )
+
+
+def _truth(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    record, role = result.flight.truth, result.scenario.observation.role
+    variables: dict[str, Variable] = {
+        "state": (("step", "region"), record.state, "1", "true value of each factor of the state"),
+        role: (("step", "sensor"), record.observation, "1", f"true {role}, without noise and faults"),
+        "sensor_status": (
+            ("step", "sensor"),
+            result.truth.status,
+            "1",
+            "what each sensor really does: 0 healthy, 1 lost, 2 drifting",
+        ),
+    }
+    for name, values in record.monitors.items():
+        variables[name] = (("step",), values, "1", f"{name}, as the asset reports it")
+    return labels.dataset(variables)

@@ -1,0 +1,149 @@
+"""The run folder: made whole or not at all, never overwritten by mistake, resumable at any moment.
+
+Layout: see `docs/run_folder.md`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from reporting.files import atomic_write_text, remove_leftovers, write_error
+from twin_master.run_errors import NotResumableError, RunFolderError, RunFolderExistsError
+
+CONFIG_NAME = "config.json"
+SUMMARY_NAME = "summary.json"
+KIND = "uav-twin run"
+"""Value of `kind` in `config.json`, by which a run folder is known."""
+
+
+def to_json(record: Mapping[str, Any]) -> str:
+    """Return a record as JSON text that is the same for the same record."""
+    return json.dumps(record, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def is_run_folder(folder: Path) -> bool:
+    """Return whether a folder holds a run."""
+    try:
+        record = json.loads((folder / CONFIG_NAME).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(record, dict) and record.get("kind") == KIND
+
+
+def create_run_folder(folder: Path, config: Mapping[str, Any], *, replace: bool = False) -> None:
+    """Make a run folder that holds its configuration, in one step.
+
+    Parameters
+    ----------
+    folder
+        Where; an empty folder is as good as none.
+    config
+        Content of `config.json`.
+    replace
+        Put the new folder in the place of an existing run folder. Anything else is never replaced.
+
+    Raises
+    ------
+    RunFolderExistsError
+        The folder exists and is not to be replaced, or is no run folder.
+    FileNotWrittenError
+        The disk is full or the place is not writable.
+    """
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise RunFolderExistsError(f"{folder} exists and is no folder: choose another --out.")
+    occupied = folder.is_dir() and any(folder.iterdir())
+    if occupied and not is_run_folder(folder):
+        raise RunFolderExistsError(
+            f"{folder} exists and is no run folder, so it is not touched: choose another --out."
+        )
+    if occupied and not replace:
+        raise RunFolderExistsError(
+            f"{folder} holds a run already: choose another --out, continue it with --resume {folder}, "
+            "or give --replace."
+        )
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
+        fresh.chmod(0o777 & ~_umask())
+    except OSError as error:
+        raise write_error(error, folder) from error
+    old: Path | None = None
+    try:
+        atomic_write_text(fresh / CONFIG_NAME, to_json(config))
+        if occupied:
+            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.old-", dir=folder.parent))
+            folder.rename(old / folder.name)
+        fresh.rename(folder)
+    except OSError as error:
+        if old is not None and not folder.exists():
+            (old / folder.name).rename(folder)
+        raise write_error(error, folder) from error
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+        if old is not None and folder.exists():
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """Return the configuration of a run folder.
+
+    Raises
+    ------
+    NotResumableError
+        There is none.
+    """
+    if not folder.is_dir():
+        raise NotResumableError(
+            f"there is no run folder {folder}: nothing was begun there, fly the mission with --out."
+        )
+    if not is_run_folder(folder):
+        raise NotResumableError(f"{folder} is no run folder: it holds no {CONFIG_NAME} of a run.")
+    config: dict[str, Any] = json.loads((folder / CONFIG_NAME).read_text(encoding="utf-8"))
+    return config
+
+
+def write_config(folder: Path, config: Mapping[str, Any]) -> None:
+    """Replace the configuration of a run folder in one step."""
+    atomic_write_text(folder / CONFIG_NAME, to_json(config))
+
+
+def is_finished(folder: Path) -> bool:
+    """Return whether the run came to its end: the summary is the last of the results to be written."""
+    return (folder / SUMMARY_NAME).is_file()
+
+
+def lock_run_folder(folder: Path) -> int:
+    """Take the folder for this process; return a file descriptor to close at the end.
+
+    Raises
+    ------
+    RunFolderError
+        Another process is flying in the folder.
+    """
+    import fcntl
+
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise RunFolderError(f"another process is flying in {folder}: wait for it to end.") from None
+    return descriptor
+
+
+def tidy(folder: Path) -> None:
+    """Remove what killed processes left half-written."""
+    for place in [folder, *(path for path in folder.rglob("*") if path.is_dir())]:
+        remove_leftovers(place)

@@ -1,0 +1,235 @@
+"""The figures of a mission, each beside the published one where there is one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin_master.graphical_model import GraphicalModel
+from twin_master.parameter import ParameterDraws
+from twin_master.results import MissionResult
+from twin_master.rewards import REWARD_NAMES
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+PAPER = "Kapteyn et al. 2021"
+REFERENCE_TWIN = "reference twin on the authors' library, mean of many missions"
+
+_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of a mission.
+
+    Attributes
+    ----------
+    key : str
+        Name for programs.
+    title : str
+        Name for people.
+    value : float, int, str or None
+        The figure; None where the mission gave none.
+    unit : str
+        Unit of `value` and `reference`, as printed.
+    reference : float, str or None
+        The published figure.
+    reference_source : str
+        Where it was published.
+    """
+
+    key: str
+    title: str
+    value: float | int | str | None
+    unit: str = ""
+    reference: float | str | None = None
+    reference_source: str = ""
+
+
+@dataclass(frozen=True)
+class Fallback:
+    """How the control fell back to the gentler one.
+
+    Attributes
+    ----------
+    switch_state : str or None
+        The state factor on which alone the policy depends; None if it depends on several or none.
+    switch_level : float or None
+        Level of that factor from which the policy leaves the control of the first turn, SI.
+    called_for_step : int or None
+        First step at which the truth reaches that level.
+    fallback_step : int or None
+        First step from `called_for_step` on at which another control than that of the first turn is in force.
+    early_step : int or None
+        First step before `called_for_step` with another control.
+    """
+
+    switch_state: str | None
+    switch_level: float | None
+    called_for_step: int | None
+    fallback_step: int | None
+    early_step: int | None
+
+    @property
+    def delay(self) -> int | None:
+        """Steps from the damage that calls for it to the fallback."""
+        if self.fallback_step is None or self.called_for_step is None:
+            return None
+        return self.fallback_step - self.called_for_step
+
+
+def find_fallback(
+    model: GraphicalModel, policy_index: Index, first_control: int, control_index: Index, true_state: Float
+) -> Fallback:
+    """Return how the control fell back.
+
+    Parameters
+    ----------
+    model : GraphicalModel
+        S states with F factors.
+    policy_index : (S,)
+        Control of the policy in each state.
+    first_control : int
+        Control of the first turn.
+    control_index : (T,)
+        Controls flown.
+    true_state : (T, F)
+        True state, SI.
+    """
+    table = (policy_index != first_control).reshape(model.states.shape)
+    for axis, factor in enumerate(model.states.factors):
+        others = tuple(index for index in range(table.ndim) if index != axis)
+        any_of, all_of = table.any(axis=others), table.all(axis=others)
+        switched = np.flatnonzero(all_of)
+        if np.array_equal(any_of, all_of) and len(switched) and all_of[switched[0] :].all():
+            level = factor.levels[switched[0]]
+            return _fallback_of(factor.name, level, first_control, control_index, true_state[:, axis])
+    return Fallback(None, None, None, None, None)
+
+
+def _fallback_of(name: str, level: float, first_control: int, control_index: Index, truth: Float) -> Fallback:
+    reached = np.flatnonzero(truth >= level - _TOLERANCE)
+    other = np.flatnonzero(control_index != first_control)
+    called = int(reached[0]) if len(reached) else None
+    before = other[other < called] if called is not None else other
+    after = other[other >= called] if called is not None else other[:0]
+    return Fallback(
+        switch_state=name,
+        switch_level=float(level),
+        called_for_step=called,
+        fallback_step=int(after[0]) if len(after) else None,
+        early_step=int(before[0]) if len(before) else None,
+    )
+
+
+def filtered_rms_error(model: GraphicalModel, filtered: Float, true_state: Float) -> Float:
+    """Return the root mean square error of the filtered mean of each factor over the steps: (F,), SI."""
+    error = model.states.mean(filtered) - true_state
+    return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
+
+
+def summarise(result: MissionResult, draws: ParameterDraws, reward_mean: Float) -> tuple[Figure, ...]:
+    """Return the figures of a mission; all of them are the same for the same seed.
+
+    Parameters
+    ----------
+    result
+        The mission.
+    draws
+        The calibrated parameter.
+    reward_mean : (T, R)
+        Mean rewards under the filtered belief.
+    """
+    scenario, flight, model = result.scenario, result.flight, result.model
+    published = scenario.mission.name == "level_turns"
+    first = scenario.control_names.index(scenario.mission.first_control)
+    fallback = find_fallback(
+        model, result.plan.control_index, first, flight.control_index, flight.truth.state
+    )
+    figures = _fallback_figures(fallback, scenario.control_names, published)
+    errors = filtered_rms_error(model, flight.filtered, flight.truth.state)
+    reference = {"z1": 3.8, "z2": 11.4} if published else {}
+    for name, error in zip(scenario.state_names, errors, strict=True):
+        figures.append(
+            Figure(
+                f"filtered_rms_error_{name}",
+                f"filtered rms error of {name}",
+                100.0 * float(error),
+                "points",
+                reference.get(name),
+                REFERENCE_TWIN if name in reference else "",
+            )
+        )
+    for index, name in enumerate(REWARD_NAMES):
+        figures.append(
+            Figure(f"mean_reward_{name}", f"mean reward for {name}", float(np.nanmean(reward_mean[:, index])))
+        )
+    paper = (1.0073, 0.0103) if scenario.calibration.source == "static_test" else (None, None)
+    for key, title, value, known in (
+        ("mean", "posterior mean", draws.mean, paper[0]),
+        ("standard_deviation", "posterior standard deviation", draws.standard_deviation, paper[1]),
+    ):
+        source = PAPER if known is not None else ""
+        figures.append(Figure(f"{draws.name}_{key}", f"{title} of {draws.name}", value, "", known, source))
+    figures.append(
+        Figure("log_evidence", "log evidence of all observations", float(flight.log_evidence.sum()))
+    )
+    figures += _sensor_figures(flight.observed)
+    bound = flight.truth.monitors.get("strain_error_bound")
+    if bound is not None:
+        figures.append(
+            Figure(
+                "strain_error_bound", "worst certified strain error", 1e6 * float(bound.max()), "microstrain"
+            )
+        )
+    return tuple(figures)
+
+
+def _fallback_figures(fallback: Fallback, controls: Sequence[str], published: bool) -> list[Figure]:
+    level = None if fallback.switch_level is None else 100.0 * fallback.switch_level
+    name = fallback.switch_state
+    return [
+        Figure(
+            "policy_switch_damage",
+            f"policy leaves the first control from {name}" if name else "policy leaves the first control",
+            level if level is not None else "depends on several states, or never",
+            "%" if level is not None else "",
+            60.0 if published else None,
+            PAPER if published else "",
+        ),
+        Figure("damage_step", "step of the damage that calls for it", fallback.called_for_step),
+        Figure("fallback_step", "step of the fallback", fallback.fallback_step),
+        Figure(
+            "fallback_delay",
+            "delay of the fallback",
+            fallback.delay,
+            "steps",
+            "at most 2 in 98 % of missions" if published else None,
+            "acceptance" if published else "",
+        ),
+        Figure("early_fallback_step", "step of a fallback before the damage", fallback.early_step),
+    ]
+
+
+def _sensor_figures(observed: Float) -> list[Figure]:
+    received = np.isfinite(observed)
+    blind = np.flatnonzero(~received.any(axis=1))
+    if received.all():
+        return []
+    figures = [Figure("lost_observations", "observations lost", 100.0 * float(1.0 - received.mean()), "%")]
+    if len(blind):
+        steps = ", ".join(str(step) for step in blind)
+        figures.append(
+            Figure("blind_steps", "steps without any observation (belief follows the dynamics)", steps)
+        )
+    return figures
+
+
+def to_record(figures: Sequence[Figure], heading: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of `summary.json`: the heading, and each figure beside its reference."""
+    return {**heading, "figures": [asdict(figure) for figure in figures]}

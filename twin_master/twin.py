@@ -1,0 +1,175 @@
+"""The twin: it is shown observations and the control in force, and says what to do next.
+
+It holds no asset and no truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin_master.graphical_model import (
+    Factor,
+    GraphicalModel,
+    StateSpace,
+    TransitionModel,
+    worsening_table,
+)
+from twin_master.inference import ObservationContext, Predicted, filter_step, predict, smooth
+from twin_master.scenario import Scenario
+from twin_master.sensor_model import GaussianSensorModel
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_WORST_SHOWN = 3
+
+
+def build_graphical_model(scenario: Scenario) -> GraphicalModel:
+    """Return states, controls, prior and transitions of a scenario: Kapteyn et al. 2021, eqs. (28)-(29).
+
+    The factors of the state move independently given the control, and are independent before the first
+    observation.
+    """
+    states = StateSpace(tuple(Factor(factor.name, factor.levels) for factor in scenario.state))
+    prior = np.ones(1)
+    for factor in scenario.state:
+        prior = np.kron(prior, factor.prior)
+    tables = []
+    for control in scenario.control_names:
+        if scenario.transition.kind == "independent_tables":
+            given = scenario.transition.tables[control]
+            tables.append([np.asarray(given[name], dtype=np.float64) for name in scenario.state_names])
+        else:
+            entry = scenario.transition.probability[control]
+            tables.append(
+                [
+                    worsening_table(
+                        len(factor.levels), entry[factor.name] if isinstance(entry, dict) else entry
+                    )
+                    for factor in scenario.state
+                ]
+            )
+    return GraphicalModel(states, scenario.control_names, prior, TransitionModel.from_factors(tables))
+
+
+@dataclass(frozen=True)
+class TwinTurn:
+    """What the twin concludes in one turn t.
+
+    Attributes
+    ----------
+    filtered : (S,)
+        p(D_t | o_0..o_t).
+    log_evidence : float
+        log p(o_t | o_0..o_{t-1}).
+    smoothed : (t + 1, S)
+        p(D_k | o_0..o_t) for k = 0..t.
+    prediction : Predicted
+        Beliefs and controls of the steps t + 1 ... t + H.
+    next_control : int
+        The most probable control of step t + 1, eq. (39).
+    """
+
+    filtered: Float
+    log_evidence: float
+    smoothed: Float
+    prediction: Predicted
+    next_control: int
+
+
+class Twin:
+    """Belief about one asset, updated turn by turn.
+
+    Parameters
+    ----------
+    name : str
+        Name of the twin, for messages.
+    model : GraphicalModel
+        S states, U controls.
+    sensor_model : GaussianSensorModel
+        Gives log p(o_t | D_t, u_t).
+    policy : (S, U)
+        p(U | D), row-stochastic.
+    steps : int
+        Largest number of turns.
+    prediction_steps : int
+        How far to predict.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        model: GraphicalModel,
+        sensor_model: GaussianSensorModel,
+        policy: Float,
+        steps: int,
+        prediction_steps: int,
+    ) -> None:
+        self.name = name
+        self.model = model
+        self.sensor_model = sensor_model
+        self.policy = policy
+        self.prediction_steps = prediction_steps
+        size = model.states.size
+        self._log_filtered: Float = np.zeros((steps, size))
+        self._control: Index = np.zeros(steps, dtype=np.int64)
+        self._turns = 0
+
+    @property
+    def turns(self) -> int:
+        """Number of turns seen so far."""
+        return self._turns
+
+    def turn(self, observation: Float, control_index: int) -> TwinTurn:
+        """Assimilate one observation, smooth the whole history, predict and decide.
+
+        Parameters
+        ----------
+        observation : (G,)
+            What the sensors say, SI; NaN where nothing was received.
+        control_index : int
+            The control in force during this turn.
+
+        Raises
+        ------
+        ImpossibleObservation
+            If the observation is impossible in every state that the belief allows; the twin is unchanged.
+        """
+        step = self._turns
+        log_likelihood = self.sensor_model.log_likelihood(observation, control_index)
+
+        def worst(_step: int) -> Mapping[str, float]:
+            return self._worst_residuals(observation, control_index)
+
+        filtered = filter_step(
+            self.model,
+            self._log_filtered[step - 1] if step else None,
+            int(self._control[step - 1]) if step else None,
+            log_likelihood,
+            ObservationContext(self.name, step, worst),
+        )
+        self._log_filtered[step] = filtered.log_filtered
+        self._control[step] = control_index
+        self._turns = step + 1
+        seen = slice(0, step + 1)
+        smoothed = smooth(self.model, self._control[seen], self._log_filtered[seen]).smoothed
+        prediction = predict(self.model, filtered.filtered, control_index, self.policy, self.prediction_steps)
+        return TwinTurn(
+            filtered=filtered.filtered,
+            log_evidence=filtered.log_evidence,
+            smoothed=smoothed,
+            prediction=prediction,
+            next_control=int(np.argmax(prediction.control_probability[0])),
+        )
+
+    def _worst_residuals(self, observation: Float, control_index: int) -> dict[str, float]:
+        """Return the sensors that fit worst in the state that fits best, in standard deviations."""
+        predicted = self.sensor_model.mean[:, control_index]
+        residual = (observation - predicted) / self.sensor_model.standard_deviation
+        best = int(np.argmin(np.nansum(residual**2, axis=1)))
+        order = np.argsort(-np.abs(np.nan_to_num(residual[best])))[:_WORST_SHOWN]
+        return {f"sensor {index + 1}": float(residual[best, index]) for index in order}

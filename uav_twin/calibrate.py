@@ -1,0 +1,57 @@
+"""`uav-twin calibrate ...`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+calibrate_app = typer.Typer(no_args_is_help=True, help="Tailor the model to the real wing.")
+
+
+@calibrate_app.callback()
+def _calibrate() -> None:
+    """Tailor the model to the real wing."""
+
+
+@calibrate_app.command("static")
+def calibrate_static(
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="Measured pairs: the authors' folder or a CSV file; the published eight by default."
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for record, figures and report.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the particle filter.")] = 0,
+    design: Annotated[
+        Path | None, typer.Option(help="Use the stiffness curve of this wing design, not the published line.")
+    ] = None,
+) -> None:
+    """Posterior of Young's modulus factor e from loads and displacements of the tip."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from calibration.stiffness import PUBLISHED_LINE, StiffnessCurve, stiffness_curve_of
+    from calibration.workflow import result_files, run_static, summary_rows
+
+    curve: StiffnessCurve = PUBLISHED_LINE
+    if design is not None:
+        from fe.cache import reduced_model
+
+        from fe.design import load_design
+        from reporting.progress import RichProgress
+
+        curve = stiffness_curve_of(
+            reduced_model(load_design(design), progress=RichProgress()), name=str(design)
+        )
+    result = run_static(data, out, seed, curve)
+    console = Console(highlight=False)
+    table = Table("figure", "found", "paper", "unit")
+    for row in summary_rows(result):
+        paper = "" if row.paper is None else f"{row.paper:.4g}"
+        table.add_row(row.name, f"{row.ours:.5g}", paper, "" if row.unit == "1" else row.unit)
+    console.print(table)
+    if out is not None:
+        console.print(f"Report: {result_files(out).report}", soft_wrap=True)

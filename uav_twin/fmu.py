@@ -1,0 +1,77 @@
+"""`uav-twin fmu ...`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+fmu_app = typer.Typer(no_args_is_help=True, help="Build, describe and check FMUs.")
+
+
+@fmu_app.command("build")
+def build(
+    out: Annotated[Path, typer.Option(help="The file to write.")] = Path("uav_wing.fmu"),
+    design: Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
+) -> None:
+    """Pack the wing as an FMI 2.0 co-simulation FMU; equal designs give equal bytes."""
+    from fe.cache import reduced_model
+
+    from fe.design import load_design
+    from fmu_asset.build import build_fmu
+    from fmu_asset.errors import FmuBuildError
+    from reporting.progress import RichProgress
+
+    if out.exists() and not replace:
+        raise FmuBuildError(f"{out} exists: choose another --out or give --replace.")
+    model = reduced_model(load_design(design), progress=RichProgress())
+    info = build_fmu(model, out, replace=replace)
+    typer.echo(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
+
+
+@fmu_app.command("info")
+def info(
+    file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)],
+    variables: Annotated[bool, typer.Option("--variables/--no-variables", help="List the variables.")] = True,
+) -> None:
+    """Say what an FMU is: version, capabilities, variables with units and ranges."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from fmu_asset.archive import read_fmu
+    from fmu_asset.session import describe_fmu
+
+    record = describe_fmu(read_fmu(file))
+    console = Console(highlight=False)
+    facts = Table(show_header=False, title=str(file))
+    for name, value in record.items():
+        if isinstance(value, str | int | float | bool) and value != "":
+            facts.add_row(name.replace("_", " "), str(value))
+        elif name == "platforms":
+            facts.add_row("platforms", ", ".join(value))
+    console.print(facts)
+    if variables:
+        table = Table("variable", "causality", "unit", "least", "largest", "start", "description")
+        for variable in record["variables"]:
+            table.add_row(
+                *(
+                    "" if variable.get(key) is None else str(variable[key])
+                    for key in ("name", "causality", "unit", "minimum", "maximum", "start", "description")
+                )
+            )
+        console.print(table)
+
+
+@fmu_app.command("check")
+def check(file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)]) -> None:
+    """Check an FMU; exit code 1 if anything is wrong with it."""
+    from fmu_asset.check import check_fmu
+
+    findings = check_fmu(file)
+    for finding in findings:
+        typer.echo(str(finding))
+    if findings:
+        raise typer.Exit(1)
+    typer.echo(f"{file}: nothing found.")
