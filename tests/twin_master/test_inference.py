@@ -29,7 +29,7 @@ from twin_master.inference import (
 )
 
 sys.path.insert(0, str(Path(__file__).parent))
-from decision_oracles import (  # noqa: E402 - a helper beside the tests
+from decision_oracles import (
     eliminate_variables,
     enumerate_prediction,
     enumerate_trajectories,
