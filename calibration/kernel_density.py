@@ -27,7 +27,7 @@ def normal_reference_bandwidth(samples: NDArray[np.float64]) -> float:
     """Return the bandwidth that is optimal for Gaussian data: sigma_robust * (4 / (3 n))^(1/5).
 
     sigma_robust is the median absolute deviation from the median over 0.6745. This is the default of
-    MATLAB's `fitdist(samples, 'kernel')`, which the authors used (Bowman and Azzalini 1997, section 2.4.2).
+    MATLAB's `fitdist(samples, 'kernel')`, which the authors used (Bowman and Azzalini 1997).
 
     Parameters
     ----------
