@@ -8,193 +8,39 @@ semi-span, chordwise places are fractions of the local chord measured from the l
 import hashlib
 import itertools
 import json
-import math
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from .airfoil import four_digit_half_thickness
 from .errors import DesignFileError, InvalidDesignError
+from .parts import (
+    AddedDensity,
+    Airfoil,
+    Defect,
+    Gauges,
+    Lift,
+    Masses,
+    MeshSettings,
+    Part,
+    Planform,
+    PointMassPlace,
+    Rib,
+    Rod,
+    Root,
+    Skin,
+    TipLoad,
+    Web,
+)
 from .state import STIFFNESS_LOSS_NAMES, Geometry
 
 SHIPPED_DESIGN = Path(__file__).parent / "designs" / "uav_wing.toml"
 """The design of the wing of Kapteyn et al. 2021."""
 
-Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
-Thickness = Annotated[float, Field(gt=0.0, lt=0.1, description="m")]
-Modulus = Annotated[float, Field(ge=1e6, le=1e13, description="Pa")]
-PoissonRatio = Annotated[float, Field(ge=0.0, lt=0.5)]
-ShearRatio = Annotated[float, Field(gt=0.0, le=1.0)]
-Density = Annotated[float, Field(ge=0.0, le=3e4, description="kg/m^3")]
-Spring = Annotated[float, Field(gt=0.0, le=1e15)]
 
-
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False)
-
-
-class Planform(_Part):
-    """Straight-tapered half-wing; the chord line `straight_chord_line` is the spanwise axis."""
-
-    semi_span: float = Field(gt=0.05, lt=60.0, description="m")
-    root_chord: float = Field(gt=0.01, lt=15.0, description="m")
-    tip_chord: float = Field(gt=0.01, lt=15.0, description="m")
-    straight_chord_line: Fraction
-
-    def chord(self, station: float) -> float:
-        """Chord [m] at a fraction of the semi-span."""
-        return self.root_chord + (self.tip_chord - self.root_chord) * station
-
-
-class Airfoil(_Part):
-    """Symmetric four-digit section."""
-
-    thickness_ratio: float = Field(ge=0.02, le=0.4)
-
-
-class SkinBand(_Part):
-    """Young's modulus [Pa] of the skin from the previous band's end to `end`, a fraction of the span."""
-
-    end: Fraction
-    young_modulus: Modulus
-
-
-class Skin(_Part):
-    """Shell of the wing; orthotropic with equal moduli, the shear moduli as ratios to Young's modulus."""
-
-    thickness: Thickness
-    density: Density
-    poisson_ratio: PoissonRatio
-    in_plane_shear_ratio: ShearRatio
-    transverse_shear_ratio: ShearRatio
-    closed_leading_edge: bool = True
-    bands: tuple[SkinBand, ...] = Field(min_length=1)
-
-    @model_validator(mode="after")
-    def _bands_cover_the_span(self) -> "Skin":
-        ends = [band.end for band in self.bands]
-        if any(after <= before for before, after in zip([0.0, *ends], ends, strict=False)) or ends[-1] != 1.0:
-            raise ValueError(f"the ends of the bands must rise from above 0 to 1, but are {ends}")
-        return self
-
-
-class Web(_Part):
-    """Spanwise web at a chordwise place; the first and the last close the box."""
-
-    chord: Fraction
-    thickness: Thickness
-    young_modulus: Modulus
-    shear_modulus: Modulus
-    poisson_ratio: PoissonRatio
-    density: Density
-
-
-class Rib(_Part):
-    """Rib at a fraction of the span, isotropic, over the whole height and width of the box."""
-
-    station: Fraction
-    thickness: Thickness
-    young_modulus: Modulus
-    poisson_ratio: PoissonRatio
-    density: Density
-
-
-class Rod(_Part):
-    """Solid round rod at mid-height of a web, from the root to `reach`, a fraction of the span.
-
-    Its flapwise bending stiffness and its mass are spread over the cells of that web.
-    """
-
-    web: int = Field(ge=0)
-    reach: float = Field(gt=0.0, le=1.0)
-    diameter: Thickness
-    young_modulus: Modulus
-    density: Density
-
-
-class AddedDensity(_Part):
-    """Density [kg/m^3] added to everything between two fractions of the span (glue, paint, wiring)."""
-
-    start: Fraction
-    end: Fraction
-    density: Density
-
-
-class Root(_Part):
-    """Springs that carry the rigid root rib; its other motions are held."""
-
-    transverse_spring: Spring = Field(description="N/m")
-    flap_spring: Spring = Field(description="N m/rad")
-    yaw_spring: Spring = Field(description="N m/rad")
-
-
-class PointMassPlace(_Part):
-    """Where a point mass of a kind sits; its mass is `masses.<kind>` until calibrated."""
-
-    kind: Literal["servo", "pitot"]
-    station: Fraction
-    chord: Fraction
-
-
-class Masses(_Part):
-    """Nominal masses [kg] of one servo and of the pitot tube."""
-
-    servo: float = Field(ge=0.0, lt=1e3)
-    pitot: float = Field(ge=0.0, lt=1e3)
-
-
-class Gauges(_Part):
-    """Strain gauges on the upper skin, along the span.
-
-    Positions are (distance from the root [m], chord fraction); a gauge reads the strain averaged over a
-    patch of `averaging_chordwise` by `averaging_spanwise` [m].
-    """
-
-    averaging_chordwise: float = Field(ge=0.0, lt=1.0, description="m")
-    averaging_spanwise: float = Field(default=0.0, ge=0.0, lt=1.0, description="m")
-    positions: tuple[tuple[float, float], ...] = Field(min_length=1)
-
-
-class Defect(_Part):
-    """Region of the upper skin that may lose stiffness: distances from the root [m], chord fractions."""
-
-    span_start: float = Field(ge=0.0)
-    span_end: float = Field(gt=0.0)
-    chord_start: Fraction
-    chord_end: Fraction
-
-
-class Lift(_Part):
-    """Net load of a level turn, linear in the load factor.
-
-    `force` [N] and `forward_force` [N] are the totals on the half-wing at `load_factor`. The lift per
-    chord is weighted by 2 (1 - xi), xi the chord fraction.
-    """
-
-    distribution: Literal["schrenk", "lifting_line"]
-    force: float = Field(gt=0.0, lt=1e6)
-    forward_force: float = Field(ge=0.0, lt=1e6)
-    load_factor: float = Field(gt=0.0, lt=20.0)
-
-
-class TipLoad(_Part):
-    """Place of the static test load: distance from the tip [m] and chord fraction."""
-
-    distance_from_tip: float = Field(ge=0.0)
-    chord: Fraction
-
-
-class MeshSettings(_Part):
-    """Largest cell: along the span [m] and along the chord (fraction); both are divided by `refinement`."""
-
-    span_size: float = Field(gt=1e-3, lt=10.0)
-    chord_size: float = Field(gt=0.005, le=1.0)
-    refinement: float = Field(default=1.0, ge=0.25, le=8.0)
-
-
-class WingDesign(_Part):
+class WingDesign(Part):
     """A wing: everything that decides its model. Construct it with `load_design` or `parse_design`.
 
     Raises
@@ -425,8 +271,3 @@ def load_design(path: Path | str | None = None) -> WingDesign:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise DesignFileError(f"The wing design {file} is not valid TOML: {error}.") from None
     return parse_design(content, source=str(file))
-
-
-def rod_bending_stiffness(rod: Rod) -> float:
-    """Bending stiffness E I [N m^2] of a solid round rod."""
-    return rod.young_modulus * math.pi * rod.diameter**4 / 64.0

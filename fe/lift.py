@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .design import Planform
+from .parts import Planform
 
 FloatArray = NDArray[np.float64]
 Distribution = Callable[[ArrayLike], FloatArray]

@@ -23,7 +23,7 @@ from .assembly import (
     rotate_elasticity,
     shape_functions,
 )
-from .design import WingDesign, rod_bending_stiffness
+from .design import WingDesign
 from .lift import DISTRIBUTIONS
 from .mesh import DEFECT_1, DEFECT_2, SKIN, SurfacePoint, WingMesh, build_mesh
 
@@ -152,7 +152,7 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
     for rod in design.rods:
         inside = (mesh.web == rod.web) & (station < rod.reach)
         second_moment = design.webs[rod.web].thickness * _web_height(mesh)[inside] ** 3 / 12.0
-        local[inside, 1, 1] += rod_bending_stiffness(rod) / second_moment
+        local[inside, 1, 1] += rod.bending_stiffness / second_moment
     return rotate_elasticity(local, cell_axes(mesh.corners))
 
 
@@ -175,8 +175,7 @@ def cell_density(mesh: WingMesh) -> FloatArray:
         density[(station > added.start) & (station < added.end)] += added.density
     for rod in design.rods:
         inside = (mesh.web == rod.web) & (station < rod.reach)
-        area = np.pi * rod.diameter**2 / 4.0
-        density[inside] += rod.density * area / (design.webs[rod.web].thickness * _web_height(mesh)[inside])
+        density[inside] += rod.mass_per_length / (design.webs[rod.web].thickness * _web_height(mesh)[inside])
     return density
 
 
