@@ -72,6 +72,7 @@ class BinnedKernelDensity:
         *,
         weights: NDArray[np.float64] | None = None,
         bandwidth: float | None = None,
+        window: tuple[float, float] = (-math.inf, math.inf),
     ) -> BinnedKernelDensity:
         """Spread each sample over the two grid points beside it, then convolve with the kernel.
 
@@ -83,27 +84,35 @@ class BinnedKernelDensity:
             Weights that sum to one; equal by default.
         bandwidth : float, optional
             Standard deviation of the kernel; `normal_reference_bandwidth` by default.
+        window : (float, float)
+            Where the density is wanted; it is kept as zero beyond, so that a heavy tail costs nothing.
 
         Raises
         ------
         PosteriorError
-            If the samples have no spread, or spread so far that the grid would not fit in memory.
+            If the samples have no spread, or fill a window too wide for the grid to fit in memory.
         """
         bandwidth = normal_reference_bandwidth(samples) if bandwidth is None else bandwidth
         spacing = bandwidth / GRID_CELLS_PER_BANDWIDTH
         reach = math.ceil(_KERNEL_REACH * GRID_CELLS_PER_BANDWIDTH)
-        lowest, highest = float(samples.min()), float(samples.max())
+        shares = np.full(samples.size, 1.0 / samples.size) if weights is None else weights
+        lowest = max(float(samples.min()), window[0] - reach * spacing)
+        highest = min(float(samples.max()), window[1] + reach * spacing)
+        if lowest > highest:
+            return cls(origin=window[0], spacing=spacing, density=np.zeros(2), bandwidth=bandwidth)
         if not (highest - lowest) / spacing < _LARGEST_GRID:
             raise PosteriorError(
-                f"the samples reach from {lowest:g} to {highest:g}, too far for a kernel density of "
-                f"bandwidth {bandwidth:.3g}; the readings are too uncertain to take their ratio."
+                f"a kernel density of bandwidth {bandwidth:.3g} from {lowest:g} to {highest:g} would need "
+                f"more than {_LARGEST_GRID} grid points; give a narrower window."
             )
+        near = (samples >= lowest) & (samples <= highest)
+        if not near.all():
+            samples, shares = samples[near], shares[near]
         cells = math.ceil((highest - lowest) / spacing) + 2 + 2 * reach
         origin = lowest - reach * spacing
         position = (samples - origin) / spacing
         cell = position.astype(np.int64)
         position -= cell  # now the share of the right neighbour
-        shares = np.full(samples.size, 1.0 / samples.size) if weights is None else weights
         right = np.bincount(cell, weights=position * shares, minlength=cells)
         mass = np.bincount(cell, weights=shares, minlength=cells) - right
         mass[1:] += right[:-1]

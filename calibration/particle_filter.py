@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DegenerateFilterError
+from .errors import DegenerateFilterError, PosteriorError
 from .experiments import LoadDisplacementData
 from .kernel_density import BinnedKernelDensity, reference_bandwidth_factor
 from .posterior import GaussianPrior, ScalarPosterior, Seed, child_seed
@@ -19,6 +19,7 @@ DEFAULT_PARTICLE_COUNT = 1_000_000
 
 _PURPOSE_PAIRS = 0
 _PURPOSE_PARTICLES = 1
+_FEWEST_PARTICLES = 100
 _FEWEST_EFFECTIVE_PARTICLES = 10.0
 
 
@@ -66,12 +67,17 @@ class ParticlePosterior:
 
 
 def pair_likelihoods(
-    curve: StiffnessCurve, data: LoadDisplacementData, seed: Seed, sample_count: int
+    curve: StiffnessCurve,
+    data: LoadDisplacementData,
+    seed: Seed,
+    sample_count: int,
+    window: tuple[float, float] = (-math.inf, math.inf),
 ) -> list[BinnedKernelDensity]:
     """Return the paper's likelihood of each pair: a kernel density of e = k^-1(f / x).
 
     Loads and displacements are drawn from the Gaussians of their readings; each drawn pair is turned
-    into a stiffness and, through the inverse of eq. (14), into a sample of e.
+    into a stiffness and, through the inverse of eq. (14), into a sample of e. The densities are kept for e
+    in `window`.
     """
     generator = np.random.default_rng(child_seed(seed, _PURPOSE_PAIRS))
     densities = []
@@ -80,7 +86,8 @@ def pair_likelihoods(
         displacements = generator.standard_normal(sample_count)
         displacements *= data.displacement_standard_deviation
         displacements += displacement
-        densities.append(BinnedKernelDensity.fit(curve.young_modulus_factor(loads / displacements)))
+        factors = curve.young_modulus_factor(loads / displacements)
+        densities.append(BinnedKernelDensity.fit(factors, window=window))
     return densities
 
 
@@ -116,11 +123,18 @@ def particle_filter(
     DegenerateFilterError
         If fewer than ten effective particles remain: prior and measurements contradict each other, or
         there are too few particles.
+    PosteriorError
+        If fewer than a hundred particles are asked for.
     """
     prior = prior or GaussianPrior()
-    likelihoods = pair_likelihoods(curve, data, seed, particle_count)
+    if particle_count < _FEWEST_PARTICLES:
+        raise PosteriorError(
+            f"at least {_FEWEST_PARTICLES} particles are needed, but {particle_count} were given."
+        )
     generator = np.random.default_rng(child_seed(seed, _PURPOSE_PARTICLES))
     particles = prior.mean + prior.standard_deviation * generator.standard_normal(particle_count)
+    grid = prior.mean + prior.standard_deviation * np.linspace(-8.0, 8.0, 801)
+    likelihoods = pair_likelihoods(curve, data, seed, particle_count, (float(grid[0]), float(grid[-1])))
     log_weight = np.zeros(particle_count)
     effective = np.zeros(data.count)
     weight = np.full(particle_count, 1.0 / particle_count)
@@ -148,7 +162,6 @@ def particle_filter(
     bandwidth = standard_deviation * reference_bandwidth_factor(float(effective[-1]))
     alive = weight > 0.0
     density = BinnedKernelDensity.fit(particles[alive], weights=weight[alive], bandwidth=bandwidth)
-    grid = prior.mean + prior.standard_deviation * np.linspace(-8.0, 8.0, 801)
     return ParticlePosterior(
         posterior=ScalarPosterior(
             density.grid[::4], density.density[::4], mean=mean, standard_deviation=standard_deviation

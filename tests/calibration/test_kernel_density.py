@@ -65,6 +65,20 @@ def test_samples_without_spread_are_refused(samples):
         BinnedKernelDensity.fit(samples)
 
 
-def test_samples_too_far_apart_are_refused():
-    with pytest.raises(PosteriorError, match="too far"):
-        BinnedKernelDensity.fit(np.array([0.0, 1e-3, 2e-3, 3e-3, 1e9]))
+def test_samples_too_far_apart_need_a_window():
+    samples = np.array([0.0, 1e-3, 2e-3, 3e-3, 1e9])
+    with pytest.raises(PosteriorError, match="narrower window"):
+        BinnedKernelDensity.fit(samples)
+    within = BinnedKernelDensity.fit(samples, window=(-0.01, 0.01))
+    value = np.linspace(-0.005, 0.008, 100)
+    exact = direct(samples, np.full(5, 0.2), within.bandwidth, value)
+    assert np.abs(within(value) - exact).max() < 1e-3 * exact.max()
+
+
+def test_a_window_changes_nothing_within_it():
+    samples = np.random.default_rng(5).standard_t(2, 2000)
+    whole, part = BinnedKernelDensity.fit(samples), BinnedKernelDensity.fit(samples, window=(-1.0, 2.0))
+    value = np.linspace(-1.0, 2.0, 301)
+    assert np.abs(whole(value) - part(value)).max() < 1e-3 * whole.density.max()
+    assert part.density.size < whole.density.size
+    assert BinnedKernelDensity.fit(samples, window=(1e6, 2e6))([0.0, 1.5e6]).tolist() == [0.0, 0.0]

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calibration.errors import DegenerateFilterError
+from calibration.errors import DegenerateFilterError, PosteriorError
 from calibration.errors_in_variables import exact_posterior, log_ratio_density
 from calibration.experiments import published_measurements
 from calibration.particle_filter import pair_likelihoods, particle_filter
@@ -84,4 +84,14 @@ def test_measurements_that_no_particle_explains_are_refused():
 
 def test_too_few_effective_particles_are_refused():
     with pytest.raises(DegenerateFilterError, match="effectively remain"):
-        particle_filter(DATA, seed=0, prior=GaussianPrior(0.93, 0.003), particle_count=12)
+        particle_filter(DATA, seed=0, prior=GaussianPrior(0.93, 0.015), particle_count=100)
+    with pytest.raises(PosteriorError, match="at least 100"):
+        particle_filter(DATA, seed=0, particle_count=0)
+
+
+def test_uncertain_readings_whose_ratio_has_heavy_tails():
+    vague = dataclasses.replace(DATA, displacement_standard_deviation=2e-3)
+    posterior = particle_filter(vague, seed=0, particle_count=200_000)
+    limit = exact_posterior(vague, measure="ratio")
+    assert posterior.mean == pytest.approx(limit.mean, abs=1e-3)
+    assert posterior.standard_deviation == pytest.approx(limit.standard_deviation, rel=0.02)
