@@ -9,7 +9,8 @@ import stat
 import tempfile
 import zipfile
 import zlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -147,7 +148,7 @@ def read_fmu(path: str | os.PathLike[str]) -> FmuDescription:
         )
     try:
         declared = read_model_description(str(file), validate=False)
-    except Exception as error:  # noqa: BLE001 - the parser raises anything, and all of it is a damaged file
+    except Exception as error:
         raise FmuFileError(f"The model description of {file} cannot be read ({error}).") from error
     if declared.coSimulation is None:
         raise FmuUnsupportedError(
@@ -222,7 +223,7 @@ def plain_folder() -> Path:
     FmuFileError
         If no such folder can be made.
     """
-    candidates = [tempfile.gettempdir(), "/tmp", "/var/tmp", "/dev/shm"]  # noqa: S108 - mkdtemp is private
+    candidates = [tempfile.gettempdir(), "/tmp", "/var/tmp", "/dev/shm"]
     for parent in candidates:
         path = Path(parent)
         if _PLAIN_PATH.fullmatch(str(path.absolute())) and path.is_dir() and os.access(path, os.W_OK):
@@ -330,3 +331,29 @@ def _unit(declared: Any) -> UnitInfo:
         offset=0.0 if base is None else float(base.offset),
         displays=tuple((str(d.name), float(d.factor), float(d.offset)) for d in declared.displayUnits),
     )
+
+
+def describe_fmu(description: FmuDescription, roles: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Return an FMU's description as plain records, with the role of each variable if known.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        As `read_fmu` returns it.
+    roles : mapping of str to str, optional
+        Role by variable name.
+
+    Returns
+    -------
+    dict
+        Plain values, JSON-serialisable.
+    """
+    record = asdict(description)
+    record["path"] = str(description.path)
+    record["platforms"] = list(description.platforms)
+    record["units"] = [asdict(unit) for unit in description.units]
+    record["variables"] = [
+        asdict(variable) | {"role": (roles or {}).get(variable.name, "")}
+        for variable in description.variables
+    ]
+    return record

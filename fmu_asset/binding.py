@@ -227,8 +227,8 @@ def parse_binding(content: Mapping[str, Any], *, where: str = "the binding") -> 
             here = f"{role}.{key}"
             if scalar.variable in taken:
                 raise BindingError(
-                    f"In {where}, the FMU variable {scalar.variable!r} is set by both {taken[scalar.variable]} "
-                    f"and {here}; keep one."
+                    f"In {where}, the FMU variable {scalar.variable!r} is set by both "
+                    f"{taken[scalar.variable]} and {here}; keep one."
                 )
             taken[scalar.variable] = here
     return parsed

@@ -164,12 +164,22 @@ def build_fmu(
         raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
     content, content_hash = fmu_bytes(model, state)
     atomic_write_bytes(target, content)
-    tag = content_hash[:_TAG_LENGTH]
+    return _info(model, target, content, content_hash)
+
+
+def content_info(model: ReducedModel, state: DigitalState | None, folder: Path) -> tuple[bytes, FmuInfo]:
+    """Return the archive, and what it would be called in a folder that is ordered by content."""
+    content, content_hash = fmu_bytes(model, state)
+    target = folder / f"uav_wing_{content_hash[:_TAG_LENGTH]}.fmu"
+    return content, _info(model, target, content, content_hash)
+
+
+def _info(model: ReducedModel, path: Path, content: bytes, content_hash: str) -> FmuInfo:
     return FmuInfo(
-        path=target,
+        path=path,
         guid=_guid(content_hash),
         content_hash=content_hash,
-        model_identifier=f"uav_wing_{tag}",
+        model_identifier=f"uav_wing_{content_hash[:_TAG_LENGTH]}",
         design_hash=model.design_hash,
         size=len(content),
     )
@@ -238,8 +248,8 @@ def _check_start(table: Iterable[FmuVariable]) -> None:
         high = float("inf") if row.maximum is None else row.maximum
         if not low <= row.start <= high:
             raise FmuBuildError(
-                f"The start value {row.start:g} of {row.name} lies outside {low:g} to {high:g}, the range of the "
-                "reduced model; give another state or build a model with a wider range."
+                f"The start value {row.start:g} of {row.name} lies outside {low:g} to {high:g}, the range of "
+                "the reduced model; give another state or build a model with a wider range."
             )
 
 

@@ -1,4 +1,4 @@
-"""The model description (modelDescription.xml) and the documentation page, both from the table of variables."""
+"""The model description (modelDescription.xml) and the documentation page, from the table of variables."""
 
 from __future__ import annotations
 

@@ -108,22 +108,21 @@ class Block:
         self.count = count
         self.references = (ctypes.c_uint * count)(*references)
         self._doubles, self._begin = doubles, begin
-        self._real = kind is ctypes.c_double
-        self.values = (
-            (kind * count).from_buffer(doubles, 8 * begin) if self._real and count else (kind * count)()
-        )
+        self.real = kind is ctypes.c_double
+        if self.real and count:
+            self.values = (kind * count).from_buffer(doubles, 8 * begin)
+        else:
+            self.values = (kind * count)()
 
     def to_fmu(self) -> None:
-        """Convert the doubles for the FMU; nothing to do for reals."""
-        if not self._real:
-            for index in range(self.count):
-                self.values[index] = int(self._doubles[self._begin + index])
+        """Convert the doubles for the FMU; reals need none of it, since they are the block itself."""
+        for index in range(self.count):
+            self.values[index] = int(self._doubles[self._begin + index])
 
     def from_fmu(self) -> None:
-        """Convert what the FMU gave to doubles; nothing to do for reals."""
-        if not self._real:
-            for index in range(self.count):
-                self._doubles[self._begin + index] = float(self.values[index])
+        """Convert what the FMU gave to doubles; reals need none of it."""
+        for index in range(self.count):
+            self._doubles[self._begin + index] = float(self.values[index])
 
 
 class FmuInstance:
@@ -154,8 +153,8 @@ class FmuInstance:
         _listeners[name.encode()] = self._listener
         self._name = name.encode()
         self._lost = False
-        self._set: list[tuple[Callable[..., int], Block]] = []
-        self._get: list[tuple[Callable[..., int], Block]] = []
+        self._set: list[tuple[str, Callable[..., int], Block]] = []
+        self._get: list[tuple[str, Callable[..., int], Block]] = []
         self._phase = "instantiated"
         with _guarded_directory():
             try:
@@ -166,29 +165,32 @@ class FmuInstance:
                     instanceName=name,
                 )
                 self._fmu.instantiate(callbacks=_callbacks(), loggingOn=True)
-            except Exception as error:  # noqa: BLE001 - fmpy raises plain exceptions here
+            except Exception as error:
                 messages = self._texts()
                 _listeners.pop(self._name, None)
                 raise FmuCallError(f"The FMU could not be instantiated ({error}).", messages) from error
         fmu = self._fmu
         begin = 2
-        for setter, references, kind in (
-            (fmu.fmi2SetReal, plan.real_inputs, ctypes.c_double),
-            (fmu.fmi2SetInteger, plan.integer_inputs, ctypes.c_int),
-            (fmu.fmi2SetBoolean, plan.boolean_inputs, ctypes.c_int),
+        for name, references, kind in (
+            ("fmi2SetReal", plan.real_inputs, ctypes.c_double),
+            ("fmi2SetInteger", plan.integer_inputs, ctypes.c_int),
+            ("fmi2SetBoolean", plan.boolean_inputs, ctypes.c_int),
         ):
             if references:
-                self._set.append((setter, Block(references, self.request, begin, kind)))
+                self._set.append((name, getattr(fmu.dll, name), Block(references, self.request, begin, kind)))
             begin += len(references)
         begin = 0
-        for getter, references, kind in (
-            (fmu.fmi2GetReal, plan.real_outputs, ctypes.c_double),
-            (fmu.fmi2GetInteger, plan.integer_outputs, ctypes.c_int),
-            (fmu.fmi2GetBoolean, plan.boolean_outputs, ctypes.c_int),
+        for name, references, kind in (
+            ("fmi2GetReal", plan.real_outputs, ctypes.c_double),
+            ("fmi2GetInteger", plan.integer_outputs, ctypes.c_int),
+            ("fmi2GetBoolean", plan.boolean_outputs, ctypes.c_int),
         ):
             if references:
-                self._get.append((getter, Block(references, self.reply, begin, kind)))
+                self._get.append((name, getattr(fmu.dll, name), Block(references, self.reply, begin, kind)))
             begin += len(references)
+        # The C functions themselves, with the types that FMU2Slave has given them: its methods log and look
+        # up names at every call.
+        self._do_step = fmu.dll.fmi2DoStep
 
     def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
         """Set parameters, and inputs if wanted, and bring the instance to its first communication point.
@@ -219,7 +221,7 @@ class FmuInstance:
                     fmu.setBoolean([reference], [bool(value)])
             fmu.enterInitializationMode()
             if with_inputs:
-                self._send_inputs()
+                self._exchange(self._set, sending=True)
             fmu.exitInitializationMode()
             self._phase = "stepping"
         self._refuse_logged_errors("refused its initialisation")
@@ -236,24 +238,17 @@ class FmuInstance:
         """
         if self._lost:
             raise FmuWorkerError("The instance was lost to a fatal error; reset the asset to go on.")
-        component = self._fmu.component
-        try:
-            for setter, block in self._set:
-                block.to_fmu()
-                setter(component, block.references, block.count, block.values)
-            self._fmu.fmi2DoStep(component, self.request[0], self.request[1], 1)
-            for getter, block in self._get:
-                getter(component, block.references, block.count, block.values)
-                block.from_fmu()
-        except FMICallException as error:
-            raise self._call_error(error, f"the step from t = {self.request[0]:g} s") from error
+        request = self.request
+        self._exchange(self._set, sending=True)
+        status = self._do_step(self._fmu.component, request[0], request[1], 1)
+        if status > _WARNING:
+            raise self._call_error("fmi2DoStep", status, f"the step from t = {request[0]:g} s")
+        self._exchange(self._get, sending=False)
 
     def read(self) -> None:
         """Read the outputs of this moment into the reply block."""
         with self._calls("reading the outputs"):
-            for getter, block in self._get:
-                getter(self._fmu.component, block.references, block.count, block.values)
-                block.from_fmu()
+            self._exchange(self._get, sending=False)
 
     def save(self) -> bytes:
         """Return the serialised FMU state."""
@@ -322,10 +317,16 @@ class FmuInstance:
             self._fmu.freeInstance()
         _listeners.pop(self._name, None)
 
-    def _send_inputs(self) -> None:
-        for setter, block in self._set:
-            block.to_fmu()
-            setter(self._fmu.component, block.references, block.count, block.values)
+    def _exchange(self, blocks: list[tuple[str, Callable[..., int], Block]], *, sending: bool) -> None:
+        component = self._fmu.component
+        for name, function, block in blocks:
+            if sending and not block.real:
+                block.to_fmu()
+            status = function(component, block.references, block.count, block.values)
+            if status > _WARNING:
+                raise self._call_error(name, status, "setting inputs" if sending else "reading outputs")
+            if not sending and not block.real:
+                block.from_fmu()
 
     @contextmanager
     def _calls(self, what: str) -> Iterator[None]:
@@ -335,10 +336,9 @@ class FmuInstance:
             try:
                 yield
             except FMICallException as error:
-                raise self._call_error(error, what) from error
+                raise self._call_error(str(error.function), int(error.status), what) from error
 
-    def _call_error(self, error: Any, what: str) -> FmuCallError:
-        status = int(error.status)
+    def _call_error(self, function: str, status: int, what: str) -> FmuCallError:
         name = STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
         if status == _FATAL or not 0 <= status <= _FATAL:
             self._lost = True
@@ -347,7 +347,7 @@ class FmuInstance:
             after = "the FMU did not accept it"
         else:
             after = "its values are no longer to be trusted"
-        return FmuCallError(f"{error.function} returned {name} in {what}: {after}.", self._texts())
+        return FmuCallError(f"{function} returned {name} in {what}: {after}.", self._texts())
 
     def _refuse_logged_errors(
         self, verb: str, kind: type[FmuCallError | FmuStateError] = FmuCallError

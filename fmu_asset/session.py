@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 import os
@@ -10,17 +9,16 @@ import shutil
 import struct
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from types import TracebackType
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from .archive import FmuDescription, VariableInfo, extract_fmu, read_fmu
-from .binding import INPUT_ROLES, Binding, Scalar, load_binding
+from .archive import FmuDescription, describe_fmu, extract_fmu, read_fmu
+from .binding import INPUT_ROLES, Binding, load_binding
 from .errors import (
-    BindingError,
     FmuCallError,
     FmuError,
     FmuInputError,
@@ -28,21 +26,15 @@ from .errors import (
     FmuStateError,
     FmuWorkerError,
 )
-from .instance import STATUS_NAMES, FmuInstance, Plan, Settings
-from .units import IDENTITY, Conversion, conversion
+from .exchange import Exchange
+from .instance import STATUS_NAMES, FmuInstance
 from .worker import WorkerInstance
 
 StateMethod = Literal["serialised", "replay"]
 
 _MAGIC = b"UAVASSET"
 _STATE_HEADER = struct.Struct("<8sI")
-_KINDS = {"Real": "Real", "Integer": "Integer", "Enumeration": "Integer", "Boolean": "Boolean"}
 _LOG_LENGTH = 200
-_CAUSALITY = {
-    "input": ("input",),
-    "parameter": ("parameter",),
-    "output": ("output", "local", "calculatedParameter"),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,18 +54,6 @@ class Observation:
     values: npt.NDArray[np.float64]
     time: float
     extra: dict[str, float] = field(default_factory=dict)
-
-
-class _Slot(NamedTuple):
-    """Where an input goes: index in the request block, range in the FMU's unit, conversion."""
-
-    index: int
-    low: float
-    high: float
-    conversion: Conversion
-    label: str
-    whole: bool
-    variable: VariableInfo
 
 
 class FmiAsset:
@@ -122,11 +102,9 @@ class FmiAsset:
                 f"step_timeout must be a positive number of seconds, but is {step_timeout!r}."
             )
         self._step_timeout = step_timeout
-        self._slots: dict[str, dict[str, _Slot]] = {}
-        self._plan = self._make_plan()
-        self._parameter_slots = self._make_slots("parameter", 0)
+        self._exchange = Exchange(self._description, self._binding)
         self._parameters = dict(parameters or {})
-        self._settings = self._make_settings(self._parameters)
+        self._settings = self._exchange.settings(self._parameters)
         self._instance: FmuInstance | WorkerInstance | None = None
         self._ready = False
         self._index = 0
@@ -250,10 +228,10 @@ class FmiAsset:
             If the FMU or its worker fails.
         """
         if parameters is not None:
-            self._settings = self._make_settings(parameters)
+            self._settings = self._exchange.settings(parameters)
             self._parameters = dict(parameters)
-        start = self._start_values()
-        given = self._place(start, control, health, load)
+        start = self._exchange.start_values()
+        given = self._exchange.place(start, control, health, load)
         self._begin(start, with_inputs=given)
 
     def step(
@@ -295,9 +273,9 @@ class FmiAsset:
         instance = self._instance
         assert instance is not None
         request = instance.request
-        before = request[:]
+        before: list[Any] = request[:]
         values = before[2:]
-        self._place(values, control, health, load)
+        self._exchange.place(values, control, health, load)
         begin = self._start_time + self._index * self._step_size
         request[:] = [begin, self._step_size, *values]
         try:
@@ -308,7 +286,7 @@ class FmiAsset:
         self._index += 1
         if self._recording:
             self._record.append(bytes(memoryview(request).cast("B")[16:]))
-        return self._observation(instance.reply)
+        return self._observation()
 
     def observe(self) -> Observation:
         """Return the observation of this moment without a step, such as the initial one."""
@@ -320,15 +298,15 @@ class FmiAsset:
             instance.read()
         except FmuError as error:
             raise self._told(error, f"reading at t = {self.time:g} s") from error
-        return self._observation(instance.reply)
+        return self._observation()
 
     # ------------------------------------------------------------------ state
 
     def save_state(self) -> bytes:
         """Return the state of the asset, for `restore_state` in this or another process.
 
-        If the FMU can serialise its state, that is what is kept; if not, the inputs of all steps since the last
-        reset are, and restoring replays them (see `state_method`).
+        If the FMU can serialise its state, that is what is kept; if not, the inputs of all steps since the
+        last reset are, and restoring replays them (see `state_method`).
 
         Raises
         ------
@@ -377,22 +355,23 @@ class FmiAsset:
         head, body = _unpack_state(content)
         if head["fmu"] != self._description.sha256:
             raise FmuStateError(
-                f"The state was saved with another FMU than {self._description.path} (its hash differs); use that one."
+                f"The state was saved with another FMU than {self._description.path} (its hash differs); "
+                "use that one."
             )
         if (head["step_size"], head["start_time"]) != (
             self._binding.step_size,
             self._binding.binding.start_time,
         ):
             raise FmuStateError("The state was saved with another step size or start time; use that binding.")
-        width = 8 * self._plan.input_count
+        width = 8 * self._exchange.plan.input_count
         if head["method"] != self.state_method or (
             head["method"] == "replay" and len(body) != width * int(head["index"])
         ):
             raise FmuStateError("The saved state is damaged: its length is not what it says.")
-        self._settings = self._make_settings(head["parameters"])
+        self._settings = self._exchange.settings(head["parameters"])
         self._parameters = dict(head["parameters"])
         start_inputs = bytes.fromhex(head["start_inputs"])
-        start = list(np.frombuffer(start_inputs)) if start_inputs else self._start_values()
+        start = list(np.frombuffer(start_inputs)) if start_inputs else self._exchange.start_values()
         self._begin([float(value) for value in start], with_inputs=bool(start_inputs))
         instance = self._instance
         assert instance is not None
@@ -430,7 +409,7 @@ class FmiAsset:
                 self._instance.reset()
             instance = self._instance
             assert instance is not None
-            instance.request[2:] = start
+            instance.request[2:] = list(start)
             instance.initialise(self._binding.binding.start_time, self._settings, with_inputs=with_inputs)
         except FmuError as error:
             told = self._told(error, "the start")
@@ -444,7 +423,7 @@ class FmiAsset:
     def _open(self) -> None:
         folder = extract_fmu(self._description)
         self._folder = folder
-        plan = replace(self._plan, folder=str(folder))
+        plan = replace(self._exchange.plan, folder=str(folder))
         try:
             self._instance = (
                 WorkerInstance(plan, step_timeout=self._step_timeout) if self._isolated else FmuInstance(plan)
@@ -452,178 +431,22 @@ class FmiAsset:
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
+        self._reply = np.frombuffer(memoryview(self._instance.reply).cast("B"), dtype=np.float64)
 
-    def _make_plan(self) -> Plan:
-        """Resolve all names of the binding and lay out the two blocks."""
-        binding, inputs = self._binding, {}
-        for role in INPUT_ROLES:
-            self._slots[role] = self._make_slots(role, 0)
-            inputs.update({slot.label: slot for slot in self._slots[role].values()})
-        order = {"Real": 0, "Integer": 1, "Boolean": 2}
-        # Stable: within a base type the order is that of the binding.
-        labels = sorted(inputs, key=lambda label: order[_KINDS[inputs[label].variable.kind]])
-        self._ordered = [inputs[label].variable for label in labels]
-        for role, slots in self._slots.items():
-            self._slots[role] = {
-                name: slot._replace(index=labels.index(slot.label)) for name, slot in slots.items()
-            }
-        observed = [
-            (name, self._resolve(name, f"observation.{key}", "output"), vector.unit, f"observation.{key}")
-            for key, vector in binding.observation.items()
-            for name in vector.variables
-        ]
-        monitored = [
-            (
-                name,
-                self._resolve(scalar.variable, f"monitor.{name}", "output"),
-                scalar.unit,
-                f"monitor.{name}",
-            )
-            for name, scalar in binding.monitor.items()
-        ]
-        everything = [*observed, *monitored]
-        outputs = sorted(range(len(everything)), key=lambda i: order[_KINDS[everything[i][1].kind]])
-        place = {which: position for position, which in enumerate(outputs)}
-        self._output_names = [everything[which][1].name for which in outputs]
-        conversions = [
-            conversion(unit, variable, self._description.units, where=where)
-            for _, variable, unit, where in everything
-        ]
-        self._observation_count = len(observed)
-        index = np.array([place[which] for which in range(len(observed))])
-        self._observation_index = None if np.array_equal(index, np.arange(len(observed))) else index
-        own = conversions[: len(observed)]
-        self._observation_scale = (
-            None
-            if all(item == IDENTITY for item in own)
-            else (np.array([item.factor for item in own]), np.array([item.offset for item in own]))
-        )
-        self._monitors = [
-            (name, place[len(observed) + position], conversions[len(observed) + position])
-            for position, (name, *_) in enumerate(monitored)
-        ]
-
-        def references(kind: str, variables: Sequence[VariableInfo]) -> list[int]:
-            return [variable.reference for variable in variables if _KINDS[variable.kind] == kind]
-
-        read = [everything[which][1] for which in outputs]
-        return Plan(
-            folder="",
-            guid=self._description.guid,
-            model_identifier=self._description.model_identifier,
-            instance_name=binding.name,
-            real_inputs=references("Real", self._ordered),
-            integer_inputs=references("Integer", self._ordered),
-            boolean_inputs=references("Boolean", self._ordered),
-            real_outputs=references("Real", read),
-            integer_outputs=references("Integer", read),
-            boolean_outputs=references("Boolean", read),
-        )
-
-    def _make_slots(self, role: str, index: int) -> dict[str, _Slot]:
-        slots = {}
-        table: Mapping[str, Scalar] = getattr(self._binding, role)
-        for name, scalar in table.items():
-            label = f"{role}.{name}"
-            causality = "parameter" if role == "parameter" else "input"
-            variable = self._resolve(scalar.variable, label, causality)
-            slots[name] = _Slot(
-                index=index,
-                low=-math.inf if variable.minimum is None else variable.minimum,
-                high=math.inf if variable.maximum is None else variable.maximum,
-                conversion=conversion(scalar.unit, variable, self._description.units, where=label),
-                label=label,
-                whole=variable.kind != "Real",
-                variable=variable,
-            )
-        return slots
-
-    def _resolve(self, name: str, label: str, causality: str) -> VariableInfo:
-        variable = self._description.variable(name)
-        if variable is None:
-            near = difflib.get_close_matches(name, [v.name for v in self._description.variables], 1, 0.6)
-            hint = f"; did you mean {near[0]!r}?" if near else "."
-            raise BindingError(
-                f"{label} of the binding {self._binding.name} names {name!r}, which is not a variable of "
-                f"{self._description.path}{hint}"
-            )
-        if variable.causality not in _CAUSALITY[causality]:
-            raise BindingError(
-                f"{label} of the binding {self._binding.name} needs an {causality}, but {name!r} is declared as "
-                f"{variable.causality} in {self._description.path}."
-            )
-        if variable.kind not in _KINDS:
-            raise BindingError(
-                f"{label} of the binding {self._binding.name} names {name!r}, which is of type {variable.kind}; "
-                "only numbers can be bound."
-            )
-        return variable
-
-    def _start_values(self) -> list[float]:
-        return [_start_value(variable) for variable in self._ordered]
-
-    def _make_settings(self, parameters: Mapping[str, float]) -> Settings:
-        slots = self._parameter_slots
-        for name in parameters:
-            if name not in slots:
-                raise BindingError(
-                    f"The binding {self._binding.name} has no parameter {name!r}; it has {', '.join(slots) or 'none'}."
-                )
-        fixed = {
-            name: parameter.value
-            for name, parameter in self._binding.parameter.items()
-            if parameter.value is not None
-        }
-        return [
-            (_KINDS[slots[name].variable.kind], slots[name].variable.reference, _checked(slots[name], value))
-            for name, value in {**fixed, **parameters}.items()
-        ]
-
-    def _place(
-        self,
-        target: Any,
-        control: Mapping[str, float] | None,
-        health: Mapping[str, float] | None,
-        load: Mapping[str, float] | None,
-    ) -> bool:
-        given = False
-        for role, values in (("control", control), ("health", health), ("load", load)):
-            if not values:
-                continue
-            given = True
-            slots = self._slots[role]
-            for name, value in values.items():
-                slot = slots.get(name)
-                if slot is None:
-                    raise BindingError(
-                        f"The binding {self._binding.name} has no {role} {name!r}; it has {', '.join(slots) or 'none'}."
-                    )
-                target[slot.index] = _checked(slot, value)
-        return given
-
-    def _observation(self, reply: Any) -> Observation:
-        block = np.frombuffer(reply, dtype=np.float64)
+    def _observation(self) -> Observation:
+        block = self._reply
+        # One sum tells whether all are finite; only a suspicion is looked at more closely.
         if not math.isfinite(block.sum()):
-            self._refuse_not_finite(block)
-        if self._observation_index is None:
-            values = block[: self._observation_count].copy()
-        else:
-            values = block[self._observation_index]
-        if self._observation_scale is not None:
-            factor, offset = self._observation_scale
-            values = (values - offset) / factor
-        extra = {name: scale.from_fmu(reply[index]) for name, index, scale in self._monitors}
+            bad = self._exchange.not_finite(block)
+            if bad:
+                more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+                raise FmuOutputError(
+                    f"The FMU {self._description.path} gave values that are not finite at "
+                    f"t = {self.time:g} s: {', '.join(bad[:5])}{more}.",
+                    [text for _, text in self.log[-5:]],
+                )
+        values, extra = self._exchange.read(block)
         return Observation(values, self._start_time + self._index * self._step_size, extra)
-
-    def _refuse_not_finite(self, block: npt.NDArray[np.float64]) -> None:
-        bad = np.flatnonzero(~np.isfinite(block[: len(self._output_names)]))
-        if bad.size:
-            first = int(bad[0])
-            raise FmuOutputError(
-                f"The FMU {self._description.path} gave {self._output_names[first]} = {block[first]} at "
-                f"t = {self.time:g} s ({bad.size} of {len(self._output_names)} outputs are not finite).",
-                [text for _, text in self.log[-5:]],
-            )
 
     def _collect_log(self) -> None:
         instance = self._instance
@@ -638,62 +461,6 @@ class FmiAsset:
         if isinstance(error, FmuCallError | FmuWorkerError | TimeoutError):
             return type(error)(f"{self._description.path}, {what}: {error.sentence}", error.messages)
         return error
-
-
-def describe_fmu(description: FmuDescription, roles: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Return an FMU's description as plain records, with the role of each variable if known.
-
-    Parameters
-    ----------
-    description : FmuDescription
-        As `read_fmu` returns it.
-    roles : mapping of str to str, optional
-        Role by variable name.
-
-    Returns
-    -------
-    dict
-        Plain values, JSON-serialisable.
-    """
-    record = asdict(description)
-    record["path"] = str(description.path)
-    record["platforms"] = list(description.platforms)
-    record["units"] = [asdict(unit) for unit in description.units]
-    record["variables"] = [
-        asdict(variable) | {"role": (roles or {}).get(variable.name, "")}
-        for variable in description.variables
-    ]
-    return record
-
-
-def _checked(slot: _Slot, value: float) -> float:
-    """Return the value in the FMU's unit, refused if it is not finite, not whole or out of range."""
-    try:
-        number = slot.conversion.to_fmu(float(value))
-    except (TypeError, ValueError) as error:
-        raise FmuInputError(f"{slot.label} must be a number, but is {value!r}.") from error
-    if slot.low <= number <= slot.high and not slot.whole and number - number == 0.0:
-        return number
-    if not math.isfinite(number):
-        raise FmuInputError(f"{slot.label} must be finite, but is {value!r}; nothing was sent to the FMU.")
-    if slot.whole and not number.is_integer():
-        raise FmuInputError(
-            f"{slot.label} must be a whole number, but is {value!r}; nothing was sent to the FMU."
-        )
-    # A conversion of units may round a value at the edge of the range to just outside of it.
-    inside = min(max(number, slot.low), slot.high)
-    if abs(inside - number) > 1e-12 * max(abs(inside), 1.0):
-        unit = slot.variable.unit
-        raise FmuInputError(
-            f"{slot.label} = {value!r} lies outside the range of {slot.variable.name!r}, {slot.low:g} to "
-            f"{slot.high:g}{'' if unit is None else ' ' + unit}; nothing was sent to the FMU."
-        )
-    return inside
-
-
-def _start_value(variable: VariableInfo) -> float:
-    text = (variable.start or "0").lower()
-    return float({"true": "1", "false": "0"}.get(text, text))
 
 
 def _unpack_state(content: bytes) -> tuple[dict[str, Any], bytes]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import struct
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -121,7 +121,7 @@ class WingSlave:
         self._phase = TERMINATED
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Advance by one communication step with the inputs held; False means fmi2Discard, nothing changed."""
+        """Advance by one communication step, the inputs held; False (fmi2Discard) means nothing changed."""
         try:
             return self._step(current_time, step_size)
         except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
@@ -140,8 +140,8 @@ class WingSlave:
         if not (step_size > 0.0 and math.isfinite(step_size) and math.isfinite(current_time)):
             return self._refuse(
                 STATUS_BAD_STEP,
-                f"the step from t = {current_time!r} s over {step_size!r} s was refused: the communication point "
-                "must be finite, the step size finite and positive",
+                f"the step from t = {current_time!r} s over {step_size!r} s was refused: the communication "
+                "point must be finite, the step size finite and positive",
             )
         if abs(current_time - self._time) > 1e-6 * step_size + 1e-9 * abs(self._time):
             return self._refuse(
@@ -341,7 +341,7 @@ class WingSlave:
             return self._refuse(
                 STATUS_OUTSIDE_RANGE,
                 f"{row.name} = {value!r} lies outside its range {self._low[index]:g} to {self._high[index]:g}"
-                f"{'' if row.unit is None else ' ' + row.unit}; {consequence}",
+                f"{'' if row.unit in (None, '1') else f' {row.unit}'}; {consequence}",
             )
         return True
 
@@ -356,8 +356,3 @@ class WingSlave:
 
     def _get_log_queue(self) -> list[LogMessage]:
         return self.log_queue
-
-
-def start_values(text: Mapping[str, float]) -> dict[str, float]:
-    """Return start values by variable name as plain floats."""
-    return {str(name): float(value) for name, value in text.items()}

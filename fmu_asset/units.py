@@ -96,8 +96,8 @@ def conversion(
     source = _meaning(unit, definitions)
     if source is None or target is None or source[0] != target[0]:
         raise BindingError(
-            f"{where} is in {unit!r}, but the FMU has {variable.name!r} in {variable.unit!r}, and there is no "
-            f"conversion between the two; state the value in {variable.unit!r}."
+            f"{where} is in {unit!r}, but the FMU has {variable.name!r} in {variable.unit!r}, and there is "
+            f"no conversion between the two; state the value in {variable.unit!r}."
         )
     # SI = factor * value + offset, for both
     return Conversion(source[1] / target[1], (source[2] - target[2]) / target[1])

@@ -1,7 +1,7 @@
 """A process of its own for every FMU: what it crashes, blocks or prints is not the twin's.
 
-Two pipes carry binary messages: a header (operation or kind, number of log messages, length), then the payload.
-A step is the request block of `instance` one way and the reply block the other, without copies.
+Two pipes carry binary messages: a header (operation or kind, whether there are log messages, length), then
+the payload. A step is the request block of `instance` one way and the reply block the other, without copies.
 
 The worker imports fmpy and nothing of the project but `errors` and `instance`.
 """
@@ -52,7 +52,7 @@ def _receive(descriptor: int, target: memoryview) -> bool:
     return True
 
 
-def _send(descriptor: int, *parts: bytes | memoryview) -> None:
+def _send(descriptor: int, *parts: bytes | bytearray | memoryview) -> None:
     total = sum(len(part) for part in parts)
     sent = os.writev(descriptor, parts)
     if sent < total:
@@ -111,7 +111,7 @@ def serve(incoming: int, outgoing: int, folder: str) -> None:
             instance.close()
     except BrokenPipeError:
         pass  # the twin is gone
-    except BaseException:  # the twin reads the last words in worker.log
+    except BaseException:  # noqa: BLE001 - the twin reads the last words in worker.log
         traceback.print_exc()
         sys.stderr.flush()
         os._exit(1)
