@@ -73,7 +73,7 @@ def check_wing_scenario(wing: ReducedModel, scenario: Scenario) -> None:
     MissingObservationModelError
         It does not.
     """
-    expected = {
+    expected: dict[str, tuple[set[str] | set[int], set[str] | set[int]]] = {
         "states": (set(scenario.state_names), {"z1", "z2"}),
         "control inputs": (set(scenario.control[0].values), {"load_factor"}),
         "calibrated parameter": ({scenario.calibration.parameter}, {"young_modulus_factor"}),
@@ -82,8 +82,8 @@ def check_wing_scenario(wing: ReducedModel, scenario: Scenario) -> None:
     for what, (came, wanted) in expected.items():
         if came != wanted:
             raise MissingObservationModelError(
-                f"the design's model predicts observations for the {what} {_names(wanted)}, and the scenario has "
-                f"{_names(came)}: set `asset.observation_model` to `asset` to use the asset itself."
+                f"the design's model predicts observations for the {what} {_names(wanted)}, and the scenario "
+                f"has {_names(came)}: set `asset.observation_model` to `asset` to use the asset itself."
             )
 
 
@@ -146,8 +146,8 @@ class StrainLibrarySource:
         missing = [name for name in self._scenario.control_names if name not in self._library.controls]
         if missing:
             raise MissingObservationModelError(
-                f"the strain library has the controls {', '.join(self._library.controls)}, and the scenario asks "
-                f"for {', '.join(missing)}."
+                f"the strain library has the controls {', '.join(self._library.controls)}, and the scenario "
+                f"asks for {', '.join(missing)}."
             )
         return [self._library.controls.index(name) for name in self._scenario.control_names]
 

@@ -52,7 +52,8 @@ def run(
     if resume is not None:
         if out is not None or replace or overrides != Overrides():
             raise typer.BadParameter(
-                "a run is continued with what its folder holds: give nothing but SCENARIO and --quiet beside it.",
+                "a run is continued with what its folder holds: give nothing but SCENARIO and --quiet "
+                "beside it.",
                 param_hint="--resume",
             )
         loaded = None if scenario is None else load_scenario(scenario)

@@ -65,7 +65,9 @@ class Knowledge:
 
 
 def prepare_knowledge(scenario: Scenario, source: AssetSource, seed: int) -> Knowledge:
-    """Calibrate, predict the observations of every state and control, and plan: Kapteyn et al. 2021, eq. (36).
+    """Calibrate, predict the observations of every state and control, and plan.
+
+    Kapteyn et al. 2021, eqs. (30) and (36).
 
     Parameters
     ----------

@@ -174,7 +174,8 @@ class FmuSource:
         if chosen.stop - chosen.start != self._scenario.observation.count:
             raise MissionInputError(
                 f"the binding {session.binding.name} observes {chosen.stop - chosen.start} values of "
-                f"`{self._scenario.observation.role}`, and the scenario expects {self._scenario.observation.count}."
+                f"`{self._scenario.observation.role}`, and the scenario expects "
+                f"{self._scenario.observation.count}."
             )
         try:
             session.reset()

@@ -1,4 +1,4 @@
-"""The mission loop: control -> asset -> observation -> assimilate -> smooth -> predict -> decide -> control."""
+"""The mission loop: control, asset, observation, assimilate, smooth, predict, decide, control."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The flown asset with its truth: the only thing that the mission loop shows to the twin is an observation."""
+"""The flown asset with its truth; the mission loop shows the twin its observations and nothing else."""
 
 from __future__ import annotations
 

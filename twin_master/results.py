@@ -1,4 +1,4 @@
-"""A flown mission as labelled arrays: what was observed, believed, predicted and decided, and what was true."""
+"""A flown mission as labelled arrays: what was observed, believed, predicted, decided, and true."""
 
 from __future__ import annotations
 

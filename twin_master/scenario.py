@@ -12,7 +12,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-FORMAT = 1
+ROW_SUM_TOLERANCE = 1e-12
+"""Largest departure of the sum of probabilities from one, as the graphical model has it."""
 UNIT_DIVISOR = {"percent": 100.0, "microstrain": 1.0e6, "microstrain_per_step": 1.0e6}
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -99,7 +100,7 @@ class StateFactor(Section):
                 f"`prior` of state `{self.name}` must hold one probability for each of its "
                 f"{len(self.levels)} levels, and {len(self.prior)} came"
             )
-        if abs(sum(self.prior) - 1.0) > 1e-9:
+        if abs(sum(self.prior) - 1.0) > ROW_SUM_TOLERANCE:
             raise ValueError(
                 f"`prior` of state `{self.name}` must sum to 1, and sums to {sum(self.prior):.12g}"
             )
@@ -165,7 +166,7 @@ class AssetSection(Section):
     parameters: dict[str, Number] = {}
     load: dict[str, Number] = {}
     observation_model: Literal["design", "asset"] | None = None
-    """Where the twin's predicted observations come from: the reduced model of the design, or the asset itself."""
+    """Where the twin's predicted observations come from: the model of the design, or the asset itself."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -331,12 +332,14 @@ class Scenario(Section):
                 table = tables[factor.name]
                 if len(table) != size or any(len(row) != size for row in table):
                     raise ValueError(
-                        f"`transition.tables.{name}.{factor.name}` must be {size} rows of {size} probabilities"
+                        f"`transition.tables.{name}.{factor.name}` must be {size} rows of {size} "
+                        "probabilities"
                     )
                 worst = max(abs(sum(row) - 1.0) for row in table)
-                if worst > 1e-9:
+                if worst > ROW_SUM_TOLERANCE:
                     raise ValueError(
-                        f"each row of `transition.tables.{name}.{factor.name}` must sum to 1, one misses it by {worst:.3g}"
+                        f"each row of `transition.tables.{name}.{factor.name}` must sum to 1, "
+                        f"one misses it by {worst:.3g}"
                     )
 
 
@@ -353,6 +356,5 @@ def _known(name: str, names: tuple[str, ...], where: str, what: str) -> None:
 
 def _same(table: Mapping[str, object], names: tuple[str, ...], where: str, what: str) -> None:
     if set(table) != set(names):
-        raise ValueError(
-            f"`{where}` must have one entry for each {what} ({_short(names)}), and has {_short(list(table)) or 'none'}"
-        )
+        came = _short(list(table)) or "none"
+        raise ValueError(f"`{where}` must have one entry for each {what} ({_short(names)}), and has {came}")

@@ -55,7 +55,7 @@ def load_scenario(name_or_path: str | Path) -> LoadedScenario:
     UnknownScenarioError
         There is no such scenario.
     ScenarioError
-        The file cannot be read, is not TOML, or breaks the schema; names file, key, what was expected and came.
+        The file cannot be read, is not TOML, or breaks the schema; the sentence names file and key.
     """
     path = find_scenario(str(name_or_path))
     try:

@@ -1,4 +1,4 @@
-"""The same mission under many seeds, without run folders: how reliably does the twin steer?"""
+"""The same mission under many seeds, without run folders, to see how reliably the twin steers."""
 
 from __future__ import annotations
 

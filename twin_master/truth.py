@@ -99,7 +99,7 @@ class Truth:
 
     def sense(self, step: int, observation: Float) -> Float:
         """Return what the sensors say about an observation (G,): noise and drift added, lost ones NaN."""
-        sensed = observation + self.noise[step] + self.drift[step]
+        sensed: Float = observation + self.noise[step] + self.drift[step]
         sensed[self.status[step] == SensorStatus.LOST] = np.nan
         return sensed
 

@@ -35,7 +35,7 @@ def build_graphical_model(scenario: Scenario) -> GraphicalModel:
     observation.
     """
     states = StateSpace(tuple(Factor(factor.name, factor.levels) for factor in scenario.state))
-    prior = np.ones(1)
+    prior: Float = np.ones(1)
     for factor in scenario.state:
         prior = np.kron(prior, factor.prior)
     tables = []
@@ -169,7 +169,9 @@ class Twin:
     def _worst_residuals(self, observation: Float, control_index: int) -> dict[str, float]:
         """Return the sensors that fit worst in the state that fits best, in standard deviations."""
         predicted = self.sensor_model.mean[:, control_index]
-        residual = (observation - predicted) / self.sensor_model.standard_deviation
-        best = int(np.argmin(np.nansum(residual**2, axis=1)))
-        order = np.argsort(-np.abs(np.nan_to_num(residual[best])))[:_WORST_SHOWN]
+        with np.errstate(over="ignore"):  # an absurd observation is what this is for
+            residual = (observation - predicted) / self.sensor_model.standard_deviation
+            distance = np.nan_to_num(np.abs(residual), nan=0.0)
+            best = int(np.argmin(distance.sum(axis=1)))
+        order = np.argsort(-distance[best])[:_WORST_SHOWN]
         return {f"sensor {index + 1}": float(residual[best, index]) for index in order}

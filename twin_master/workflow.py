@@ -33,7 +33,7 @@ from twin_master.run_folder import (
 )
 from twin_master.scenario import Scenario
 from twin_master.scenario_file import LoadedScenario, parse_scenario
-from twin_master.store import store_mission, write_summary, write_timing
+from twin_master.store import store_mission, values_of, write_summary, write_timing
 from twin_master.strain_library import FILE_NAME, load_strain_library
 from twin_master.summary import Figure, summarise
 
@@ -237,8 +237,8 @@ def resume_run(
         ) from error
     if loaded is not None and config["scenario_file"]["sha256"] != loaded.content_hash:
         raise NotResumableError(
-            f"{folder} flies another scenario ({scenario.mission.name}, {config['scenario_file']['name']}) than "
-            f"{loaded.path}: resume it without naming a scenario."
+            f"{folder} flies another scenario ({scenario.mission.name}, {config['scenario_file']['name']}) "
+            f"than {loaded.path}: resume it without naming a scenario."
         )
     now = collect_provenance(scenario.mission.seed).as_dict()
     for what in ("versions", "source_hashes"):
@@ -247,8 +247,8 @@ def resume_run(
         )
         if changed:
             raise NotResumableError(
-                f"{folder} was begun with another version of {', '.join(changed)}, so its results could not be the "
-                "same: fly the mission again with --replace."
+                f"{folder} was begun with another version of {', '.join(changed)}, so its results could not "
+                "be the same: fly the mission again with --replace."
             )
     return _run(folder, config, scenario, progress or SilentProgress())
 
@@ -344,7 +344,7 @@ def _store(
         "parameter_source": knowledge.draws.source,
     }
     tree = store_mission(folder, result, attributes, _field_writer(knowledge, source, result))
-    figures = summarise(result, knowledge.draws, tree["filtered"]["reward_mean"].values)
+    figures = summarise(result, knowledge.draws, values_of(tree, "filtered", "reward_mean"))
     write_summary(
         folder,
         figures,

@@ -40,8 +40,7 @@ def info(
     from rich.console import Console
     from rich.table import Table
 
-    from fmu_asset.archive import read_fmu
-    from fmu_asset.session import describe_fmu
+    from fmu_asset.archive import describe_fmu, read_fmu
 
     record = describe_fmu(read_fmu(file))
     console = Console(highlight=False)
@@ -69,9 +68,11 @@ def check(file: Annotated[Path, typer.Argument(help="An FMU.", show_default=Fals
     """Check an FMU; exit code 1 if anything is wrong with it."""
     from fmu_asset.check import check_fmu
 
-    findings = check_fmu(file)
-    for finding in findings:
-        typer.echo(str(finding))
-    if findings:
+    result = check_fmu(file)
+    for problem in result.problems:
+        typer.secho(f"problem: {problem}", fg="red", err=True)
+    for warning in result.warnings:
+        typer.echo(f"warning: {warning}")
+    if not result.passed:
         raise typer.Exit(1)
-    typer.echo(f"{file}: nothing found.")
+    typer.echo(f"{file}: no problem found.")

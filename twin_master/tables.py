@@ -1,0 +1,93 @@
+"""The CSV files of a run, for people: strains in microstrain, losses in percent, units in the headers."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+MICROSTRAIN = 1.0e6
+PERCENT = 100.0
+
+Table = tuple[list[str], list[list[str]]]
+
+
+def tables_of(groups: Mapping[str, xr.Dataset], role: str) -> dict[str, str]:
+    """Return the text of each CSV file by its name.
+
+    Parameters
+    ----------
+    groups
+        Groups of `run.nc`.
+    role
+        Name of the observed quantity, such as `strain`.
+    """
+    steps = [str(step) for step in groups["observed"]["step"].values]
+    tables = {
+        "observed": _observations(steps, groups["observed"], role, role),
+        "estimated": _observations(steps, groups["filtered"], "quantity_mean", role),
+        "true": _observations(steps, groups["truth"], role, role),
+        "health": _health(steps, groups),
+        "decisions": _decisions(steps, groups),
+        "policy": _policy(groups),
+    }
+    return {name: _csv(*table) for name, table in tables.items()}
+
+
+def _observations(steps: list[str], group: xr.Dataset, variable: str, role: str) -> Table:
+    header = ["step", *(f"{role}_{sensor}_microstrain" for sensor in group["sensor"].values)]
+    rows = zip(steps, group[variable].values * MICROSTRAIN, strict=True)
+    return header, [[step, *_numbers(row)] for step, row in rows]
+
+
+def _health(steps: list[str], groups: Mapping[str, xr.Dataset]) -> Table:
+    kinds = [(kind, name) for kind in ("filtered", "smoothed") for name in ("mean", "standard_deviation")]
+    columns = [groups["truth"]["state"].values, *(groups[kind][name].values for kind, name in kinds)]
+    header = ["step"]
+    for region in groups["truth"]["region"].values:
+        header += [f"{region}_true_percent", *(f"{region}_{kind}_{name}_percent" for kind, name in kinds)]
+    stacked = np.stack(columns, axis=-1).reshape(len(steps), -1) * PERCENT
+    return header, [[step, *_numbers(row)] for step, row in zip(steps, stacked, strict=True)]
+
+
+def _decisions(steps: list[str], groups: Mapping[str, xr.Dataset]) -> Table:
+    names = _names(groups["policy"]["control"].values)
+    flown = groups["observed"]["control_index"].values
+    rewards = groups["filtered"]
+    header = ["step", "control", *(f"{name}_reward" for name in rewards["reward"].values)]
+    rows = zip(steps, flown, rewards["reward_mean"].values, strict=True)
+    return header, [[step, names[control], *_numbers(row)] for step, control, row in rows]
+
+
+def _policy(groups: Mapping[str, xr.Dataset]) -> Table:
+    policy = groups["policy"]
+    names = _names(policy["control"].values)
+    regions = _names(groups["truth"]["region"].values)
+    levels = np.stack([policy[name].values for name in regions], axis=-1) * PERCENT
+    header = [*(f"{name}_percent" for name in regions), "control", *(f"action_value_{n}" for n in names)]
+    rows = zip(levels, policy["control_index"].values, policy["action_value"].values, strict=True)
+    return header, [[*_numbers(level), names[control], *_numbers(row)] for level, control, row in rows]
+
+
+def _names(values: NDArray[Any]) -> list[str]:
+    return [str(value) for value in values]
+
+
+def _numbers(values: Iterable[float]) -> list[str]:
+    """Return numbers for people; empty where nothing was received."""
+    return ["" if np.isnan(value) else f"{value:.6g}" for value in values]
+
+
+def _csv(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return buffer.getvalue()
