@@ -134,8 +134,8 @@ def _remarks(
             remarks.append(
                 f"Loading runs {first.run + 1} and {second.run + 1} differ by {abs(difference) * 1e3:.2f} mm "
                 f"({abs(difference) / deviation:.1f} standard deviations): their offsets are "
-                f"{first.offset * 1e3:+.2f} mm and {second.offset * 1e3:+.2f} mm, as if the zero of the "
-                "displacement had moved between them."
+                f"{_signed(first.offset * 1e3)} mm and {_signed(second.offset * 1e3)} mm, as if the zero of "
+                "the displacement had moved between them."
             )
     large = np.flatnonzero(np.abs(standardised) > NOTICEABLE_SCORE)
     remarks.extend(
@@ -144,3 +144,7 @@ def _remarks(
         for pair in large
     )
     return remarks
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.2f}".replace("-", "−")

@@ -69,7 +69,12 @@ def _page(result: StaticCalibration, drawings: dict[str, bytes]) -> Page:
         Table(
             (Column("figure"), Column("here", numeric=True), Column("paper", numeric=True), Column("unit")),
             [
-                (row.name, _number(row.ours), "" if row.paper is None else _number(row.paper), row.unit)
+                (
+                    row.name,
+                    _number(row.ours),
+                    "" if row.paper is None else _number(row.paper),
+                    row.unit if row.unit != "1" else "",
+                )
                 for row in summary_rows(result)
             ],
         ),
@@ -96,11 +101,13 @@ def _page(result: StaticCalibration, drawings: dict[str, bytes]) -> Page:
             if quality.degrees_of_freedom
             else ". "
         )
-        + f"The experiment took {result.reward.uncertainty_reduction:.0%} of the prior's standard deviation "
+        + f"The experiment took {100.0 * result.reward.uncertainty_reduction:.0f} % of the prior's "
+        "standard deviation "
         f"away and brought {result.reward.information_gain:.2f} nat of information. The mean absolute error "
         "of the displacement, in half-widths of its 95 % interval, was "
         f"{-result.reward.prior_error:.2f} at the prior mean and is "
-        f"{-result.reward.posterior_error:.2f} at the posterior mean."
+        f"{-result.reward.posterior_error:.2f} at the posterior mean, which weighs "
+        "squared errors."
     )
     _add_pairs(page, result)
     page.add_section("Method")
@@ -111,9 +118,9 @@ def _page(result: StaticCalibration, drawings: dict[str, bytes]) -> Page:
         f"{HALF_WIDTH_95 * data.load_standard_deviation:.3g} N."
     )
     page.add_paragraph(
-        f"Particle filter as in the paper: {particle.particle_count} samples of each pair, turned into e "
+        f"Particle filter as in the paper: {particle.particle_count:,} samples of each pair, turned into e "
         "through k = f / x, give a Gaussian kernel density that weighs as many particles drawn from the "
-        f"prior; {particle.effective_sample_size[-1]:.0f} effective particles remain."
+        f"prior; {particle.effective_sample_size[-1]:,.0f} effective particles remain."
     )
     page.add_paragraph(
         "Exact posterior: load and displacement are both read with errors; with a prior flat in the true "
@@ -157,4 +164,4 @@ def _add_pairs(page: Page, result: StaticCalibration) -> None:
 
 
 def _number(value: float) -> str:
-    return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.4f}"
+    return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.4f}"

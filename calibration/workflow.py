@@ -17,7 +17,7 @@ from .stiffness import calibrate_static
 from .stiffness_curve import PUBLISHED_LINE, StiffnessCurve
 from .summary import summary_rows
 
-__all__ = ["StaticRun", "read_calibration", "run_static", "summary_rows", "write_calibration"]
+__all__ = ["StaticRun", "read_calibration", "result_files", "run_static", "summary_rows", "write_calibration"]
 
 RECORD_NAME = "calibration.json"
 """Name of the record in the folder of results."""
