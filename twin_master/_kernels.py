@@ -16,6 +16,7 @@ __all__ = ["backward_pass", "forward_pass", "smooth_many"]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
+Unsigned = NDArray[np.uint64]
 
 SAFE = 1e-280
 NEGLIGIBLE = -45.0
@@ -31,7 +32,9 @@ def _exp(value: float) -> float:
 
 
 @compiled
-def _log_forecast(begin: int, end: int, source: Index, log_probability: Float, log_filtered: Float) -> float:
+def _log_forecast(
+    begin: int, end: int, source: Unsigned, log_probability: Float, log_filtered: Float
+) -> float:
     """Return the log of the sum over the predecessors begin..end of one state."""
     largest = -np.inf
     for k in range(begin, end):
@@ -49,8 +52,8 @@ def _log_forecast(begin: int, end: int, source: Index, log_probability: Float, l
 @compiled
 def forward_pass(
     log_prior: Float,
-    start: Index,
-    source: Index,
+    start: Unsigned,
+    source: Unsigned,
     probability: Float,
     log_probability: Float,
     control: Index,
@@ -104,8 +107,8 @@ def forward_pass(
 
 @compiled
 def backward_pass(
-    start: Index,
-    source: Index,
+    start: Unsigned,
+    source: Unsigned,
     probability: Float,
     log_probability: Float,
     control: Index,
@@ -158,8 +161,8 @@ def backward_pass(
 @compiled
 def smooth_many(
     log_prior: Float,
-    start: Index,
-    source: Index,
+    start: Unsigned,
+    source: Unsigned,
     probability: Float,
     log_probability: Float,
     control: Index,

@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 Float = NDArray[np.float64]
-Index = NDArray[np.int64]
+Unsigned = NDArray[np.uint64]
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of a probability distribution from one."""
@@ -217,7 +217,8 @@ class SparseTransition:
     """The non-zero transitions as predecessor lists.
 
     Row ``control * S + state`` lists the states from which `state` is reached under `control`. The arrays
-    are for the compiled loops, which never write to them.
+    are for the compiled loops, which never write to them; unsigned indices spare the loops the test for
+    negative ones.
 
     Attributes
     ----------
@@ -229,8 +230,8 @@ class SparseTransition:
         Of the transition from it.
     """
 
-    start: Index
-    source: Index
+    start: Unsigned
+    source: Unsigned
     probability: Float
     log_probability: Float
 
@@ -239,10 +240,10 @@ class SparseTransition:
         """Build the lists from a transition array (U, S, S)."""
         rows = matrix.transpose(0, 2, 1).reshape(-1, matrix.shape[2])
         row, source = np.nonzero(rows)
-        start = np.zeros(len(rows) + 1, dtype=np.int64)
+        start = np.zeros(len(rows) + 1, dtype=np.uint64)
         np.cumsum(np.bincount(row, minlength=len(rows)), out=start[1:])
         probability = rows[row, source]
-        return cls(start, source.astype(np.int64), probability, np.log(probability))
+        return cls(start, source.astype(np.uint64), probability, np.log(probability))
 
 
 @dataclass(frozen=True)

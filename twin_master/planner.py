@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from twin_master.compilation import compiled
 from twin_master.errors import PlanningError
 from twin_master.graphical_model import deterministic_policy, stochastic_matrix
 
@@ -44,7 +45,7 @@ class PlannedPolicy:
 def _checked(transition: ArrayLike, reward: ArrayLike, discount: float) -> tuple[Float, Float]:
     """Return transition (U, S, S) and reward (S, U)."""
     matrix = stochastic_matrix(transition, name="transition[control, state]")
-    rewards = np.array(reward, dtype=np.float64)
+    rewards = np.array(reward, dtype=np.float64, order="C")
     if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2] or rewards.shape != matrix.shape[1::-1]:
         raise PlanningError(
             "expected transitions of shape (controls, states, states) and rewards of shape "
@@ -58,6 +59,36 @@ def _checked(transition: ArrayLike, reward: ArrayLike, discount: float) -> tuple
     if not 0.0 <= discount < 1.0:
         raise PlanningError(f"expected a discount factor in [0, 1), got {discount}")
     return matrix, rewards
+
+
+@compiled
+def _sweep(
+    discounted: Float, reward: Float, limit: float, max_iterations: int, value: Float, action_value: Float
+) -> tuple[int, float]:
+    """Sweep until the value changes by no more than `limit`; return the sweeps and the last change.
+
+    `action_value` belongs to the value that it is returned with.
+    """
+    controls, states, _ = discounted.shape
+    change = np.inf
+    iterations = 0
+    while True:
+        for state in range(states):
+            for control in range(controls):
+                total = reward[state, control]
+                for following in range(states):
+                    total += discounted[control, state, following] * value[following]
+                action_value[state, control] = total
+        if change <= limit or iterations == max_iterations:
+            return iterations, change
+        change = 0.0
+        for state in range(states):
+            improved = action_value[state, 0]
+            for control in range(1, controls):
+                improved = max(improved, action_value[state, control])
+            change = max(change, abs(improved - value[state]))
+            value[state] = improved
+        iterations += 1
 
 
 def value_iteration(
@@ -97,34 +128,25 @@ def value_iteration(
         If a row of the transition does not sum to one.
     """
     matrix, rewards = _checked(transition, reward, discount)
-    controls, states, _ = matrix.shape
     scale = float(np.abs(rewards).max()) or 1.0
-    discounted = (discount * matrix).reshape(controls * states, states)
-    flat_rewards = np.ascontiguousarray(rewards.T).reshape(-1)
     # |V_k - V*| <= gamma / (1 - gamma) |V_k - V_{k-1}|; below rounding nothing changes any more.
     limit = max(tolerance * scale * (1.0 - discount), 4e-16 * scale / (1.0 - discount))
-    value = np.zeros(states)
-    iterations = 0
-    change = np.inf
-    while change > limit:
-        if iterations == max_iterations:
-            raise PlanningError(
-                f"value iteration still changes by {change:.3g} after {max_iterations} sweeps with discount "
-                f"{discount}; allow more sweeps or a larger tolerance"
-            )
-        iterations += 1
-        action_value = (flat_rewards + discounted @ value).reshape(controls, states)
-        improved = action_value.max(axis=0)
-        change = float(np.abs(improved - value).max())
-        value = improved
-    action_value = (flat_rewards + discounted @ value).reshape(controls, states)
+    value = np.zeros(len(rewards))
+    action_value = np.empty_like(rewards)
+    iterations, change = _sweep(discount * matrix, rewards, limit, max_iterations, value, action_value)
+    if change > limit:
+        raise PlanningError(
+            f"value iteration still changes by {change:.3g} after {max_iterations} sweeps with discount "
+            f"{discount}; allow more sweeps or a larger tolerance"
+        )
     tie = 2.0 * max(tolerance * scale, limit / (1.0 - discount))
-    control_index = np.argmax(action_value >= action_value.max(axis=0) - tie, axis=0).astype(np.int64)
+    best = action_value.max(axis=1, keepdims=True)
+    control_index = np.argmax(action_value >= best - tie, axis=1).astype(np.int64)
     return PlannedPolicy(
         value=value,
-        action_value=np.ascontiguousarray(action_value.T),
+        action_value=action_value,
         control_index=control_index,
-        policy=deterministic_policy(control_index, controls),
+        policy=deterministic_policy(control_index, rewards.shape[1]),
         iterations=iterations,
     )
 
