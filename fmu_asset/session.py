@@ -107,6 +107,7 @@ class FmiAsset:
         self._settings = self._exchange.settings(self._parameters)
         self._instance: FmuInstance | WorkerInstance | None = None
         self._ready = False
+        self._broken = False
         self._index = 0
         self._step_size = self._binding.step_size
         self._start_time = self._binding.binding.start_time
@@ -268,10 +269,7 @@ class FmiAsset:
         FmuWorkerError, FmuTimeoutError
             If the worker died or took too long.
         """
-        if not self._ready:
-            self.reset()
-        instance = self._instance
-        assert instance is not None
+        instance = self._opened()
         request = instance.request
         before: list[Any] = request[:]
         values = before[2:]
@@ -290,10 +288,7 @@ class FmiAsset:
 
     def observe(self) -> Observation:
         """Return the observation of this moment without a step, such as the initial one."""
-        if not self._ready:
-            self.reset()
-        instance = self._instance
-        assert instance is not None
+        instance = self._opened()
         try:
             instance.read()
         except FmuError as error:
@@ -384,7 +379,7 @@ class FmiAsset:
                 for index in range(int(head["index"])):
                     self._replay(body[index * width : (index + 1) * width])
         except FmuError as error:
-            self._ready = False
+            self._ready, self._broken = False, True
             raise self._told(error, "restoring the state") from error
 
     def _replay(self, inputs: bytes) -> None:
@@ -416,9 +411,20 @@ class FmiAsset:
             self.close()
             raise told from error
         self._index = 0
+        self._broken = False
         self._record = []
         self._start_inputs = bytes(memoryview(instance.request).cast("B")[16:]) if with_inputs else b""
         self._ready = True
+
+    def _opened(self) -> FmuInstance | WorkerInstance:
+        """Return the instance, which is opened by its first use but never started again unasked."""
+        if self._broken:
+            raise FmuStateError("A state could not be restored; reset the asset to go on.")
+        if not self._ready:
+            self.reset()
+        instance = self._instance
+        assert instance is not None
+        return instance
 
     def _open(self) -> None:
         folder = extract_fmu(self._description)

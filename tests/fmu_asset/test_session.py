@@ -181,6 +181,9 @@ def test_state_of_another_fmu_or_nonsense_is_refused(
         np.testing.assert_array_equal(before.values, after.values)
         with pytest.raises(FmuStateError, match=r"refused the state"):
             asset.restore_state(saved[:-40] + b"\0" * 8)
+        with pytest.raises(FmuStateError, match="reset the asset"):
+            asset.step()
+        asset.reset()
         assert asset.step({"load_factor": 2.0}).time == 1.0
 
 

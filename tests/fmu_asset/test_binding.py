@@ -1,0 +1,143 @@
+"""Binding files: the schema, patterns and units."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fmu_asset.archive import UnitInfo, VariableInfo
+from fmu_asset.binding import Binding, expand, load_binding
+from fmu_asset.errors import BindingError
+from fmu_asset.units import Conversion, conversion
+
+GOOD = """
+[binding]
+name = "asset"
+step_size = 1.0
+[control.n]
+variable = "n"
+unit = "1"
+[observation.strain]
+variables = ["a", "strain[{9..11}]"]
+unit = "1"
+[observation.tip]
+variables = "tip"
+unit = "mm"
+"""
+
+
+def read(tmp_path: Path, text: str) -> Binding:
+    path = tmp_path / "binding.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_binding(path)
+
+
+def test_shipped_binding(binding: Binding) -> None:
+    assert binding.name == "uav_wing"
+    assert list(binding.control) == ["load_factor"]
+    assert list(binding.health) == ["z1", "z2"]
+    assert binding.observation_variables == tuple(f"strain[{i}]" for i in range(1, 25))
+
+
+def test_observations_keep_their_order(tmp_path: Path) -> None:
+    binding = read(tmp_path, GOOD)
+    assert binding.observation_variables == ("a", "strain[9]", "strain[10]", "strain[11]", "tip")
+    assert binding.observation_slice("tip") == slice(4, 5)
+    with pytest.raises(BindingError, match="no observation 'x'; it has strain, tip"):
+        binding.observation_slice("x")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (
+            "step_size = 1.0",
+            "step_sise = 1.0",
+            r"the key 'binding\.step_sise' is unknown|'binding\.step_size'",
+        ),
+        ("step_size = 1.0", "step_size = 0.0", r"binding\.step_size is wrong"),
+        ("step_size = 1.0", "step_size = nan", r"binding\.step_size is wrong"),
+        ("step_size = 1.0", 'step_size = "1"', r"binding\.step_size is wrong"),
+        ("step_size = 1.0", 'step_size = 1.0\nfmi_version = "3.0"', r"binding\.fmi_version is wrong"),
+        ("[control.n]", "[controll.n]", r"the key 'controll' is unknown"),
+        ('variable = "n"\n', "", r"the key 'control\.n\.variable' is missing"),
+        ('unit = "mm"', "", r"the key 'observation\.tip\.unit' is missing"),
+        ("{9..11}", "{11..9}", r"the range of .* is empty"),
+        ("{9..11}", "{1..2}{1..2}", r"more than one range"),
+        ('variable = "n"', "variable = 3", r"control\.n\.variable is wrong"),
+        ("[control.n]", "[control.n", r"not valid TOML"),
+        (
+            '[control.n]\nvariable = "n"',
+            '[load.m]\nvariable="n"\nunit="1"\n[control.n]\nvariable = "n"',
+            "set by both",
+        ),
+    ],
+)
+def test_bad_files_are_one_sentence(tmp_path: Path, old: str, new: str, sentence: str) -> None:
+    assert old in GOOD
+    with pytest.raises(BindingError, match=sentence) as caught:
+        read(tmp_path, GOOD.replace(old, new))
+    assert "\n" not in str(caught.value)
+    assert "binding.toml" in str(caught.value)
+
+
+def test_missing_or_unreadable_file(tmp_path: Path) -> None:
+    with pytest.raises(BindingError, match="There is no binding file"):
+        load_binding(tmp_path / "none.toml")
+    (tmp_path / "x.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(BindingError, match="cannot be read"):
+        load_binding(tmp_path / "x.toml")
+    with pytest.raises(BindingError, match=r"no \[observation"):
+        read(tmp_path, '[binding]\nname = "a"\nstep_size = 1.0\n')
+
+
+@given(st.integers(0, 500), st.integers(0, 50))
+def test_patterns_count(first: int, more: int) -> None:
+    names = expand(f"x[{{{first}..{first + more}}}].y")
+    assert names == tuple(f"x[{i}].y" for i in range(first, first + more + 1))
+
+
+def variable(unit: str | None) -> VariableInfo:
+    return VariableInfo("v", 0, "Real", "input", "continuous", "", unit, None, None, None, None)
+
+
+SI = (0, 0, 0, 0, 0, 0, 0, 0)
+KELVIN = (0, 0, 0, 0, 1, 0, 0, 0)
+DEFINED = (
+    UnitInfo("1", SI, 1.0, 0.0, (("microstrain", 1e6, 0.0),)),
+    UnitInfo("K", KELVIN, 1.0, 0.0, (("degC", 1.0, -273.15),)),
+    UnitInfo("degF", KELVIN, 5 / 9, 459.67 * 5 / 9, ()),
+)
+
+
+@pytest.mark.parametrize(
+    ("unit", "of_fmu", "value", "in_fmu"),
+    [
+        ("microstrain", "1", 2500.0, 2.5e-3),
+        ("percent", "1", 40.0, 0.4),
+        ("degC", "K", 20.0, 293.15),
+        ("degF", "K", 68.0, 293.15),
+        ("mm", "m", 12.0, 0.012),
+        ("anything", None, 3.0, 3.0),
+    ],
+)
+def test_units_convert_both_ways(unit: str, of_fmu: str | None, value: float, in_fmu: float) -> None:
+    scale = conversion(unit, variable(of_fmu), DEFINED, where="here")
+    assert scale.to_fmu(value) == pytest.approx(in_fmu, rel=1e-12)
+    assert scale.from_fmu(in_fmu) == pytest.approx(value, rel=1e-12)
+
+
+@pytest.mark.parametrize(("unit", "of_fmu"), [("N", "1"), ("m", "K"), ("bushel", "1"), ("1", "bushel")])
+def test_units_that_do_not_fit(unit: str, of_fmu: str) -> None:
+    with pytest.raises(BindingError, match=rf"here is in '{unit}', but the FMU has 'v' in '{of_fmu}'"):
+        conversion(unit, variable(of_fmu), DEFINED, where="here")
+
+
+@given(st.floats(1e-6, 1e6), st.floats(-1e3, 1e3), st.floats(-1e6, 1e6))
+def test_conversions_are_inverse(factor: float, offset: float, value: float) -> None:
+    scale = Conversion(factor, offset)
+    there_and_back = scale.from_fmu(scale.to_fmu(value))
+    assert there_and_back == pytest.approx(value, rel=1e-9, abs=1e-9 * (1.0 + abs(offset) / factor))
