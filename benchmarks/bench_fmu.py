@@ -1,0 +1,92 @@
+"""An FMU step as the master makes it: set all inputs with another health, step, read 24 strains."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from fe.cache import reduced_model
+from fmpy.fmi2 import FMU2Slave
+
+from benchmarks.measurement import Measurement, median_seconds
+from fmu_asset.archive import extract_fmu, read_fmu
+from fmu_asset.binding import Binding, load_binding
+from fmu_asset.build import build_fmu
+from fmu_asset.session import FmiAsset
+
+BINDING = Path(__file__).parents[1] / "scenarios" / "bindings" / "uav_wing.toml"
+INNER = 400
+
+
+def run() -> list[Measurement]:
+    """Measure a step in process and through the worker, beside the list-based calls of fmpy."""
+    model = reduced_model()
+    binding = load_binding(BINDING)
+    with tempfile.TemporaryDirectory() as folder:
+        path = build_fmu(model, Path(folder) / "wing.fmu").path
+        plain = _fmpy_lists(path)
+        in_process = _asset(path, binding, isolated=False)
+        isolated = _asset(path, binding, isolated=True)
+        opening = median_seconds(lambda: _open_and_close(path, binding), repeats=5)
+    damage = itertools.cycle(range(INNER))
+    alone = _microseconds(lambda: model.static_response(1.0, (0.001 * next(damage), 0.2), 3.0), inner=INNER)
+    lists = "fmpy, lists, no checks"
+    return [
+        Measurement("FMU step in process", in_process, "us", 60.0, lists, plain),
+        Measurement("FMU step through the worker", isolated, "us", 130.0, lists, plain),
+        Measurement("static response of the reduced model", alone, "us", None, lists, plain),
+        Measurement("worker started, FMU initialised, closed", 1e3 * opening, "ms"),
+    ]
+
+
+def _microseconds(function: Callable[[], object], *, inner: int) -> float:
+    return 1e6 * median_seconds(function, repeats=15, inner=inner)
+
+
+def _asset(path: Path, binding: Binding, *, isolated: bool) -> float:
+    damage = itertools.cycle(range(INNER))
+    with FmiAsset(path, binding, isolated=isolated) as asset:
+
+        def step() -> None:
+            asset.step({"load_factor": 3.0}, {"z1": 0.001 * next(damage), "z2": 0.2})
+
+        return _microseconds(step, inner=INNER)
+
+
+def _fmpy_lists(path: Path) -> float:
+    """Time the same exchange through fmpy's own convenience calls, in process."""
+    description = read_fmu(path)
+    folder = extract_fmu(description)
+    references = {variable.name: variable.reference for variable in description.variables}
+    inputs = [references[name] for name in ("load_factor", "health.z1", "health.z2", "tip_force")]
+    outputs = [references[f"strain[{gauge}]"] for gauge in range(1, 25)]
+    outputs += [references["tip_displacement"], references["strain_error_bound"]]
+    slave = FMU2Slave(
+        guid=description.guid, modelIdentifier=description.model_identifier, unzipDirectory=str(folder)
+    )
+    slave.instantiate()
+    slave.setupExperiment(startTime=0.0)
+    slave.enterInitializationMode()
+    slave.exitInitializationMode()
+    count = itertools.count()
+
+    def step() -> None:
+        index = next(count)
+        slave.setReal(inputs, [3.0, 0.001 * (index % INNER), 0.2, 0.0])
+        slave.doStep(float(index), 1.0)
+        slave.getReal(outputs)
+
+    try:
+        return _microseconds(step, inner=INNER)
+    finally:
+        slave.terminate()
+        slave.freeInstance()
+        shutil.rmtree(folder)
+
+
+def _open_and_close(path: Path, binding: Binding) -> None:
+    with FmiAsset(path, binding):
+        pass
