@@ -133,6 +133,17 @@ def library():
 
 
 @needs_library
+def test_the_example_of_the_documentation_runs():
+    page = (Path(__file__).parents[2] / "docs" / "inference.md").read_text(encoding="utf-8")
+    code = page.split("```python\n")[1].split("```")[0]
+    names: dict[str, object] = {}
+    exec(code.replace("path/to/UAV-Digital-Twin", str(LIBRARY)), names)
+    assert names["history"].shape == (1, 25)
+    assert names["next_control"] == 1
+    assert np.all(names["low"] < names["high"])
+
+
+@needs_library
 class TestAuthorsLibrary:
     """What is known of the published library, each fact checked."""
 
