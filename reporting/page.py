@@ -6,6 +6,7 @@ No script, no request to any server; light, and fit to be printed. All text is e
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -13,6 +14,8 @@ from importlib import resources
 
 from reporting.errors import InvalidFigureError
 from reporting.figures import inline_svg
+
+_UNIT_SPACE = re.compile(r"(?<=\d) (?=(%|µε|s|ms|Hz|mm|m|kg|N)(?!\w))")
 
 
 @dataclass(frozen=True)
@@ -90,20 +93,20 @@ class Page:
             self._body.append("</section>")
         self._sections.append(title)
         number = len(self._sections)
-        self._body.append(f'<section id="section-{number}"><h2>{html.escape(title)}</h2>')
+        self._body.append(f'<section id="section-{number}"><h2>{_text(title)}</h2>')
 
     def add_paragraph(self, text: str) -> None:
         """Add a paragraph of plain text."""
-        self._body.append(f"<p>{html.escape(text)}</p>")
+        self._body.append(f"<p>{_text(text)}</p>")
 
     def add_notice(self, text: str) -> None:
         """Add a paragraph that the reader must not overlook."""
-        self._body.append(f'<p class="notice">{html.escape(text)}</p>')
+        self._body.append(f'<p class="notice">{_text(text)}</p>')
 
     def add_highlights(self, items: Sequence[tuple[str, str]]) -> None:
         """Add a row of few figures in large print: (value with unit, what it is)."""
         cells = "".join(
-            f"<div><strong>{html.escape(value)}</strong><span>{html.escape(meaning)}</span></div>"
+            f"<div><strong>{_text(value)}</strong><span>{_text(meaning)}</span></div>"
             for value, meaning in items
         )
         self._body.append(f'<div class="highlights">{cells}</div>')
@@ -130,7 +133,7 @@ class Page:
         drawing = inline_svg(svg, prefix=f"f{number}", description=title)
         self._body.append(
             f'<figure id="figure-{number}">{drawing}<figcaption><b>Figure {number}. '
-            f"{html.escape(title)}.</b> {html.escape(caption)}</figcaption></figure>"
+            f"{_text(title)}.</b> {_text(caption)}</figcaption></figure>"
         )
         return number
 
@@ -139,15 +142,15 @@ class Page:
         self._table_count += 1
         number = self._table_count
         heads = "".join(
-            f"<th{_alignment(column)}>{html.escape(column.name)}"
-            + (f"<small>{html.escape(column.unit)}</small>" if column.unit else "")
+            f"<th{_alignment(column)}>{_text(column.name)}"
+            + (f"<small>{_text(column.unit)}</small>" if column.unit else "")
             + "</th>"
             for column in table.columns
         )
         rows = "".join(
             "<tr>"
             + "".join(
-                f"<td{_alignment(column)}>{html.escape(cell)}</td>"
+                f"<td{_alignment(column)}>{_text(cell)}</td>"
                 for column, cell in zip(table.columns, row, strict=True)
             )
             + "</tr>"
@@ -155,7 +158,7 @@ class Page:
         )
         self._body.append(
             f'<div class="table" id="table-{number}"><p class="caption"><b>Table {number}. '
-            f"{html.escape(title)}.</b> {html.escape(caption)}</p>"
+            f"{_text(title)}.</b> {_text(caption)}</p>"
             f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>"
         )
         return number
@@ -163,20 +166,25 @@ class Page:
     def render(self) -> str:
         """Return the page as one string of HTML."""
         contents = "".join(
-            f'<li><a href="#section-{number}">{html.escape(title)}</a></li>'
+            f'<li><a href="#section-{number}">{_text(title)}</a></li>'
             for number, title in enumerate(self._sections, start=1)
         )
         navigation = f"<nav><ol>{contents}</ol></nav>" if len(self._sections) > 1 else ""
-        subtitle = f'<p class="subtitle">{html.escape(self._subtitle)}</p>' if self._subtitle else ""
-        footer = "".join(f"<p>{html.escape(line)}</p>" for line in self._footer)
+        subtitle = f'<p class="subtitle">{_text(self._subtitle)}</p>' if self._subtitle else ""
+        footer = "".join(f"<p>{_text(line)}</p>" for line in self._footer)
         body = "\n".join(self._body) + ("</section>" if self._sections else "")
         return (
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
             '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-            f"<title>{html.escape(self._title)}</title>\n<style>\n{_style_sheet()}</style>\n</head>\n<body>\n<main>\n"
-            f"<header><h1>{html.escape(self._title)}</h1>{subtitle}</header>\n{navigation}\n{body}\n"
+            f"<title>{_text(self._title)}</title>\n<style>\n{_style_sheet()}</style>\n</head>\n<body>\n<main>\n"
+            f"<header><h1>{_text(self._title)}</h1>{subtitle}</header>\n{navigation}\n{body}\n"
             f"<footer>{footer}</footer>\n</main>\n</body>\n</html>\n"
         )
+
+
+def _text(text: str) -> str:
+    """Escape text for HTML and keep a figure and its unit on one line."""
+    return html.escape(_UNIT_SPACE.sub("\u00a0", text))
 
 
 def _alignment(column: Column) -> str:

@@ -38,7 +38,8 @@ MAIN_FIGURE = "mission_now"
 
 _SOURCES = (
     "M. G. Kapteyn, J. V. R. Pretorius, K. E. Willcox: A probabilistic graphical model foundation for "
-    "enabling predictive digital twins at scale. Nature Computational Science 1 (2021) 337-347; arXiv:2012.05841. "
+    "enabling predictive digital twins at scale. Nature Computational Science 1 (2021) 337-347, "
+    "arXiv:2012.05841. "
     "Equation numbers in the captions are those of this paper.",
     "Colours: M. Okabe, K. Ito, Color Universal Design (2008).",
 )
@@ -209,7 +210,7 @@ def _highlights(record: RunRecord) -> list[tuple[str, str]]:
         truth = (
             "" if record.truth_state is None else f" (truth {100.0 * record.truth_state[-1, factor]:.0f} %)"
         )
-        items.append((f"{mean:.0f} ± {deviation:.0f} %", f"{title} at the end{truth}"))
+        items.append((f"{mean:.1f} ± {deviation:.1f} %", f"{title} at the end{truth}"))
     changes = np.flatnonzero(np.diff(record.control_index)) + 1
     if len(changes):
         first = int(changes[0])

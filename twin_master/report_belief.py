@@ -184,8 +184,8 @@ def policy_figure(record: RunRecord) -> Figure | None:
     margin = policy_margin(record)
     shape = tuple(len(level) for level in record.levels)
     with style.publication_style():
-        figure = style.new_figure(3.35)
-        grid = figure.add_gridspec(1, 2, left=0.075, right=0.91, top=0.80, bottom=0.14, wspace=0.22)
+        figure = style.new_figure(3.2)
+        grid = figure.add_gridspec(1, 2, left=0.075, right=0.91, top=0.83, bottom=0.14, wspace=0.22)
         _policy_map(figure.add_subplot(grid[0, 0]), record, shape)
         if margin is not None:
             _margin_map(figure, figure.add_subplot(grid[0, 1]), record, margin, shape)
@@ -229,7 +229,7 @@ def _policy_map(axes: Axes, record: RunRecord, shape: tuple[int, ...]) -> None:
         for name, color in zip(record.controls, colors, strict=True)
     ]
     handles += [line for line in axes.get_lines() if line.get_label() in {"estimate", "truth"}]
-    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(-0.02, 1.09), ncols=4, handlelength=1.4)
+    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(-0.02, 1.08), ncols=4, handlelength=1.4)
 
 
 def _margin_map(figure: Figure, axes: Axes, record: RunRecord, margin: Float, shape: tuple[int, ...]) -> None:

@@ -206,7 +206,7 @@ _PANELS = {"state": _state_panel, "sensor": _sensor_panel, "control": _control_p
 def _legend(figure: Figure, record: RunRecord, now: int) -> None:
     handles = [
         Line2D([], [], color=style.PAST, label="past"),
-        Line2D([], [], color=style.PRESENT, linewidth=0.9, label="loss as seen at the time"),
+        Line2D([], [], color=style.PRESENT, linewidth=0.9, label="state as seen at the time"),
         Line2D([], [], color=style.PRESENT, marker="D", linestyle="none", label="present"),
     ]
     if record.horizon:

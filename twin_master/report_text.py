@@ -87,10 +87,8 @@ def mission_caption(record: RunRecord, now: int) -> str:
 def belief_caption(record: RunRecord) -> str:
     """Return the caption of the belief."""
     if len(record.state_names) != 2:
-        return (
-            "Marginal belief about each factor (percent) given the observations up to each turn."
-            + _truth_clause(record)
-        )
+        line = " Black line: truth." if record.truth_state is not None else ""
+        return f"Marginal belief about each factor (percent) given the observations up to each turn.{line}"
     first, second = (symbol(name) for name in record.state_names)
     ring = "; ring: truth" if record.truth_state is not None else ""
     return (
@@ -120,8 +118,8 @@ def check_caption(record: RunRecord, check: PredictiveCheck) -> str:
     noise = assumed_noise(record)
     word = sensor_word(record).lower()
     sentences = [
-        "a: observation less its expectation at the same turn, in standard deviations of what the twin expects "
-        "(noise and uncertainty of the state); grey: lost.",
+        "a: observation less its expectation at the same turn, in standard deviations of what the twin "
+        "expects (noise and uncertainty of the state); grey: lost.",
         f"b: share of each {word}'s observations within the 95 % interval.",
         f"c: probability integral transform of all {len(check.transform)} observations.",
         "Grey bands: where 95 % of such figures lie if the twin is right.",
@@ -137,9 +135,10 @@ def check_caption(record: RunRecord, check: PredictiveCheck) -> str:
 def network_caption() -> str:
     """Return the caption of the network."""
     return (
-        "Circles are random variables, squares controls, diamonds rewards; grey ones are known at the present "
-        "turn. A digital state D follows the one before under the control U in force, eqs. (28)–(29), and is "
-        "updated by the observation O, eq. (30); it gives the quantities of interest Q, and these the "
-        "rewards R, eqs. (9)–(11). From the present on, controls follow the policy. The physical state S is "
-        "never seen. Arrows show how information flows; the joint distribution is that of eqs. (1)–(4)."
+        "Circles are random variables, squares controls, diamonds rewards; grey ones are known at the "
+        "present turn. A digital state D follows the one before under the control U in force, "
+        "eqs. (28)–(29), and is updated by the observation O, eq. (30); it gives the quantities of interest "
+        "Q, and these the rewards R, eqs. (9)–(11). In the prediction, controls follow the policy. "
+        "The physical state S is never seen. Arrows show how information flows; the joint distribution is "
+        "that of eqs. (1)–(4)."
     )

@@ -1,0 +1,97 @@
+"""One style, reproducible bytes, nothing global."""
+
+import xml.etree.ElementTree as ElementTree
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from reporting import figures
+from reporting.errors import InvalidFigureError
+
+
+def drawing() -> "figures.Figure":
+    with figures.publication_style():
+        figure = figures.new_figure(2.0)
+        axes = figure.add_axes((0.1, 0.1, 0.8, 0.8))
+        axes.plot(np.arange(5), np.arange(5) ** 2, color=figures.PAST, marker="o", label="$x^2$")
+        axes.fill_between([0, 4], [0, 1], [5, 6], alpha=figures.BAND_OPACITY)
+        axes.pcolormesh(np.eye(3), cmap=figures.LEVELS)
+        figures.panel_label(axes, "a", "title")
+        axes.legend()
+    return figure
+
+
+def test_bytes_are_the_same_for_the_same_data() -> None:
+    assert figures.to_svg(drawing()) == figures.to_svg(drawing())
+    assert figures.to_png(drawing(), 60) == figures.to_png(drawing(), 60)
+
+
+def test_a_user_setting_changes_nothing() -> None:
+    expected = figures.to_svg(drawing())
+    with mpl.rc_context({"font.size": 30, "svg.fonttype": "none", "lines.linewidth": 9, "savefig.dpi": 7}):
+        assert figures.to_svg(drawing()) == expected
+
+
+def test_no_date_no_address_but_name_spaces() -> None:
+    text = figures.to_svg(drawing()).decode()
+    assert "<!DOCTYPE" not in text
+    assert "metadata" not in text
+    assert "date" not in text
+    for part in text.split("http")[1:]:
+        assert part.startswith("://www.w3.org/")
+
+
+def test_settings_of_the_caller_are_restored_and_pyplot_knows_nothing() -> None:
+    import matplotlib.pyplot as pyplot
+
+    before = dict(mpl.rcParams)
+    figures.to_svg(drawing())
+    assert dict(mpl.rcParams) == before
+    assert pyplot.get_fignums() == []
+
+
+def test_png_is_a_png_without_program_name() -> None:
+    data = figures.to_png(drawing(), 50)
+    assert data.startswith(b"\x89PNG")
+    assert b"Software" not in data
+
+
+def test_inline_ids_are_unique_in_a_page_and_references_follow() -> None:
+    svg = figures.to_svg(drawing())
+    first, second = (figures.inline_svg(svg, prefix, 'what & "whose" <size>') for prefix in ("f1", "f2"))
+    nodes = [ElementTree.fromstring(text) for text in (first, second)]
+    identifiers = [{node.get("id") for node in tree.iter() if node.get("id")} for tree in nodes]
+    assert identifiers[0]
+    assert not identifiers[0] & identifiers[1]
+    assert nodes[0].get("aria-label") == 'what & "whose" <size>'
+    for tree, known in zip(nodes, identifiers, strict=True):
+        for node in tree.iter():
+            for name, value in node.attrib.items():
+                if name.endswith("href"):
+                    assert value.removeprefix("#") in known
+                if value.startswith("url(#"):
+                    assert value[5:-1] in known
+    assert "http" not in first
+
+
+@pytest.mark.parametrize("data", [b"", b"not a drawing", b"<svg", b"<svg width='3'></svg>"])
+def test_something_else_than_a_drawing_is_refused(data: bytes) -> None:
+    with pytest.raises(InvalidFigureError):
+        figures.inline_svg(data, "f1", "x")
+
+
+@pytest.mark.parametrize("size", [0.0, -1.0, float("nan")])
+def test_sizes_must_be_positive(size: float) -> None:
+    with pytest.raises(InvalidFigureError, match="positive size"):
+        figures.new_figure(size)
+
+
+def test_the_palette_can_be_told_apart_in_grey_and_by_colour_blind_readers() -> None:
+    """Lightness of the three zones differs, and so do the colours under simulated deuteranopia."""
+    colors = np.array([mpl.colors.to_rgb(c) for c in (figures.PAST, figures.PREDICTION, figures.TRUTH)])
+    deuteranopia = np.array([[0.625, 0.375, 0.0], [0.70, 0.30, 0.0], [0.0, 0.30, 0.70]])
+    seen = colors @ deuteranopia.T
+    for i in range(3):
+        for j in range(i):
+            assert np.linalg.norm(seen[i] - seen[j]) > 0.3

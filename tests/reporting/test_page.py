@@ -1,0 +1,114 @@
+"""A page is self-contained, escaped, numbered and well-formed."""
+
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from reporting import figures
+from reporting.errors import InvalidFigureError
+from reporting.page import Column, Page, Table
+
+VOID = {"meta", "br", "link", "img"}
+
+
+class Checker(HTMLParser):
+    """Collects tags, and notices one that is closed out of turn."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.seen: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.seen.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.seen.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def parse(text: str) -> Checker:
+    checker = Checker()
+    checker.feed(text)
+    checker.close()
+    assert checker.open == []
+    return checker
+
+
+def svg() -> bytes:
+    with figures.publication_style():
+        figure = figures.new_figure(1.0)
+        figure.add_axes((0.2, 0.2, 0.6, 0.6)).plot([0, 1], [1, 0])
+    return figures.to_svg(figure)
+
+
+def page(title: str = "Title") -> Page:
+    result = Page(title, subtitle="one <b>line</b>", footer=["A source & its year."])
+    result.add_section("First <section>")
+    result.add_paragraph("if a < b & b > c")
+    result.add_highlights([("3.5 %", "damage <1>")])
+    result.add_notice("<script>alert('x')</script>")
+    assert result.add_figure(svg(), "What is seen, in µε.", title="A figure") == 1
+    result.add_section("Second")
+    assert result.add_figure(svg(), "The same.", title="Another") == 2
+    columns = (Column("quantity"), Column("value", unit="N/mm", numeric=True))
+    assert result.add_table(Table(columns, [("<k>", "0.677")]), "A caption.", title="Stiffness") == 1
+    return result
+
+
+def test_page_is_well_formed_and_escaped() -> None:
+    text = page("Title <img src=x>").render()
+    checker = parse(text)
+    tags = [tag for tag, _ in checker.seen]
+    assert "script" not in tags
+    assert "img" not in tags
+    assert "b" in tags  # the numbers of figures and tables only
+    assert "one &lt;b&gt;line&lt;/b&gt;" in text
+    assert tags.count("figure") == 2
+    assert tags.count("section") == 2
+
+
+def test_page_asks_nothing_of_any_server() -> None:
+    text = page().render()
+    for tag, attributes in parse(text).seen:
+        assert tag not in {"script", "link", "iframe", "object", "embed"}
+        assert "src" not in attributes
+        for name in ("href", "xlink:href"):
+            assert (attributes.get(name) or "#").startswith("#")
+    assert "@import" not in text
+    assert not re.search(r"url\((?!#)", text)
+
+
+def test_ids_are_unique_and_links_lead_somewhere() -> None:
+    seen = parse(page().render()).seen
+    identifiers = [attributes["id"] for _, attributes in seen if "id" in attributes]
+    assert len(identifiers) == len(set(identifiers))
+    for tag, attributes in seen:
+        if tag == "a":
+            assert (attributes["href"] or "").removeprefix("#") in identifiers
+
+
+def test_same_content_same_bytes() -> None:
+    assert page().render() == page().render()
+
+
+def test_units_and_figures_stay_on_one_line() -> None:
+    text = page().render()
+    assert "3.5\u00a0%" in text
+    assert "<small>N/mm</small>" in text
+
+
+def test_a_ragged_table_is_refused() -> None:
+    with pytest.raises(InvalidFigureError, match="Row 1 of a table has 1 cells"):
+        Table((Column("a"), Column("b")), [("1", "2"), ("3",)])
+
+
+def test_an_empty_page_is_still_a_page() -> None:
+    text = Page("Empty").render()
+    parse(text)
+    assert "<nav>" not in text
