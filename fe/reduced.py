@@ -13,11 +13,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numpy import einsum
+from numpy.linalg import solve
 
 from .archive import arrays_from_bytes, arrays_to_bytes, write_bytes_atomically
 from .errors import OutsideModelError, ReducedModelFileError
 
 FloatArray = npt.NDArray[np.float64]
+multiply_outer = np.multiply.outer
 
 RUNTIME_FILES = ("errors.py", "state.py", "archive.py", "damping.py", "reduced.py", "transient.py")
 """Files of this package that evaluate a reduced model; they need the standard library and NumPy only."""
@@ -115,6 +118,11 @@ class ReducedModel:
         Loads in an orthonormal basis of the residuals (norm dual to the one of `bound_reference`).
     residual_stiffness : (R, 4, N) ndarray
         Stiffness terms times static basis vectors, in the same basis.
+    residual_allowance : float
+        Bound of what that basis leaves out of a residual, per unit length of the reduced coordinates.
+    rounding_allowance : float
+        Part of the norm of the strains, and of the tip displacement, added to the bounds for rounding: a
+        multiple of the difference seen where the reduced model holds the full solution itself.
     dual_split_1, dual_split_2 : (A1 - 1,), (A2 - 1,) ndarray
         Values of z1 and z2 at which the next approximate dual solution takes over.
     dual_correction : (A1, A2, G + 1, R) ndarray
@@ -145,6 +153,8 @@ class ReducedModel:
     bound_reference: FloatArray
     residual_load: FloatArray
     residual_stiffness: FloatArray
+    residual_allowance: float
+    rounding_allowance: float
     dual_split_1: FloatArray
     dual_split_2: FloatArray
     dual_correction: FloatArray
@@ -171,6 +181,12 @@ class ReducedModel:
                 f"A reduced model with {self.modal_stiffness.shape[1]} modal basis vectors cannot have "
                 f"{self.mode_count} modes; build the model anew."
             )
+        for name in ("residual_allowance", "rounding_allowance"):
+            value = getattr(self, name)
+            if not (isfinite(value) and value >= 0.0):
+                raise ReducedModelFileError(
+                    f"The {name} of a reduced model must not be negative, but is {value!r}; build it anew."
+                )
         object.__setattr__(self, "_online", _Online(self))
 
     def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -279,27 +295,32 @@ class ReducedModel:
                 young_modulus_factor=e, z1=z1, z2=z2, load_factor=load_factor, tip_force=tip_force
             )
         remaining_1, remaining_2 = 1.0 - z1, 1.0 - z2
-        theta = np.array((e, remaining_1, remaining_2, 1.0))
-        load = np.array((load_factor, tip_force))
-        stiffness = (theta @ online.flat_stiffness).reshape(online.square)
-        coordinates = np.asarray(np.linalg.solve(stiffness, load @ self.static_load), dtype=np.float64)
+        values = np.array((e, remaining_1, remaining_2, 1.0, load_factor, tip_force))
+        theta, load = values[:4], values[4:]
+        stiffness = (theta @ online.stiffness).reshape(online.square)
+        coordinates = np.asarray(solve(stiffness, load @ self.static_load), dtype=np.float64)
         output = self.static_output @ coordinates
+        strain = output[:-1]
+        tip_displacement = float(output[-1])
 
         # |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha, norms dual to bound_reference
-        residual = online.residual @ np.concatenate(
-            (load, (theta[:, np.newaxis] * coordinates).ravel()),
-        )
+        coefficients = np.empty(online.coefficient_count)
+        coefficients[:2] = load
+        multiply_outer(theta, coordinates, out=coefficients[2:].reshape(4, -1))
+        residual = online.residual @ coefficients
         anchor = online.dual[bisect_right(online.split_1, z1)][bisect_right(online.split_2, z2)]
-        dual = (anchor.factor @ np.array((1.0, -e, -remaining_1, -remaining_2))).reshape(-1, 4)
+        dual = (anchor.factor @ theta).reshape(-1, 4)
         reference_e, reference_1, reference_2 = online.reference
         coercivity = min(e / reference_e, remaining_1 / reference_1, remaining_2 / reference_2, 1.0)
-        remainder = sqrt(residual @ residual) / coercivity
-        bound = np.abs(anchor.correction @ residual) + remainder * np.sqrt(np.einsum("ij,ij->i", dual, dual))
+        outside = self.residual_allowance * sqrt(coordinates @ coordinates)
+        remainder = (sqrt(residual @ residual) + outside) / coercivity
+        bound = remainder * np.sqrt(einsum("ij,ij->i", dual, dual)) + np.abs(anchor.correction @ residual)
+        rounding = self.rounding_allowance
         return StaticResponse(
-            strain=output[:-1],
-            tip_displacement=float(output[-1]),
-            strain_error_bound=float(bound[:-1].max()),
-            tip_displacement_error_bound=float(bound[-1]),
+            strain=strain,
+            tip_displacement=tip_displacement,
+            strain_error_bound=float(bound[:-1].max()) + rounding * sqrt(strain @ strain),
+            tip_displacement_error_bound=float(bound[-1]) + rounding * abs(tip_displacement),
             coordinates=coordinates,
         )
 
@@ -354,9 +375,9 @@ class ReducedModel:
                 self.check_validity(**{name: float(column[bad[0]])})
         e, z1, z2, n, f = columns
         theta = np.stack((e, 1.0 - z1, 1.0 - z2, np.ones_like(e)), axis=1)
-        stiffness = (theta @ self._online.flat_stiffness).reshape(-1, *self._online.square)
+        stiffness = (theta @ self._online.stiffness).reshape(-1, *self._online.square)
         load = np.stack((n, f), axis=1) @ self.static_load
-        coordinates = np.linalg.solve(stiffness, load[:, :, np.newaxis])[:, :, 0]
+        coordinates = solve(stiffness, load[:, :, np.newaxis])[:, :, 0]
         return np.asarray(coordinates @ self.static_output[:-1].T)
 
     def tip_stiffness(
@@ -514,6 +535,8 @@ class ReducedModel:
             )
         values: dict[str, Any] = {name: arrays[name] for name in names}
         values["design_hash"] = str(arrays["design_hash"])
+        for name in ("residual_allowance", "rounding_allowance"):
+            values[name] = float(arrays[name])
         values["mode_count"] = int(arrays["mode_count"])
         return cls(**values)
 
@@ -567,24 +590,37 @@ class _Dual:
 class _Online:
     """Arrays of a model laid out for the fewest operations per evaluation."""
 
-    __slots__ = ("dual", "flat_stiffness", "limits", "reference", "residual", "split_1", "split_2", "square")
+    __slots__ = (
+        "coefficient_count",
+        "dual",
+        "limits",
+        "reference",
+        "residual",
+        "split_1",
+        "split_2",
+        "square",
+        "stiffness",
+    )
 
     def __init__(self, model: ReducedModel) -> None:
         n = model.static_stiffness.shape[1]
         self.square = (n, n)
-        self.flat_stiffness = np.ascontiguousarray(model.static_stiffness.reshape(4, -1))
-        r = model.residual_load.shape[0]
+        self.stiffness = np.ascontiguousarray(model.static_stiffness.reshape(4, -1))
+        # to be multiplied by the loads, then the stiffness coefficients times the coordinates
         self.residual = np.concatenate(
-            (model.residual_load, -model.residual_stiffness.reshape(r, -1)), axis=1
+            (model.residual_load, -model.residual_stiffness.reshape(len(model.residual_load), -1)), axis=1
         )
+        self.coefficient_count = self.residual.shape[1]
         self.limits = tuple(float(value) for value in model.validity_box[:5].ravel())
         self.reference = tuple(float(value) for value in model.bound_reference)
         self.split_1 = [float(value) for value in model.dual_split_1]
         self.split_2 = [float(value) for value in model.dual_split_2]
+        # to be multiplied by (e, 1 - z1, 1 - z2, 1), as the stiffness
+        factors = np.concatenate((-model.dual_residual[..., 1:], model.dual_residual[..., :1]), axis=-1)
         self.dual = [
             [
                 _Dual(np.ascontiguousarray(correction), np.ascontiguousarray(factor.reshape(-1, 4)))
                 for correction, factor in zip(correction_row, factor_row, strict=True)
             ]
-            for correction_row, factor_row in zip(model.dual_correction, model.dual_residual, strict=True)
+            for correction_row, factor_row in zip(model.dual_correction, factors, strict=True)
         ]

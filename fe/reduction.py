@@ -1,0 +1,498 @@
+"""Offline: make a `ReducedModel` from the full model, static part by a certified greedy search (pyMOR).
+
+The method and what it reaches are in `docs/reduced_model.md`.
+"""
+
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from .errors import ReductionError
+from .modal_reduction import ModalData, ModalSettings, reduce_modes
+from .reduced import PARAMETER_NAMES, ReducedModel
+from .subspace import (
+    AffineSystem,
+    Factorisation,
+    Norm,
+    OrthonormalBasis,
+    affine_sum,
+    conjugate_gradients,
+    triangular_factors,
+)
+
+FloatArray = npt.NDArray[np.float64]
+Range = tuple[float, float]
+
+SEARCH_MARGIN = 0.3
+"""The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""
+DUAL_TOLERANCE = 0.02
+"""Relative residual of the approximate dual solutions at their own anchors."""
+
+
+class Stage(Protocol):
+    """One stretch of work under way."""
+
+    def advance(self, amount: int = 1, detail: str | None = None) -> None:
+        """Report `amount` more parts done."""
+
+
+class Progress(Protocol):
+    """Where the build reports how far it is; `reporting.progress` has implementations."""
+
+    def stage(
+        self, description: str, total: int | None = None, unit: str = ""
+    ) -> AbstractContextManager[Stage]:
+        """Open a stretch of work of `total` parts."""
+
+
+@contextmanager
+def stage_of(progress: Progress | None, description: str, total: int | None = None) -> Iterator[Stage]:
+    """Open a stretch of work, silent without `progress`."""
+    if progress is None:
+        yield _Silent()
+    else:
+        with progress.stage(description, total) as stage:
+            yield stage
+
+
+class _Silent:
+    def advance(self, amount: int = 1, detail: str | None = None) -> None:
+        """Do nothing."""
+
+
+@dataclass(frozen=True)
+class ReductionSettings:
+    """Where the reduced model is to hold, and how well.
+
+    Attributes
+    ----------
+    young_modulus_factor, stiffness_loss_1, stiffness_loss_2 : tuple of float
+        Ranges of e, z1 and z2 [1].
+    load_factor, tip_force : tuple of float
+        Ranges of the loads [1], [N]; the model is linear in them.
+    servo_mass, pitot_mass : tuple of float
+        Ranges of the masses [kg].
+    nominal_masses : tuple of float
+        Servo and pitot mass at which the flapwise modes are named [kg].
+    bound_tolerance : float
+        The certified bound of the strain error, relative to the largest strain, wanted everywhere on the
+        training set, for each of the two loads.
+    most_snapshots : int
+        Limit of the greedy search.
+    dual_anchors : tuple of int
+        How many approximate dual solutions along z1 and z2.
+    modal : ModalSettings
+        Accuracy and number of modes.
+    """
+
+    young_modulus_factor: Range = (0.9, 1.1)
+    stiffness_loss_1: Range = (0.0, 0.8)
+    stiffness_loss_2: Range = (0.0, 0.8)
+    load_factor: Range = (-4.0, 6.0)
+    tip_force: Range = (-100.0, 100.0)
+    servo_mass: Range = (0.05, 0.30)
+    pitot_mass: Range = (0.0, 0.30)
+    nominal_masses: tuple[float, float] = (0.169, 0.134)
+    bound_tolerance: float = 6e-4
+    most_snapshots: int = 24
+    dual_anchors: tuple[int, int] = (2, 2)
+    modal: ModalSettings = field(default_factory=ModalSettings)
+
+    def validity_box(self) -> FloatArray:
+        """Return the ranges in the order of `fe.reduced.PARAMETER_NAMES`, (7, 2)."""
+        ranges = {
+            "young_modulus_factor": self.young_modulus_factor,
+            "z1": self.stiffness_loss_1,
+            "z2": self.stiffness_loss_2,
+            "load_factor": self.load_factor,
+            "tip_force": self.tip_force,
+            "servo_mass": self.servo_mass,
+            "pitot_mass": self.pitot_mass,
+        }
+        return np.array([ranges[name] for name in PARAMETER_NAMES], dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """A reduced model with the bases that made it.
+
+    Attributes
+    ----------
+    model : ReducedModel
+        What is evaluated online.
+    static_basis : (n, N) ndarray
+        Static basis vectors, on the unknowns of the full model.
+    modal_basis : (n, Nm) ndarray
+        Modal basis vectors.
+    snapshots : tuple of tuple
+        Parameters (e, z1, z2) of the full solutions, in the order of the search.
+    bound_history : tuple of float
+        Largest relative bound on the training set before each of them and at the end.
+    """
+
+    model: ReducedModel
+    static_basis: FloatArray
+    modal_basis: FloatArray
+    snapshots: tuple[tuple[float, float, float], ...]
+    bound_history: tuple[float, ...]
+
+
+def remaining_levels(loss: Range, count: int) -> FloatArray:
+    """Return `count` values of 1 - z in the middle of equal ratios over a range of z, ascending in z."""
+    high, low = 1.0 - loss[0], 1.0 - loss[1]
+    return np.asarray(high * (low / high) ** ((np.arange(count) + 0.5) / count))
+
+
+def loss_splits(loss: Range, count: int) -> FloatArray:
+    """Return the values of z that part a range into `count` equal ratios of 1 - z, ends left out."""
+    high, low = 1.0 - loss[0], 1.0 - loss[1]
+    return np.asarray(1.0 - high * (low / high) ** (np.arange(1, count) / count))
+
+
+@dataclass(frozen=True)
+class _DualData:
+    """Approximate dual solutions: products with X (A1, A2, n, G + 1) and factors of their residuals."""
+
+    products: FloatArray
+    factors: FloatArray
+
+
+class _StaticReduction:
+    """State of the greedy search; hands `ReducedModel`s to the bound and snapshots to the basis."""
+
+    def __init__(
+        self,
+        system: AffineSystem,
+        settings: ReductionSettings,
+        norm: Norm,
+        reference: FloatArray,
+        advance: Callable[[int, str], object],
+    ) -> None:
+        self.advance = advance
+        self.system, self.settings, self.norm, self.reference = system, settings, norm, reference
+        self.loads = np.stack((system.load_lift, system.load_tip), axis=1)
+        self.outputs = np.concatenate(
+            (
+                np.asarray(system.gauge_output.T.toarray()),
+                np.asarray(system.tip_displacement_output)[:, np.newaxis],
+            ),
+            axis=1,
+        )
+        n = len(system.load_lift)
+        self.basis = OrthonormalBasis(n, drop=1e-7)
+        self.images = [np.empty((n, 0)) for _ in range(4)]  # stiffness terms times basis vectors
+        self.rounding = 0.0
+        self.residual_basis = OrthonormalBasis(n, drop=1e-8)
+        self.residual_basis.extend(norm.riesz(self.loads), self.loads)
+        self.dual = self._approximate_duals()
+        self.snapshots: list[tuple[float, float, float]] = []
+
+    def _approximate_duals(self) -> _DualData:
+        """Solve the dual problems at the anchors, and prepare the norms of their residuals elsewhere."""
+        system, settings = self.system, self.settings
+        levels_1 = remaining_levels(settings.stiffness_loss_1, settings.dual_anchors[0])
+        levels_2 = remaining_levels(settings.stiffness_loss_2, settings.dual_anchors[1])
+        n, count = self.outputs.shape
+        products = np.empty((len(levels_1), len(levels_2), n, count))
+        factors = np.empty((len(levels_1), len(levels_2), count, 4, 4))
+        at_reference = self.norm.riesz(self.outputs)
+        for (i, level_1), (j, level_2) in itertools.product(enumerate(levels_1), enumerate(levels_2)):
+            theta = np.array((self.reference[0], level_1, level_2, 1.0))
+            # a rough solution will do: the norm of what it leaves is computed, not assumed
+            dual = conjugate_gradients(
+                affine_sum(theta, system.stiffness_terms),
+                self.norm.factorisation,
+                self.outputs,
+                at_reference,
+                tolerance=DUAL_TOLERANCE,
+            )
+            images = [np.asarray(term @ dual) for term in system.stiffness_terms]
+            lifted = [self.norm.riesz(image) for image in images[:3]]
+            # X^-1 K_base dual, since X is the sum of all terms at the reference
+            base = dual - sum(t * part for t, part in zip(self.reference, lifted, strict=True))
+            factors[i, j] = triangular_factors(
+                np.stack((at_reference - base, *lifted), axis=2),
+                np.stack((self.outputs - images[3], *images[:3]), axis=2),
+            )
+            products[i, j] = self.norm.product(dual)
+            self.advance(1, "dual solutions")
+        return _DualData(products, factors)
+
+    def add_snapshot(self, parameters: tuple[float, float, float]) -> None:
+        """Solve the full model for both loads and extend the bases."""
+        e, z1, z2 = parameters
+        theta = np.array((e, 1.0 - z1, 1.0 - z2, 1.0))
+        matrix = affine_sum(theta, self.system.stiffness_terms)
+        start = np.zeros_like(self.loads)
+        if self.basis.size:
+            image = sum(t * k for t, k in zip(theta, self.images, strict=True))
+            start = self.basis.vectors @ np.linalg.solve(
+                self.basis.vectors.T @ image, self.basis.vectors.T @ self.loads
+            )
+        solution = conjugate_gradients(matrix, self.norm.factorisation, self.loads, start, tolerance=1e-8)
+        before = self.basis.size
+        self.basis.extend(solution, self.norm.product(solution))
+        new = self.basis.vectors[:, before:]
+        if not new.shape[1]:
+            raise ReductionError(
+                f"The solution at (e, z1, z2) = {parameters} adds nothing to the {before} basis "
+                "vectors, although the error bound asks for it; ask for a looser bound_tolerance."
+            )
+        images = [np.asarray(term @ new) for term in self.system.stiffness_terms]
+        self.images = [np.concatenate(pair, axis=1) for pair in zip(self.images, images, strict=True)]
+        varying = np.concatenate(images[:3], axis=1)
+        self.residual_basis.extend(
+            np.concatenate((new, self.norm.riesz(varying)), axis=1),
+            np.concatenate((self.basis.products[:, before:], varying), axis=1),
+        )
+        self.snapshots.append(parameters)
+        self._measure_rounding(theta, self.outputs.T @ solution)
+
+    def _measure_rounding(self, theta: FloatArray, wanted: FloatArray) -> None:
+        """Compare the outputs of the full solutions just added with those of the reduced model."""
+        basis = self.basis.vectors
+        image = sum(t * k for t, k in zip(theta, self.images, strict=True))
+        coordinates = np.linalg.solve(basis.T @ image, basis.T @ self.loads)
+        difference = np.abs(self.outputs.T @ (basis @ coordinates) - wanted)
+        for rows in (slice(0, -1), slice(-1, None)):
+            relative = difference[rows].max(axis=0) / np.abs(wanted[rows]).max(axis=0)
+            self.rounding = max(self.rounding, float(relative.max()))
+
+    def model(self, modal: ModalData) -> ReducedModel:
+        """Return the reduced model of the present bases."""
+        basis, residual, settings = self.basis.vectors, self.residual_basis.vectors, self.settings
+        stiffness = np.stack([basis.T @ image for image in self.images])
+        return ReducedModel(
+            design_hash=self.system.design_hash,
+            validity_box=settings.validity_box(),
+            static_stiffness=0.5 * (stiffness + stiffness.transpose(0, 2, 1)),
+            static_load=self.loads.T @ basis,
+            static_output=self.outputs.T @ basis,
+            bound_reference=self.reference,
+            residual_load=residual.T @ self.loads,
+            residual_stiffness=np.stack([residual.T @ image for image in self.images], axis=1),
+            # |sum theta_q a_j d_qj| <= |theta| |a| |d|, |theta| < 2 in every sensible range; plus rounding
+            residual_allowance=2.0 * float(np.sqrt(self.residual_basis.dropped_square)) + 1e-10,
+            rounding_allowance=4.0 * self.rounding + 1e-9,
+            dual_split_1=loss_splits(settings.stiffness_loss_1, settings.dual_anchors[0]),
+            dual_split_2=loss_splits(settings.stiffness_loss_2, settings.dual_anchors[1]),
+            dual_correction=np.swapaxes(self.dual.products, 2, 3) @ residual,
+            dual_residual=self.dual.factors,
+            modal_stiffness=modal.stiffness,
+            modal_mass=modal.mass,
+            modal_load=self.loads.T @ modal.basis,
+            modal_output=self.outputs.T @ modal.basis,
+            cross_mass=np.stack([(modal.basis.T @ image) for image in self._mass_images()]),
+            flapwise_reference=modal.flapwise_reference,
+            mode_count=modal.mode_count,
+        )
+
+    def _mass_images(self) -> list[FloatArray]:
+        return [np.asarray(term @ self.basis.vectors) for term in self.system.mass_terms]
+
+
+def compressed(model: ReducedModel, directions: FloatArray) -> ReducedModel:
+    """Return the model on fewer static basis vectors, its residuals on as few as they then need.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        A model with N static basis vectors.
+    directions : (N, K) ndarray
+        Orthonormal combinations of them.
+
+    Returns
+    -------
+    ReducedModel
+        The Galerkin model on the combinations; its bound is as certified as before.
+    """
+    stiffness = directions.T @ model.static_stiffness @ directions
+    residual = np.concatenate(
+        (model.residual_load, (model.residual_stiffness @ directions).reshape(len(model.residual_load), -1)),
+        axis=1,
+    )
+    orthonormal, factor = np.linalg.qr(residual)
+    return replace(
+        model,
+        static_stiffness=0.5 * (stiffness + stiffness.transpose(0, 2, 1)),
+        static_load=model.static_load @ directions,
+        static_output=model.static_output @ directions,
+        residual_load=np.ascontiguousarray(factor[:, :2]),
+        residual_stiffness=np.ascontiguousarray(factor[:, 2:].reshape(len(factor), 4, -1)),
+        dual_correction=model.dual_correction @ orthonormal,
+        cross_mass=model.cross_mass @ directions,
+    )
+
+
+def fewest_directions(
+    model: ReducedModel, states: list[tuple[float, float, float]], tolerance: float
+) -> FloatArray:
+    """Return the fewest singular directions of the reduced solutions that keep the bound below a tolerance.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        The model that the greedy search made.
+    states : list of tuple
+        States (e, z1, z2) to look at.
+    tolerance : float
+        Relative bound wanted.
+
+    Returns
+    -------
+    (N, K) ndarray
+        Orthonormal combinations of its static basis vectors; all of them if fewer do not suffice.
+    """
+    solutions = []
+    for e, z1, z2 in states:
+        for load in ((1.0, 0.0), (0.0, 1.0)):
+            coordinates = model.static_response(e, (z1, z2), *load).coordinates
+            solutions.append(coordinates / np.linalg.norm(coordinates))
+    directions = np.linalg.svd(np.array(solutions).T)[0]
+    low, high = 2, directions.shape[1]
+    while low < high:
+        middle = (low + high) // 2
+        smaller = compressed(model, directions[:, :middle])
+        if max(relative_bound(smaller, state) for state in states) <= tolerance:
+            high = middle
+        else:
+            low = middle + 1
+    return np.asarray(directions[:, :low])
+
+
+def relative_bound(model: ReducedModel, parameters: tuple[float, float, float]) -> float:
+    """Return the larger certified strain error bound of the two loads, relative to the largest strain."""
+    e, z1, z2 = parameters
+    worst = 0.0
+    for load in ((1.0, 0.0), (0.0, 1.0)):
+        response = model.static_response(e, (z1, z2), *load)
+        worst = max(worst, response.strain_error_bound / float(np.abs(response.strain).max()))
+    return worst
+
+
+def training_set(settings: ReductionSettings) -> list[tuple[float, float, float]]:
+    """Return the states (e, z1, z2) on which the greedy search looks for the largest bound."""
+    low, high = settings.young_modulus_factor
+
+    def losses(span: Range) -> FloatArray:
+        top, bottom = 1.0 - span[0], 1.0 - span[1]
+        return np.asarray(np.clip(1.0 - top * (bottom / top) ** np.linspace(0.0, 1.0, 7), *span))
+
+    return [
+        (float(e), float(z1), float(z2))
+        for e in (low, 0.5 * (low + high), high)
+        for z1 in losses(settings.stiffness_loss_1)
+        for z2 in losses(settings.stiffness_loss_2)
+    ]
+
+
+def reduce_model(
+    system: AffineSystem, settings: ReductionSettings | None = None, progress: Progress | None = None
+) -> Reduction:
+    """Make the reduced model of a full model.
+
+    Parameters
+    ----------
+    system : AffineSystem
+        The full model, `fe.operators.AffineOperators`.
+    settings : ReductionSettings, optional
+        Where and how well it is to hold.
+    progress : Progress, optional
+        Where to report.
+
+    Returns
+    -------
+    Reduction
+        The model and its bases.
+
+    Raises
+    ------
+    ReductionError
+        If the accuracy asked for is not reached.
+    SolutionError
+        If the full model cannot be solved.
+    """
+    settings = settings or ReductionSettings()
+    reference = np.array(
+        (
+            np.mean(settings.young_modulus_factor),
+            remaining_levels(settings.stiffness_loss_1, 1)[0],
+            remaining_levels(settings.stiffness_loss_2, 1)[0],
+        )
+    )
+    with stage_of(progress, "Factorising the wing"):
+        norm = Norm(Factorisation(affine_sum((*reference, 1.0), system.stiffness_terms)))
+    with stage_of(progress, "Reducing the modes") as stage:
+        modal = reduce_modes(
+            system,
+            norm,
+            reference,
+            settings.validity_box(),
+            settings.nominal_masses,
+            settings.modal,
+            stage.advance,
+        )
+    with stage_of(progress, "Reducing the statics") as stage:
+        static = _StaticReduction(system, settings, norm, reference, stage.advance)
+        history = _greedy(static, modal)
+    model = static.model(modal)
+    if history[-1] > settings.bound_tolerance:
+        raise ReductionError(
+            f"After {len(static.snapshots)} full solutions the strain error bound is {history[-1]:.2g} of "
+            f"the largest strain, but {settings.bound_tolerance:.2g} was asked for; "
+            "allow more snapshots or a looser tolerance."
+        )
+    directions = fewest_directions(model, training_set(settings), settings.bound_tolerance)
+    return Reduction(
+        compressed(model, directions),
+        static.basis.vectors @ directions,
+        modal.basis,
+        tuple(static.snapshots),
+        tuple(history),
+    )
+
+
+def _greedy(static: _StaticReduction, modal: ModalData) -> list[float]:
+    """Run pyMOR's weak greedy search with the certified bound as its surrogate; return the bounds it met."""
+    from pymor.algorithms.greedy import WeakGreedySurrogate, weak_greedy
+    from pymor.core.logger import set_log_levels
+
+    set_log_levels({"pymor.algorithms.greedy": "WARN"})
+
+    class Surrogate(WeakGreedySurrogate):  # type: ignore[misc]
+        """The reduced model's own bound, as pyMOR's search wants it."""
+
+        def evaluate(self, mus: list[Any], return_all_values: bool = False) -> Any:
+            """Return the largest bound and where it is, or all bounds."""
+            if not static.basis.size:  # nothing to bound yet: begin in the middle
+                bounds = np.array([-sum((np.array(mu) - np.mean(mus, axis=0)) ** 2) for mu in mus]) + 1e3
+            else:
+                model = static.model(modal)
+                bounds = np.array([relative_bound(model, mu) for mu in mus])
+            if return_all_values:
+                return bounds
+            worst = int(bounds.argmax())
+            return float(bounds[worst]), mus[worst]
+
+        def extend(self, mu: tuple[float, float, float]) -> None:
+            """Add the full solutions at the worst state."""
+            static.add_snapshot(mu)
+            static.advance(1, f"full solution {len(static.snapshots)}")
+
+    settings = static.settings
+    result = weak_greedy(
+        Surrogate(),
+        training_set(settings),
+        atol=settings.bound_tolerance,
+        max_extensions=settings.most_snapshots,
+    )
+    bounds = [float(value) for value in result["max_errs"][1:]]
+    if len(bounds) < len(static.snapshots):  # stopped by the limit: the last bound was not evaluated
+        model = static.model(modal)
+        bounds.append(max(relative_bound(model, mu) for mu in training_set(settings)))
+    return bounds
