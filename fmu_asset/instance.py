@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import itertools
 import os
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,8 +32,8 @@ from .errors import FmuCallError, FmuStateError, FmuWorkerError
 
 STATUS_NAMES = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 _WARNING, _DISCARD, _ERROR, _FATAL = 1, 2, 3, 4
-_ANNOUNCED_END = 3  # fmi2Terminated
 _LONGEST_LOG = 1000
+_MESSAGES_IN_ERROR = 10
 
 Settings = list[tuple[str, int, float]]
 """Base type (Real, Integer or Boolean), value reference, value."""
@@ -78,13 +79,13 @@ class Plan:
 
 # fmpy's native proxy, which formats the messages of C FMUs, knows one logger in a process. This one gives
 # every message to the instance whose name it carries.
-_listeners: dict[bytes, list[tuple[int, str]]] = {}
+_listeners: dict[bytes, deque[tuple[int, str]]] = {}
 _instance_numbers = itertools.count(1)
 
 
 def _log(_: object, instance_name: bytes, status: int, category: bytes, message: bytes) -> None:
     listener = _listeners.get(instance_name or b"")
-    if listener is not None and len(listener) < _LONGEST_LOG:
+    if listener is not None:
         listener.append((int(status), (message or b"").decode("utf-8", "replace").rstrip()))
 
 
@@ -149,7 +150,7 @@ class FmuInstance:
         self.reply = (ctypes.c_double * max(plan.output_count, 1))()
         # Unique in the process, so that log messages find their instance.
         name = f"{plan.instance_name}-{os.getpid()}-{next(_instance_numbers)}"
-        self._listener: list[tuple[int, str]] = []
+        self._listener: deque[tuple[int, str]] = deque(maxlen=_LONGEST_LOG)
         _listeners[name.encode()] = self._listener
         self._name = name.encode()
         self._lost = False
@@ -312,8 +313,9 @@ class FmuInstance:
             try:
                 if self._phase == "stepping":
                     self._fmu.terminate()
-            except FMICallException:
-                pass  # it is freed in any case
+            except FMICallException as error:
+                if error.status == _FATAL:
+                    return
             self._fmu.freeInstance()
         _listeners.pop(self._name, None)
 
@@ -356,7 +358,7 @@ class FmuInstance:
             raise kind(f"The FMU {verb}.", self._texts())
 
     def _texts(self) -> list[str]:
-        return [text for _, text in self.take_log()]
+        return [text for _, text in self.take_log()][-_MESSAGES_IN_ERROR:]
 
 
 @contextmanager

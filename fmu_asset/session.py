@@ -7,9 +7,11 @@ import math
 import os
 import shutil
 import struct
+import weakref
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
@@ -106,8 +108,8 @@ class FmiAsset:
         self._parameters = dict(parameters or {})
         self._settings = self._exchange.settings(self._parameters)
         self._instance: FmuInstance | WorkerInstance | None = None
-        self._ready = False
-        self._broken = False
+        self._release: Callable[[], object] = lambda: None
+        self._phase: Literal["new", "ready", "broken", "closed"] = "new"
         self._index = 0
         self._step_size = self._binding.step_size
         self._start_time = self._binding.binding.start_time
@@ -181,7 +183,7 @@ class FmiAsset:
     # ------------------------------------------------------------------ life
 
     def __enter__(self) -> Self:
-        if not self._ready:
+        if self._phase != "ready":
             self.reset()
         return self
 
@@ -192,15 +194,8 @@ class FmiAsset:
 
     def close(self) -> None:
         """End the worker and remove its files; the asset can be opened again by `reset`."""
-        instance, self._instance, self._ready = self._instance, None, False
-        if instance is not None:
-            instance.close()
-        if isinstance(instance, FmuInstance):
-            shutil.rmtree(self._folder, ignore_errors=True)
-
-    def __del__(self) -> None:
-        if getattr(self, "_instance", None) is not None:
-            self.close()
+        self._instance, self._phase = None, "closed"
+        self._release()
 
     def reset(
         self,
@@ -310,7 +305,7 @@ class FmiAsset:
         FmuCallError
             If the FMU fails to save.
         """
-        if not self._ready or self._instance is None:
+        if self._phase != "ready" or self._instance is None:
             raise FmuStateError("There is no state to save before the first reset or step.")
         if self.state_method == "serialised":
             try:
@@ -379,7 +374,7 @@ class FmiAsset:
                 for index in range(int(head["index"])):
                     self._replay(body[index * width : (index + 1) * width])
         except FmuError as error:
-            self._ready, self._broken = False, True
+            self._phase = "broken"
             raise self._told(error, "restoring the state") from error
 
     def _replay(self, inputs: bytes) -> None:
@@ -394,16 +389,8 @@ class FmiAsset:
     # ------------------------------------------------------------------ inside
 
     def _begin(self, start: Sequence[float], *, with_inputs: bool) -> None:
-        self._ready = False
-        if self._instance is not None and self._instance.lost:
-            self.close()
         try:
-            if self._instance is None:
-                self._open()
-            else:
-                self._instance.reset()
-            instance = self._instance
-            assert instance is not None
+            instance = self._fresh()
             instance.request[2:] = list(start)
             instance.initialise(self._binding.binding.start_time, self._settings, with_inputs=with_inputs)
         except FmuError as error:
@@ -411,33 +398,45 @@ class FmiAsset:
             self.close()
             raise told from error
         self._index = 0
-        self._broken = False
         self._record = []
         self._start_inputs = bytes(memoryview(instance.request).cast("B")[16:]) if with_inputs else b""
-        self._ready = True
+        self._phase = "ready"
 
     def _opened(self) -> FmuInstance | WorkerInstance:
         """Return the instance, which is opened by its first use but never started again unasked."""
-        if self._broken:
+        if self._phase == "broken":
             raise FmuStateError("A state could not be restored; reset the asset to go on.")
-        if not self._ready:
+        if self._phase == "closed":
+            raise FmuStateError("The asset is closed; reset it to start anew.")
+        if self._phase == "new":
             self.reset()
         instance = self._instance
         assert instance is not None
         return instance
 
-    def _open(self) -> None:
+    def _fresh(self) -> FmuInstance | WorkerInstance:
+        """Return an instance as after its instantiation; never one that a fatal error has touched."""
+        if self._instance is not None and not self._instance.lost:
+            try:
+                self._instance.reset()
+                return self._instance
+            except FmuCallError:
+                pass  # an FMU that cannot be reset is instantiated anew
+        self.close()
         folder = extract_fmu(self._description)
-        self._folder = folder
         plan = replace(self._exchange.plan, folder=str(folder))
         try:
-            self._instance = (
+            instance = (
                 WorkerInstance(plan, step_timeout=self._step_timeout) if self._isolated else FmuInstance(plan)
             )
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
-        self._reply = np.frombuffer(memoryview(self._instance.reply).cast("B"), dtype=np.float64)
+        self._instance = instance
+        # Also at the end of the interpreter, or when the asset is forgotten without being closed.
+        self._release = weakref.finalize(self, _release, instance, folder)
+        self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
+        return instance
 
     def _observation(self) -> Observation:
         block = self._reply
@@ -467,6 +466,11 @@ class FmiAsset:
         if isinstance(error, FmuCallError | FmuWorkerError | TimeoutError):
             return type(error)(f"{self._description.path}, {what}: {error.sentence}", error.messages)
         return error
+
+
+def _release(instance: FmuInstance | WorkerInstance, folder: Path) -> None:
+    instance.close()
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _unpack_state(content: bytes) -> tuple[dict[str, Any], bytes]:

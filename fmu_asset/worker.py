@@ -183,6 +183,8 @@ class WorkerInstance:
         self._folder = Path(plan.folder)
         self._logged = False
         self._lost = False
+        # An exception between question and answer, such as an interruption, leaves the two out of step.
+        self._busy = False
         self._process, self._out, self._in = self._start()
         self._poll = select.poll()
         self._poll.register(self._in, select.POLLIN | select.POLLHUP)
@@ -245,8 +247,7 @@ class WorkerInstance:
 
     def step(self) -> None:
         """Make the step that the request block describes."""
-        if self._lost:
-            raise FmuWorkerError("The FMU's worker is gone; reset the asset to go on.")
+        self._begin()
         try:
             _send(self._out, self._step_header, self._request)
         except BrokenPipeError:
@@ -255,6 +256,7 @@ class WorkerInstance:
         kind, length = self._await(what, self._limit)
         if kind == _RESULT and length == len(self._reply):
             self._fill(self._reply, what)
+            self._busy = False
         else:
             self._fail(length, what)
 
@@ -277,7 +279,7 @@ class WorkerInstance:
 
     def take_log(self) -> list[tuple[int, str]]:
         """Return and forget the messages that the FMU has logged: status and text."""
-        if not self._logged or self._lost:
+        if not self._logged or self.lost:
             return []
         self._logged = False
         content = json.loads(self._call(_LOG, b"", "reading the log", self._limit))
@@ -291,7 +293,7 @@ class WorkerInstance:
     @property
     def lost(self) -> bool:
         """Whether worker or instance is gone."""
-        return self._lost
+        return self._lost or self._busy
 
     @property
     def process_id(self) -> int:
@@ -302,7 +304,7 @@ class WorkerInstance:
         """End the worker, kindly at first, and remove its folder."""
         if self._out < 0:
             return
-        if not self._lost:
+        if not (self._lost or self._busy):
             with contextlib.suppress(BrokenPipeError):
                 _send(self._out, _HEADER.pack(_CLOSE, 0, 0))
         self._lost = True
@@ -310,15 +312,14 @@ class WorkerInstance:
         os.close(self._in)
         self._out = self._in = -1
         try:
-            self._process.wait(_CLOSE_LIMIT)
+            self._process.wait(0.0 if self._busy else _CLOSE_LIMIT)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _call(self, operation: int, content: bytes, what: str, limit: float) -> bytes:
-        if self._lost:
-            raise FmuWorkerError("The FMU's worker is gone; reset the asset to go on.")
+        self._begin()
         try:
             _send(self._out, _HEADER.pack(operation, 0, len(content)), content)
         except BrokenPipeError:
@@ -328,7 +329,13 @@ class WorkerInstance:
             self._fail(length, what)
         answer = bytearray(length)
         self._fill(memoryview(answer), what)
+        self._busy = False
         return bytes(answer)
+
+    def _begin(self) -> None:
+        if self._lost or self._busy:
+            raise FmuWorkerError("The FMU's worker is gone or was interrupted; reset the asset to go on.")
+        self._busy = True
 
     def _await(self, what: str, limit: float) -> tuple[int, int]:
         if not self._poll.poll(1000.0 * limit):
@@ -351,6 +358,7 @@ class WorkerInstance:
     def _fail(self, length: int, what: str) -> None:
         content = bytearray(length)
         self._fill(memoryview(content), what)
+        self._busy = False
         name, sentence, messages, lost = json.loads(content)
         self._lost = self._lost or bool(lost)
         self._logged = False

@@ -17,7 +17,7 @@ import pytest
 from fe.reduced import ReducedModel
 from fmu_asset.binding import Binding
 from fmu_asset.build import build_fmu
-from fmu_asset.errors import FmuCallError, FmuOutputError, FmuTimeoutError, FmuWorkerError
+from fmu_asset.errors import FmuCallError, FmuOutputError, FmuStateError, FmuTimeoutError, FmuWorkerError
 from fmu_asset.session import FmiAsset
 
 ROOT = Path(__file__).parents[2]
@@ -93,10 +93,11 @@ def test_discard_is_an_error_and_the_asset_can_go_on(
         np.testing.assert_allclose(after.values, spring(1.0, 4.0, 2), rtol=1e-12)
 
 
+@BOTH
 def test_a_fatal_error_names_its_cause_and_the_instance_is_not_used_again(
-    spring_mass: Path, spring_binding: Binding
+    spring_mass: Path, spring_binding: Binding, isolated: bool
 ) -> None:
-    with FmiAsset(spring_mass, spring_binding) as asset:
+    with FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset:
         asset.step({"push": 1.0})
         with pytest.raises(FmuCallError, match=r"(?s)returned Fatal.*the spring broke"):
             asset.step(load={"misbehaviour": RAISE})
@@ -139,6 +140,37 @@ def test_a_step_that_hangs_is_stopped(spring_mass: Path, spring_binding: Binding
         assert time.monotonic() - begin < 30.0
         with pytest.raises(FmuWorkerError, match="reset the asset"):
             asset.step()
+
+
+def test_an_interruption_leaves_no_stale_answer(
+    spring_mass: Path, spring_binding: Binding, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with FmiAsset(spring_mass, spring_binding) as asset:
+        asset.step({"push": 1.0})
+        with monkeypatch.context() as patch:
+            patch.setattr("fmu_asset.worker.WorkerInstance._await", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                asset.step({"push": 2.0})
+        with pytest.raises(FmuWorkerError, match="interrupted; reset the asset"):
+            asset.step()
+        asset.reset()
+        np.testing.assert_allclose(asset.step({"push": 1.0}).values, spring(1.0, 4.0, 1), rtol=1e-12)
+
+
+def test_a_closed_asset_is_not_started_again_unasked(spring_mass: Path, spring_binding: Binding) -> None:
+    asset = FmiAsset(spring_mass, spring_binding)
+    assert asset.step().time == 2.0 + 0.1
+    asset.close()
+    with pytest.raises(FmuStateError, match="closed; reset"):
+        asset.step()
+    with pytest.raises(FmuStateError, match="no state to save"):
+        asset.save_state()
+    asset.reset()
+    assert asset.observe().time == 2.0
+    del asset
 
 
 def test_chatter_of_the_fmu_does_not_reach_the_pipes(
