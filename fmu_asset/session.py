@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shutil
-import struct
 import weakref
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -30,12 +28,9 @@ from .errors import (
 )
 from .exchange import Exchange
 from .instance import STATUS_NAMES, FmuInstance
+from .saved_state import SavedState, StateMethod
 from .worker import WorkerInstance
 
-StateMethod = Literal["serialised", "replay"]
-
-_MAGIC = b"UAVASSET"
-_STATE_HEADER = struct.Struct("<8sI")
 _LOG_LENGTH = 200
 
 
@@ -105,7 +100,7 @@ class FmiAsset:
             )
         self._step_timeout = step_timeout
         self._exchange = Exchange(self._description, self._binding)
-        self._parameters = dict(parameters or {})
+        self._parameters = {name: float(value) for name, value in (parameters or {}).items()}
         self._settings = self._exchange.settings(self._parameters)
         self._instance: FmuInstance | WorkerInstance | None = None
         self._release: Callable[[], object] = lambda: None
@@ -225,7 +220,7 @@ class FmiAsset:
         """
         if parameters is not None:
             self._settings = self._exchange.settings(parameters)
-            self._parameters = dict(parameters)
+            self._parameters = {name: float(value) for name, value in parameters.items()}
         start = self._exchange.start_values()
         given = self._exchange.place(start, control, health, load)
         self._begin(start, with_inputs=given)
@@ -314,18 +309,17 @@ class FmiAsset:
                 raise self._told(error, "saving the state") from error
         else:
             body = b"".join(self._record)
-        head = {
-            "method": self.state_method,
-            "fmu": self._description.sha256,
-            "index": self._index,
-            "step_size": self._binding.step_size,
-            "start_time": self._binding.binding.start_time,
-            "parameters": self._parameters,
-            "start_inputs": self._start_inputs.hex(),
-            "inputs": bytes(memoryview(self._instance.request).cast("B")[16:]).hex(),
-        }
-        text = json.dumps(head, sort_keys=True).encode()
-        return _STATE_HEADER.pack(_MAGIC, len(text)) + text + body
+        return SavedState(
+            method=self.state_method,
+            fmu=self._description.sha256,
+            index=self._index,
+            step_size=self._step_size,
+            start_time=self._start_time,
+            parameters=self._parameters,
+            start_inputs=self._start_inputs,
+            inputs=bytes(memoryview(self._instance.request).cast("B")[16:]),
+            body=body,
+        ).to_bytes()
 
     def restore_state(self, content: bytes) -> None:
         """Bring the asset to a state that `save_state` returned, in this or an earlier process.
@@ -342,37 +336,39 @@ class FmiAsset:
         FmuCallError, FmuWorkerError, FmuTimeoutError
             If the FMU fails.
         """
-        head, body = _unpack_state(content)
-        if head["fmu"] != self._description.sha256:
+        saved = SavedState.from_bytes(content)
+        if saved.fmu != self._description.sha256:
             raise FmuStateError(
                 f"The state was saved with another FMU than {self._description.path} (its hash differs); "
                 "use that one."
             )
-        if (head["step_size"], head["start_time"]) != (
-            self._binding.step_size,
-            self._binding.binding.start_time,
-        ):
+        if (saved.step_size, saved.start_time) != (self._step_size, self._start_time):
             raise FmuStateError("The state was saved with another step size or start time; use that binding.")
         width = 8 * self._exchange.plan.input_count
-        if head["method"] != self.state_method or (
-            head["method"] == "replay" and len(body) != width * int(head["index"])
+        replayed = saved.method == "replay"
+        if (
+            saved.method != self.state_method
+            or len(saved.inputs) != width
+            or len(saved.start_inputs) not in (0, width)
+            or (replayed and len(saved.body) != width * saved.index)
         ):
-            raise FmuStateError("The saved state is damaged: its length is not what it says.")
-        self._settings = self._exchange.settings(head["parameters"])
-        self._parameters = dict(head["parameters"])
-        start_inputs = bytes.fromhex(head["start_inputs"])
-        start = list(np.frombuffer(start_inputs)) if start_inputs else self._exchange.start_values()
-        self._begin([float(value) for value in start], with_inputs=bool(start_inputs))
+            raise FmuStateError(
+                "The saved state is damaged, or another binding was in use; use that binding."
+            )
+        self._settings = self._exchange.settings(saved.parameters)
+        self._parameters = dict(saved.parameters)
+        start = np.frombuffer(saved.start_inputs).tolist() or self._exchange.start_values()
+        self._begin(start, with_inputs=bool(saved.start_inputs))
         instance = self._instance
         assert instance is not None
         try:
-            if head["method"] == "serialised":
-                instance.restore(body)
-                self._index = int(head["index"])
-                memoryview(instance.request).cast("B")[16:] = bytes.fromhex(head["inputs"])
+            if replayed:
+                for index in range(saved.index):
+                    self._replay(saved.body[index * width : (index + 1) * width])
             else:
-                for index in range(int(head["index"])):
-                    self._replay(body[index * width : (index + 1) * width])
+                instance.restore(saved.body)
+                self._index = saved.index
+                memoryview(instance.request).cast("B")[16:] = saved.inputs
         except FmuError as error:
             self._phase = "broken"
             raise self._told(error, "restoring the state") from error
@@ -471,15 +467,3 @@ class FmiAsset:
 def _release(instance: FmuInstance | WorkerInstance, folder: Path) -> None:
     instance.close()
     shutil.rmtree(folder, ignore_errors=True)
-
-
-def _unpack_state(content: bytes) -> tuple[dict[str, Any], bytes]:
-    try:
-        magic, length = _STATE_HEADER.unpack_from(content)
-        if magic != _MAGIC:
-            raise ValueError(magic)
-        begin = _STATE_HEADER.size + length
-        head = json.loads(content[_STATE_HEADER.size : begin])
-        return dict(head), content[begin:]
-    except (struct.error, ValueError, TypeError) as error:
-        raise FmuStateError("What was given is not a state of an FMI asset, or it is damaged.") from error

@@ -1,0 +1,96 @@
+"""The state of an asset as bytes: what a mission's checkpoint keeps of an FMU."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Self
+
+from .errors import FmuStateError
+
+StateMethod = Literal["serialised", "replay"]
+"""How a state is kept: serialised by the FMU, or as the inputs of all steps, to be replayed."""
+
+_MAGIC = b"UAVASSET"
+_HEADER = struct.Struct("<8sI")
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """A saved state.
+
+    Attributes
+    ----------
+    method : {"serialised", "replay"}
+        What `body` is.
+    fmu : str
+        SHA-256 of the FMU file.
+    index : int
+        Number of steps made.
+    step_size, start_time : float
+        Of the binding [s].
+    parameters : mapping of str to float
+        As the caller gave them.
+    start_inputs : bytes
+        Inputs during initialisation, as doubles; empty if the FMU's start values held.
+    inputs : bytes
+        The last inputs, as doubles.
+    body : bytes
+        The FMU's serialised state, or the inputs of each step.
+    """
+
+    method: StateMethod
+    fmu: str
+    index: int
+    step_size: float
+    start_time: float
+    parameters: Mapping[str, float]
+    start_inputs: bytes
+    inputs: bytes
+    body: bytes
+
+    def to_bytes(self) -> bytes:
+        """Return the state as bytes; equal states give equal bytes."""
+        head = {
+            "method": self.method,
+            "fmu": self.fmu,
+            "index": self.index,
+            "step_size": self.step_size,
+            "start_time": self.start_time,
+            "parameters": dict(self.parameters),
+            "start_inputs": self.start_inputs.hex(),
+            "inputs": self.inputs.hex(),
+        }
+        text = json.dumps(head, sort_keys=True).encode()
+        return _HEADER.pack(_MAGIC, len(text)) + text + self.body
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> Self:
+        """Return the state that `to_bytes` packed.
+
+        Raises
+        ------
+        FmuStateError
+            If it is something else, or damaged.
+        """
+        try:
+            magic, length = _HEADER.unpack_from(content)
+            begin = _HEADER.size + length
+            head: dict[str, Any] = json.loads(content[_HEADER.size : begin])
+            if magic != _MAGIC or head["method"] not in ("serialised", "replay"):
+                raise ValueError(magic)
+            return cls(
+                method=head["method"],
+                fmu=str(head["fmu"]),
+                index=int(head["index"]),
+                step_size=float(head["step_size"]),
+                start_time=float(head["start_time"]),
+                parameters={str(name): float(value) for name, value in head["parameters"].items()},
+                start_inputs=bytes.fromhex(head["start_inputs"]),
+                inputs=bytes.fromhex(head["inputs"]),
+                body=content[begin:],
+            )
+        except (struct.error, ValueError, TypeError, KeyError, AttributeError) as error:
+            raise FmuStateError("What was given is not a state of an FMI asset, or it is damaged.") from error
