@@ -100,8 +100,8 @@ class FmiAsset:
             )
         self._step_timeout = step_timeout
         self._exchange = Exchange(self._description, self._binding)
+        self._settings = self._exchange.settings(parameters or {})
         self._parameters = {name: float(value) for name, value in (parameters or {}).items()}
-        self._settings = self._exchange.settings(self._parameters)
         self._instance: FmuInstance | WorkerInstance | None = None
         self._release: Callable[[], object] = lambda: None
         self._phase: Literal["new", "ready", "broken", "closed"] = "new"
