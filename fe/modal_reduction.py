@@ -172,9 +172,7 @@ def reduce_modes(
     matrix = affine_sum((1.0, *np.mean(box[5:7], axis=1)), system.mass_terms)
     start = np.random.default_rng(1).normal(size=unknowns)
     inverse = LinearOperator(matrix.shape, matvec=norm.riesz, dtype=np.float64)
-    _, vectors = eigsh(
-        norm.factorisation.matrix, k=count, M=matrix, sigma=0.0, OPinv=inverse, v0=start, tol=1e-6
-    )
+    _, vectors = eigsh(norm.stiffness, k=count, M=matrix, sigma=0.0, OPinv=inverse, v0=start, tol=1e-6)
     working.extend(vectors)
     for theta, mass_theta in sampled_states(box):
         _refine(working, theta, mass_theta, count, settings)

@@ -17,7 +17,6 @@ from .modal_reduction import ModalData, ModalSettings, reduce_modes
 from .reduced import PARAMETER_NAMES, ReducedModel
 from .subspace import (
     AffineSystem,
-    Factorisation,
     Norm,
     OrthonormalBasis,
     affine_sum,
@@ -206,7 +205,7 @@ class _StaticReduction:
             # a rough solution will do: the norm of what it leaves is computed, not assumed
             dual = conjugate_gradients(
                 affine_sum(theta, system.stiffness_terms),
-                self.norm.factorisation,
+                self.norm,
                 self.outputs,
                 at_reference,
                 tolerance=DUAL_TOLERANCE,
@@ -234,7 +233,7 @@ class _StaticReduction:
             start = self.basis.vectors @ np.linalg.solve(
                 self.basis.vectors.T @ image, self.basis.vectors.T @ self.loads
             )
-        solution = conjugate_gradients(matrix, self.norm.factorisation, self.loads, start, tolerance=1e-8)
+        solution = conjugate_gradients(matrix, self.norm, self.loads, start, tolerance=1e-8)
         before = self.basis.size
         self.basis.extend(solution, self.norm.product(solution))
         new = self.basis.vectors[:, before:]
@@ -426,7 +425,7 @@ def reduce_model(
         )
     )
     with stage_of(progress, "Factorising the wing"):
-        norm = Norm(Factorisation(affine_sum((*reference, 1.0), system.stiffness_terms)))
+        norm = Norm(affine_sum((*reference, 1.0), system.stiffness_terms))
     with stage_of(progress, "Reducing the modes") as stage:
         modal = reduce_modes(
             system,

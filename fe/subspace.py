@@ -1,13 +1,12 @@
 """Tools of the offline reduction: one factorised stiffness, its norm, and bases orthonormal in it."""
 
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse.linalg import splu
 
 from .errors import ReductionError, SolutionError
+from .statics import Factorisation
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -53,13 +52,13 @@ def affine_sum(coefficients: npt.ArrayLike, terms: tuple[Any, ...]) -> Any:
     return total.tocsr()
 
 
-class Factorisation:
-    """A factorised symmetric positive definite sparse matrix.
+class Norm:
+    """The energy norm of one stiffness X, and the norm dual to it.
 
     Parameters
     ----------
-    matrix : sparse (n, n)
-        The matrix.
+    stiffness : sparse (n, n)
+        X, symmetric positive definite; it is factorised here.
 
     Raises
     ------
@@ -67,29 +66,22 @@ class Factorisation:
         If it is singular.
     """
 
-    def __init__(self, matrix: Any) -> None:
-        self.matrix = matrix
-        try:
-            self._lu = splu(
-                matrix.tocsc(),
-                permc_spec="MMD_AT_PLUS_A",
-                diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True},
-            )
-        except RuntimeError as cause:
-            raise SolutionError(
-                f"The stiffness of {matrix.shape[0]} unknowns could not be factorised ({cause}); some part "
-                "of the wing is not held. Check the root springs and the regions of the design."
-            ) from cause
+    def __init__(self, stiffness: Any) -> None:
+        self.stiffness = stiffness
+        self._factorisation = Factorisation(stiffness)
 
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Return the solutions (n, k) for right-hand sides (n, k), or (n,) for (n,)."""
-        return np.asarray(self._lu.solve(np.asfortranarray(right)))
+    def product(self, vectors: FloatArray) -> FloatArray:
+        """Return X times vectors (n, k)."""
+        return np.asarray(self.stiffness @ vectors)
+
+    def riesz(self, functionals: FloatArray) -> FloatArray:
+        """Return the representatives X^-1 functionals, (n, k) or (n,)."""
+        return self._factorisation.raw_solve(functionals)
 
 
 def conjugate_gradients(
     matrix: Any,
-    preconditioner: Factorisation,
+    preconditioner: Norm,
     right: FloatArray,
     start: FloatArray,
     *,
@@ -102,8 +94,8 @@ def conjugate_gradients(
     ----------
     matrix : sparse (n, n)
         The matrix, spectrally equivalent to the preconditioner.
-    preconditioner : Factorisation
-        The factorised matrix nearby.
+    preconditioner : Norm
+        The norm of a matrix nearby.
     right : (n, k) ndarray
         Right-hand sides.
     start : (n, k) ndarray
@@ -124,9 +116,9 @@ def conjugate_gradients(
         If the tolerance is not reached.
     """
     solution = np.array(start)
-    wanted = tolerance**2 * np.einsum("ik,ik->k", right, preconditioner.solve(right))
+    wanted = tolerance**2 * np.einsum("ik,ik->k", right, preconditioner.riesz(right))
     residual = right - matrix @ solution
-    direction = correction = preconditioner.solve(residual)
+    direction = correction = preconditioner.riesz(residual)
     size = np.einsum("ik,ik->k", residual, correction)
     for _ in range(most_iterations):
         if np.all(size <= wanted):
@@ -136,7 +128,7 @@ def conjugate_gradients(
         step = np.divide(size, curvature, out=np.zeros_like(size), where=curvature > 0.0)
         solution += step * direction
         residual = residual - step * image
-        correction = preconditioner.solve(residual)
+        correction = preconditioner.riesz(residual)
         before, size = size, np.einsum("ik,ik->k", residual, correction)
         direction = (
             correction + np.divide(size, before, out=np.zeros_like(size), where=before > 0.0) * direction
@@ -148,21 +140,6 @@ def conjugate_gradients(
         f"{float(np.sqrt(np.max(size / wanted))) * tolerance:.2g}); the stiffness terms must be positive "
         "semi-definite."
     )
-
-
-@dataclass(frozen=True)
-class Norm:
-    """The energy norm of one stiffness X, and the norm dual to it."""
-
-    factorisation: Factorisation
-
-    def product(self, vectors: FloatArray) -> FloatArray:
-        """Return X times vectors (n, k)."""
-        return np.asarray(self.factorisation.matrix @ vectors)
-
-    def riesz(self, functionals: FloatArray) -> FloatArray:
-        """Return the representatives X^-1 functionals, (n, k)."""
-        return self.factorisation.solve(functionals)
 
 
 class OrthonormalBasis:

@@ -1,0 +1,240 @@
+"""Reduced models kept between runs: an unchanged design is built once, a changed one is built anew."""
+
+import fcntl
+import hashlib
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .archive import write_bytes_atomically
+from .errors import ReducedModelFileError
+from .fields import FieldBasis, WingFields, field_basis
+from .reduced import ReducedModel
+
+if TYPE_CHECKING:
+    from .design import WingDesign
+    from .reduction import Progress, ReductionSettings
+
+MODELLING_FILES = (
+    "airfoil.py",
+    "archive.py",
+    "assembly.py",
+    "design.py",
+    "fields.py",
+    "grid.py",
+    "lift.py",
+    "mesh.py",
+    "modal_reduction.py",
+    "operators.py",
+    "parts.py",
+    "reduced.py",
+    "reduction.py",
+    "statics.py",
+    "subspace.py",
+)
+"""The files that decide what a reduced model holds; a change in any of them makes a new cache entry."""
+
+_logger = logging.getLogger(__name__)
+
+
+def cache_folder() -> Path:
+    """Return the folder of the kept models: `$XDG_CACHE_HOME/uav-twin`, or `~/.cache/uav-twin`."""
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if base else Path.home() / ".cache") / "uav-twin"
+
+
+def modelling_hash() -> str:
+    """Return the SHA-256 of the modelling code, hexadecimal."""
+    digest = hashlib.sha256()
+    for name in MODELLING_FILES:
+        content = (Path(__file__).parent / name).read_bytes()
+        digest.update(f"{name} {len(content)}\n".encode())
+        digest.update(content)
+    return digest.hexdigest()
+
+
+def cache_key(design: "WingDesign", settings: "ReductionSettings | None" = None) -> str:
+    """Return the name of a cache entry: a hash of design, reduction settings and modelling code."""
+    content = f"{design.hash} {settings!r} {modelling_hash()}"
+    return hashlib.sha256(content.encode()).hexdigest()[:32]
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """The two files of one cache entry."""
+
+    model: Path
+    fields: Path
+
+
+def _entry(design: "WingDesign", settings: "ReductionSettings | None") -> _Entry:
+    key = cache_key(design, settings)
+    return _Entry(cache_folder() / f"wing-{key}.npz", cache_folder() / f"wing-{key}-fields.npz")
+
+
+def reduced_model(
+    design: "WingDesign | None" = None,
+    progress: "Progress | None" = None,
+    settings: "ReductionSettings | None" = None,
+) -> ReducedModel:
+    """Return the reduced model of a design, from the cache if it is there.
+
+    Parameters
+    ----------
+    design : WingDesign, optional
+        The wing; the shipped one if left out.
+    progress : Progress, optional
+        Where a build reports.
+    settings : ReductionSettings, optional
+        Where and how well the model is to hold.
+
+    Returns
+    -------
+    ReducedModel
+        The model.
+
+    Raises
+    ------
+    FiniteElementError
+        If the design cannot be modelled or reduced.
+    """
+    design = _shipped(design)
+    path = _entry(design, settings).model
+    try:
+        return _checked_model(path, design)
+    except FileNotFoundError:
+        pass
+    except ReducedModelFileError as error:
+        _logger.warning("A kept model is not usable and is built anew: %s", error)
+    return _build(design, progress, settings).model
+
+
+def wing_fields(
+    design: "WingDesign | None" = None,
+    progress: "Progress | None" = None,
+    settings: "ReductionSettings | None" = None,
+) -> WingFields:
+    """Return the reduced model of a design with its field basis, from the cache if both are there.
+
+    Parameters
+    ----------
+    design : WingDesign, optional
+        The wing; the shipped one if left out.
+    progress : Progress, optional
+        Where a build reports.
+    settings : ReductionSettings, optional
+        Where and how well the model is to hold.
+
+    Returns
+    -------
+    WingFields
+        Model and field basis.
+
+    Raises
+    ------
+    FiniteElementError
+        If the design cannot be modelled or reduced.
+    """
+    design = _shipped(design)
+    try:
+        return _checked_fields(_entry(design, settings), design)
+    except FileNotFoundError:
+        pass
+    except ReducedModelFileError as error:
+        _logger.warning("A kept model is not usable and is built anew: %s", error)
+    return _build(design, progress, settings)
+
+
+def _shipped(design: "WingDesign | None") -> "WingDesign":
+    if design is not None:
+        return design
+    from .design import load_design
+
+    return load_design()
+
+
+def _checked_model(path: Path, design: "WingDesign") -> ReducedModel:
+    model = ReducedModel.load(path)
+    if model.design_hash != design.hash:
+        raise ReducedModelFileError(f"{path} holds the model of another design; delete it.")
+    return model
+
+
+def _checked_fields(entry: _Entry, design: "WingDesign") -> WingFields:
+    model = _checked_model(entry.model, design)
+    return WingFields(model, FieldBasis.from_bytes(entry.fields.read_bytes(), str(entry.fields)))
+
+
+def _build(
+    design: "WingDesign", progress: "Progress | None", settings: "ReductionSettings | None"
+) -> WingFields:
+    """Build and keep an entry; of several builders of one entry, one builds and the others wait for it."""
+    entry = _entry(design, settings)
+    with _locked(entry.model.with_suffix(".lock")):
+        try:
+            return _checked_fields(entry, design)  # another process may have been faster
+        except (FileNotFoundError, ReducedModelFileError):
+            pass
+        wing = build(design, progress, settings)
+        try:
+            # the model last: where it is, its fields are
+            write_bytes_atomically(entry.fields, wing.basis.to_bytes())
+            write_bytes_atomically(entry.model, wing.model.to_bytes())
+        except OSError as error:
+            _logger.warning(
+                "The model could not be kept in %s and will be built again: %s", cache_folder(), error
+            )
+    return wing
+
+
+def build(
+    design: "WingDesign", progress: "Progress | None" = None, settings: "ReductionSettings | None" = None
+) -> WingFields:
+    """Build the reduced model and the field basis of a design, without the cache.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The wing.
+    progress : Progress, optional
+        Where to report.
+    settings : ReductionSettings, optional
+        Where and how well the model is to hold.
+
+    Returns
+    -------
+    WingFields
+        Model and field basis.
+
+    Raises
+    ------
+    FiniteElementError
+        If the design cannot be modelled or reduced.
+    """
+    from .operators import assemble
+    from .reduction import reduce_model, stage_of
+
+    with stage_of(progress, "Meshing and assembling the wing"):
+        operators = assemble(design)
+    reduction = reduce_model(operators, settings, progress)
+    return WingFields(reduction.model, field_basis(operators, reduction))
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold a lock file while building; without a writable folder there is nothing to guard."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError:
+        yield
+        return
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
