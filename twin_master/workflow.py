@@ -40,6 +40,8 @@ from twin_master.summary import Figure, summarise
 REPORT_NAME = "report.html"
 CALIBRATION_NAME = "calibration.json"
 SHIPPED_DESIGN_NAME = "uav_wing"
+HARMLESS_PACKAGES = frozenset({"discrepancy", "reporting", "scenarios", "uav_twin", "matplotlib"})
+"""A run may be resumed after a change of these: no stored figure depends on them."""
 
 
 @dataclass(frozen=True)
@@ -243,7 +245,9 @@ def resume_run(
     now = collect_provenance(scenario.mission.seed).as_dict()
     for what in ("versions", "source_hashes"):
         changed = sorted(
-            name for name, value in now[what].items() if recorded.get(what, {}).get(name) != value
+            name
+            for name, value in now[what].items()
+            if name not in HARMLESS_PACKAGES and recorded.get(what, {}).get(name) != value
         )
         if changed:
             raise NotResumableError(

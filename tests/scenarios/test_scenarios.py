@@ -1,0 +1,37 @@
+"""The shipped scenarios and bindings."""
+
+from __future__ import annotations
+
+import pytest
+
+from scenarios import binding_files, scenario_files
+from twin_master.scenario_file import load_scenario
+from twin_master.truth import Truth
+from twin_master.twin import build_graphical_model
+
+
+def test_what_is_shipped() -> None:
+    assert set(scenario_files()) == {"level_turns", "growing_damage", "failing_gauges"}
+    assert "uav_wing" in binding_files()
+
+
+@pytest.mark.parametrize("name", sorted(scenario_files()))
+def test_each_scenario_names_a_shipped_binding_and_can_be_flown(name: str) -> None:
+    scenario = load_scenario(name).scenario
+    assert scenario.asset.binding in binding_files()
+    model = build_graphical_model(scenario)
+    assert model.states.size == 25
+    assert Truth(scenario, model, 0).noise.shape == (50, 24)
+
+
+def test_the_papers_figures() -> None:
+    scenario = load_scenario("level_turns").scenario
+    assert scenario.mission.steps == 50
+    assert scenario.mission.prediction_steps == 10
+    assert scenario.planner.gamma == 0.6
+    assert scenario.transition.probability == {"2g": 0.05, "3g": 0.10}
+    assert scenario.rewards.health_limit == 2500e-6
+    assert (scenario.rewards.health_weight, scenario.rewards.control_weight) == (1.0, 2.5)
+    assert scenario.rewards.control == {"2g": -0.1, "3g": 0.1}
+    assert scenario.truth.noise.standard_deviation == 150e-6
+    assert scenario.observation.standard_deviation == 125e-6

@@ -1,0 +1,247 @@
+"""Runs from scenario to report: what a run folder holds, what is refused, and what survives."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from reporting.errors import DiskFullError
+from twin_master import workflow
+from twin_master.checkpoint import Checkpoint
+from twin_master.errors import InvalidStrainLibraryError
+from twin_master.run_errors import (
+    MissionInputError,
+    NotResumableError,
+    RunFolderError,
+    RunFolderExistsError,
+)
+from twin_master.run_folder import lock_run_folder
+from twin_master.scenario_file import load_scenario
+from twin_master.workflow import Overrides, new_run, resolve_scenario, resume_run
+
+ROOT = Path(__file__).parents[2]
+SAME = ("run.nc", "config.json", "summary.json", "csv/health.csv", "csv/observed.csv", "csv/decisions.csv")
+
+
+@pytest.fixture(autouse=True)
+def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The report has tests of its own and takes seconds."""
+    monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+
+
+def fly(folder: Path, library: Path, scenario: str = "level_turns", **options: object) -> workflow.RunOutcome:
+    return new_run(load_scenario(scenario), folder, Overrides(strain_library=library, **options))  # type: ignore[arg-type]
+
+
+def stop_after(monkeypatch: pytest.MonkeyPatch, turns: int, error: BaseException) -> None:
+    """Let the run die when the checkpoint of a turn was written."""
+    write = workflow.write_checkpoint
+
+    def failing(folder: Path, checkpoint: Checkpoint) -> None:
+        write(folder, checkpoint)
+        if checkpoint.turns == turns:
+            raise error
+
+    monkeypatch.setattr(workflow, "write_checkpoint", failing)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in SAME}
+
+
+def test_run_folder(tmp_path: Path, library_file: Path) -> None:
+    outcome = fly(tmp_path / "a" / "run", library_file, "failing_gauges")
+    folder = outcome.folder
+    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
+        tree.load()
+    assert set(tree.children) == {
+        "observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth",
+    }  # fmt: skip
+    assert tree["predicted"]["quantity_mean"].shape == (50, 10, 24)
+    assert tree["filtered"]["reward_mean"].dims == ("step", "reward")
+    for group in tree.children.values():
+        for name, variable in group.data_vars.items():
+            assert variable.attrs["units"], name
+            assert variable.attrs["long_name"], name
+    np.testing.assert_allclose(tree["filtered"]["probability"].sum("state"), 1.0)
+    np.testing.assert_array_equal(tree["policy"]["z2"][:5], [0.0, 0.2, 0.4, 0.6, 0.8])
+    lower, upper = tree["filtered"]["quantity_lower"], tree["filtered"]["quantity_upper"]
+    assert np.all(lower <= upper)
+    assert np.all(np.isnan(tree["observed"]["strain"].values[36]))
+    assert tree["filtered"]["sensors_received"].values[36] == 0
+    assert int(tree.attrs["seed"]) == 2021
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    figures = {figure["key"]: figure for figure in summary["figures"]}
+    assert figures["blind_steps"]["value"] == "36, 37"
+    assert "follows the dynamics" in figures["blind_steps"]["title"]
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    assert config["scenario"]["state"][0]["levels"] == [0.0, 0.2, 0.4, 0.6, 0.8]
+    header, first = (folder / "csv" / "observed.csv").read_text(encoding="utf-8").splitlines()[:2]
+    assert header.startswith("step,strain_1_microstrain,strain_2_microstrain")
+    assert 2000 < float(first.split(",")[1]) < 4000
+    row = (folder / "csv" / "observed.csv").read_text(encoding="utf-8").splitlines()[37]
+    assert row == "36" + 24 * ","
+    assert "seconds" not in (folder / "summary.json").read_text(encoding="utf-8")
+    assert json.loads((folder / "timing.json").read_text(encoding="utf-8"))["turns"] == 50
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_mission(
+    tmp_path: Path, library_file: Path
+) -> None:
+    first, second = fly(tmp_path / "a", library_file).folder, fly(tmp_path / "b", library_file).folder
+    assert contents(first) == contents(second)
+    other = fly(tmp_path / "c", library_file, seed=5).folder
+    assert (other / "run.nc").read_bytes() != (first / "run.nc").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("scenario", "turns"), [("level_turns", 1), ("growing_damage", 30), ("failing_gauges", 50)]
+)
+def test_a_resumed_run_is_bit_identical(
+    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch, scenario: str, turns: int
+) -> None:
+    whole = contents(fly(tmp_path / "whole", library_file, scenario).folder)
+    with monkeypatch.context() as patch:
+        stop_after(patch, turns, KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            fly(tmp_path / "part", library_file, scenario)
+    assert not (tmp_path / "part" / "run.nc").exists()
+    (tmp_path / "part" / ".checkpoint.1-2.partial.npz").write_bytes(b"left by a killed process")
+    resume_run(tmp_path / "part", load_scenario(scenario))
+    assert contents(tmp_path / "part") == whole
+    assert not list((tmp_path / "part").glob(".*"))
+    resume_run(tmp_path / "part")  # a finished run may be resumed; nothing changes
+    assert contents(tmp_path / "part") == whole
+
+
+def test_a_full_disk_loses_nothing(
+    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = contents(fly(tmp_path / "whole", library_file).folder)
+    replace = Path.replace
+    count = 0
+
+    def full(self: Path, target: Path) -> Path:
+        nonlocal count
+        count += 1
+        if count > 20:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return replace(self, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", full)
+        with pytest.raises(DiskFullError, match="No space is left"):
+            fly(tmp_path / "part", library_file)
+    resume_run(tmp_path / "part")
+    assert contents(tmp_path / "part") == whole
+
+
+def test_existing_folders_are_refused(tmp_path: Path, library_file: Path) -> None:
+    folder = tmp_path / "run"
+    fly(folder, library_file)
+    (folder / "notes.txt").write_text("mine", encoding="utf-8")
+    with pytest.raises(RunFolderExistsError, match="--resume"):
+        fly(folder, library_file)
+    loaded = load_scenario("level_turns")
+    new_run(loaded, folder, Overrides(strain_library=library_file), replace=True)
+    assert not (folder / "notes.txt").exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.txt").write_text("important", encoding="utf-8")
+    with pytest.raises(RunFolderExistsError, match="no run folder"):
+        new_run(loaded, mine, Overrides(strain_library=library_file), replace=True)
+    assert (mine / "thesis.txt").read_text(encoding="utf-8") == "important"
+    with pytest.raises(RunFolderExistsError, match="no folder"):
+        new_run(loaded, mine / "thesis.txt", Overrides(strain_library=library_file), replace=True)
+    (tmp_path / "empty").mkdir()
+    fly(tmp_path / "empty", library_file)
+
+
+def test_what_cannot_be_resumed(
+    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(NotResumableError, match="there is no run folder"):
+        resume_run(tmp_path / "nothing")
+    with pytest.raises(NotResumableError, match="is no run folder"):
+        resume_run(tmp_path)
+    folder = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        stop_after(patch, 3, KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            fly(folder, library_file)
+    with pytest.raises(NotResumableError, match="another scenario"):
+        resume_run(folder, load_scenario("growing_damage"))
+    config = (folder / "config.json").read_text(encoding="utf-8")
+    numpy = json.loads(config)["provenance"]["versions"]["numpy"]
+    (folder / "config.json").write_text(config.replace(f'"{numpy}"', '"1.0"'), encoding="utf-8")
+    with pytest.raises(NotResumableError, match="another version of numpy"):
+        resume_run(folder)
+    altered = config.replace('"gamma": 0.6', '"gamma": 0.5')
+    assert altered != config
+    (folder / "config.json").write_text(altered, encoding="utf-8")
+    with pytest.raises(NotResumableError, match="another configuration"):
+        resume_run(folder)
+    (folder / "config.json").write_text(config, encoding="utf-8")
+    os.close(lock := lock_run_folder(folder))
+    lock = lock_run_folder(folder)
+    try:
+        with pytest.raises(RunFolderError, match="another process"):
+            resume_run(folder)
+    finally:
+        os.close(lock)
+    resume_run(folder)
+
+
+def test_a_library_that_changed_or_is_gone(
+    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library = tmp_path / "library.json"
+    library.write_bytes(library_file.read_bytes())
+    with monkeypatch.context() as patch:
+        stop_after(patch, 3, KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            fly(tmp_path / "run", library)
+    library.write_bytes(library_file.read_bytes() + b"\n")
+    with pytest.raises(NotResumableError, match="strain library changed"):
+        resume_run(tmp_path / "run")
+    library.unlink()
+    with pytest.raises(InvalidStrainLibraryError, match="cannot read"):
+        resume_run(tmp_path / "run")
+    with pytest.raises(InvalidStrainLibraryError):
+        fly(tmp_path / "never", library)
+    assert not (tmp_path / "never").exists()
+
+
+def test_overrides(tmp_path: Path, library_file: Path) -> None:
+    loaded = load_scenario("level_turns")
+    with pytest.raises(MissionInputError, match="either"):
+        resolve_scenario(loaded, Overrides(strain_library=library_file, fmu=tmp_path / "x.fmu"))
+    scenario = resolve_scenario(loaded, Overrides(seed=4, fmu=tmp_path / "x.fmu", in_process=True))
+    assert scenario.mission.seed == 4
+    assert scenario.asset.file == str(tmp_path / "x.fmu")
+    assert scenario.asset.isolated is False
+    assert scenario.asset.binding == "uav_wing"
+    text = loaded.path.read_text(encoding="utf-8").replace('binding = "uav_wing"', 'binding = "mine.toml"')
+    (tmp_path / "s.toml").write_text(text, encoding="utf-8")
+    moved = resolve_scenario(load_scenario(tmp_path / "s.toml"), Overrides())
+    assert moved.asset.binding == str(tmp_path / "mine.toml")
+
+
+@pytest.mark.slow
+def test_kill_at_random_moments(library_file: Path) -> None:
+    """A few trials; `python -m benchmarks.kill_and_resume --trials 20` makes more."""
+    result = subprocess.run(
+        [sys.executable, "-m", "benchmarks.kill_and_resume", "--trials", "3", "--seed", "2",
+         "--", "--strain-library", str(library_file)],
+        cwd=ROOT, capture_output=True, text=True, check=False, timeout=600,
+    )  # fmt: skip
+    assert "3 of 3 trials bit-identical" in result.stdout, result.stdout + result.stderr

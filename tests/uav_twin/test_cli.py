@@ -1,0 +1,158 @@
+"""The command line: what it says, and how it ends when something is wrong."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from twin_master.run_errors import ScenarioError
+from uav_twin import cli
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Run the command line in this process and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["uav-twin", *arguments])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    code = caught.value.code
+    return 0 if code is None else int(code)
+
+
+@pytest.fixture
+def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("twin_master.workflow._report", lambda folder: folder / "report.html")
+
+
+def test_commands_are_listed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(monkeypatch, "--help") == 0
+    text = capsys.readouterr().out
+    for command in ("run", "wing", "calibrate", "scenarios", "fmu"):
+        assert command in text
+    assert call(monkeypatch, "run", "--help") == 0
+    text = capsys.readouterr().out
+    for option in ("--out", "--seed", "--resume", "--replace", "--fmu", "--binding", "--strain-library", "--in-process"):
+        assert option in text
+
+
+def test_scenarios(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(monkeypatch, "scenarios") == 0
+    text = capsys.readouterr().out
+    for name in ("level_turns", "growing_damage", "failing_gauges"):
+        assert name in text
+
+
+@pytest.mark.usefixtures("no_report")
+def test_run_prints_figures_and_report(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, library_file: Path
+) -> None:
+    out = tmp_path / "run"
+    arguments = ["run", "level_turns", "--out", str(out), "--strain-library", str(library_file)]
+    assert call(monkeypatch, *arguments, "--seed", "3") == 0
+    text = capsys.readouterr().out
+    assert "filtered rms error of z1" in text
+    assert "Kapteyn et al. 2021" in text
+    assert f"Report: {out / 'report.html'}" in text
+    assert call(monkeypatch, *arguments) == 1
+    error = capsys.readouterr().err
+    assert "holds a run already" in error
+    assert len(error.strip().splitlines()) == 1
+    assert call(monkeypatch, *arguments, "--replace", "--quiet") == 0
+    captured = capsys.readouterr()
+    assert captured.out == captured.err == ""
+    assert call(monkeypatch, "run", "--resume", str(out), "--quiet") == 0
+
+
+def test_usage_errors_end_with_2(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    for arguments in (
+        ["run"],
+        ["run", "level_turns", "--nonsense"],
+        ["run", "level_turns", "--seed", "-1"],
+        ["run", "--resume", str(tmp_path), "--seed", "3"],
+        ["run", "--resume", str(tmp_path), "--out", str(tmp_path)],
+        ["nonsense"],
+    ):
+        assert call(monkeypatch, *arguments) == 2
+        assert "Traceback" not in capsys.readouterr().err
+
+
+def test_errors_of_the_packages_are_one_sentence_and_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    broken = tmp_path / "broken.toml"
+    broken.write_text("format = 2", encoding="utf-8")
+    for arguments, word in (
+        (["run", "no_such_scenario"], "no_such_scenario"),
+        (["run", str(broken)], "format"),
+        (["run", "--resume", str(tmp_path / "nothing")], "no run folder"),
+        (["run", "level_turns", "--out", str(tmp_path / "x"), "--strain-library", str(tmp_path)], "UAVconfig.json"),
+        (["fmu", "info", str(tmp_path / "no.fmu")], "no.fmu"),
+        (["fmu", "info", str(broken)], "broken.toml"),
+        (["fmu", "check", str(tmp_path / "no.fmu")], "no.fmu"),
+        (["wing", "--design", str(tmp_path / "no.toml")], "no.toml"),
+        (["calibrate", "static", "--data", str(tmp_path / "no.csv")], "no.csv"),
+    ):
+        assert call(monkeypatch, *arguments) == 1
+        error = capsys.readouterr().err
+        assert word in error.replace("\n", " ")
+        assert "Traceback" not in error
+    assert not (tmp_path / "x").exists()
+
+
+def test_an_error_that_is_not_ours_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken() -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(cli, "app", lambda **_: broken())
+    monkeypatch.setattr(sys, "argv", ["uav-twin"])
+    with pytest.raises(ZeroDivisionError):
+        cli.main()
+    assert issubclass(ScenarioError, ValueError)
+
+
+def test_ctrl_c_says_how_to_go_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, library_file: Path
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("twin_master.workflow._fly", interrupted)
+    out = tmp_path / "run"
+    code = call(monkeypatch, "run", "level_turns", "--out", str(out), "--strain-library", str(library_file), "-q")
+    assert code == 130
+    assert f"--resume {out}" in capsys.readouterr().err
+
+
+def test_calibrate_static(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(monkeypatch, "calibrate", "static") == 0
+    text = capsys.readouterr().out
+    assert "e, exact, mean" in text
+    assert "1.0073" in text or "1.007" in text
+
+
+def test_the_master_script_is_the_same_command(tmp_path: Path, library_file: Path) -> None:
+    environment = os.environ | {"COLUMNS": "200"}
+    for module, arguments in (("twin_master", []), ("uav_twin", ["run"])):
+        result = subprocess.run(
+            [sys.executable, "-m", module, *arguments, "--resume", str(tmp_path / "nothing")],
+            capture_output=True, text=True, check=False, env=environment,
+        )  # fmt: skip
+        assert result.returncode == 1
+        assert "there is no run folder" in result.stderr
+
+
+def test_start_up_is_lazy() -> None:
+    """`--help` must not import what only a flight needs."""
+    code = (
+        "import sys, uav_twin.cli\n"
+        "heavy = {'numpy', 'scipy', 'skfem', 'pymor', 'fmpy', 'xarray', 'matplotlib', 'numba', 'pydantic'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
