@@ -15,7 +15,7 @@ from importlib import resources
 from reporting.errors import InvalidFigureError
 from reporting.figures import inline_svg
 
-_UNIT_SPACE = re.compile(r"(?<=\d) (?=(%|µε|s|ms|Hz|mm|m|kg|N)(?!\w))")
+_UNIT_SPACE = re.compile(r"(?<=\d) (?=(%|µε|s|ms|µs|Hz|mm|m|kg|N)(?!\w))")
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from twin_master.report_network import network_figure
 from twin_master.report_text import (
     belief_caption,
     check_caption,
+    duration,
     lost_ranges,
     mission_caption,
     network_caption,
@@ -210,7 +211,7 @@ def _highlights(record: RunRecord) -> list[tuple[str, str]]:
         truth = (
             "" if record.truth_state is None else f" (truth {100.0 * record.truth_state[-1, factor]:.0f} %)"
         )
-        items.append((f"{mean:.1f} ± {deviation:.1f} %", f"{title} at the end{truth}"))
+        items.append((f"{mean:.1f}\u00a0±\u00a0{deviation:.1f} %", f"{title} at the end{truth}"))
     changes = np.flatnonzero(np.diff(record.control_index)) + 1
     if len(changes):
         first = int(changes[0])
@@ -259,38 +260,69 @@ def _add_run(page: Page, record: RunRecord) -> None:
     page.add_table(
         Table((Column("item"), Column("value")), rows), "From run.nc and config.json.", title="Run"
     )
-    timing = list(_flat(record.timing))
-    if timing:
-        page.add_table(
-            Table((Column("item"), Column("value", numeric=True)), timing),
-            "Wall-clock figures of this machine, from timing.json.",
-            title="Times",
-        )
-    else:
-        page.add_paragraph("Wall-clock times stand in timing.json, so that equal runs give equal reports.")
-    origin = [*_flat(_provenance(record))]
+    _add_times(page, record.timing)
+    origin = _origin(record)
     if origin:
         page.add_table(
             Table((Column("item"), Column("value")), origin),
-            "Versions of the software and SHA-256 of sources and inputs.",
+            "Versions of the software, and the first 12 digits of the SHA-256 of sources and inputs; "
+            "config.json has them in full.",
             title="Provenance",
         )
 
 
-def _provenance(record: RunRecord) -> dict[str, Any]:
+def _add_times(page: Page, timing: Mapping[str, Any]) -> None:
+    """Add the entries of ``timing.json`` whose names end in ``_seconds``: stages, then turns."""
+    stages: list[tuple[str, str]] = []
+    turns: dict[str, Mapping[str, Any]] = {}
+    for key, value in timing.items():
+        name = str(key).removesuffix("_seconds").replace("_", " ")
+        if str(key).endswith("_seconds") and isinstance(value, Mapping) and "median" in value:
+            turns[name] = value
+        elif str(key).endswith("_seconds") and isinstance(value, Mapping):
+            stages += [
+                (str(inner), duration(float(v))) for inner, v in value.items() if isinstance(v, int | float)
+            ]
+        elif str(key).endswith("_seconds") and isinstance(value, int | float):
+            stages.append((name, duration(float(value))))
+    if not stages and not turns:
+        page.add_paragraph("Wall-clock times stand in timing.json, so that equal runs give equal reports.")
+    if stages:
+        page.add_table(
+            Table((Column("stage"), Column("time", numeric=True)), stages),
+            "Wall-clock times of the process that finished the run, up to this page. From timing.json.",
+            title="Times",
+        )
+    if turns:
+        kinds = list(next(iter(turns.values())))
+        rows = [
+            (name, *(duration(float(value[kind])) if kind in value else "" for kind in kinds))
+            for name, value in turns.items()
+        ]
+        page.add_table(
+            Table((Column("part of a turn"), *(Column(str(kind), numeric=True) for kind in kinds)), rows),
+            "Over the turns that the same process flew.",
+            title="Times of the turns",
+        )
+
+
+def _origin(record: RunRecord) -> list[tuple[str, str]]:
     """Return versions and hashes as the configuration keeps them."""
-    known = record.config.get("provenance", record.config)
-    if not isinstance(known, Mapping):
-        return {}
-    return {key: value for key, value in known.items() if "version" in key or "hash" in key}
-
-
-def _flat(record: Mapping[str, Any], prefix: str = "") -> Sequence[tuple[str, str]]:
+    origin, inputs = record.config.get("provenance", {}), record.config.get("inputs", {})
+    origin = origin if isinstance(origin, Mapping) else {}
     rows: list[tuple[str, str]] = []
-    for key, value in record.items():
-        name = f"{prefix}{str(key).replace('_', ' ')}"
-        if isinstance(value, Mapping):
-            rows += _flat(value, f"{name}: ")
-        elif isinstance(value, str | int | float) or value is None:
-            rows.append((name, number(value)))
+    versions = origin.get("versions")
+    if isinstance(versions, Mapping) and versions:
+        rows.append(
+            ("software", ", ".join(f"{name} {version}" for name, version in sorted(versions.items())))
+        )
+    for title, hashes in (
+        ("sources", origin.get("source_hashes")),
+        ("inputs", origin.get("input_hashes")),
+        ("inputs", inputs),
+    ):
+        if isinstance(hashes, Mapping) and hashes:
+            rows.append(
+                (title, ", ".join(f"{name} {str(value)[:12]}" for name, value in sorted(hashes.items())))
+            )
     return rows

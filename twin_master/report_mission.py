@@ -98,7 +98,7 @@ def _zones(axes: Axes, record: RunRecord, now: int, *, named: bool) -> None:
     axes.set_xlim(-0.8, end + 0.8)
     axes.axvspan(now + 0.5, end + 0.8, color=style.PREDICTION, alpha=0.06, linewidth=0)
     axes.axvline(now, color=style.PRESENT, linewidth=0.8, zorder=0.5)
-    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], integer=True))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.grid(axis="y")
     axes.yaxis.set_label_coords(-0.16, 0.5)

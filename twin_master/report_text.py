@@ -13,14 +13,22 @@ from twin_master.report_view import observation_scale, sensor_word, symbol
 
 
 def number(value: Any) -> str:
-    """Return a figure as printed: text as it is, four significant digits, a dash for none."""
+    """Return a figure as printed: text as it is, five significant digits, a dash for none."""
     if value is None:
         return "—"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.4g}".replace("-", "−")
+        return f"{value:.5g}".replace("-", "−")
     return str(value)
+
+
+def duration(seconds: float) -> str:
+    """Return a duration with three significant digits in a unit that suits it."""
+    for limit, factor, unit in ((1e-3, 1e6, "µs"), (1.0, 1e3, "ms")):
+        if abs(seconds) < limit:
+            return f"{factor * seconds:.3g} {unit}"
+    return f"{seconds:.3g} s"
 
 
 def turn_ranges(turns: ArrayLike) -> str:
@@ -127,6 +135,11 @@ def check_caption(record: RunRecord, check: PredictiveCheck) -> str:
         f"{100.0 * check.overall_coverage:.1f} % of all observations lie within their intervals.",
         "A root mean square above 1 means that the noise is larger than assumed, or the model is off.",
     ]
+    if np.isfinite(check.coverage).any():
+        lowest = int(np.nanargmin(check.coverage))
+        sentences.append(
+            f"Lowest coverage: {word} {record.sensors[lowest]}, {100.0 * check.coverage[lowest]:.0f} %."
+        )
     if noise is not None:
         sentences.append(f"The twin assumes a noise of {scale * noise:.4g} {unit}.")
     return " ".join(sentences)

@@ -2,6 +2,7 @@
 
 import errno
 import importlib.util
+import json
 import os
 import re
 from dataclasses import replace
@@ -17,7 +18,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from reporting.errors import DiskFullError
 from reporting.figures import to_svg
 from twin_master import report, report_belief, report_check, report_data, report_mission, report_network
-from twin_master.report_text import lost_ranges, number, turn_ranges
+from twin_master.report_text import duration, lost_ranges, number, turn_ranges
 from twin_master.report_view import choose_sensors, default_now
 from twin_master.run_errors import RunFolderError
 
@@ -299,10 +300,16 @@ def test_the_page_needs_nothing_from_outside(folder: Path) -> None:
 @pytest.mark.usefixtures("no_drawing")
 def test_times_appear_when_they_are_known(tmp_path: Path, tree: xr.DataTree) -> None:
     place = synthetic_run.write_run(tmp_path / "run", tree)
-    (place / "timing.json").write_text('{"turns": {"total_seconds": 0.4321}, "report_seconds": 1.5}')
+    times = {
+        "total_seconds": 4.321,
+        "turns": 50,
+        "stages_seconds": {"mission": 0.702},
+        "twin_seconds": {"median": 2.463e-4, "largest": 0.0402},
+    }
+    (place / "timing.json").write_text(json.dumps(times))
     text = report.write_report(place).read_text(encoding="utf-8")
-    assert "turns: total seconds" in text
-    assert "0.4321" in text
+    for words in ("total 4.32 s", "mission 702 ms", "twin 246 µs 40.2 ms"):
+        assert words in re.sub(r"(<[^>]*>|\s)+", " ", text)
 
 
 @pytest.mark.parametrize(
@@ -449,11 +456,12 @@ def test_a_full_disk_keeps_the_old_report(
 
 
 def test_words() -> None:
+    assert [duration(value) for value in (2.5e-5, 0.0402, 12.345)] == ["25 µs", "40.2 ms", "12.3 s"]
     assert turn_ranges([]) == "no turn"
     assert turn_ranges([4]) == "turn 4"
     assert turn_ranges([4, 5, 6, 9]) == "turns 4–6, 9"
     assert number(None) == "—"
-    assert number(-0.12345) == "−0.1235"
+    assert number(-0.123456) == "−0.12346"
     assert number(3) == "3"
     assert number(True) == "yes"
 
