@@ -71,9 +71,9 @@ class Factorisation:
         change = float(np.linalg.norm(correction)) / max(float(np.linalg.norm(solution)), 1e-300)
         if not (error <= BACKWARD_ERROR_LIMIT and change <= CORRECTION_LIMIT):
             raise SolutionError(
-                f"The static solution has a backward error of {error:.2g} and is "
-                f"accurate to {change:.2g}, but {BACKWARD_ERROR_LIMIT:g} and {CORRECTION_LIMIT:g} are needed: the "
-                "stiffness matrix is nearly singular, some part is hardly held."
+                f"The static solution has a backward error of {error:.2g} (at most {BACKWARD_ERROR_LIMIT:g}) "
+                f"and is accurate to {change:.2g} (at most {CORRECTION_LIMIT:g}); the stiffness matrix is nearly "
+                "singular, some part of the structure is hardly held."
             )
         return solution
 

@@ -1,0 +1,61 @@
+import numpy as np
+import pytest
+
+from fe.design import WingDesign
+from fe.verification import (
+    cantilever_check,
+    mesh_convergence,
+    patch_test,
+    rigid_body_check,
+    rigid_body_residual,
+    wing_balance,
+)
+
+
+def test_a_constant_strain_passes_through_distorted_cells():
+    result = patch_test()
+    assert result.displacement_error < 1e-12
+    assert result.strain_error < 1e-12
+
+
+def test_an_unsupported_body_has_six_rigid_motions():
+    result = rigid_body_check()
+    assert result.count == 6
+    assert result.smallest_elastic > 1e-6
+
+
+def test_a_cantilever_bends_as_timoshenko_says():
+    assert abs(cantilever_check().relative_error) < 1e-3
+    # It converges to the beam, and a coarse one is already near.
+    assert abs(cantilever_check(20).relative_error) < abs(cantilever_check(5).relative_error) < 0.01
+
+
+def test_the_wing_resists_no_rigid_motion(coarse_operators):
+    assert rigid_body_residual(coarse_operators) < 1e-12
+
+
+def test_mass_reactions_and_energy_balance(coarse_operators):
+    balance = wing_balance(coarse_operators)
+    assert balance.structural_mass == pytest.approx(balance.volume_mass, rel=1e-10)
+    assert balance.spring_force == pytest.approx(balance.lift, rel=1e-5)
+    assert balance.spring_moment == pytest.approx(balance.lift_moment, rel=1e-5)
+    assert balance.strain_energy == pytest.approx(balance.work, rel=1e-5)
+
+
+def test_the_structure_weighs_what_it_should(shipped_operators):
+    assert wing_balance(shipped_operators).structural_mass == pytest.approx(0.97, rel=0.03)
+
+
+@pytest.fixture(scope="module")
+def convergence(shipped_design: WingDesign):
+    return mesh_convergence(shipped_design, (0.25, 0.5, 1.0))
+
+
+def test_the_mesh_converges(convergence):
+    coarse, half, one = convergence
+    assert coarse.unknowns < half.unknowns < one.unknowns
+    for name in ("tip_stiffness", "first_bending", "second_bending"):
+        first, second, third = (getattr(row, name) for row in convergence)
+        assert abs(third / second - 1.0) < 0.02
+        assert abs(third - second) < abs(second - first)
+    assert np.sqrt(np.mean((one.strain / half.strain - 1.0) ** 2)) < 0.05
