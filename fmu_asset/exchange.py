@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -76,7 +76,7 @@ class Exchange:
         self._ordered = [inputs[label].variable for label in labels]
         for role, slots in self._slots.items():
             self._slots[role] = {
-                name: slot._replace(position=labels.index(slot.label)) for name, slot in slots.items()
+                name: slot._replace(position=2 + labels.index(slot.label)) for name, slot in slots.items()
             }
         observed = [
             (name, self._resolve(name, f"observation.{key}", "output"), vector.unit, f"observation.{key}")
@@ -110,8 +110,8 @@ class Exchange:
             else (np.array([item.factor for item in own]), np.array([item.offset for item in own]))
         )
         self._monitors = [
-            (name, place[len(observed) + position], conversions[len(observed) + position])
-            for position, (name, *_) in enumerate(monitored)
+            (name, place[which], None if conversions[which] == IDENTITY else conversions[which])
+            for which, (name, *_) in enumerate(monitored, len(observed))
         ]
 
         def references(kind: str, variables: Sequence[VariableInfo]) -> list[int]:
@@ -174,8 +174,8 @@ class Exchange:
         return variable
 
     def start_values(self) -> list[float]:
-        """Return the FMU's own start values of the inputs, in the order of the request block."""
-        return [_start_value(variable) for variable in self._ordered]
+        """Return a request block with the FMU's own start values of the inputs."""
+        return [0.0, 0.0, *(_start_value(variable) for variable in self._ordered)]
 
     def settings(self, parameters: Mapping[str, float]) -> Settings:
         """Return what is set before initialisation: the values of the binding, then the caller's.
@@ -216,7 +216,7 @@ class Exchange:
 
     def place(
         self,
-        target: list[float],
+        target: Any,
         control: Mapping[str, float] | None,
         health: Mapping[str, float] | None,
         load: Mapping[str, float] | None,
@@ -225,8 +225,8 @@ class Exchange:
 
         Parameters
         ----------
-        target : list of float
-            All inputs in the order of the request block; changed in place.
+        target : list of float or ctypes array
+            A request block; changed in place.
         control, health, load : mapping of str to float or None
             By the binding's names and in its units.
 
@@ -284,7 +284,10 @@ class Exchange:
         if self._observation_scale is not None:
             factor, offset = self._observation_scale
             values = (values - offset) / factor
-        extra = {name: scale.from_fmu(float(block[index])) for name, index, scale in self._monitors}
+        extra = {
+            name: block.item(index) if scale is None else scale.from_fmu(block.item(index))
+            for name, index, scale in self._monitors
+        }
         return values, extra
 
     def not_finite(self, block: npt.NDArray[np.float64]) -> list[str]:

@@ -192,6 +192,7 @@ class FmuInstance:
         # The C functions themselves, with the types that FMU2Slave has given them: its methods log and look
         # up names at every call.
         self._do_step = fmu.dll.fmi2DoStep
+        self._component = fmu.component
 
     def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
         """Set parameters, and inputs if wanted, and bring the instance to its first communication point.
@@ -241,7 +242,7 @@ class FmuInstance:
             raise FmuWorkerError("The instance was lost to a fatal error; reset the asset to go on.")
         request = self.request
         self._exchange(self._set, sending=True)
-        status = self._do_step(self._fmu.component, request[0], request[1], 1)
+        status = self._do_step(self._component, request[0], request[1], 1)
         if status > _WARNING:
             raise self._call_error("fmi2DoStep", status, f"the step from t = {request[0]:g} s")
         self._exchange(self._get, sending=False)
@@ -320,14 +321,13 @@ class FmuInstance:
         _listeners.pop(self._name, None)
 
     def _exchange(self, blocks: list[tuple[str, Callable[..., int], Block]], *, sending: bool) -> None:
-        component = self._fmu.component
         for name, function, block in blocks:
             if sending and not block.real:
                 block.to_fmu()
-            status = function(component, block.references, block.count, block.values)
+            status = function(self._component, block.references, block.count, block.values)
             if status > _WARNING:
                 raise self._call_error(name, status, "setting inputs" if sending else "reading outputs")
-            if not sending and not block.real:
+            if not (sending or block.real):
                 block.from_fmu()
 
     @contextmanager

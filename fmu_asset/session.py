@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal, NoReturn, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -261,19 +261,19 @@ class FmiAsset:
         """
         instance = self._opened()
         request = instance.request
-        before: list[Any] = request[:]
-        values = before[2:]
-        self._exchange.place(values, control, health, load)
+        before = bytes(request)
         begin = self._start_time + self._index * self._step_size
-        request[:] = [begin, self._step_size, *values]
         try:
+            self._exchange.place(request, control, health, load)
+            request[0] = begin
+            request[1] = self._step_size
             instance.step()
         except FmuError as error:
-            request[:] = before
-            raise self._told(error, f"step {self._index} from t = {begin:g} s") from error
+            memoryview(request).cast("B")[:] = before
+            self._fail(error, f"step {self._index} from t = {begin:g} s")
         self._index += 1
         if self._recording:
-            self._record.append(bytes(memoryview(request).cast("B")[16:]))
+            self._record.append(bytes(request)[16:])
         return self._observation()
 
     def observe(self) -> Observation:
@@ -282,7 +282,7 @@ class FmiAsset:
         try:
             instance.read()
         except FmuError as error:
-            raise self._told(error, f"reading at t = {self.time:g} s") from error
+            self._fail(error, f"reading at t = {self.time:g} s")
         return self._observation()
 
     # ------------------------------------------------------------------ state
@@ -306,7 +306,7 @@ class FmiAsset:
             try:
                 body = self._instance.save()
             except FmuError as error:
-                raise self._told(error, "saving the state") from error
+                self._fail(error, "saving the state")
         else:
             body = b"".join(self._record)
         return SavedState(
@@ -317,7 +317,7 @@ class FmiAsset:
             start_time=self._start_time,
             parameters=self._parameters,
             start_inputs=self._start_inputs,
-            inputs=bytes(memoryview(self._instance.request).cast("B")[16:]),
+            inputs=bytes(self._instance.request)[16:],
             body=body,
         ).to_bytes()
 
@@ -357,7 +357,9 @@ class FmiAsset:
             )
         self._settings = self._exchange.settings(saved.parameters)
         self._parameters = dict(saved.parameters)
-        start = np.frombuffer(saved.start_inputs).tolist() or self._exchange.start_values()
+        start = self._exchange.start_values()
+        if saved.start_inputs:
+            start[2:] = np.frombuffer(saved.start_inputs).tolist()
         self._begin(start, with_inputs=bool(saved.start_inputs))
         instance = self._instance
         assert instance is not None
@@ -371,7 +373,7 @@ class FmiAsset:
                 memoryview(instance.request).cast("B")[16:] = saved.inputs
         except FmuError as error:
             self._phase = "broken"
-            raise self._told(error, "restoring the state") from error
+            self._fail(error, "restoring the state")
 
     def _replay(self, inputs: bytes) -> None:
         instance = self._instance
@@ -387,15 +389,14 @@ class FmiAsset:
     def _begin(self, start: Sequence[float], *, with_inputs: bool) -> None:
         try:
             instance = self._fresh()
-            instance.request[2:] = list(start)
+            instance.request[:] = list(start)
             instance.initialise(self._binding.binding.start_time, self._settings, with_inputs=with_inputs)
         except FmuError as error:
-            told = self._told(error, "the start")
             self.close()
-            raise told from error
+            self._fail(error, "the start")
         self._index = 0
         self._record = []
-        self._start_inputs = bytes(memoryview(instance.request).cast("B")[16:]) if with_inputs else b""
+        self._start_inputs = bytes(instance.request)[16:] if with_inputs else b""
         self._phase = "ready"
 
     def _opened(self) -> FmuInstance | WorkerInstance:
@@ -436,8 +437,8 @@ class FmiAsset:
 
     def _observation(self) -> Observation:
         block = self._reply
-        # One sum tells whether all are finite; only a suspicion is looked at more closely.
-        if not math.isfinite(block.sum()):
+        # The sum of squares tells whether all are finite; only a suspicion is looked at more closely.
+        if not math.isfinite(block.dot(block)):
             bad = self._exchange.not_finite(block)
             if bad:
                 more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
@@ -456,12 +457,14 @@ class FmiAsset:
                 name = STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
                 self._log.append((name, text))
 
-    def _told(self, error: FmuError, what: str) -> FmuError:
-        """Return the error with the FMU's file and the moment, and keep its messages."""
+    def _fail(self, error: FmuError, what: str) -> NoReturn:
+        """Raise the error with the FMU's file and the moment, and keep its messages."""
         self._log.extend(("Error", message) for message in error.messages)
         if isinstance(error, FmuCallError | FmuWorkerError | TimeoutError):
-            return type(error)(f"{self._description.path}, {what}: {error.sentence}", error.messages)
-        return error
+            raise type(error)(
+                f"{self._description.path}, {what}: {error.sentence}", error.messages
+            ) from error
+        raise error
 
 
 def _release(instance: FmuInstance | WorkerInstance, folder: Path) -> None:

@@ -25,8 +25,14 @@ FINE, NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD, WANDER, TALK = map(float, range(
 BOTH = pytest.mark.parametrize("isolated", [True, False], ids=["worker", "in process"])
 
 
-def leftovers() -> set[str]:
-    return {path.name for path in Path(tempfile.gettempdir()).glob("uav-twin-fmu-*")}
+@pytest.fixture
+def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder in which this test alone makes its temporary folders, here and in subprocesses."""
+    folder = tmp_path / "scratch"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    monkeypatch.setenv("TMPDIR", str(folder))
+    return folder
 
 
 def spring(force: float, stiffness: float, steps: int) -> tuple[float, float]:
@@ -193,8 +199,7 @@ def test_the_twin_keeps_its_working_directory(spring_mass: Path, spring_binding:
     assert Path.cwd() == here
 
 
-def test_nothing_is_left_behind(spring_mass: Path, spring_binding: Binding) -> None:
-    before = leftovers()
+def test_nothing_is_left_behind(spring_mass: Path, spring_binding: Binding, scratch: Path) -> None:
     descriptors = len(list(Path("/proc/self/fd").iterdir()))
     for isolated in (True, False):
         with FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset:
@@ -202,11 +207,13 @@ def test_nothing_is_left_behind(spring_mass: Path, spring_binding: Binding) -> N
         asset.close()
     with FmiAsset(spring_mass, spring_binding) as asset, pytest.raises(FmuWorkerError):
         asset.step(load={"misbehaviour": DIE})
-    assert leftovers() <= before
+    assert not list(scratch.iterdir())
     assert len(list(Path("/proc/self/fd").iterdir())) == descriptors
 
 
-def test_a_worker_ends_when_the_twin_is_killed(fmu: Path, binding: Binding, tmp_path: Path) -> None:
+def test_a_worker_ends_when_the_twin_is_killed(
+    fmu: Path, binding: Binding, tmp_path: Path, scratch: Path
+) -> None:
     (tmp_path / "binding.json").write_text(binding.model_dump_json(exclude_none=True), encoding="utf-8")
     program = (
         "import json, os, signal, sys\n"
@@ -219,7 +226,6 @@ def test_a_worker_ends_when_the_twin_is_killed(fmu: Path, binding: Binding, tmp_
         "print(asset.worker_process_id, flush=True)\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    before = leftovers()
     done = subprocess.run(
         [sys.executable, "-c", program, fmu, tmp_path], cwd=ROOT, check=False, capture_output=True, text=True
     )
@@ -229,7 +235,7 @@ def test_a_worker_ends_when_the_twin_is_killed(fmu: Path, binding: Binding, tmp_
     while worker.exists() and time.monotonic() < deadline:
         time.sleep(0.02)
     assert not worker.exists()
-    assert leftovers() <= before
+    assert not list(scratch.iterdir())
 
 
 def test_fifty_sessions_leak_nothing(fmu: Path, binding: Binding) -> None:
