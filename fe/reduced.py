@@ -91,7 +91,7 @@ class Modes:
     flapwise_mac: tuple[float, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ReducedModel:
     """Reduced wing: affine dense matrices, outputs, modal data, error bound, validity.
 
@@ -188,6 +188,13 @@ class ReducedModel:
                     f"The {name} of a reduced model must not be negative, but is {value!r}; build it anew."
                 )
         object.__setattr__(self, "_online", _Online(self))
+
+    def __repr__(self) -> str:
+        return (
+            f"ReducedModel(design_hash={self.design_hash!r}, gauges={self.gauge_count}, "
+            f"static_basis={len(self.static_load.T)}, modal_basis={len(self.modal_load.T)}, "
+            f"modes={self.mode_count})"
+        )
 
     def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
         n, outputs, r = (

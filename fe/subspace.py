@@ -135,10 +135,11 @@ def conjugate_gradients(
         )
     if np.all(size <= wanted):
         return solution
+    missed = size > wanted
+    reached = tolerance * float(np.sqrt(np.max(size[missed] / wanted[missed])))
     raise SolutionError(
-        f"Conjugate gradients did not reach {tolerance:g} in {most_iterations} iterations (reached "
-        f"{float(np.sqrt(np.max(size / wanted))) * tolerance:.2g}); the stiffness terms must be positive "
-        "semi-definite."
+        f"Conjugate gradients reached {reached:.2g} in {most_iterations} iterations, but {tolerance:g} is "
+        "needed; the stiffness terms must be positive semi-definite."
     )
 
 

@@ -1,4 +1,4 @@
-"""Modal integration against general integrators, closed forms and step-by-step integration of the full model."""
+"""Modal integration against general integrators, closed forms and the full model step by step."""
 
 import numpy as np
 import pytest
