@@ -72,8 +72,8 @@ class Factorisation:
         if not (error <= BACKWARD_ERROR_LIMIT and change <= CORRECTION_LIMIT):
             raise SolutionError(
                 f"The static solution has a backward error of {error:.2g} (at most {BACKWARD_ERROR_LIMIT:g}) "
-                f"and is accurate to {change:.2g} (at most {CORRECTION_LIMIT:g}); the stiffness matrix is nearly "
-                "singular, some part of the structure is hardly held."
+                f"and is accurate to {change:.2g} (at most {CORRECTION_LIMIT:g}); the stiffness matrix is "
+                "nearly singular, some part of the structure is hardly held."
             )
         return solution
 
