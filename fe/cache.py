@@ -106,7 +106,7 @@ def reduced_model(
     path = _entry(design, settings).model
     try:
         return _checked_model(path, design)
-    except FileNotFoundError:
+    except OSError:  # not there, or not readable
         pass
     except ReducedModelFileError as error:
         _logger.warning("A kept model is not usable and is built anew: %s", error)
@@ -142,7 +142,7 @@ def wing_fields(
     design = _shipped(design)
     try:
         return _checked_fields(_entry(design, settings), design)
-    except FileNotFoundError:
+    except OSError:  # not there, or not readable
         pass
     except ReducedModelFileError as error:
         _logger.warning("A kept model is not usable and is built anew: %s", error)
@@ -177,7 +177,7 @@ def _build(
     with _locked(entry.model.with_suffix(".lock")):
         try:
             return _checked_fields(entry, design)  # another process may have been faster
-        except (FileNotFoundError, ReducedModelFileError):
+        except (OSError, ReducedModelFileError):
             pass
         wing = build(design, progress, settings)
         try:
