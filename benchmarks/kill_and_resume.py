@@ -29,7 +29,9 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
-def wait_for_moment(process: subprocess.Popen[bytes], folder: Path, moment: random.Random, seconds: float) -> None:
+def wait_for_moment(
+    process: subprocess.Popen[bytes], folder: Path, moment: random.Random, seconds: float
+) -> None:
     """Wait for a random moment of the run: anywhere, or soon after the first checkpoint."""
     begin = time.monotonic()
     if moment.random() < 0.5:

@@ -26,7 +26,7 @@ def synthetic_library() -> dict[str, object]:
             strain = healthy / ((1.0 - first * z1 / 100.0) * (1.0 - second * z2 / 100.0))
             entry = {}
             for control, load in (("2g", 2.0), ("3g", 3.0)):
-                draws = {"mean": (load / 3.0 * strain / 1.0 ** 0.85).tolist()}
+                draws = {"mean": (load / 3.0 * strain / 1.0**0.85).tolist()}
                 draws |= {str(e): (load / 3.0 * strain / e**0.85).tolist() for e in factors}
                 entry[control] = draws
             observations[str(z1)][str(z2)] = entry  # type: ignore[index]

@@ -39,6 +39,9 @@ class AssetSource(Protocol):
     def open(self) -> Asset:
         """Return the asset at its start."""
 
+    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
+        """Write the asset's field under an estimated state and a control; return whether it has one."""
+
 
 def wing_observation_table(
     wing: ReducedModel, scenario: Scenario, draws: ParameterDraws, model: GraphicalModel
@@ -126,6 +129,10 @@ class ReducedModelSource:
         """Return the model as an asset."""
         return wing_asset(self._wing, self._scenario)
 
+    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
+        """Write nothing: there is no mesh."""
+        return False
+
 
 class StrainLibrarySource:
     """A strain library in the format of the authors of Kapteyn et al. 2021, as model and as asset."""
@@ -186,3 +193,7 @@ class StrainLibrarySource:
             return AssetReading(self._library.strain_at([health[name] for name in names], index))
 
         return StatelessAsset(observe)
+
+    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
+        """Write nothing: there is no mesh."""
+        return False

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from twin_master.summary import Figure
     from twin_master.workflow import RunOutcome
 
 INTERRUPTED = 130
@@ -92,8 +91,8 @@ def show_outcome(outcome: RunOutcome) -> None:
     for figure in outcome.figures:
         table.add_row(
             figure.title,
-            _shown(figure.value, figure),
-            _shown(figure.reference, figure),
+            _shown(figure.value, figure.unit, "none"),
+            _shown(figure.reference, figure.unit),
             figure.reference_source,
         )
     for title, key in (
@@ -111,11 +110,12 @@ def show_outcome(outcome: RunOutcome) -> None:
     console.print(f"Report: {outcome.report}", soft_wrap=True)
 
 
-def _shown(value: float | int | str | None, figure: Figure) -> str:
+def _shown(value: float | int | str | None, unit: str, missing: str = "") -> str:
     if value is None:
-        return "" if figure.reference_source or not figure.key.endswith("step") else "none"
-    text = value if isinstance(value, str) else f"{value:.4g}" if isinstance(value, float) else str(value)
-    return f"{text} {figure.unit}".strip() if not isinstance(value, str) else text
+        return missing
+    if isinstance(value, str):
+        return value
+    return f"{value:.4g} {unit}".strip()
 
 
 def guarded(application: Callable[[], None]) -> None:

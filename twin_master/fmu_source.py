@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from fe.cache import reduced_model
 from numpy.typing import NDArray
 
+from fe.cache import reduced_model, wing_fields
 from fe.design import load_design
+from fe.fields import write_wing_vtu
 from fe.reduced import ReducedModel
 from fmu_asset.binding import load_binding
 from fmu_asset.build import build_fmu
@@ -183,6 +184,21 @@ class FmuSource:
             session.close()
             raise
         return FmuAsset(session, chosen, self._scenario.asset.load)
+
+    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
+        """Write displacement and strain of the wing as VTU, with the parameters of the scenario."""
+        if self._wing is None or {*state} != {"z1", "z2"} or {*control} != {"load_factor"}:
+            return False
+        asset = self._scenario.asset
+        write_wing_vtu(
+            path,
+            wing_fields(load_design(self._path("design.toml"))),
+            young_modulus_factor=asset.parameters.get("young_modulus_factor", 1.0),
+            stiffness_loss=(state["z1"], state["z2"]),
+            load_factor=control["load_factor"],
+            tip_force=asset.load.get("tip_force", 0.0),
+        )
+        return True
 
 
 def _content(path: Path) -> bytes:

@@ -70,9 +70,9 @@ def store_mission(
     folder: Path,
     result: MissionResult,
     attributes: Mapping[str, Any],
-    write_field: Callable[[Path], None] | None = None,
+    write_field: Callable[[Path], object] | None = None,
 ) -> xr.DataTree:
-    """Write `run.nc`, the CSV files and, where a finite element model flew, `wing.vtu`.
+    """Write `run.nc`, the CSV files and, where the asset has a mesh, `wing.vtu`.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ def build_graphical_model(scenario: Scenario) -> GraphicalModel:
     states = StateSpace(tuple(Factor(factor.name, factor.levels) for factor in scenario.state))
     prior: Float = np.ones(1)
     for factor in scenario.state:
-        prior = np.kron(prior, factor.prior)
+        prior = np.asarray(np.kron(prior, factor.prior), dtype=np.float64)
     tables = []
     for control in scenario.control_names:
         if scenario.transition.kind == "independent_tables":

@@ -359,8 +359,13 @@ def _store(
 
 def _field_writer(
     knowledge: Knowledge, source: AssetSource, result: MissionResult
-) -> Callable[[Path], None] | None:
-    return None
+) -> Callable[[Path], object]:
+    """Return what writes the field under the last estimate and the last control."""
+    flight, scenario = result.flight, knowledge.scenario
+    estimate = knowledge.model.states.mean(flight.filtered[-1]).tolist()
+    state = dict(zip(scenario.state_names, estimate, strict=True))
+    control = scenario.control[int(flight.control_index[-1])].values
+    return lambda path: source.write_field(path, state, control)
 
 
 def _timing(flight: Flight, clock: _Clock) -> dict[str, Any]:

@@ -18,7 +18,6 @@ def build(
 ) -> None:
     """Pack the wing as an FMI 2.0 co-simulation FMU; equal designs give equal bytes."""
     from fe.cache import reduced_model
-
     from fe.design import load_design
     from fmu_asset.build import build_fmu
     from fmu_asset.errors import FmuBuildError

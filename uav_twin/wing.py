@@ -3,20 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from fe.design import WingDesign
+    from fe.reduced import Modes
+
+PUBLISHED = {
+    "tip stiffness": "0.6770 (eq. 14)",
+    "first flapwise bending": "5.632 (step 3, e = 1)",
+    "second flapwise bending": "28.544 (step 3, e = 1)",
+}
 
 
 def wing(
     design: Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")] = None,
-    vtu: Annotated[Path | None, typer.Option(help="Write the wing with its fields for ParaView.")] = None,
+    vtu: Annotated[
+        Path | None,
+        typer.Option(help="Write the undamaged wing at 3g for ParaView, and its modes beside it."),
+    ] = None,
 ) -> None:
     """Say what the wing weighs, how it vibrates and how stiff its tip is."""
-    from fe.cache import reduced_model
     from rich.console import Console
     from rich.table import Table
 
+    from fe.cache import reduced_model
     from fe.design import load_design
     from fe.state import DigitalState
     from reporting.progress import RichProgress
@@ -24,13 +37,71 @@ def wing(
     wing_design = load_design(design)
     model = reduced_model(wing_design, progress=RichProgress())
     state = DigitalState()
-    modes = model.modes(state.young_modulus_factor, state.stiffness_loss, state.servo_mass, state.pitot_mass)
-    table = Table("figure", "this wing", "reference", "unit")
-    table.add_row("tip stiffness", f"{1e-3 * model.tip_stiffness(1.0):.4f}", "0.6770", "N/mm")
-    reference = {modes.flapwise[0]: "5.632", modes.flapwise[1]: "28.544"}
-    names = {modes.flapwise[0]: ", first flapwise bending", modes.flapwise[1]: ", second flapwise bending"}
+    masses = (state.servo_mass, state.pitot_mass)
+    modes = model.modes(state.young_modulus_factor, state.stiffness_loss, *masses)
+    structure = structural_mass(wing_design)
+    table = Table("figure", "this wing", "published model", "unit")
+    table.add_row("mass of the structure", f"{structure:.4f}", "", "kg")
+    table.add_row("mass with two servos and pitot", f"{structure + 2 * masses[0] + masses[1]:.4f}", "", "kg")
+    stiffness = 1e-3 * model.tip_stiffness(state.young_modulus_factor)
+    table.add_row("tip stiffness", f"{stiffness:.4f}", PUBLISHED["tip stiffness"], "N/mm")
     for index, frequency in enumerate(modes.frequency):
-        name = f"frequency {index + 1}{names.get(index, '')}"
-        table.add_row(name, f"{frequency:.3f}", reference.get(index, ""), "Hz")
+        name = mode_name(modes, index)
+        title = f"frequency {index + 1}" + (f", {name}" if name else "")
+        table.add_row(title, f"{frequency:.3f}", PUBLISHED.get(name, ""), "Hz")
     console = Console(highlight=False)
     console.print(table)
+    console.print("The published figures are of Kapteyn et al. 2021 and belong to the shipped wing.")
+    if vtu is not None:
+        for path in write_fields(wing_design, vtu):
+            console.print(f"Wrote {path}", soft_wrap=True)
+
+
+def mode_name(modes: Modes, index: int) -> str:
+    """Return the name of a mode that is followed by its shape, or nothing."""
+    names = ("first flapwise bending", "second flapwise bending")
+    return dict(zip(modes.flapwise, names, strict=True)).get(index, "")
+
+
+def structural_mass(design: WingDesign) -> float:
+    """Return the mass of the structure without its point masses, from the volumes of the cells [kg]."""
+    import numpy as np
+
+    from fe.assembly import global_gradients
+    from fe.mesh import build_mesh
+    from fe.operators import cell_density
+
+    mesh = build_mesh(design)
+    half = 0.5 / np.sqrt(3.0)  # two Gauss points each way integrate a trilinear Jacobian exactly
+    signs = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
+    _, determinant = global_gradients(mesh.corners, 0.5 + half * signs)
+    return float((determinant.mean(axis=1) * cell_density(mesh)).sum())
+
+
+def write_fields(design: WingDesign, path: Path) -> tuple[Path, Path]:
+    """Write the undamaged wing in a 3g turn, and its modes in a file beside it; return both paths."""
+    from fe.cache import wing_fields
+    from fe.fields import write_modes_vtu, write_wing_vtu
+    from fe.state import DigitalState
+    from reporting.progress import RichProgress
+
+    state = DigitalState()
+    fields = wing_fields(design, progress=RichProgress())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_wing_vtu(
+        path,
+        fields,
+        young_modulus_factor=state.young_modulus_factor,
+        stiffness_loss=state.stiffness_loss,
+        load_factor=3.0,
+    )
+    modes = path.with_name(f"{path.stem}-modes{path.suffix}")
+    write_modes_vtu(
+        modes,
+        fields,
+        young_modulus_factor=state.young_modulus_factor,
+        stiffness_loss=state.stiffness_loss,
+        servo_mass=state.servo_mass,
+        pitot_mass=state.pitot_mass,
+    )
+    return path, modes

@@ -35,7 +35,15 @@ def flown(source: StrainLibrarySource, knowledge: Knowledge, seed: int = 3, **op
 
 
 def same(first: Flight, second: Flight) -> bool:
-    arrays = ("observed", "control_index", "filtered", "log_evidence", "smoothed", "predicted", "predicted_joint")
+    arrays = (
+        "observed",
+        "control_index",
+        "filtered",
+        "log_evidence",
+        "smoothed",
+        "predicted",
+        "predicted_joint",
+    )
     return all(
         np.array_equal(getattr(first, name), getattr(second, name), equal_nan=name == "observed")
         for name in arrays
@@ -76,7 +84,9 @@ def test_timing_of_a_turn(library_file: Path) -> None:
         assert flight.control_index[step + 1] == np.argmax(flight.predicted_joint[step, 0].sum(axis=0))
 
 
-def test_the_observation_is_the_truth_with_noise_and_nothing_else_reaches_the_twin(library_file: Path) -> None:
+def test_the_observation_is_the_truth_with_noise_and_nothing_else_reaches_the_twin(
+    library_file: Path,
+) -> None:
     scenario = load_scenario("level_turns").scenario
     source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
     knowledge = prepare_knowledge(scenario, source, 1)

@@ -21,7 +21,9 @@ from twin_master.twin import build_graphical_model
 @pytest.fixture
 def knowledge(library_file: Path) -> Knowledge:
     scenario = load_scenario("level_turns").scenario
-    return prepare_knowledge(scenario, StrainLibrarySource(scenario, load_strain_library(library_file), "h"), 0)
+    return prepare_knowledge(
+        scenario, StrainLibrarySource(scenario, load_strain_library(library_file), "h"), 0
+    )
 
 
 def test_the_model_of_the_paper() -> None:
@@ -47,7 +49,9 @@ def test_probabilities_may_differ_between_states_and_tables_may_be_given() -> No
     assert model.transition.matrix[1, at((0.0, 0.0)), at((0.0, 0.2))] == 0.0
     tables = {
         control: {
-            name: [[1.0 - p if i == j else p if j == (i + 1) % 5 else 0.0 for j in range(5)] for i in range(5)]
+            name: [
+                [1.0 - p if i == j else p if j == (i + 1) % 5 else 0.0 for j in range(5)] for i in range(5)
+            ]
             for name, p in (("z1", 0.25), ("z2", 0.5))
         }
         for control in ("2g", "3g")

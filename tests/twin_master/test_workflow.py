@@ -166,9 +166,7 @@ def test_existing_folders_are_refused(tmp_path: Path, library_file: Path) -> Non
     fly(tmp_path / "empty", library_file)
 
 
-def test_what_cannot_be_resumed(
-    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_resumed(tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(NotResumableError, match="there is no run folder"):
         resume_run(tmp_path / "nothing")
     with pytest.raises(NotResumableError, match="is no run folder"):

@@ -35,7 +35,16 @@ def test_commands_are_listed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
         assert command in text
     assert call(monkeypatch, "run", "--help") == 0
     text = capsys.readouterr().out
-    for option in ("--out", "--seed", "--resume", "--replace", "--fmu", "--binding", "--strain-library", "--in-process"):
+    for option in (
+        "--out",
+        "--seed",
+        "--resume",
+        "--replace",
+        "--fmu",
+        "--binding",
+        "--strain-library",
+        "--in-process",
+    ):
         assert option in text
 
 
@@ -91,7 +100,10 @@ def test_errors_of_the_packages_are_one_sentence_and_1(
         (["run", "no_such_scenario"], "no_such_scenario"),
         (["run", str(broken)], "format"),
         (["run", "--resume", str(tmp_path / "nothing")], "no run folder"),
-        (["run", "level_turns", "--out", str(tmp_path / "x"), "--strain-library", str(tmp_path)], "UAVconfig.json"),
+        (
+            ["run", "level_turns", "--out", str(tmp_path / "x"), "--strain-library", str(tmp_path)],
+            "UAVconfig.json",
+        ),
         (["fmu", "info", str(tmp_path / "no.fmu")], "no.fmu"),
         (["fmu", "info", str(broken)], "broken.toml"),
         (["fmu", "check", str(tmp_path / "no.fmu")], "no.fmu"),
@@ -124,7 +136,9 @@ def test_ctrl_c_says_how_to_go_on(
 
     monkeypatch.setattr("twin_master.workflow._fly", interrupted)
     out = tmp_path / "run"
-    code = call(monkeypatch, "run", "level_turns", "--out", str(out), "--strain-library", str(library_file), "-q")
+    code = call(
+        monkeypatch, "run", "level_turns", "--out", str(out), "--strain-library", str(library_file), "-q"
+    )
     assert code == 130
     assert f"--resume {out}" in capsys.readouterr().err
 
