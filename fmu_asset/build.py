@@ -263,7 +263,9 @@ def _members(model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str,
         raise FmuBuildError(
             f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed} is installed."
         )
-    wrapper, own, wing = files("pythonfmu"), files("fmu_asset"), files("fe")
+    # As installed, not as imported: an FMU in this process may have brought a pythonfmu of its own.
+    wrapper = Path(str(distribution("pythonfmu").locate_file("pythonfmu")))
+    own, wing = files("fmu_asset"), files("fe")
     module = f"uav_wing_{_PLACEHOLDER}"
     runtime = f"resources/{module}_runtime"
     members = {
@@ -294,10 +296,9 @@ def _members(model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str,
     }
     members |= {f"{runtime}/{name}": (own / name).read_bytes() for name in _OWN_FILES}
     members |= {f"{runtime}/fe/{name}": (wing / name).read_bytes() for name in RUNTIME_FILES}
-    folder = Path(str(wrapper))
     members |= {
-        f"{runtime}/pythonfmu/{name}": (folder / name).read_bytes()
-        for name in relative_imports(folder, ["fmi2slave.py"])
+        f"{runtime}/pythonfmu/{name}": (wrapper / name).read_bytes()
+        for name in relative_imports(wrapper, ["fmi2slave.py"])
     }
     return members
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import itertools
 import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -307,6 +308,7 @@ class FmuInstance:
 
     def close(self) -> None:
         """Free the instance; one that was lost to a fatal error is left alone, since freeing it can crash."""
+        _listeners.pop(self._name, None)
         if self._lost:
             return
         self._lost = True
@@ -318,7 +320,6 @@ class FmuInstance:
                 if error.status == _FATAL:
                     return
             self._fmu.freeInstance()
-        _listeners.pop(self._name, None)
 
     def _exchange(self, blocks: list[tuple[str, Callable[..., int], Block]], *, sending: bool) -> None:
         for name, function, block in blocks:
@@ -359,6 +360,19 @@ class FmuInstance:
 
     def _texts(self) -> list[str]:
         return [text for _, text in self.take_log()][-_MESSAGES_IN_ERROR:]
+
+
+def forget_modules(folder: str) -> None:
+    """Take what an FMU in Python has imported from its folder out of this process.
+
+    Otherwise the next FMU with a module of the same name, or the caller, would be given that module, and the
+    folder is about to be removed. Instances that still run keep what they have.
+    """
+    inside = folder.rstrip(os.sep) + os.sep
+    sys.path[:] = [entry for entry in sys.path if not (entry + os.sep).startswith(inside)]
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", None) or "").startswith(inside):
+            del sys.modules[name]
 
 
 @contextmanager

@@ -27,7 +27,7 @@ from .errors import (
     FmuWorkerError,
 )
 from .exchange import Exchange
-from .instance import STATUS_NAMES, FmuInstance
+from .instance import STATUS_NAMES, FmuInstance, forget_modules
 from .saved_state import SavedState, StateMethod
 from .worker import WorkerInstance
 
@@ -469,4 +469,6 @@ class FmiAsset:
 
 def _release(instance: FmuInstance | WorkerInstance, folder: Path) -> None:
     instance.close()
+    if isinstance(instance, FmuInstance):
+        forget_modules(str(folder))
     shutil.rmtree(folder, ignore_errors=True)

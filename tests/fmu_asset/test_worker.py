@@ -199,6 +199,20 @@ def test_the_twin_keeps_its_working_directory(spring_mass: Path, spring_binding:
     assert Path.cwd() == here
 
 
+def test_an_fmu_in_this_process_leaves_no_modules(
+    spring_mass: Path, spring_binding: Binding, fmu: Path, binding: Binding
+) -> None:
+    path, modules = list(sys.path), set(sys.modules)
+    with FmiAsset(fmu, binding, isolated=False) as wing:
+        with FmiAsset(spring_mass, spring_binding, isolated=False) as asset:
+            asset.step()
+            assert "SpringMass" in sys.modules
+        wing.step({"load_factor": 2.0})
+    assert sys.path == path
+    assert "SpringMass" not in sys.modules
+    assert not [name for name in set(sys.modules) - modules if name.startswith("uav_wing_")]
+
+
 def test_nothing_is_left_behind(spring_mass: Path, spring_binding: Binding, scratch: Path) -> None:
     descriptors = len(list(Path("/proc/self/fd").iterdir()))
     for isolated in (True, False):
