@@ -8,10 +8,10 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from fe.cache import reduced_model
 from fmpy.fmi2 import FMU2Slave
 
 from benchmarks.measurement import Measurement, median_seconds
+from fe.cache import reduced_model
 from fmu_asset.archive import extract_fmu, read_fmu
 from fmu_asset.binding import Binding, load_binding
 from fmu_asset.build import build_fmu

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import shutil
 import stat
 import tempfile
 import zipfile
@@ -209,6 +210,7 @@ def extract_fmu(description: FmuDescription) -> Path:
         with zipfile.ZipFile(description.path) as archive:
             archive.extractall(folder)
     except (OSError, zipfile.BadZipFile, zlib.error) as error:
+        shutil.rmtree(folder, ignore_errors=True)
         raise FmuFileError(f"{description.path} could not be extracted to {folder} ({error}).") from error
     return folder
 

@@ -123,6 +123,17 @@ def test_refused_inputs_change_nothing(make_slave: Any, index: int, value: float
     assert wing.everything() == twin.everything()
 
 
+@given(size=st.floats(1e-4, 0.5), parts=st.integers(2, 7))
+def test_the_transient_does_not_depend_on_the_step_size(make_slave: Any, size: float, parts: int) -> None:
+    whole, split = (make_slave(response=2.0, initial_tip_displacement=0.02) for _ in range(2))
+    for wing in (whole, split):
+        wing.set_real([N, Z1], [3.0, 0.5])
+    assert whole.do_step(0.0, size)
+    for part in range(parts):
+        assert split.do_step(part * size / parts, size / parts)
+    np.testing.assert_allclose(whole.everything()[11:36], split.everything()[11:36], rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("size", [0.0, -1.0, math.nan, math.inf])
 def test_bad_step_sizes(make_slave: Any, size: float) -> None:
     wing = make_slave()
