@@ -124,7 +124,7 @@ def panel_label(axes: Axes, label: str, title: str = "", *, offset: float = 0.0)
     offset
         How far left of the axes the text begins, as a fraction of the axes' width.
     """
-    text = axes.set_title(f"{label}  {title}" if title else label, loc="left")
+    text = axes.set_title("  ".join(part for part in (label, title) if part), loc="left")
     if offset:
         text.set_x(-offset)
 
@@ -135,7 +135,10 @@ def to_svg(figure: Figure) -> bytes:
     with publication_style():
         # All four must be left out for the block of metadata, with its addresses, to vanish.
         figure.savefig(
-            buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None}
+            buffer,
+            format="svg",
+            dpi=PNG_RESOLUTION,  # of what is rasterised in it
+            metadata={"Date": None, "Creator": None, "Format": None, "Type": None},
         )
     text = buffer.getvalue().decode("utf-8")
     text = re.sub(r"<!DOCTYPE[^>]*>\s*", "", text, count=1)

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 STACK = (
-    "uav-twin", "numpy", "scipy", "scikit-fem", "pymor", "numba", "fmpy", "pythonfmu", "xarray", "h5netcdf", "h5py",
-    "pydantic", "matplotlib",
+    "uav-twin", "numpy", "scipy", "scikit-fem", "pymor", "numba", "fmpy", "pythonfmu", "xarray", "h5netcdf",
+    "h5py", "pydantic", "matplotlib",
 )  # fmt: skip
 """Distributions whose version can change a figure of a result."""
 

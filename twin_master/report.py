@@ -14,6 +14,7 @@ from reporting.figures import to_png, to_svg
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.page import Column, Page, Table
 from twin_master.report_belief import belief_figure, policy_figure
+from twin_master.report_calibration import calibration_caption, calibration_figure, calibration_view
 from twin_master.report_check import check_figure, predictive_check
 from twin_master.report_data import RunRecord, read_run
 from twin_master.report_mission import mission_figure
@@ -127,6 +128,11 @@ def report_figures(record: RunRecord, now: int) -> list[ReportFigure]:
         figures.append(
             ReportFigure("check", drawing, "Posterior predictive check", check_caption(record, check))
         )
+    view = calibration_view(record)
+    if view is not None:
+        drawing = calibration_figure(view)
+        title = "What the model was tailored with"
+        figures.append(ReportFigure("calibration", drawing, title, calibration_caption(view)))
     figures.append(
         ReportFigure(
             "network", network_figure(), "The dynamic decision network for a few turns", network_caption()
@@ -152,7 +158,7 @@ def render_page(record: RunRecord, figures: Mapping[str, ReportFigure], drawings
         ("What the twin believes", ("belief",)),
         ("What the twin decides", ("policy",)),
         ("Whether the data agree", ("check",)),
-        ("The model", ("network",)),
+        ("The model", ("calibration", "network")),
     ):
         present = [figures[key] for key in names if key in figures]
         if present:
@@ -254,9 +260,12 @@ def _add_run(page: Page, record: RunRecord) -> None:
     ]
     if record.log_evidence is not None:
         rows.append(("log evidence of all observations", f"{float(np.sum(record.log_evidence)):.2f}"))
-    for name, values in record.monitors.items():
-        scale, unit = (1.0e6, " µε") if name == "strain_error_bound" else (1.0, "")
-        rows.append((f"largest {name.replace('_', ' ')}", f"{scale * float(np.nanmax(values)):.3g}{unit}"))
+    for name, (values, unit) in record.monitors.items():
+        scale, printed = (1.0e6, "µε") if name == "strain_error_bound" else (1.0, unit)
+        if printed != "1" and np.isfinite(values).any():
+            rows.append(
+                (f"largest {name.replace('_', ' ')}", f"{scale * float(np.nanmax(values)):.3g} {printed}")
+            )
     page.add_table(
         Table((Column("item"), Column("value")), rows), "From run.nc and config.json.", title="Run"
     )

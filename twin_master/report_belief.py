@@ -229,18 +229,23 @@ def _policy_map(axes: Axes, record: RunRecord, shape: tuple[int, ...]) -> None:
         for name, color in zip(record.controls, colors, strict=True)
     ]
     handles += [line for line in axes.get_lines() if line.get_label() in {"estimate", "truth"}]
-    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(-0.02, 1.08), ncols=4, handlelength=1.4)
+    axes.legend(
+        handles=handles, loc="lower left", bbox_to_anchor=(-0.02, 1.08), ncols=len(handles), handlelength=1.4
+    )
 
 
 def _margin_map(figure: Figure, axes: Axes, record: RunRecord, margin: Float, shape: tuple[int, ...]) -> None:
     assert record.policy is not None
-    signed, label = margin, "value of the chosen control beyond the next best"
+    signed, label = margin, "value beyond the next best"
     if len(record.controls) == 2 and record.policy.action_value is not None:
         signed = record.policy.action_value[:, 1] - record.policy.action_value[:, 0]
         label = f"Q({record.controls[1]}) − Q({record.controls[0]})"
     largest = float(np.abs(signed).max()) or 1.0
     values = signed.reshape(shape).T
-    image = _map(axes, record, values, cmap="PuOr", norm=TwoSlopeNorm(0.0, -largest, largest))
+    if signed is margin:
+        image = _map(axes, record, values, cmap="Purples", vmin=0.0, vmax=largest)
+    else:
+        image = _map(axes, record, values, cmap="PuOr", norm=TwoSlopeNorm(0.0, -largest, largest))
     for i, x in enumerate(100.0 * record.levels[0]):
         for j, y in enumerate(100.0 * record.levels[1]):
             strong = abs(values[j, i]) > 0.62 * largest

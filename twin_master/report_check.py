@@ -20,6 +20,7 @@ from twin_master.report_view import sensor_word
 Float = NDArray[np.floating[Any]]
 
 _PIT_BINS = 10
+_MOST_CELLS = 6000  # as vectors; more would make the page too large
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,7 @@ def _residual_panel(figure: Figure, axes: Axes, record: RunRecord, check: Predic
     image = axes.pcolormesh(
         np.arange(record.step_count + 1) - 0.5, np.arange(len(record.sensors) + 1) + 0.5,
         np.ma.masked_invalid(check.residual.T), cmap="PuOr_r", vmin=-4.0, vmax=4.0,
+        rasterized=check.residual.size > _MOST_CELLS,
     )  # fmt: skip
     axes.set_xlabel("turn")
     axes.set_ylabel(sensor_word(record).lower())

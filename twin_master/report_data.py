@@ -112,8 +112,14 @@ class RunRecord:
     truth_state : (T, K) or None
     truth_observation : (T, G) or None
         Noise-free.
-    monitors : mapping of (T,)
-        What the asset reported of itself, such as a certified error bound, SI.
+    monitors : mapping of ((T,), unit)
+        What the asset reported of itself, such as a certified error bound.
+    parameter_name : str
+        The uncertain parameter of the model; empty if it was not stored.
+    parameter_draws : (E,) or None
+        Its draws, over which the twin averages.
+    calibration : mapping
+        Content of ``calibration.json``; empty if there is none.
     attributes : mapping
         Root attributes of ``run.nc``.
     config, summary, timing : mapping
@@ -139,7 +145,10 @@ class RunRecord:
     policy: PolicyTable | None
     truth_state: Float | None
     truth_observation: Float | None
-    monitors: Mapping[str, Float]
+    monitors: Mapping[str, tuple[Float, str]]
+    parameter_name: str
+    parameter_draws: Float | None
+    calibration: Mapping[str, Any]
     attributes: Mapping[str, Any]
     config: Mapping[str, Any]
     summary: Mapping[str, Any]
@@ -325,7 +334,7 @@ def _record(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], fol
     filtered = _estimate(filtered_group, "filtered", coordinates, "step")
     if filtered is None:
         raise ValueError("the variable filtered/probability is missing")
-    policy_group, truth = groups.get("policy"), groups.get("truth")
+    policy_group, truth, draws_group = (groups.get(name) for name in ("policy", "truth", "calibration"))
     chosen = _array(policy_group, "control_index", "state")
     policy = None
     if chosen is not None:
@@ -357,6 +366,9 @@ def _record(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], fol
         truth_state=_array(truth, "state", "step", "region"),
         truth_observation=_array(truth, role, "step", "sensor"),
         monitors=_monitors(truth),
+        parameter_name="" if draws_group is None else _text(draws_group.attrs.get("parameter", "parameter")),
+        parameter_draws=_array(draws_group, "draw_value", "draw"),
+        calibration=_read_json(folder / "calibration.json"),
         attributes=attributes,
         config=config,
         summary=_read_json(folder / "summary.json"),
@@ -364,12 +376,12 @@ def _record(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], fol
     )
 
 
-def _monitors(truth: xr.Dataset | None) -> dict[str, Float]:
-    """Return the variables of `truth` with one value a step."""
+def _monitors(truth: xr.Dataset | None) -> dict[str, tuple[Float, str]]:
+    """Return the variables of `truth` with one value a step, and their units."""
     if truth is None:
         return {}
     return {
-        str(name): np.asarray(variable.values, dtype=np.float64)
+        str(name): (np.asarray(variable.values, dtype=np.float64), str(variable.attrs.get("units", "1")))
         for name, variable in truth.data_vars.items()
         if variable.dims == ("step",) and variable.dtype.kind == "f"
     }

@@ -30,6 +30,8 @@ from twin_master.report_view import (
 Float = NDArray[np.floating[Any]]
 
 _ROW_HEIGHT = 1.22
+_NARROW = 0.12  # a share of the time axis that has no room for a name above it
+_MANY_TURNS = 120  # more have no room for gaps between bars
 _DASHES = (0, (3, 1.2))
 _TRUTH: dict[str, Any] = {
     "color": style.TRUTH,
@@ -107,7 +109,7 @@ def _zones(axes: Axes, record: RunRecord, now: int, *, named: bool) -> None:
         axes.text(now, height, f"now: {now}", transform=where, ha="right", color=style.PRESENT)
         if now > 0.35 * end:
             axes.text(-0.8, height, "past", transform=where, ha="left", color=style.PAST)
-        if record.horizon:
+        if record.horizon > _NARROW * end:
             axes.text(now + 0.5, height, "prediction", transform=where, ha="left", color=style.PREDICTION)
 
 
@@ -169,15 +171,16 @@ def _sensor_panel(axes: Axes, record: RunRecord, sensor: int, now: int) -> str:
 
 
 def _control_panel(axes: Axes, record: RunRecord, _index: int, now: int) -> str:
-    tallest = 0.82
+    tallest, width = 0.82, 0.8 if now + record.horizon < _MANY_TURNS else 1.0
     for control in range(len(record.controls)):
         flown = np.flatnonzero(record.control_index[: now + 1] == control)
         colors = [style.PRESENT if turn == now else style.PAST for turn in flown]
-        axes.bar(flown, np.full(len(flown), tallest), width=0.8, bottom=control, color=colors, linewidth=0)
+        axes.bar(flown, np.full(len(flown), tallest), width=width, bottom=control, color=colors, linewidth=0)
         if record.control_probability is not None and record.horizon:
             axes.bar(
                 now + 1.0 + np.arange(record.horizon), tallest * record.control_probability[now, :, control],
-                width=0.8, bottom=control, color=style.PREDICTION, linewidth=0, label=f"predicted {control}",
+                width=width, bottom=control, color=style.PREDICTION, linewidth=0,
+                label=f"predicted {control}",
             )  # fmt: skip
         axes.axhline(control, color=style.REFERENCE, linewidth=0.6)
     later = np.arange(now + 1, min(now + 1 + record.horizon, record.step_count))

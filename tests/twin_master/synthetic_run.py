@@ -154,6 +154,11 @@ def build_tree(
             }
         ),
     }
+    groups["calibration"] = xr.Dataset(
+        {"draw_value": ("draw", draw)}, attrs={"parameter": "young_modulus_factor"}
+    )
+    groups["truth"]["strain_error_bound"] = ("step", np.full(steps, 1.2e-6), {"units": "1"})
+    groups["truth"]["tip_displacement"] = ("step", np.full(steps, 0.18), {"units": "m"})
     if horizon:
         groups["predicted"] = describe(
             np.array(predicted), np.array(control_probability), ("step", "horizon")

@@ -17,7 +17,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from reporting.errors import DiskFullError
 from reporting.figures import to_svg
-from twin_master import report, report_belief, report_check, report_data, report_mission, report_network
+from twin_master import (
+    report,
+    report_belief,
+    report_calibration,
+    report_check,
+    report_data,
+    report_mission,
+    report_network,
+)
 from twin_master.report_text import duration, lost_ranges, number, turn_ranges
 from twin_master.report_view import choose_sensors, default_now
 from twin_master.run_errors import RunFolderError
@@ -256,6 +264,38 @@ def test_predictive_check_of_a_right_twin_is_uniform(record: report_data.RunReco
     assert np.all(np.abs(np.histogram(check.transform, 10)[0] - 120) < 45)
 
 
+def test_calibration_shows_draws_posterior_and_measurements(
+    record: report_data.RunRecord, tree: xr.DataTree
+) -> None:
+    bare = report_calibration.calibration_view(record)
+    assert bare is not None
+    assert (bare.posterior, bare.pairs, bare.true_value) == (None, None, 1.0073)
+    assert len(report_calibration.calibration_figure(bare).axes) == 1
+    grid = np.linspace(0.9, 1.1, 101)
+    kept = {
+        "prior": {"mean": 1.0, "standard_deviation": 0.0255},
+        "exact": {"grid": list(grid), "density": list(np.exp(-0.5 * ((grid - 1.007) / 0.01) ** 2))},
+        "data": {"load_N": [2.5, 5.0, 7.5], "displacement_m": [0.004, 0.008, 0.011]},
+        "tip_stiffness_exact": {"mean": 681.1, "standard_deviation": 6.0, "unit": "N/m"},
+    }
+    view = report_calibration.calibration_view(replace(record, calibration=kept))
+    assert view is not None
+    figure = report_calibration.calibration_figure(view)
+    assert_allclose(line(figure.axes[0], "measured"), [[2.5, 4.0], [5.0, 8.0], [7.5, 11.0]])
+    assert_allclose(line(figure.axes[0], "calibrated")[1], [8.1, 1e3 * 8.1 / 681.1])
+    posterior = line(figure.axes[1], "posterior")
+    assert_allclose(posterior[:, 1], np.exp(-0.5 * ((posterior[:, 0] - 1.007) / 0.01) ** 2))
+    assert "681.1 ± 6.0 N/m" in report_calibration.calibration_caption(view)
+    for broken in (
+        {"prior": 3},
+        {"exact": {"grid": [1.0]}},
+        {"data": {"load_N": [1.0], "displacement_m": []}},
+    ):
+        assert report_calibration.calibration_view(replace(record, calibration=broken)) is not None
+    fixed = replace(record, parameter_draws=np.ones(5))
+    assert report_calibration.calibration_figure(report_calibration.calibration_view(fixed)).axes
+
+
 def test_network_has_the_dependences_of_the_factors() -> None:
     parents: dict[tuple[str, int], set[tuple[str, int]]] = {}
     for edge in report_network.network_edges():
@@ -279,7 +319,7 @@ def test_equal_runs_give_equal_bytes(folder: Path, tmp_path: Path, tree: xr.Data
     assert contents[0] == contents[1]
     assert set(contents[0][0]) == {
         "mission_now.svg", "mission_now.png", "mission_whole.svg", "belief.svg", "policy.svg", "check.svg",
-        "network.svg",
+        "calibration.svg", "network.svg",
     }  # fmt: skip
     assert first.read_bytes() == second.read_bytes()
 
@@ -291,8 +331,10 @@ def test_the_page_needs_nothing_from_outside(folder: Path) -> None:
     assert "<script" not in text
     assert not re.search(r'(?:src|href)="(?!#|data:image/png;base64,)', text)
     assert not re.search(r"url\((?!#)", text)
-    assert text.count("<figure") == 6
+    assert text.count("<figure") == 7
     assert str(folder) not in text
+    assert re.search(r"largest tip displacement</td><td>0.18\sm<", text)
+    assert re.search(r"largest strain error bound</td><td>1.2\sµε<", text)
     for word in ("Kapteyn", "seed 5", "policy leaves the first control from z1", "timing.json"):
         assert word in text
 
@@ -315,7 +357,8 @@ def test_times_appear_when_they_are_known(tmp_path: Path, tree: xr.DataTree) -> 
 @pytest.mark.parametrize(
     "missing",
     [
-        "truth", "smoothed", "predicted", "policy", "policy/action_value", "observed/strain", "truth/strain",
+        "truth", "smoothed", "predicted", "policy", "calibration", "policy/action_value", "observed/strain",
+        "truth/strain",
         "filtered/quantity_mean", "filtered/reward_mean", "predicted/quantity_mean",
         "predicted/control_probability", "filtered/log_evidence", "filtered/quantity_standard_deviation",
         "filtered/quantity_lower", "predicted/reward_standard_deviation",
