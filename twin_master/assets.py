@@ -35,6 +35,10 @@ class AssetReading:
 class Asset(Protocol):
     """An asset under control."""
 
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units of control inputs and monitors by name; those that are missing are dimensionless."""
+
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         """Fly one step with the given control inputs and true health (SI)."""
 
@@ -58,10 +62,18 @@ class StatelessAsset:
     ----------
     observe
         Returns the reading for control inputs and health.
+    units
+        Units of control inputs and monitors by name; those that are missing are dimensionless.
     """
 
-    def __init__(self, observe: ObservationFunction) -> None:
+    def __init__(self, observe: ObservationFunction, units: Mapping[str, str] | None = None) -> None:
         self._observe = observe
+        self._units = dict(units or {})
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units of control inputs and monitors by name."""
+        return self._units
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         """Return the observation under the given control inputs and health."""

@@ -125,7 +125,8 @@ def guarded(application: Callable[[], None]) -> None:
     except Exception as error:
         if not _is_ours(error):
             raise
-        typer.secho(str(error), fg="red", err=True)
+        for line in (str(error), *getattr(error, "__notes__", ())):
+            typer.secho(line, fg="red", err=True)
         raise SystemExit(1) from None
 
 

@@ -12,7 +12,7 @@ from fe.cache import reduced_model, wing_fields
 from fe.design import load_design
 from fe.fields import write_wing_vtu
 from fe.reduced import ReducedModel
-from fmu_asset.binding import load_binding
+from fmu_asset.binding import Binding, load_binding
 from fmu_asset.build import build_fmu
 from fmu_asset.session import FmiAsset
 from reporting.files import atomic_write_bytes
@@ -48,6 +48,15 @@ class FmuAsset:
         self._session = session
         self._observation = observation
         self._load = dict(load)
+        binding = session.binding
+        self._units = {
+            name: scalar.unit for name, scalar in [*binding.control.items(), *binding.monitor.items()]
+        }
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units of control inputs and monitors, as the binding has them."""
+        return self._units
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         """Make one communication step."""
@@ -112,7 +121,7 @@ class FmuSource:
         for name, path in self._given.items():
             if path is not None and not self._path(name).exists():
                 atomic_write_bytes(self._path(name), _content(path))
-        load_binding(self._path("binding.toml"))
+        self._observed(load_binding(self._path("binding.toml")))
         hashes = {"binding": hash_file(self._path("binding.toml"))}
         if self._given["design.toml"] is not None:
             design = load_design(self._path("design.toml"))
@@ -140,7 +149,7 @@ class FmuSource:
         states, controls = model.states.coordinates, scenario.control
         table = np.empty((len(draws.values), len(states), len(controls), scenario.observation.count))
         with self._session() as session:
-            chosen = session.binding.observation_slice(scenario.observation.role)
+            chosen = self._observed(session.binding)
             for row, value in enumerate(draws.values):
                 session.reset({**scenario.asset.parameters, draws.name: float(value)})
                 for state, levels in enumerate(states):
@@ -149,6 +158,17 @@ class FmuSource:
                         reading = session.step(control.values, health, scenario.asset.load)
                         table[row, state, index] = reading.values[chosen]
         return table
+
+    def _observed(self, binding: Binding) -> slice:
+        """Return where the observed quantity stands among the observations of the binding."""
+        role, expected = self._scenario.observation.role, self._scenario.observation.count
+        chosen = binding.observation_slice(role)
+        if chosen.stop - chosen.start != expected:
+            raise MissionInputError(
+                f"the binding {binding.name} observes {chosen.stop - chosen.start} values of `{role}`, and the "
+                f"scenario expects {expected}."
+            )
+        return chosen
 
     def _session(self) -> FmiAsset:
         asset = self._scenario.asset
@@ -171,13 +191,7 @@ class FmuSource:
             The FMU observes another number of values than the scenario.
         """
         session = self._session()
-        chosen = session.binding.observation_slice(self._scenario.observation.role)
-        if chosen.stop - chosen.start != self._scenario.observation.count:
-            raise MissionInputError(
-                f"the binding {session.binding.name} observes {chosen.stop - chosen.start} values of "
-                f"`{self._scenario.observation.role}`, and the scenario expects "
-                f"{self._scenario.observation.count}."
-            )
+        chosen = self._observed(session.binding)
         try:
             session.reset()
         except BaseException:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,8 @@ class MissionResult:
         What the sensors really did.
     flight : Flight
         The mission.
+    units : dict of str to str
+        Units of control inputs and monitors; those that are missing are dimensionless.
     """
 
     scenario: Scenario
@@ -54,6 +56,17 @@ class MissionResult:
     plan: PlannedPolicy
     truth: Truth
     flight: Flight
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def state_unit(self) -> str:
+        """Unit of the state factors; a list where they have several."""
+        return ", ".join(dict.fromkeys(factor.unit for factor in self.scenario.state))
+
+    @property
+    def observation_unit(self) -> str:
+        """Unit of the observed values."""
+        return self.scenario.observation.unit
 
 
 def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.DataTree:
@@ -117,8 +130,10 @@ class _Labels:
             ),
         }
         self.states = {
-            name: xr.Variable("state", model.states.coordinates[:, index], {"long_name": name, "units": "1"})
-            for index, name in enumerate(names)
+            factor.name: xr.Variable(
+                "state", model.states.coordinates[:, index], {"long_name": factor.name, "units": factor.unit}
+            )
+            for index, factor in enumerate(scenario.state)
         }
 
     def dataset(self, variables: Mapping[str, Variable]) -> xr.Dataset:
@@ -139,14 +154,14 @@ class _Labels:
 
 def _observed(result: MissionResult, labels: _Labels) -> xr.Dataset:
     flight, scenario = result.flight, result.scenario
-    role = scenario.observation.role
+    role, unit = scenario.observation.role, result.observation_unit
     variables: dict[str, Variable] = {
-        role: (("step", "sensor"), flight.observed, "1", f"{role} as received; NaN where a sensor is lost"),
+        role: (("step", "sensor"), flight.observed, unit, f"{role} as received; NaN where a sensor is lost"),
         "control_index": (("step",), flight.control_index, "1", "control in force"),
     }
     for name in scenario.control[0].values:
         values = np.array([control.values[name] for control in scenario.control])[flight.control_index]
-        variables[name] = (("step",), values, "1", f"{name} in force")
+        variables[name] = (("step",), values, result.units.get(name, "1"), f"{name} in force")
     return labels.dataset(variables)
 
 
@@ -157,26 +172,31 @@ def _belief(
     states = result.model.states
     mean, deviation = result.sensor_model.moments(joint)
     quantiles = result.sensor_model.quantiles(joint, (0.025, 0.975))
-    role = result.scenario.observation.role
+    role, unit = result.scenario.observation.role, result.observation_unit
     sensor = (*lead, "sensor")
     return {
         "probability": ((*lead, "state"), probability, "1", f"p(state | {given})"),
-        "mean": ((*lead, "region"), states.mean(probability), "1", f"mean of each factor given {given}"),
+        "mean": (
+            (*lead, "region"),
+            states.mean(probability),
+            result.state_unit,
+            f"mean of each factor given {given}",
+        ),
         "standard_deviation": (
             (*lead, "region"),
             states.standard_deviation(probability),
-            "1",
+            result.state_unit,
             f"standard deviation of each factor given {given}",
         ),
-        "quantity_mean": (sensor, mean, "1", f"mean of the noise-free {role} given {given}"),
+        "quantity_mean": (sensor, mean, unit, f"mean of the noise-free {role} given {given}"),
         "quantity_standard_deviation": (
             sensor,
             deviation,
-            "1",
+            unit,
             f"standard deviation of the noise-free {role} given {given}",
         ),
-        "quantity_lower": (sensor, quantiles[..., 0, :], "1", f"2.5 % quantile of the noise-free {role}"),
-        "quantity_upper": (sensor, quantiles[..., 1, :], "1", f"97.5 % quantile of the noise-free {role}"),
+        "quantity_lower": (sensor, quantiles[..., 0, :], unit, f"2.5 % quantile of the noise-free {role}"),
+        "quantity_upper": (sensor, quantiles[..., 1, :], unit, f"97.5 % quantile of the noise-free {role}"),
     }
 
 
@@ -263,8 +283,18 @@ def _policy(result: MissionResult, labels: _Labels) -> xr.Dataset:
 def _truth(result: MissionResult, labels: _Labels) -> xr.Dataset:
     record, role = result.flight.truth, result.scenario.observation.role
     variables: dict[str, Variable] = {
-        "state": (("step", "region"), record.state, "1", "true value of each factor of the state"),
-        role: (("step", "sensor"), record.observation, "1", f"true {role}, without noise and faults"),
+        "state": (
+            ("step", "region"),
+            record.state,
+            result.state_unit,
+            "true value of each factor of the state",
+        ),
+        role: (
+            ("step", "sensor"),
+            record.observation,
+            result.observation_unit,
+            f"true {role}, without noise and faults",
+        ),
         "sensor_status": (
             ("step", "sensor"),
             result.truth.status,
@@ -273,5 +303,5 @@ def _truth(result: MissionResult, labels: _Labels) -> xr.Dataset:
         ),
     }
     for name, values in record.monitors.items():
-        variables[name] = (("step",), values, "1", f"{name}, as the asset reports it")
+        variables[name] = (("step",), values, result.units.get(name, "1"), f"{name}, as the asset reports it")
     return labels.dataset(variables)

@@ -88,6 +88,8 @@ class StateFactor(Section):
     units: ClassVar[Mapping[str, str]] = {"levels": "percent"}
     name: Name
     title: str = ""
+    unit: str = "1"
+    """Unit of the levels; a dimensionless level is a fraction, printed in percent."""
     levels: Annotated[tuple[Number, ...], Field(min_length=1)]
     prior: Annotated[tuple[Probability, ...], Field(min_length=1)]
 
@@ -121,6 +123,8 @@ class ObservationSection(Section):
     units: ClassVar[Mapping[str, str]] = {"standard_deviation": "microstrain"}
     role: Name = "strain"
     count: Count
+    unit: str = "1"
+    """Unit of the observed values as the binding gives them; a dimensionless strain is printed in microstrain."""
     standard_deviation: Positive
     integral: Literal["exact", "per_sensor"] = "exact"
     """How the parameter is integrated out: `exact` is eq. (30), `per_sensor` is eq. (32) of the paper."""

@@ -151,31 +151,33 @@ def summarise(result: MissionResult, draws: ParameterDraws, reward_mean: Float) 
     fallback = find_fallback(
         model, result.plan.control_index, first, flight.control_index, flight.truth.state
     )
-    figures = _fallback_figures(fallback, scenario.control_names, published)
+    units = {factor.name: factor.unit for factor in scenario.state}
+    figures = _fallback_figures(fallback, units, published)
     errors = filtered_rms_error(model, flight.filtered, flight.truth.state)
     reference = {"z1": 3.8, "z2": 11.4} if published else {}
-    for name, error in zip(scenario.state_names, errors, strict=True):
+    for factor, error in zip(scenario.state, errors, strict=True):
+        name, fraction = factor.name, factor.unit == "1"
         figures.append(
             Figure(
                 f"filtered_rms_error_{name}",
                 f"filtered rms error of {name}",
-                100.0 * float(error),
-                "points",
+                (100.0 if fraction else 1.0) * float(error),
+                "points" if fraction else factor.unit,
                 reference.get(name),
                 REFERENCE_TWIN if name in reference else "",
             )
         )
     for index, name in enumerate(REWARD_NAMES):
-        figures.append(
-            Figure(f"mean_reward_{name}", f"mean reward for {name}", float(np.nanmean(reward_mean[:, index])))
-        )
+        known = reward_mean[np.isfinite(reward_mean[:, index]), index]
+        mean = float(known.mean()) if len(known) else None
+        figures.append(Figure(f"mean_reward_{name}", f"mean reward for {name}", mean))
     paper = (1.0073, 0.0103) if scenario.calibration.source == "static_test" else (None, None)
-    for key, title, value, known in (
+    for key, title, value, printed in (
         ("mean", "posterior mean", draws.mean, paper[0]),
         ("standard_deviation", "posterior standard deviation", draws.standard_deviation, paper[1]),
     ):
-        source = PAPER if known is not None else ""
-        figures.append(Figure(f"{draws.name}_{key}", f"{title} of {draws.name}", value, "", known, source))
+        source = PAPER if printed is not None else ""
+        figures.append(Figure(f"{draws.name}_{key}", f"{title} of {draws.name}", value, "", printed, source))
     figures.append(
         Figure("log_evidence", "log evidence of all observations", float(flight.log_evidence.sum()))
     )
@@ -190,15 +192,17 @@ def summarise(result: MissionResult, draws: ParameterDraws, reward_mean: Float) 
     return tuple(figures)
 
 
-def _fallback_figures(fallback: Fallback, controls: Sequence[str], published: bool) -> list[Figure]:
-    level = None if fallback.switch_level is None else 100.0 * fallback.switch_level
-    name = fallback.switch_state
+def _fallback_figures(fallback: Fallback, units: Mapping[str, str], published: bool) -> list[Figure]:
+    level, name = fallback.switch_level, fallback.switch_state
+    unit = units.get(name or "", "")
+    if level is not None and unit == "1":
+        level, unit = 100.0 * level, "%"
     return [
         Figure(
             "policy_switch_damage",
             f"policy leaves the first control from {name}" if name else "policy leaves the first control",
             level if level is not None else "depends on several states, or never",
-            "%" if level is not None else "",
+            unit,
             60.0 if published else None,
             PAPER if published else "",
         ),

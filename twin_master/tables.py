@@ -1,4 +1,8 @@
-"""The CSV files of a run, for people: strains in microstrain, losses in percent, units in the headers."""
+"""The CSV files of a run, for people: the unit is in each header.
+
+A dimensionless observation is a strain and given in microstrain, a dimensionless state is a fraction and given
+in percent; anything else stays in its unit.
+"""
 
 from __future__ import annotations
 
@@ -42,8 +46,9 @@ def tables_of(groups: Mapping[str, xr.Dataset], role: str) -> dict[str, str]:
 
 
 def _observations(steps: list[str], group: xr.Dataset, variable: str, role: str) -> Table:
-    header = ["step", *(f"{role}_{sensor}_microstrain" for sensor in group["sensor"].values)]
-    rows = zip(steps, group[variable].values * MICROSTRAIN, strict=True)
+    factor, unit = _edge(group[variable].attrs["units"], MICROSTRAIN, "microstrain")
+    header = ["step", *(f"{role}_{sensor}_{unit}" for sensor in group["sensor"].values)]
+    rows = zip(steps, group[variable].values * factor, strict=True)
     return header, [[step, *_numbers(row)] for step, row in rows]
 
 
@@ -51,9 +56,12 @@ def _health(steps: list[str], groups: Mapping[str, xr.Dataset]) -> Table:
     kinds = [(kind, name) for kind in ("filtered", "smoothed") for name in ("mean", "standard_deviation")]
     columns = [groups["truth"]["state"].values, *(groups[kind][name].values for kind, name in kinds)]
     header = ["step"]
-    for region in groups["truth"]["region"].values:
-        header += [f"{region}_true_percent", *(f"{region}_{kind}_{name}_percent" for kind, name in kinds)]
-    stacked = np.stack(columns, axis=-1).reshape(len(steps), -1) * PERCENT
+    values = np.stack(columns, axis=-1)
+    for index, region in enumerate(_names(groups["truth"]["region"].values)):
+        factor, unit = _edge(groups["policy"][region].attrs["units"], PERCENT, "percent")
+        header += [f"{region}_true_{unit}", *(f"{region}_{kind}_{name}_{unit}" for kind, name in kinds)]
+        values[:, index] *= factor
+    stacked = values.reshape(len(steps), -1)
     return header, [[step, *_numbers(row)] for step, row in zip(steps, stacked, strict=True)]
 
 
@@ -70,10 +78,19 @@ def _policy(groups: Mapping[str, xr.Dataset]) -> Table:
     policy = groups["policy"]
     names = _names(policy["control"].values)
     regions = _names(groups["truth"]["region"].values)
-    levels = np.stack([policy[name].values for name in regions], axis=-1) * PERCENT
-    header = [*(f"{name}_percent" for name in regions), "control", *(f"action_value_{n}" for n in names)]
+    edges = [_edge(policy[name].attrs["units"], PERCENT, "percent") for name in regions]
+    levels = np.stack(
+        [policy[n].values * factor for n, (factor, _) in zip(regions, edges, strict=True)], axis=-1
+    )
+    shown = [f"{name}_{unit}" for name, (_, unit) in zip(regions, edges, strict=True)]
+    header = [*shown, "control", *(f"action_value_{n}" for n in names)]
     rows = zip(levels, policy["control_index"].values, policy["action_value"].values, strict=True)
     return header, [[*_numbers(level), names[control], *_numbers(row)] for level, control, row in rows]
+
+
+def _edge(unit: str, factor: float, name: str) -> tuple[float, str]:
+    """Return factor and name of the printed unit of a stored one."""
+    return (factor, name) if unit == "1" else (1.0, unit)
 
 
 def _names(values: NDArray[Any]) -> list[str]:

@@ -271,7 +271,7 @@ def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Pro
             if knowledge.draws.record is not None:
                 text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
                 atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
-        with clock.stage("mission"):
+        with clock.stage("mission"), _kept(folder):
             result = _fly(folder, config, knowledge, source, progress)
         with clock.stage("store"), progress.stage("Storing"):
             figures = _store(folder, config, knowledge, source, result)
@@ -284,6 +284,20 @@ def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Pro
         return RunOutcome(folder, report, figures, timing)
     finally:
         os.close(lock)
+
+
+@contextmanager
+def _kept(folder: Path) -> Iterator[None]:
+    """Add to any error how the run can be continued."""
+    try:
+        yield
+    except NotResumableError:
+        raise
+    except Exception as error:
+        error.add_note(
+            f"The turns before it are kept: once mended, continue with `uav-twin run --resume {folder}`."
+        )
+        raise
 
 
 def _with_inputs(folder: Path, config: dict[str, Any], hashes: Mapping[str, str]) -> dict[str, Any]:
@@ -318,6 +332,7 @@ def _fly(
             keep=lambda checkpoint: write_checkpoint(folder, checkpoint),
             progress=progress,
         )
+        units = asset.units
     finally:
         asset.close()
     return MissionResult(
@@ -329,6 +344,7 @@ def _fly(
         plan=knowledge.plan,
         truth=truth,
         flight=flight,
+        units=units,
     )
 
 
@@ -344,6 +360,7 @@ def _store(
         "versions": json.dumps(provenance["versions"], sort_keys=True),
         "source_hashes": json.dumps(provenance["source_hashes"], sort_keys=True),
         "input_hashes": json.dumps(config["inputs"], sort_keys=True),
+        "observed_quantity": knowledge.scenario.observation.role,
         "parameter": knowledge.draws.name,
         "parameter_source": knowledge.draws.source,
     }
