@@ -165,8 +165,8 @@ class FmuSource:
         chosen = binding.observation_slice(role)
         if chosen.stop - chosen.start != expected:
             raise MissionInputError(
-                f"the binding {binding.name} observes {chosen.stop - chosen.start} values of `{role}`, and the "
-                f"scenario expects {expected}."
+                f"the binding {binding.name} observes {chosen.stop - chosen.start} values of `{role}`, and "
+                f"the scenario expects {expected}."
             )
         return chosen
 

@@ -302,6 +302,6 @@ def _truth(result: MissionResult, labels: _Labels) -> xr.Dataset:
             "what each sensor really does: 0 healthy, 1 lost, 2 drifting",
         ),
     }
-    for name, values in record.monitors.items():
+    for name, values in sorted(record.monitors.items()):  # a checkpoint does not keep their order
         variables[name] = (("step",), values, result.units.get(name, "1"), f"{name}, as the asset reports it")
     return labels.dataset(variables)

@@ -18,6 +18,7 @@ from twin_master.run_errors import NotResumableError, RunFolderError, RunFolderE
 
 CONFIG_NAME = "config.json"
 SUMMARY_NAME = "summary.json"
+FIELD_NAME = "wing.vtu"
 KIND = "uav-twin run"
 """Value of `kind` in `config.json`, by which a run folder is known."""
 
@@ -147,3 +148,5 @@ def tidy(folder: Path) -> None:
     """Remove what killed processes left half-written."""
     for place in [folder, *(path for path in folder.rglob("*") if path.is_dir())]:
         remove_leftovers(place)
+    for path in folder.glob(f".{FIELD_NAME}.*"):  # the finite elements have temporary names of their own
+        path.unlink(missing_ok=True)

@@ -124,7 +124,7 @@ class ObservationSection(Section):
     role: Name = "strain"
     count: Count
     unit: str = "1"
-    """Unit of the observed values as the binding gives them; a dimensionless strain is printed in microstrain."""
+    """Unit of the observed values; a dimensionless one is a strain, printed in microstrain."""
     standard_deviation: Positive
     integral: Literal["exact", "per_sensor"] = "exact"
     """How the parameter is integrated out: `exact` is eq. (30), `per_sensor` is eq. (32) of the paper."""

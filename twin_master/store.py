@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes, atomic_write_text
 from twin_master.results import MissionResult, to_datatree
-from twin_master.run_folder import SUMMARY_NAME, to_json
+from twin_master.run_folder import FIELD_NAME, SUMMARY_NAME, to_json
 from twin_master.summary import Figure, to_record
 from twin_master.tables import tables_of
 
@@ -91,5 +91,5 @@ def store_mission(
     for name, text in tables_of(groups, result.scenario.observation.role).items():
         atomic_write_text(folder / CSV_FOLDER / f"{name}.csv", text)
     if write_field is not None:
-        write_field(folder / "wing.vtu")
+        write_field(folder / FIELD_NAME)
     return tree

@@ -197,15 +197,18 @@ def _fallback_figures(fallback: Fallback, units: Mapping[str, str], published: b
     unit = units.get(name or "", "")
     if level is not None and unit == "1":
         level, unit = 100.0 * level, "%"
+    switch = Figure(
+        "policy_switch_damage",
+        f"policy leaves the first control from {name}" if name else "policy leaves the first control",
+        level if level is not None else "nowhere, or by several states",
+        unit,
+        60.0 if published else None,
+        PAPER if published else "",
+    )
+    if name is None:
+        return [switch]
     return [
-        Figure(
-            "policy_switch_damage",
-            f"policy leaves the first control from {name}" if name else "policy leaves the first control",
-            level if level is not None else "depends on several states, or never",
-            unit,
-            60.0 if published else None,
-            PAPER if published else "",
-        ),
+        switch,
         Figure("damage_step", "step of the damage that calls for it", fallback.called_for_step),
         Figure("fallback_step", "step of the fallback", fallback.fallback_step),
         Figure(

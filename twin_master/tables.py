@@ -1,7 +1,7 @@
 """The CSV files of a run, for people: the unit is in each header.
 
-A dimensionless observation is a strain and given in microstrain, a dimensionless state is a fraction and given
-in percent; anything else stays in its unit.
+A dimensionless observation is a strain and given in microstrain, a dimensionless state is a fraction and
+given in percent; anything else stays in its unit.
 """
 
 from __future__ import annotations

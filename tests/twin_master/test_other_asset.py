@@ -13,7 +13,7 @@ import xarray as xr
 
 from fmu_asset.errors import FmuError, FmuFileError
 from twin_master import workflow
-from twin_master.checkpoint import read_checkpoint
+from twin_master.checkpoint import Checkpoint, read_checkpoint
 from twin_master.run_folder import read_config
 from twin_master.scenario_file import load_scenario
 from twin_master.workflow import Overrides, new_run, resume_run
@@ -77,6 +77,28 @@ def test_the_worker_and_this_process_fly_the_same_mission(asset_folder: Path, tm
     assert runs[0].read_bytes() == runs[1].read_bytes()
 
 
+def test_a_resumed_flight_of_an_fmu_is_bit_identical(
+    asset_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded = load_scenario(asset_folder / "fouling.toml")
+    whole = new_run(loaded, tmp_path / "whole").folder
+    write = workflow.write_checkpoint
+
+    def dying(folder: Path, checkpoint: Checkpoint) -> None:
+        write(folder, checkpoint)
+        if checkpoint.turns == 11:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(workflow, "write_checkpoint", dying)
+        with pytest.raises(KeyboardInterrupt):
+            new_run(loaded, tmp_path / "part")
+    # What is flown lies in the run folder: the files that it came from may change or go.
+    resume_run(tmp_path / "part")
+    for name in ("run.nc", "config.json", "summary.json", "checkpoint.npz", "csv/observed.csv"):
+        assert (tmp_path / "part" / name).read_bytes() == (whole / name).read_bytes(), name
+
+
 def test_nan_from_the_fmu_stops_the_run_which_stays_resumable(asset_folder: Path, tmp_path: Path) -> None:
     # A constant stands for the twin's table, so that only the flown asset misbehaves.
     path = changed(
@@ -86,13 +108,13 @@ def test_nan_from_the_fmu_stops_the_run_which_stays_resumable(asset_folder: Path
         "levels = [0.0, 1e-4, 2e-4, 3e-4]", "levels = [0.0, 1e-4]"
     )
     path.write_text(text.replace("prior = [1, 0, 0, 0]", "prior = [1, 0]"), encoding="utf-8")
-    with pytest.raises(FmuError, match="not finite.*outlet"):
+    with pytest.raises(FmuError, match=r"not finite.*outlet"):
         new_run(load_scenario(path), tmp_path / "run")
     config = read_config(tmp_path / "run")
     checkpoint = read_checkpoint(tmp_path / "run", workflow.hash_record(config))
     assert checkpoint is not None
     assert checkpoint.turns == 16
-    with pytest.raises(FmuError, match="not finite.*outlet"):
+    with pytest.raises(FmuError, match=r"not finite.*outlet"):
         resume_run(tmp_path / "run")
 
 

@@ -35,6 +35,8 @@ def test_resolved_scenario_reads_back(name: str) -> None:
     assert parse_scenario(scenario.to_dict(), "config.json") == scenario
 
 
+PRIOR = "prior = [1, 0, 0, 0, 0]"
+LEVELS = "[0, 20, 40, 60, 80]"
 BROKEN = {
     "unknown key": ("steps = 50", "stepps = 50", ["mission.stepps", "unknown key", "steps"]),
     "unknown key in an array": ('title = "gentle turn"', 'tittle = "x"', ["control[1].tittle", "values"]),
@@ -43,19 +45,19 @@ BROKEN = {
     "missing key": ("steps = 50\n", "", ["mission.steps", "missing"]),
     "text for a number": ("gamma = 0.6", 'gamma = "0.6"', ["planner.gamma", "number", "'0.6'"]),
     "gamma too large": ("gamma = 0.6", "gamma = 1.0", ["planner.gamma", "less than 1", "1.0"]),
-    "probability above one": ('"2g" = 0.05', '"2g" = 5', ["transition.probability.2g", "less than or equal to 1", "5"]),
+    "probability above one": ('"2g" = 0.05', '"2g" = 5', ["transition.probability.2g", "equal to 1", "5"]),
     "probability missing": ('"2g" = 0.05, ', "", ["transition.probability", "2g, 3g"]),
-    "prior of the wrong shape": ("prior = [1, 0, 0, 0, 0]", "prior = [1, 0, 0, 0]", ["prior", "z1", "5", "4"]),
-    "prior that does not sum to one": ("prior = [1, 0, 0, 0, 0]", "prior = [1, 1, 0, 0, 0]", ["z1", "sums to 2"]),
-    "levels that do not increase": ("[0, 20, 40, 60, 80]", "[0, 40, 20, 60, 80]", ["levels", "z1", "increase"]),
-    "levels above 100 %": ("[0, 20, 40, 60, 80]", "[0, 20, 40, 60, 180]", ["levels_percent", "180"]),
+    "prior of the wrong shape": (PRIOR, "prior = [1, 0, 0, 0]", ["prior", "z1", "5", "4"]),
+    "prior that does not sum to one": (PRIOR, "prior = [1, 1, 0, 0, 0]", ["z1", "sums to 2"]),
+    "levels that do not increase": (LEVELS, "[0, 40, 20, 60, 80]", ["levels", "z1", "increase"]),
+    "levels above 100 %": (LEVELS, "[0, 20, 40, 60, 180]", ["levels_percent", "180"]),
     "missing key with a unit": ("standard_deviation_microstrain = 150\n", "",
                                 ["truth.noise.standard_deviation_microstrain", "missing"]),
-    "first control unknown": ('first_control = "3g"', 'first_control = "4g"', ["first_control", "2g, 3g", "4g"]),
+    "first control unknown": ('first_control = "3g"', 'first_control = "4g"', ["2g, 3g", "4g"]),
     "controls with other inputs": ("{ load_factor = 2.0 }", "{ load = 2.0 }", ["2g", "3g", "same inputs"]),
     "normalised by nothing": ('normalise_error_by = "load_factor"', 'normalise_error_by = "lift"', ["lift"]),
     "zero steps": ("steps = 50", "steps = 0", ["mission.steps", "0"]),
-    "gain of an unknown state": ('{ state = "z1", first_step = 10', '{ state = "z9", first_step = 10', ["z9", "z1, z2"]),
+    "gain of an unknown state": ('"z1", first_step = 10', '"z9", first_step = 10', ["z9", "z1, z2"]),
     "last step before first": ("last_step = 19", "last_step = 9", ["last_step", "9", "10"]),
     "unknown kind": ('kind = "scripted"', 'kind = "written"', ["truth.kind", "scripted", "written"]),
     "gains with random growth": ('kind = "scripted"', 'kind = "random_growth"', ["truth.gains", "scripted"]),
@@ -127,7 +129,8 @@ def test_tables_are_checked() -> None:
 @given(st.recursive(
     st.none() | st.booleans() | st.floats() | st.text(max_size=4) | st.integers(),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(
-        [*Scenario.model_fields, "levels_percent", "prior", "name", "steps", "kind", "x"]), inner, max_size=4),
+        [*Scenario.model_fields, "levels_percent", "prior", "name", "steps", "kind", "x"]
+    ), inner, max_size=4),
     max_leaves=12,
 ))  # fmt: skip
 def test_no_table_whatsoever_raises_anything_but_a_sentence(table: object) -> None:
@@ -135,7 +138,9 @@ def test_no_table_whatsoever_raises_anything_but_a_sentence(table: object) -> No
     candidates = [table] if isinstance(table, dict) else []
     candidates += [base | {key: table} for key in Scenario.model_fields]
     for candidate in candidates:
+        sentence = "x.toml"
         try:
             parse_scenario(candidate, "x.toml")
         except TwinMasterError as error:
-            assert str(error).startswith("x.toml")
+            sentence = str(error)
+        assert sentence.startswith("x.toml")
