@@ -17,7 +17,6 @@ from reporting.files import atomic_write_text, remove_leftovers, write_error
 from twin_master.run_errors import NotResumableError, RunFolderError, RunFolderExistsError
 
 CONFIG_NAME = "config.json"
-SUMMARY_NAME = "summary.json"
 FIELD_NAME = "wing.vtu"
 KIND = "uav-twin run"
 """Value of `kind` in `config.json`, by which a run folder is known."""
@@ -118,11 +117,6 @@ def read_config(folder: Path) -> dict[str, Any]:
 def write_config(folder: Path, config: Mapping[str, Any]) -> None:
     """Replace the configuration of a run folder in one step."""
     atomic_write_text(folder / CONFIG_NAME, to_json(config))
-
-
-def is_finished(folder: Path) -> bool:
-    """Return whether the run came to its end: the summary is the last of the results to be written."""
-    return (folder / SUMMARY_NAME).is_file()
 
 
 def lock_run_folder(folder: Path) -> int:

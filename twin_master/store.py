@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes, atomic_write_text
 from twin_master.results import MissionResult, to_datatree
-from twin_master.run_folder import FIELD_NAME, SUMMARY_NAME, to_json
+from twin_master.run_folder import FIELD_NAME, to_json
 from twin_master.summary import Figure, to_record
 from twin_master.tables import tables_of
 
 RUN_NAME = "run.nc"
+SUMMARY_NAME = "summary.json"
 TIMING_NAME = "timing.json"
 CSV_FOLDER = "csv"
 
