@@ -51,6 +51,24 @@ class Contents(NamedTuple):
     make_behaviour: Callable[[], WingBehaviour]
 
 
+class _Reading(NamedTuple):
+    """The references that were read last, their highest, and the slice that they are, if they are one."""
+
+    references: list[int]
+    highest: int
+    part: slice | None
+
+
+def _reading(vrs: Sequence[int], known: int) -> _Reading:
+    references = list(vrs)
+    unknown = [vr for vr in references if not 0 <= vr < known]
+    if unknown:
+        raise IndexError(f"there is no value reference {unknown[0]}")
+    first, highest = min(references, default=0), max(references, default=0)
+    contiguous = references == list(range(first, highest + 1))
+    return _Reading(references, highest, slice(first, highest + 1) if contiguous else None)
+
+
 class WingSlave:
     """FMI co-simulation slave of the wing; the build makes a subclass of it and of pythonfmu's `Fmi2Slave`.
 
@@ -80,12 +98,14 @@ class WingSlave:
         self._high = [math.inf if row.maximum is None else row.maximum for row in self._table]
         self._values = [0.0 if row.start is None else row.start for row in self._table]
         self._input_count = len(INPUTS)
+        self._input_references = list(range(self._input_count))
         self._first_output = next(row.reference for row in self._table if row.causality == "output")
         self._strain = self._reference["strain[1]"]
         self._tip = self._reference["tip_displacement"]
         self._bound = self._reference["strain_error_bound"]
         self._status = self._reference["status"]
         self._modal = self._status + 1
+        self._reading = _reading((), 0)
         self._phase = INSTANTIATED
         self._time = 0.0
         # Outputs that are computed when somebody reads them, since most masters do not.
@@ -193,11 +213,14 @@ class WingSlave:
         """Set inputs at any time and parameters before the end of initialisation."""
         store = self._values
         free = self._input_count
-        for vr, value in zip(vrs, values, strict=True):
-            if vr < free:
-                store[vr] = value
-            else:
-                self._set_parameter(vr, value)
+        if vrs == self._input_references:  # all inputs in their order, as most masters send them
+            store[:free] = values
+        else:
+            for vr, value in zip(vrs, values, strict=True):
+                if 0 <= vr < free:
+                    store[vr] = value
+                else:
+                    self._set_parameter(vr, value)
         self._stale_response = True
 
     def set_integer(self, vrs: Sequence[int], values: Sequence[int]) -> None:
@@ -220,15 +243,16 @@ class WingSlave:
 
     def get_real(self, vrs: Sequence[int]) -> list[float]:
         """Return values; the error bound and the modal outputs are computed when they are asked for."""
-        values = self._values
         try:
-            highest = max(vrs, default=0)
+            if vrs != self._reading.references:
+                self._reading = _reading(vrs, len(self._values))
+            highest, part = self._reading.highest, self._reading.part
             if highest >= self._first_output:
                 if self._stale_response and self._phase == INITIALISING:
                     self._initialise()
                 if highest >= self._bound:
-                    self._complete(vrs)
-            return [values[vr] for vr in vrs]
+                    self._complete(vrs, highest)
+            return self._values[part] if part else [self._values[vr] for vr in vrs]
         except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
             self._refuse(STATUS_INTERNAL, f"values could not be read: {error!r}")
             return [math.nan] * len(vrs)
@@ -238,13 +262,13 @@ class WingSlave:
         known = len(self._values)
         return [int(self._values[vr]) if 0 <= vr < known else 0 for vr in vrs]
 
-    def _complete(self, vrs: Sequence[int]) -> None:
+    def _complete(self, vrs: Sequence[int], highest: int) -> None:
         if self._phase in (INSTANTIATED, REFUSED):
             return
         if self._stale_bound and self._bound in vrs:
             self._values[self._bound] = self._behaviour.strain_error_bound()
             self._stale_bound = False
-        if self._stale_modal and max(vrs) >= self._modal:
+        if self._stale_modal and highest >= self._modal:
             frequency, damping_ratio = self._behaviour.modal_data()
             self._values[self._modal :] = [*frequency, *damping_ratio]
             self._stale_modal = False
