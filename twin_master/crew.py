@@ -83,7 +83,7 @@ def prepare_knowledge(scenario: Scenario, source: AssetSource, seed: int) -> Kno
     sensor_model = GaussianSensorModel(
         source.observation_table(draws, model),
         scenario.observation.standard_deviation,
-        average="outside" if scenario.observation.integral == "exact" else "inside",
+        average=scenario.observation.average_over_draws,
     )
     rewards = RewardModel(sensor_model, reward_settings(scenario))
     plan = value_iteration(

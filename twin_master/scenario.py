@@ -126,8 +126,9 @@ class ObservationSection(Section):
     unit: str = "1"
     """Unit of the observed values; a dimensionless one is a strain, printed in microstrain."""
     standard_deviation: Positive
-    integral: Literal["exact", "per_sensor"] = "exact"
-    """How the parameter is integrated out: `exact` is eq. (30), `per_sensor` is eq. (32) of the paper."""
+    average_over_draws: Literal["outside", "inside"] = "outside"
+    """Where the average over the draws of the parameter stands: outside the product over the sensors as in
+    the integral (30), or inside it as eq. (32) is printed."""
 
 
 class Transition(Section):

@@ -1,0 +1,73 @@
+"""The paper's mission on our own wing: the policy, the reliability over many seeds, and the whole chain."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe.cache import reduced_model
+from fe.reduced import ReducedModel
+from twin_master import workflow
+from twin_master.asset_source import ReducedModelSource
+from twin_master.checkpoint import Checkpoint
+from twin_master.crew import prepare_knowledge
+from twin_master.scenario_file import load_scenario
+from twin_master.study import fly_many
+from twin_master.workflow import new_run, resume_run
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
+
+
+@pytest.fixture(scope="module")
+def wing() -> ReducedModel:
+    """The shipped wing, from the cache if an earlier test or run built it."""
+    return reduced_model()
+
+
+def test_the_papers_policy(wing: ReducedModel) -> None:
+    scenario = load_scenario("level_turns").scenario
+    knowledge = prepare_knowledge(scenario, ReducedModelSource(scenario, wing), 0)
+    z1 = knowledge.model.states.coordinates[:, 0]
+    np.testing.assert_array_equal(knowledge.plan.control_index, np.where(z1 < 0.59, 1, 0))
+    assert knowledge.draws.mean == pytest.approx(1.0073, abs=0.002)
+    assert knowledge.draws.standard_deviation == pytest.approx(0.0103, abs=0.001)
+
+
+def test_reliability(wing: ReducedModel) -> None:
+    """Bars of 300 missions, widened for 80; `benchmarks/study_level_turns.py` flies as many as wanted."""
+    scenario = load_scenario("level_turns").scenario
+    study = fly_many(scenario, ReducedModelSource(scenario, wing), range(80))
+    assert study.share_within(2) >= 0.95
+    assert study.early_share <= 0.2
+    assert np.all(study.rms_error <= [0.045, 0.13])
+
+
+def test_the_whole_chain_and_its_resumption(
+    wing: ReducedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+    loaded = load_scenario("level_turns")
+    outcome = new_run(loaded, tmp_path / "whole")
+    figures = {figure.key: figure for figure in outcome.figures}
+    assert figures["policy_switch_damage"].value == pytest.approx(60.0)
+    assert float(figures["strain_error_bound"].value or 0.0) < 3.0
+    config = json.loads((outcome.folder / "config.json").read_text(encoding="utf-8"))
+    assert config["inputs"]["design"] == wing.design_hash
+    assert (outcome.folder / "wing.vtu").stat().st_size > 10_000
+    write = workflow.write_checkpoint
+
+    def dying(folder: Path, checkpoint: Checkpoint) -> None:
+        write(folder, checkpoint)
+        if checkpoint.turns == 23:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(workflow, "write_checkpoint", dying)
+        with pytest.raises(KeyboardInterrupt):
+            new_run(loaded, tmp_path / "part")
+    resume_run(tmp_path / "part")
+    for name in ("run.nc", "config.json", "summary.json", "calibration.json", "wing.vtu", "asset/asset.fmu"):
+        assert (tmp_path / "part" / name).read_bytes() == (outcome.folder / name).read_bytes(), name
