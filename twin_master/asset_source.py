@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from fe.reduced import ReducedModel
 from reporting.progress import Progress
 from twin_master.assets import Asset, AssetReading, StatelessAsset
+from twin_master.errors import MissingObservationModelError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws, draw_parameter
-from twin_master.run_errors import MissingObservationModelError
 from twin_master.scenario import Scenario
 from twin_master.strain_library import StrainLibrary
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from reporting.errors import DamagedFileError
 from reporting.files import read_npz, write_npz
+from twin_master.errors import NotResumableError
 from twin_master.plant import PlantRecord
-from twin_master.run_errors import NotResumableError
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -125,7 +125,10 @@ def guarded(application: Callable[[], None]) -> None:
     except Exception as error:
         if not _is_ours(error):
             raise
-        for line in (str(error), *getattr(error, "__notes__", ())):
+        sentence = str(error)
+        if isinstance(error, OSError):
+            sentence = f"{error.filename or 'a file'}: {error.strerror or error}."
+        for line in (sentence, *getattr(error, "__notes__", ())):
             typer.secho(line, fg="red", err=True)
         raise SystemExit(1) from None
 
@@ -137,7 +140,8 @@ def _is_ours(error: Exception) -> bool:
     from reporting.errors import ReportingError
     from twin_master.errors import TwinMasterError
 
-    ours = (TwinMasterError, FmuError, FiniteElementError, CalibrationError, ReportingError)
+    # The system's own refusals (a folder without permission, a full disk) are no defect of the program.
+    ours = (OSError, TwinMasterError, FmuError, FiniteElementError, CalibrationError, ReportingError)
     return isinstance(error, ours)
 
 

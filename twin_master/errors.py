@@ -5,13 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 __all__ = [
+    "AssetOutputError",
     "ImpossibleObservation",
     "InvalidDistributionError",
     "InvalidModelError",
     "InvalidObservationError",
     "InvalidStrainLibraryError",
+    "MissingObservationModelError",
+    "MissionError",
+    "MissionInputError",
+    "NotResumableError",
     "PlanningError",
+    "RunFolderError",
+    "RunFolderExistsError",
+    "ScenarioError",
     "TwinMasterError",
+    "UnknownScenarioError",
 ]
 
 
@@ -65,3 +74,39 @@ class ImpossibleObservation(TwinMasterError, RuntimeError):  # noqa: N818 - the 
 
     def __reduce__(self) -> tuple[type[ImpossibleObservation], tuple[str, int, dict[str, float]]]:
         return type(self), (self.twin, self.step, self.worst_residuals)
+
+
+class ScenarioError(TwinMasterError, ValueError):
+    """A scenario file cannot be read or does not keep to the schema."""
+
+
+class UnknownScenarioError(ScenarioError):
+    """No shipped scenario and no file has the name that was asked for."""
+
+
+class MissionError(TwinMasterError, RuntimeError):
+    """A mission cannot be flown on."""
+
+
+class MissingObservationModelError(MissionError):
+    """The twin cannot be given predicted observations for the scenario's asset."""
+
+
+class AssetOutputError(MissionError):
+    """The asset returned something that is no observation."""
+
+
+class RunFolderError(TwinMasterError, RuntimeError):
+    """A run folder cannot be used as asked."""
+
+
+class RunFolderExistsError(RunFolderError):
+    """The folder that a run was to be written to exists already."""
+
+
+class NotResumableError(RunFolderError):
+    """A run cannot be continued from the folder."""
+
+
+class MissionInputError(MissionError, ValueError):
+    """Something that a mission was told to use is not there or does not fit."""

@@ -15,14 +15,14 @@ from fe.reduced import ReducedModel
 from fmu_asset.binding import Binding, load_binding
 from fmu_asset.build import build_fmu
 from fmu_asset.session import FmiAsset
-from reporting.files import atomic_write_bytes
+from reporting.files import atomic_write_bytes, write_error
 from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.asset_source import wing_observation_table
 from twin_master.assets import Asset, AssetReading
+from twin_master.errors import MissionInputError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws, draw_parameter
-from twin_master.run_errors import MissionInputError
 from twin_master.scenario import Scenario
 
 Float = NDArray[np.float64]
@@ -204,14 +204,18 @@ class FmuSource:
         if self._wing is None or {*state} != {"z1", "z2"} or {*control} != {"load_factor"}:
             return False
         asset = self._scenario.asset
-        write_wing_vtu(
-            path,
-            wing_fields(load_design(self._path("design.toml"))),
-            young_modulus_factor=asset.parameters.get("young_modulus_factor", 1.0),
-            stiffness_loss=(state["z1"], state["z2"]),
-            load_factor=control["load_factor"],
-            tip_force=asset.load.get("tip_force", 0.0),
-        )
+        fields = wing_fields(load_design(self._path("design.toml")))
+        try:
+            write_wing_vtu(
+                path,
+                fields,
+                young_modulus_factor=asset.parameters.get("young_modulus_factor", 1.0),
+                stiffness_loss=(state["z1"], state["z2"]),
+                load_factor=control["load_factor"],
+                tip_force=asset.load.get("tip_force", 0.0),
+            )
+        except OSError as error:
+            raise write_error(error, path) from error
         return True
 
 

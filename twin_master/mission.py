@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from reporting.progress import Progress, SilentProgress
 from twin_master.checkpoint import Checkpoint
+from twin_master.errors import NotResumableError
 from twin_master.plant import Plant, PlantRecord
-from twin_master.run_errors import NotResumableError
 from twin_master.scenario import Scenario
 from twin_master.twin import Twin, TwinTurn
 
@@ -100,7 +100,7 @@ def fly(
 
     Raises
     ------
-    ImpossibleObservation, ObservationInvalidError, FmuError
+    ImpossibleObservation, AssetOutputError, FmuError
         The mission cannot go on; the last checkpoint is that of the turn before.
     NotResumableError
         The decisions of the checkpoint do not follow from its observations.

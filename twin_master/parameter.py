@@ -12,7 +12,7 @@ from scipy.special import ndtri
 
 from calibration.stiffness import PUBLISHED_LINE, calibrate_static, stiffness_curve_of
 from calibration.stiffness_curve import StiffnessCurve, TipStiffnessModel
-from twin_master.run_errors import MissingObservationModelError
+from twin_master.errors import MissingObservationModelError
 from twin_master.scenario import Calibration
 from twin_master.seeds import generator, seed_sequence
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.assets import Asset
-from twin_master.run_errors import ObservationInvalidError
+from twin_master.errors import AssetOutputError
 from twin_master.scenario import Scenario
 from twin_master.truth import Truth
 
@@ -60,7 +60,7 @@ class Plant:
 
         Raises
         ------
-        ObservationInvalidError
+        AssetOutputError
             If the asset returns NaN, an infinity or the wrong number of values.
         """
         step = len(self._states)
@@ -71,13 +71,13 @@ class Plant:
         reading = self._asset.step(control.values, health)
         values = np.asarray(reading.values, dtype=np.float64)
         if values.shape != (self._scenario.observation.count,):
-            raise ObservationInvalidError(
+            raise AssetOutputError(
                 f"step {step}: the scenario expects {self._scenario.observation.count} values of "
                 f"`{self._scenario.observation.role}` and the asset returned {values.shape}"
             )
         if not np.all(np.isfinite(values)):
             bad = ", ".join(str(index + 1) for index in np.flatnonzero(~np.isfinite(values)))
-            raise ObservationInvalidError(
+            raise AssetOutputError(
                 f"step {step}: the asset returned NaN or an infinity for `{self._scenario.observation.role}` "
                 f"{bad} under the control `{control.name}`; the run stops here and can be resumed"
             )

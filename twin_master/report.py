@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from reporting.figures import to_png, to_svg
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.page import Column, Page, Table
+from twin_master.errors import RunFolderError
 from twin_master.report_belief import belief_figure, policy_figure
 from twin_master.report_calibration import calibration_caption, calibration_figure, calibration_view
 from twin_master.report_check import check_figure, predictive_check
@@ -31,7 +32,6 @@ from twin_master.report_text import (
     turn_ranges,
 )
 from twin_master.report_view import choose_sensors, default_now, sensor_word
-from twin_master.run_errors import RunFolderError
 
 REPORT_NAME = "report.html"
 FIGURE_FOLDER = "figures"

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from twin_master.run_errors import RunFolderError
+from twin_master.errors import RunFolderError
 from twin_master.scenario import Scenario
 from twin_master.twin import build_graphical_model
 

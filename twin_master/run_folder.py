@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from reporting.files import atomic_write_text, remove_leftovers, write_error
-from twin_master.run_errors import NotResumableError, RunFolderError, RunFolderExistsError
+from twin_master.errors import NotResumableError, RunFolderError, RunFolderExistsError
 
 CONFIG_NAME = "config.json"
 FIELD_NAME = "wing.vtu"

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from scenarios import scenario_files
-from twin_master.run_errors import ScenarioError, UnknownScenarioError
+from twin_master.errors import ScenarioError, UnknownScenarioError
 from twin_master.scenario import Scenario, Section
 
 _SHOWN_LENGTH = 60

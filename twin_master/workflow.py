@@ -20,9 +20,9 @@ from scenarios import binding_files
 from twin_master.asset_source import AssetSource, StrainLibrarySource
 from twin_master.checkpoint import read_checkpoint, write_checkpoint
 from twin_master.crew import Knowledge, prepare_knowledge
+from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission import Flight, fly
 from twin_master.results import MissionResult
-from twin_master.run_errors import MissionInputError, NotResumableError
 from twin_master.run_folder import (
     KIND,
     create_run_folder,
@@ -273,11 +273,11 @@ def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Pro
                 atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
         with clock.stage("mission"), _kept(folder):
             result = _fly(folder, config, knowledge, source, progress)
-        with clock.stage("store"), progress.stage("Storing"):
+        with clock.stage("store"), progress.stage("Storing"), _kept(folder):
             figures = _store(folder, config, knowledge, source, result)
         timing = _timing(result.flight, clock)
         write_timing(folder, timing)
-        with clock.stage("report"), progress.stage("Writing the report"):
+        with clock.stage("report"), progress.stage("Writing the report"), _kept(folder):
             report = _report(folder)
         timing = _timing(result.flight, clock)
         write_timing(folder, timing)
@@ -295,7 +295,7 @@ def _kept(folder: Path) -> Iterator[None]:
         raise
     except Exception as error:
         error.add_note(
-            f"The turns before it are kept: once mended, continue with `uav-twin run --resume {folder}`."
+            f"What was flown is kept: once mended, continue with `uav-twin run --resume {folder}`."
         )
         raise
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from twin_master.checkpoint import CHECKPOINT_NAME, Checkpoint, read_checkpoint, write_checkpoint
+from twin_master.errors import NotResumableError
 from twin_master.plant import PlantRecord
-from twin_master.run_errors import NotResumableError
 
 
 def checkpoint() -> Checkpoint:

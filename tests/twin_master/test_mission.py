@@ -12,8 +12,8 @@ from twin_master.asset_source import StrainLibrarySource
 from twin_master.assets import AssetReading, StatelessAsset
 from twin_master.checkpoint import Checkpoint
 from twin_master.crew import Knowledge, prepare_knowledge
+from twin_master.errors import AssetOutputError, NotResumableError
 from twin_master.mission import Flight, fly
-from twin_master.run_errors import NotResumableError, ObservationInvalidError
 from twin_master.scenario_file import load_scenario
 from twin_master.strain_library import load_strain_library
 from twin_master.study import fly_many
@@ -115,13 +115,13 @@ def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(library
 
     kept: list[Checkpoint] = []
     plant = knowledge.plant(knowledge.truth(1), StatelessAsset(broken))
-    with pytest.raises(ObservationInvalidError, match=r"step 3: .*NaN.*`strain` 8 under the control `3g`"):
+    with pytest.raises(AssetOutputError, match=r"step 3: .*NaN.*`strain` 8 under the control `3g`"):
         fly(scenario, knowledge.twin(), plant, keep=kept.append)
     assert kept[-1].turns == 3
     short = knowledge.plant(
         knowledge.truth(1), StatelessAsset(lambda _control, _health: AssetReading(np.zeros(3)))
     )
-    with pytest.raises(ObservationInvalidError, match="expects 24 values"):
+    with pytest.raises(AssetOutputError, match="expects 24 values"):
         fly(scenario, knowledge.twin(), short)
 
 

@@ -26,9 +26,9 @@ from twin_master import (
     report_mission,
     report_network,
 )
+from twin_master.errors import RunFolderError
 from twin_master.report_text import duration, lost_ranges, number, turn_ranges
 from twin_master.report_view import choose_sensors, default_now
-from twin_master.run_errors import RunFolderError
 
 # The tests are no package, so the generator beside this file is loaded by its path.
 _specification = importlib.util.spec_from_file_location(

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scenarios import scenario_files
-from twin_master.errors import TwinMasterError
-from twin_master.run_errors import ScenarioError, UnknownScenarioError
+from twin_master.errors import ScenarioError, TwinMasterError, UnknownScenarioError
 from twin_master.scenario import Scenario
 from twin_master.scenario_file import load_scenario, parse_scenario
 

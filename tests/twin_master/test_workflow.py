@@ -16,8 +16,8 @@ import xarray as xr
 from reporting.errors import DiskFullError
 from twin_master import workflow
 from twin_master.checkpoint import Checkpoint
-from twin_master.errors import InvalidStrainLibraryError
-from twin_master.run_errors import (
+from twin_master.errors import (
+    InvalidStrainLibraryError,
     MissionInputError,
     NotResumableError,
     RunFolderError,

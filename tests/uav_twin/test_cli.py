@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from twin_master.run_errors import ScenarioError
+from twin_master.errors import ScenarioError
 from uav_twin import cli
 
 
