@@ -11,12 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import eigh
-from scipy.sparse.linalg import LinearOperator, eigsh
 
 from .errors import ReductionError
 from .subspace import AffineSystem, Norm, OrthonormalBasis, affine_sum
 
 FloatArray = npt.NDArray[np.float64]
+
+START_ITERATIONS = 4
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class _WorkingBasis:
 
     def __init__(self, system: AffineSystem, norm: Norm) -> None:
         self.system, self.norm = system, norm
-        self.basis = OrthonormalBasis(len(system.load_lift), drop=1e-6)
+        self.basis = OrthonormalBasis(len(system.load_lift), norm, drop=1e-6)
         self.stiffness = np.empty((4, 0, 0))
         self.mass = np.empty((3, 0, 0))
 
@@ -170,9 +171,10 @@ def reduce_modes(
         )
     working = _WorkingBasis(system, norm)
     matrix = affine_sum((1.0, *np.mean(box[5:7], axis=1)), system.mass_terms)
-    start = np.random.default_rng(1).normal(size=unknowns)
-    inverse = LinearOperator(matrix.shape, matvec=norm.riesz, dtype=np.float64)
-    _, vectors = eigsh(norm.stiffness, k=count, M=matrix, sigma=0.0, OPinv=inverse, v0=start, tol=1e-6)
+    # inverse iteration on a block; what it leaves is refined below
+    vectors = np.random.default_rng(1).normal(size=(unknowns, count + 4))
+    for _ in range(START_ITERATIONS):
+        vectors = np.linalg.qr(norm.riesz(np.asarray(matrix @ vectors)))[0]
     working.extend(vectors)
     for theta, mass_theta in sampled_states(box):
         _refine(working, theta, mass_theta, count, settings)

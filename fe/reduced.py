@@ -18,11 +18,24 @@ from numpy.linalg import solve
 
 from .archive import arrays_from_bytes, arrays_to_bytes, write_bytes_atomically
 from .errors import OutsideModelError, ReducedModelFileError
+from .online import OnlineArrays
+from .responses import Modes, StaticResponse
+
+__all__ = ["PARAMETER_NAMES", "RUNTIME_FILES", "Modes", "ReducedModel", "StaticResponse"]
 
 FloatArray = npt.NDArray[np.float64]
 multiply_outer = np.multiply.outer
 
-RUNTIME_FILES = ("errors.py", "state.py", "archive.py", "damping.py", "reduced.py", "transient.py")
+RUNTIME_FILES = (
+    "errors.py",
+    "state.py",
+    "archive.py",
+    "damping.py",
+    "responses.py",
+    "online.py",
+    "reduced.py",
+    "transient.py",
+)
 """Files of this package that evaluate a reduced model; they need the standard library and NumPy only."""
 
 PARAMETER_NAMES = ("young_modulus_factor", "z1", "z2", "load_factor", "tip_force", "servo_mass", "pitot_mass")
@@ -30,65 +43,6 @@ PARAMETER_NAMES = ("young_modulus_factor", "z1", "z2", "load_factor", "tip_force
 
 FORMAT = 1
 """Version of the array layout in the file."""
-
-
-@dataclass(frozen=True, slots=True)
-class StaticResponse:
-    """Static response of the wing to one load at one state.
-
-    Attributes
-    ----------
-    strain : (G,) ndarray
-        Gauge strains, dimensionless, positive where the upper skin is compressed.
-    tip_displacement : float
-        Displacement of the tip [m], upwards positive.
-    strain_error_bound : float
-        Certified: no gauge of the full model differs from `strain` by more than this (dimensionless).
-    tip_displacement_error_bound : float
-        Certified: the tip of the full model does not differ by more than this [m].
-    coordinates : (N,) ndarray
-        Coefficients of the static basis vectors, from which a field can be reconstructed.
-    """
-
-    strain: FloatArray
-    tip_displacement: float
-    strain_error_bound: float
-    tip_displacement_error_bound: float
-    coordinates: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class Modes:
-    """First undamped eigenmodes at one state, Kapteyn et al. 2021, eq. (16), in ascending frequency.
-
-    Attributes
-    ----------
-    frequency : (M,) ndarray
-        Natural frequencies [Hz].
-    shape : (N, M) ndarray
-        Coefficients of the modal basis vectors; mass-normalised, the tip moves upwards.
-    tip_displacement : (M,) ndarray
-        Displacement of the tip per unit of modal coordinate [kg^-1/2].
-    strain : (G, M) ndarray
-        Gauge strains per unit of modal coordinate [m^-1 kg^-1/2].
-    lift_participation : (M,) ndarray
-        Modal force of the lift at load factor 1 [N kg^-1/2].
-    tip_participation : (M,) ndarray
-        Modal force of a tip force of 1 N [kg^-1/2].
-    flapwise : tuple of int
-        Indices of the first and second flapwise bending, followed by their shape, never by their rank.
-    flapwise_mac : tuple of float
-        Modal assurance criterion (mass-weighted) of these two against the shapes that define them.
-    """
-
-    frequency: FloatArray
-    shape: FloatArray
-    tip_displacement: FloatArray
-    strain: FloatArray
-    lift_participation: FloatArray
-    tip_participation: FloatArray
-    flapwise: tuple[int, int]
-    flapwise_mac: tuple[float, float]
 
 
 @dataclass(frozen=True, repr=False)
@@ -166,7 +120,7 @@ class ReducedModel:
     cross_mass: FloatArray
     flapwise_reference: FloatArray
     mode_count: int
-    _online: "_Online" = field(init=False, repr=False, compare=False)
+    _online: OnlineArrays = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name, expected in self._expected_shapes().items():
@@ -187,7 +141,20 @@ class ReducedModel:
                 raise ReducedModelFileError(
                     f"The {name} of a reduced model must not be negative, but is {value!r}; build it anew."
                 )
-        object.__setattr__(self, "_online", _Online(self))
+        object.__setattr__(
+            self,
+            "_online",
+            OnlineArrays(
+                static_stiffness=self.static_stiffness,
+                validity_box=self.validity_box,
+                bound_reference=self.bound_reference,
+                residual_load=self.residual_load,
+                residual_stiffness=self.residual_stiffness,
+                splits=(self.dual_split_1, self.dual_split_2),
+                dual_correction=self.dual_correction,
+                dual_residual=self.dual_residual,
+            ),
+        )
 
     def __repr__(self) -> str:
         return (
@@ -311,7 +278,7 @@ class ReducedModel:
         tip_displacement = float(output[-1])
 
         # |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha, norms dual to bound_reference
-        coefficients = np.empty(online.coefficient_count)
+        coefficients = np.empty(online.residual.shape[1])
         coefficients[:2] = load
         multiply_outer(theta, coordinates, out=coefficients[2:].reshape(4, -1))
         residual = online.residual @ coefficients
@@ -584,50 +551,3 @@ class ReducedModel:
             If it is damaged, incomplete or of another format.
         """
         return cls.from_bytes(Path(path).read_bytes(), str(path))
-
-
-@dataclass(frozen=True, slots=True)
-class _Dual:
-    """Approximate dual solutions at one anchor: `correction` (G + 1, R) and `factor` (4 (G + 1), 4)."""
-
-    correction: FloatArray
-    factor: FloatArray
-
-
-class _Online:
-    """Arrays of a model laid out for the fewest operations per evaluation."""
-
-    __slots__ = (
-        "coefficient_count",
-        "dual",
-        "limits",
-        "reference",
-        "residual",
-        "split_1",
-        "split_2",
-        "square",
-        "stiffness",
-    )
-
-    def __init__(self, model: ReducedModel) -> None:
-        n = model.static_stiffness.shape[1]
-        self.square = (n, n)
-        self.stiffness = np.ascontiguousarray(model.static_stiffness.reshape(4, -1))
-        # to be multiplied by the loads, then the stiffness coefficients times the coordinates
-        self.residual = np.concatenate(
-            (model.residual_load, -model.residual_stiffness.reshape(len(model.residual_load), -1)), axis=1
-        )
-        self.coefficient_count = self.residual.shape[1]
-        self.limits = tuple(float(value) for value in model.validity_box[:5].ravel())
-        self.reference = tuple(float(value) for value in model.bound_reference)
-        self.split_1 = [float(value) for value in model.dual_split_1]
-        self.split_2 = [float(value) for value in model.dual_split_2]
-        # to be multiplied by (e, 1 - z1, 1 - z2, 1), as the stiffness
-        factors = np.concatenate((-model.dual_residual[..., 1:], model.dual_residual[..., :1]), axis=-1)
-        self.dual = [
-            [
-                _Dual(np.ascontiguousarray(correction), np.ascontiguousarray(factor.reshape(-1, 4)))
-                for correction, factor in zip(correction_row, factor_row, strict=True)
-            ]
-            for correction_row, factor_row in zip(model.dual_correction, factors, strict=True)
-        ]

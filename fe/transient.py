@@ -17,7 +17,8 @@ import numpy.typing as npt
 
 from .damping import rayleigh_damping_ratio
 from .errors import InvalidStateError
-from .reduced import Modes, ReducedModel, StaticResponse
+from .reduced import ReducedModel
+from .responses import Modes, StaticResponse
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -15,6 +15,7 @@ from pymor.parameters.functionals import MinThetaParameterFunctional, Projection
 from pymor.reductors.coercive import CoerciveRBReductor
 from scipy import sparse
 
+from fe.compression import compressed, relative_bound
 from fe.errors import ReductionError, SolutionError
 from fe.modal_reduction import ModalSettings
 from fe.operators import AffineOperators
@@ -22,10 +23,8 @@ from fe.reduced import ReducedModel
 from fe.reduction import (
     Reduction,
     ReductionSettings,
-    compressed,
     loss_splits,
     reduce_model,
-    relative_bound,
     remaining_levels,
     training_set,
 )
@@ -260,10 +259,11 @@ def test_conjugate_gradients_solve_and_give_up() -> None:
         conjugate_gradients(matrix, norm, right, np.zeros_like(right), tolerance=1e-12, most_iterations=2)
 
 
-def test_basis_stays_orthonormal_with_nearly_dependent_vectors() -> None:
+@pytest.mark.parametrize("functionals", [False, True])
+def test_basis_stays_orthonormal_with_nearly_dependent_vectors(functionals: bool) -> None:
     norm = Norm(affine_sum((1, 1, 1, 1), SYSTEM.stiffness_terms))
     random = np.random.default_rng(5)
-    basis = OrthonormalBasis(60, drop=1e-9)
+    basis = OrthonormalBasis(60, norm, drop=1e-9, functionals=functionals)
     first = random.normal(size=(60, 5))
     assert basis.extend(first, norm.product(first)) == 5
     near = first + 1e-6 * random.normal(size=first.shape)
