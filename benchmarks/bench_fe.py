@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.measurement import Measurement, median_seconds
 
-# A build from nothing in a process and a cache folder of its own; prints wall time, processor time and peak memory.
+# A build from nothing in a process and a cache folder of its own: wall time, processor time, peak memory.
 _BUILD = """
 import json, resource, time
 begin = time.perf_counter()

@@ -149,9 +149,10 @@ def conjugate_gradients(
 class OrthonormalBasis:
     """A growing basis, orthonormal in a norm, with its products kept.
 
-    Gram-Schmidt in blocks, repeated, on pairs of vectors v and their products p = X v. With a condition number
-    of 1e10 either follows from the other to about 1e-6 only, so that what is left of both after a projection
-    no longer fits together. Therefore one of the two is what is meant, and the other is taken anew from it.
+    Gram-Schmidt in blocks, repeated, on pairs of vectors v and their products p = X v. With a condition
+    number of 1e10 either follows from the other to about 1e-6 only, so that what is left of both after a
+    projection no longer fits together. Therefore one of the two is what is meant, and the other is taken
+    anew from it.
 
     Parameters
     ----------
