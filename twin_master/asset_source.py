@@ -27,6 +27,9 @@ Float = NDArray[np.float64]
 class AssetSource(Protocol):
     """Everything that a mission needs to know of its asset."""
 
+    def check(self) -> None:
+        """Look at what is given before anything is made; raise what is wrong with it."""
+
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
         """Make ready what is flown, in the folder of the run; return the hashes of what went in."""
 
@@ -113,6 +116,9 @@ class ReducedModelSource:
         self._scenario = scenario
         self._wing = wing
 
+    def check(self) -> None:
+        """Accept what was read already."""
+
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
         """Return the hash of the design."""
         return {"design": self._wing.design_hash}
@@ -157,6 +163,9 @@ class StrainLibrarySource:
                 f"asks for {', '.join(missing)}."
             )
         return [self._library.controls.index(name) for name in self._scenario.control_names]
+
+    def check(self) -> None:
+        """Accept what was read already."""
 
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
         """Return the hash of the library."""

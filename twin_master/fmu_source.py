@@ -93,6 +93,7 @@ class FmuSource:
 
     def __init__(self, scenario: Scenario, binding: Path, design: Path | None, fmu: Path | None) -> None:
         self._scenario = scenario
+        self._binding = binding
         self._given = {"binding.toml": binding, "design.toml": design, "asset.fmu": fmu}
         self._folder: Path | None = None
         self._wing: ReducedModel | None = None
@@ -106,6 +107,27 @@ class FmuSource:
         if self._folder is None:
             raise MissionInputError("the asset was not prepared: call `prepare` first.")
         return self._folder / INPUT_FOLDER / name
+
+    def check(self) -> None:
+        """Read binding, design and FMU where they are, without copying or starting anything.
+
+        Raises
+        ------
+        MissionInputError
+            A file cannot be read, or the binding observes another number of values than the scenario.
+        InvalidDesignError, FmuError
+            A design, binding or FMU is wrong, or the binding does not fit the FMU.
+        """
+        for path in self._given.values():
+            if path is not None:
+                _content(path)
+        design, fmu = self._given["design.toml"], self._given["asset.fmu"]
+        binding = load_binding(self._binding)
+        self._observed(binding)
+        if design is not None:
+            load_design(design)
+        if fmu is not None:
+            FmiAsset(fmu, binding, parameters=self._scenario.asset.parameters)
 
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
         """Copy what is given into the run folder, reduce the design and pack the FMU; return the hashes.

@@ -204,8 +204,7 @@ def new_run(
         "scenario_file": {"name": loaded.path.name, "sha256": loaded.content_hash},
         "provenance": collect_provenance(scenario.mission.seed).as_dict(),
     }
-    if scenario.asset.kind == "strain_library":
-        asset_source(scenario)  # a library that is not there should not cost the user a folder
+    asset_source(scenario).check()  # what is not there should not cost the user a folder
     create_run_folder(folder, config, replace=replace)
     return _run(folder, config, scenario, progress or SilentProgress())
 

@@ -136,3 +136,4 @@ def test_what_does_not_fit_is_named(asset_folder: Path, tmp_path: Path) -> None:
     path = changed(asset_folder, "damaged.toml", "HeatExchanger.fmu", "broken.fmu")
     with pytest.raises(FmuFileError):
         new_run(load_scenario(path), tmp_path / "damaged")
+    assert not list(tmp_path.iterdir())  # what is wrong from the start costs no folder
