@@ -73,11 +73,9 @@ def _interruptible(fly: Callable[[], RunOutcome], folder: Path) -> RunOutcome:
     try:
         return fly()
     except KeyboardInterrupt:
-        typer.secho(
-            f"Interrupted; nothing is lost: continue with `uav-twin run --resume {folder}`.",
-            fg="red",
-            err=True,
-        )
+        begun = (folder / "config.json").is_file()
+        hint = f"continue with `uav-twin run --resume {folder}`" if begun else "no run was begun"
+        typer.secho(f"Interrupted; nothing is lost: {hint}.", fg="red", err=True)
         raise typer.Exit(INTERRUPTED) from None
 
 
