@@ -8,7 +8,7 @@ import os
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,9 @@ def arrays_to_bytes(arrays: Mapping[str, npt.NDArray[Any]]) -> bytes:
     return buffer.getvalue()
 
 
-def arrays_from_bytes(content: bytes, where: str) -> dict[str, npt.NDArray[Any]]:
+def arrays_from_bytes(
+    content: bytes, where: str, wanted: Collection[str] = ()
+) -> dict[str, npt.NDArray[Any]]:
     """Return the arrays of an `.npz` archive, checksums verified.
 
     Parameters
@@ -59,6 +61,8 @@ def arrays_from_bytes(content: bytes, where: str) -> dict[str, npt.NDArray[Any]]
         The archive.
     where : str
         What is being read, for the error message.
+    wanted : collection of str
+        Names that must be there.
 
     Returns
     -------
@@ -68,7 +72,7 @@ def arrays_from_bytes(content: bytes, where: str) -> dict[str, npt.NDArray[Any]]
     Raises
     ------
     ReducedModelFileError
-        If the archive is damaged, cut short or holds anything but plain arrays.
+        If the archive is damaged, cut short, lacks an array or holds anything but plain arrays.
     """
     arrays: dict[str, npt.NDArray[Any]] = {}
     try:
@@ -89,6 +93,9 @@ def arrays_from_bytes(content: bytes, where: str) -> dict[str, npt.NDArray[Any]]
         raise ReducedModelFileError(
             f"{where} is not a sound archive of plain arrays ({cause}); delete it and build it anew."
         ) from cause
+    missing = [name for name in wanted if name not in arrays]
+    if missing:
+        raise ReducedModelFileError(f"{where} lacks {', '.join(missing)}; build it anew.")
     return arrays
 
 

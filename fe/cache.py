@@ -4,11 +4,11 @@ import fcntl
 import hashlib
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from .archive import write_bytes_atomically
 from .errors import ReducedModelFileError
@@ -17,7 +17,8 @@ from .reduced import ReducedModel
 
 if TYPE_CHECKING:
     from .design import WingDesign
-    from .reduction import Progress, ReductionSettings
+    from .reduction import Progress
+    from .reduction_settings import ReductionSettings
 
 MODELLING_FILES = (
     "airfoil.py",
@@ -35,6 +36,7 @@ MODELLING_FILES = (
     "parts.py",
     "reduced.py",
     "reduction.py",
+    "reduction_settings.py",
     "responses.py",
     "statics.py",
     "subspace.py",
@@ -42,6 +44,8 @@ MODELLING_FILES = (
 """The files that decide what a reduced model holds; a change in any of them makes a new cache entry."""
 
 _logger = logging.getLogger(__name__)
+
+_Kept = TypeVar("_Kept")
 
 
 def cache_folder() -> Path:
@@ -106,14 +110,9 @@ def reduced_model(
         If the design cannot be modelled or reduced.
     """
     design = _shipped(design)
-    path = _entry(design, settings).model
-    try:
-        return _checked_model(path, design)
-    except OSError:  # not there, or not readable
-        pass
-    except ReducedModelFileError as error:
-        _logger.warning("A kept model is not usable and is built anew: %s", error)
-    return _build(design, progress, settings).model
+    entry, wing_design = _entry(design, settings), design
+    kept = _kept(lambda: _checked_model(entry.model, wing_design))
+    return kept or _build(design, progress, settings).model
 
 
 def wing_fields(
@@ -143,13 +142,8 @@ def wing_fields(
         If the design cannot be modelled or reduced.
     """
     design = _shipped(design)
-    try:
-        return _checked_fields(_entry(design, settings), design)
-    except OSError:  # not there, or not readable
-        pass
-    except ReducedModelFileError as error:
-        _logger.warning("A kept model is not usable and is built anew: %s", error)
-    return _build(design, progress, settings)
+    entry, wing_design = _entry(design, settings), design
+    return _kept(lambda: _checked_fields(entry, wing_design)) or _build(design, progress, settings)
 
 
 def _shipped(design: "WingDesign | None") -> "WingDesign":
@@ -158,6 +152,17 @@ def _shipped(design: "WingDesign | None") -> "WingDesign":
     from .design import load_design
 
     return load_design()
+
+
+def _kept(load: Callable[[], _Kept]) -> _Kept | None:
+    """Return what `load` reads, or nothing if it is not there or not usable."""
+    try:
+        return load()
+    except OSError:  # not there, or not readable
+        return None
+    except ReducedModelFileError as error:
+        _logger.warning("A kept model is not usable and is built anew: %s", error)
+        return None
 
 
 def _checked_model(path: Path, design: "WingDesign") -> ReducedModel:
@@ -199,6 +204,9 @@ def build(
 ) -> WingFields:
     """Build the reduced model and the field basis of a design, without the cache.
 
+    It works in one thread, because sums over several threads depend on their number: a design gives the
+    same bytes on a machine whatever its cores do.
+
     Parameters
     ----------
     design : WingDesign
@@ -218,13 +226,16 @@ def build(
     FiniteElementError
         If the design cannot be modelled or reduced.
     """
+    from threadpoolctl import threadpool_limits
+
     from .operators import assemble
     from .reduction import reduce_model, stage_of
 
-    with stage_of(progress, "Meshing and assembling the wing"):
-        operators = assemble(design)
-    reduction = reduce_model(operators, settings, progress)
-    return WingFields(reduction.model, field_basis(operators, reduction))
+    with threadpool_limits(1):
+        with stage_of(progress, "Meshing and assembling the wing"):
+            operators = assemble(design)
+        reduction = reduce_model(operators, settings, progress)
+        return WingFields(reduction.model, field_basis(operators, reduction))
 
 
 @contextmanager

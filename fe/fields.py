@@ -73,6 +73,30 @@ class FieldBasis:
     static_strain: FloatArray
     modal_displacement: FloatArray
 
+    def __post_init__(self) -> None:
+        points, cells = self.points.shape[:1], self.cells.shape[:1]
+        static, modal = self.static_displacement.shape[2:3], self.modal_displacement.shape[2:3]
+        expected = {
+            "points": (*points, 3),
+            "cells": (*cells, 20),
+            "region": cells,
+            "static_displacement": (*points, 3, *static),
+            "static_strain": (*cells, 6, *static),
+            "modal_displacement": (*points, 3, *modal),
+        }
+        for name, shape in expected.items():
+            array = getattr(self, name)
+            kind = "i" if name in ("cells", "region") else "f"
+            if array.shape != shape or array.dtype.kind != kind or not array.size:
+                raise ReducedModelFileError(
+                    f"The array {name} of a field basis has the shape {array.shape} and the type "
+                    f"{array.dtype}, which does not fit the others; build the basis anew."
+                )
+        if self.cells.min() < 0 or self.cells.max() >= len(self.points):
+            raise ReducedModelFileError(
+                "The cells of a field basis have nodes that are not there; build the basis anew."
+            )
+
     def to_bytes(self) -> bytes:
         """Return the basis as the bytes of an `.npz` file; equal bases give equal bytes."""
         return arrays_to_bytes({item.name: np.array(getattr(self, item.name)) for item in fields(self)})
@@ -98,12 +122,10 @@ class FieldBasis:
         ReducedModelFileError
             If the archive is damaged or incomplete.
         """
-        arrays: dict[str, Any] = dict(arrays_from_bytes(content, where))
-        missing = [item.name for item in fields(cls) if item.name not in arrays]
-        if missing:
-            raise ReducedModelFileError(f"{where} lacks {', '.join(missing)}; build it anew.")
-        arrays["design_hash"] = str(arrays["design_hash"])
-        return cls(**{item.name: arrays[item.name] for item in fields(cls)})
+        names = [item.name for item in fields(cls)]
+        arrays = arrays_from_bytes(content, where, names)
+        values: dict[str, Any] = {name: arrays[name] for name in names}
+        return cls(**{**values, "design_hash": str(arrays["design_hash"])})
 
 
 @dataclass(frozen=True)
@@ -288,7 +310,10 @@ def _write(
         point_data=point_data,
         cell_data={name: [values] for name, values in cell_data.items()},
     )
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-        temporary = Path(folder) / "wing.vtu"
-        meshio.write(temporary, mesh, file_format="vtu")
-        temporary.replace(path)
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+            temporary = Path(folder) / "wing.vtu"
+            meshio.write(temporary, mesh, file_format="vtu")
+            temporary.replace(path)
+    except OSError as error:  # with the name that was asked for, not that of the temporary file
+        raise OSError(error.errno, error.strerror, str(path)) from error

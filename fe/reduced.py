@@ -57,7 +57,7 @@ class ReducedModel:
     Attributes
     ----------
     design_hash : str
-        Hash of the design and of the modelling code that made this model.
+        Hash of the design that this model was made of.
     validity_box : (7, 2) ndarray
         Least and largest value of each of `PARAMETER_NAMES`, SI units.
     static_stiffness : (4, N, N) ndarray
@@ -498,21 +498,23 @@ class ReducedModel:
         ReducedModelFileError
             If the archive is damaged, incomplete or of another format.
         """
-        arrays = arrays_from_bytes(content, where)
         names = [item.name for item in fields(cls) if item.init]
-        missing = [name for name in ("format", *names) if name not in arrays]
-        if missing:
-            raise ReducedModelFileError(f"{where} lacks {', '.join(missing)}; build it anew.")
-        if arrays["format"].shape != () or int(arrays["format"]) != FORMAT:
+        arrays = arrays_from_bytes(content, where, ("format", *names))
+        if arrays["format"].tolist() != FORMAT:
             raise ReducedModelFileError(
                 f"{where} has the format {arrays['format']}, but this version reads {FORMAT}; build it anew."
             )
         values: dict[str, Any] = {name: arrays[name] for name in names}
         values["design_hash"] = str(arrays["design_hash"])
-        for name in ("residual_allowance", "rounding_allowance"):
-            values[name] = float(arrays[name])
-        values["mode_count"] = int(arrays["mode_count"])
-        return cls(**values)
+        try:
+            for name in ("residual_allowance", "rounding_allowance"):
+                values[name] = float(arrays[name])
+            values["mode_count"] = int(arrays["mode_count"])
+            return cls(**values)
+        except (TypeError, ValueError, IndexError) as cause:
+            raise ReducedModelFileError(
+                f"{where} does not hold the arrays of a reduced model ({cause}); build it anew."
+            ) from cause
 
     def save(self, path: str | Path) -> None:
         """Write the model to one `.npz` file, whole or not at all.

@@ -6,7 +6,7 @@ The method and what it reaches are in `docs/reduced_model.md`.
 import itertools
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,8 +17,9 @@ from pymor.core.logger import set_log_levels
 
 from .compression import compressed, fewest_directions, relative_bound
 from .errors import ReductionError
-from .modal_reduction import ModalData, ModalSettings, reduce_modes
-from .reduced import PARAMETER_NAMES, ReducedModel
+from .modal_reduction import ModalData, reduce_modes
+from .reduced import ReducedModel
+from .reduction_settings import ReductionSettings, loss_splits, remaining_levels, training_set
 from .subspace import (
     AffineSystem,
     Norm,
@@ -29,7 +30,6 @@ from .subspace import (
 )
 
 FloatArray = npt.NDArray[np.float64]
-Range = tuple[float, float]
 
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""
@@ -74,58 +74,6 @@ class _Silent:
 
 
 @dataclass(frozen=True)
-class ReductionSettings:
-    """Where the reduced model is to hold, and how well.
-
-    Attributes
-    ----------
-    young_modulus_factor, stiffness_loss_1, stiffness_loss_2 : tuple of float
-        Ranges of e, z1 and z2 [1].
-    load_factor, tip_force : tuple of float
-        Ranges of the loads [1], [N]; the model is linear in them.
-    servo_mass, pitot_mass : tuple of float
-        Ranges of the masses [kg].
-    nominal_masses : tuple of float
-        Servo and pitot mass at which the flapwise modes are named [kg].
-    bound_tolerance : float
-        The certified bound of the strain error, relative to the largest strain, wanted everywhere on the
-        training set, for each of the two loads.
-    most_snapshots : int
-        Limit of the greedy search.
-    dual_anchors : tuple of int
-        How many approximate dual solutions along z1 and z2.
-    modal : ModalSettings
-        Accuracy and number of modes.
-    """
-
-    young_modulus_factor: Range = (0.9, 1.1)
-    stiffness_loss_1: Range = (0.0, 0.8)
-    stiffness_loss_2: Range = (0.0, 0.8)
-    load_factor: Range = (-4.0, 6.0)
-    tip_force: Range = (-100.0, 100.0)
-    servo_mass: Range = (0.05, 0.30)
-    pitot_mass: Range = (0.0, 0.30)
-    nominal_masses: tuple[float, float] = (0.169, 0.134)
-    bound_tolerance: float = 6e-4
-    most_snapshots: int = 24
-    dual_anchors: tuple[int, int] = (2, 2)
-    modal: ModalSettings = field(default_factory=ModalSettings)
-
-    def validity_box(self) -> FloatArray:
-        """Return the ranges in the order of `fe.reduced.PARAMETER_NAMES`, (7, 2)."""
-        ranges = {
-            "young_modulus_factor": self.young_modulus_factor,
-            "z1": self.stiffness_loss_1,
-            "z2": self.stiffness_loss_2,
-            "load_factor": self.load_factor,
-            "tip_force": self.tip_force,
-            "servo_mass": self.servo_mass,
-            "pitot_mass": self.pitot_mass,
-        }
-        return np.array([ranges[name] for name in PARAMETER_NAMES], dtype=np.float64)
-
-
-@dataclass(frozen=True)
 class Reduction:
     """A reduced model with the bases that made it.
 
@@ -148,18 +96,6 @@ class Reduction:
     modal_basis: FloatArray
     snapshots: tuple[tuple[float, float, float], ...]
     bound_history: tuple[float, ...]
-
-
-def remaining_levels(loss: Range, count: int) -> FloatArray:
-    """Return `count` values of 1 - z in the middle of equal ratios over a range of z, ascending in z."""
-    high, low = 1.0 - loss[0], 1.0 - loss[1]
-    return np.asarray(high * (low / high) ** ((np.arange(count) + 0.5) / count))
-
-
-def loss_splits(loss: Range, count: int) -> FloatArray:
-    """Return the values of z that part a range into `count` equal ratios of 1 - z, ends left out."""
-    high, low = 1.0 - loss[0], 1.0 - loss[1]
-    return np.asarray(1.0 - high * (low / high) ** (np.arange(1, count) / count))
 
 
 @dataclass(frozen=True)
@@ -285,8 +221,10 @@ class _StaticReduction:
             bound_reference=self.reference,
             residual_load=residual.T @ self.loads,
             residual_stiffness=np.stack([residual.T @ image for image in self.images], axis=1),
-            # |sum theta_q a_j d_qj| <= |theta| |a| |d|, |theta| < 2 in every sensible range; plus rounding
-            residual_allowance=2.0 * float(np.sqrt(self.residual_basis.dropped_square)) + 1e-7,
+            # |sum c_q a_j d_qj| <= |c| |a| |d|; plus rounding
+            residual_allowance=self._largest_coefficients()
+            * float(np.sqrt(self.residual_basis.dropped_square))
+            + 1e-7,
             rounding_allowance=max(ROUNDING_FACTOR * self.rounding, LEAST_ROUNDING),
             dual_split_1=loss_splits(settings.stiffness_loss_1, settings.dual_anchors[0]),
             dual_split_2=loss_splits(settings.stiffness_loss_2, settings.dual_anchors[1]),
@@ -301,24 +239,18 @@ class _StaticReduction:
             mode_count=modal.mode_count,
         )
 
+    def _largest_coefficients(self) -> float:
+        """Return the largest length of (1, theta - reference), by which parts of a residual are multiplied.
+
+        The residual is f - X u - sum (theta_q - reference_q) K_q u, and the basis was offered X u and K_q u.
+        """
+        e, z1, z2 = self.settings.validity_box()[:3]
+        ends = np.array((e, 1.0 - z1, 1.0 - z2))
+        farthest = np.abs(ends - self.reference[:, np.newaxis]).max(axis=1)
+        return float(np.sqrt(1.0 + farthest @ farthest))
+
     def _mass_images(self) -> list[FloatArray]:
         return [np.asarray(term @ self.basis.vectors) for term in self.system.mass_terms]
-
-
-def training_set(settings: ReductionSettings) -> list[tuple[float, float, float]]:
-    """Return the states (e, z1, z2) on which the greedy search looks for the largest bound."""
-    low, high = settings.young_modulus_factor
-
-    def losses(span: Range) -> FloatArray:
-        top, bottom = 1.0 - span[0], 1.0 - span[1]
-        return np.asarray(np.clip(1.0 - top * (bottom / top) ** np.linspace(0.0, 1.0, 7), *span))
-
-    return [
-        (float(e), float(z1), float(z2))
-        for e in (low, 0.5 * (low + high), high)
-        for z1 in losses(settings.stiffness_loss_1)
-        for z2 in losses(settings.stiffness_loss_2)
-    ]
 
 
 def reduce_model(

@@ -1,4 +1,5 @@
 import pytest
+from threadpoolctl import threadpool_limits
 
 from fe.design import WingDesign, load_design
 from fe.operators import AffineOperators, assemble
@@ -17,7 +18,8 @@ def coarse_design(shipped_design: WingDesign) -> WingDesign:
 
 @pytest.fixture(scope="session")
 def coarse_operators(coarse_design: WingDesign) -> AffineOperators:
-    return assemble(coarse_design)
+    with threadpool_limits(1):  # as `fe.cache.build`, so that their bytes can be compared
+        return assemble(coarse_design)
 
 
 @pytest.fixture(scope="session")
@@ -27,4 +29,5 @@ def shipped_operators(shipped_design: WingDesign) -> AffineOperators:
 
 @pytest.fixture(scope="session")
 def coarse_reduction(coarse_operators: AffineOperators) -> Reduction:
-    return reduce_model(coarse_operators)
+    with threadpool_limits(1):
+        return reduce_model(coarse_operators)

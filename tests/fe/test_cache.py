@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 import fe.cache
 from fe.cache import MODELLING_FILES, cache_folder, cache_key, reduced_model, wing_fields
@@ -15,7 +16,8 @@ from fe.design import WingDesign
 from fe.errors import ReducedModelFileError
 from fe.fields import WingFields, field_basis
 from fe.operators import AffineOperators
-from fe.reduction import Reduction, ReductionSettings
+from fe.reduction import Reduction
+from fe.reduction_settings import ReductionSettings
 
 PACKAGE = Path(fe.cache.__file__).parent
 
@@ -28,7 +30,8 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="module")
 def coarse_wing(coarse_operators: AffineOperators, coarse_reduction: Reduction) -> WingFields:
-    return WingFields(coarse_reduction.model, field_basis(coarse_operators, coarse_reduction))
+    with threadpool_limits(1):
+        return WingFields(coarse_reduction.model, field_basis(coarse_operators, coarse_reduction))
 
 
 @pytest.fixture
@@ -180,7 +183,11 @@ def test_without_a_place_to_keep_it_the_model_is_still_given(
 def test_model_and_fields_must_belong_together(coarse_wing: WingFields) -> None:
     with pytest.raises(ReducedModelFileError, match="does not belong"):
         WingFields(replace(coarse_wing.model, design_hash="another"), coarse_wing.basis)
-    cut = replace(coarse_wing.basis, static_displacement=coarse_wing.basis.static_displacement[..., :-1])
+    cut = replace(
+        coarse_wing.basis,
+        static_displacement=coarse_wing.basis.static_displacement[..., :-1],
+        static_strain=coarse_wing.basis.static_strain[..., :-1],
+    )
     with pytest.raises(ReducedModelFileError, match="does not belong"):
         WingFields(coarse_wing.model, cut)
 
@@ -201,6 +208,16 @@ def test_every_file_that_shapes_the_model_counts_for_the_key() -> None:
     # they hold names and sentences, no numbers
     assert reached - {"errors.py", "state.py"} == set(MODELLING_FILES)
     assert all((PACKAGE / name).is_file() for name in MODELLING_FILES)
+
+
+@pytest.mark.slow
+def test_a_build_does_not_depend_on_the_number_of_threads(
+    coarse_design: WingDesign, coarse_wing: WingFields
+) -> None:
+    with threadpool_limits(2):
+        wing = fe.cache.build(coarse_design)
+    assert wing.model.to_bytes() == coarse_wing.model.to_bytes()
+    assert wing.basis.to_bytes() == coarse_wing.basis.to_bytes()
 
 
 @pytest.mark.slow

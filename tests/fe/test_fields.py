@@ -1,3 +1,5 @@
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import meshio
@@ -133,6 +135,10 @@ def test_bad_states_and_places_leave_no_file(wing: WingFields, tmp_path: Path) -
     assert not list(tmp_path.iterdir())
     with pytest.raises(FileNotFoundError):
         write_wing_vtu(tmp_path / "absent" / "wing.vtu", wing, **STATE)
+    (tmp_path / "folder.vtu").mkdir()
+    with pytest.raises(OSError, match=re.escape(f"'{tmp_path / 'folder.vtu'}'")):
+        write_wing_vtu(tmp_path / "folder.vtu", wing, **STATE)
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.vtu"]
 
 
 def test_basis_comes_back_to_the_last_bit(wing: WingFields) -> None:
@@ -142,3 +148,9 @@ def test_basis_comes_back_to_the_last_bit(wing: WingFields) -> None:
         FieldBasis.from_bytes(content[:1000], "the basis")
     with pytest.raises(ReducedModelFileError, match="lacks"):
         FieldBasis.from_bytes(wing.model.to_bytes(), "the basis")
+    for name in ("points", "cells", "region", "static_displacement", "static_strain", "modal_displacement"):
+        for value in (np.array(1.0), np.array("a"), getattr(wing.basis, name)[:-1, ...]):
+            with pytest.raises(ReducedModelFileError, match="field basis"):
+                replace(wing.basis, **{name: value})
+    with pytest.raises(ReducedModelFileError, match="nodes that are not there"):
+        replace(wing.basis, cells=wing.basis.cells + 1)

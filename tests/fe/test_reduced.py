@@ -268,6 +268,19 @@ def test_incomplete_or_foreign_files_are_refused(model: ReducedModel) -> None:
         replace(model, rounding_allowance=-1.0)
 
 
+@pytest.mark.parametrize(
+    "value", [np.array(1.0), np.array("a"), np.zeros(5), np.zeros(0), np.zeros((0, 0, 0)), np.array(1j)]
+)
+def test_arrays_of_a_wrong_kind_are_refused(model: ReducedModel, value: np.ndarray) -> None:
+    arrays = arrays_from_bytes(model.to_bytes(), "the model")
+    numbers = {"format", "mode_count", "residual_allowance", "rounding_allowance"}
+    for name in set(arrays) - {"design_hash"}:
+        if name in numbers and value.shape == () and value.dtype.kind == "f":
+            continue
+        with pytest.raises(ReducedModelFileError):
+            ReducedModel.from_bytes(arrays_to_bytes({**arrays, name: value}))
+
+
 def test_pickles_are_never_read() -> None:
     buffer = io.BytesIO()
     np.savez(buffer, format=np.array([{"a": 1}], dtype=object))

@@ -20,14 +20,8 @@ from fe.errors import ReductionError, SolutionError
 from fe.modal_reduction import ModalSettings
 from fe.operators import AffineOperators
 from fe.reduced import ReducedModel
-from fe.reduction import (
-    Reduction,
-    ReductionSettings,
-    loss_splits,
-    reduce_model,
-    remaining_levels,
-    training_set,
-)
+from fe.reduction import Reduction, reduce_model
+from fe.reduction_settings import ReductionSettings, loss_splits, remaining_levels, training_set
 from fe.subspace import Norm, OrthonormalBasis, affine_sum, conjugate_gradients, triangular_factors
 
 
