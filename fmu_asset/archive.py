@@ -149,6 +149,8 @@ def read_fmu(path: str | os.PathLike[str]) -> FmuDescription:
         )
     try:
         declared = read_model_description(str(file), validate=False)
+        variables = tuple(_variable(variable) for variable in declared.modelVariables)
+        units = tuple(_unit(unit) for unit in declared.unitDefinitions)
     except Exception as error:
         raise FmuFileError(f"The model description of {file} cannot be read ({error}).") from error
     if declared.coSimulation is None:
@@ -180,8 +182,8 @@ def read_fmu(path: str | os.PathLike[str]) -> FmuDescription:
         can_get_and_set_state=bool(declared.coSimulation.canGetAndSetFMUstate),
         can_serialise_state=bool(declared.coSimulation.canSerializeFMUstate),
         can_vary_step=bool(declared.coSimulation.canHandleVariableCommunicationStepSize),
-        variables=tuple(_variable(variable) for variable in declared.modelVariables),
-        units=tuple(_unit(unit) for unit in declared.unitDefinitions),
+        variables=variables,
+        units=units,
     )
 
 

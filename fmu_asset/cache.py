@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from fe.cache import cache_folder
 from fe.reduced import ReducedModel
 from fe.state import DigitalState
 
@@ -30,8 +31,7 @@ def wing_fmu(
     FmuInfo
         The FMU; its file name is its model identifier.
     """
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    place = Path(folder) if folder is not None else home / "uav-twin" / "fmu"
+    place = Path(folder) if folder is not None else cache_folder() / "fmu"
     content, info = content_info(model, state, place)
     # Comparing the bytes costs less than trusting the name: a kill or a full disk may have been here.
     if info.path.is_file() and info.path.read_bytes() == content:

@@ -72,7 +72,12 @@ def _content_problems(description: FmuDescription) -> list[str]:
         ours = {"resources/start.json", "resources/reduced_model.npz"} <= set(archive.namelist())
     if not ours:
         return []
-    declared, actual = recorded_content_hash(description.path)
+    try:
+        declared, actual = recorded_content_hash(description.path)
+    except (KeyError, IndexError, UnicodeDecodeError):
+        return [
+            "Its parts are not those of a wing FMU as it was built: the file was changed after its build."
+        ]
     if declared == actual:
         return []
     return [f"The GUID {declared} does not fit the content ({actual}): the file was changed after its build."]

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from .archive import FmuDescription, VariableInfo
 from .binding import INPUT_ROLES, Binding, Scalar
-from .errors import BindingError, FmuInputError
+from .errors import BindingError, FmuFileError, FmuInputError
 from .instance import Plan, Settings
 from .units import IDENTITY, Conversion, conversion
 
@@ -174,8 +174,19 @@ class Exchange:
         return variable
 
     def start_values(self) -> list[float]:
-        """Return a request block with the FMU's own start values of the inputs."""
-        return [0.0, 0.0, *(_start_value(variable) for variable in self._ordered)]
+        """Return a request block with the FMU's own start values of the inputs.
+
+        Raises
+        ------
+        FmuFileError
+            If a start value is no number.
+        """
+        try:
+            return [0.0, 0.0, *(_start_value(variable) for variable in self._ordered)]
+        except ValueError as error:
+            raise FmuFileError(
+                f"An input of {self._description.path} has a start value that is no number ({error})."
+            ) from error
 
     def settings(self, parameters: Mapping[str, float]) -> Settings:
         """Return what is set before initialisation: the values of the binding, then the caller's.

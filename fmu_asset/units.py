@@ -90,7 +90,7 @@ def conversion(
     own = next((definition for definition in definitions if definition.name == variable.unit), None)
     if own is not None:
         for name, factor, offset in own.displays:
-            if name == unit:  # display = factor * value + offset
+            if name == unit and factor:  # display = factor * value + offset
                 return Conversion(1.0 / factor, -offset / factor)
     target = _meaning(variable.unit, definitions)
     source = _meaning(unit, definitions)
@@ -105,7 +105,7 @@ def conversion(
 
 def _meaning(unit: str, definitions: Sequence[UnitInfo]) -> tuple[Exponents, float, float] | None:
     for definition in definitions:
-        if definition.name == unit and definition.exponents is not None:
+        if definition.name == unit and definition.exponents is not None and definition.factor:
             return definition.exponents, definition.factor, definition.offset
     if unit in _COMMON:
         exponents, factor = _COMMON[unit]

@@ -13,7 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fmu_asset.archive import extract_fmu, read_fmu
+from fmu_asset.binding import Binding
 from fmu_asset.errors import FmuError, FmuFileError, FmuUnsupportedError
+from fmu_asset.session import FmiAsset
 
 Repack = Callable[[Callable[[str, bytes], tuple[str, bytes] | None]], Path]
 
@@ -63,6 +65,14 @@ def test_no_description(repack: Repack) -> None:
 def test_broken_description(repack: Repack) -> None:
     with pytest.raises(FmuFileError, match=r"The model description of .* cannot be read"):
         read_fmu(repack(in_description(b"</ModelVariables>", b"")))
+
+
+def test_numbers_that_are_none(repack: Repack, binding: Binding) -> None:
+    with pytest.raises(FmuFileError, match=r"The model description of .* cannot be read .*'abc'"):
+        read_fmu(repack(in_description(b'min="0.0"', b'min="abc"')))
+    strange = repack(in_description(b'start="1.0"', b'start="abc"'))
+    with pytest.raises(FmuFileError, match=r"start value that is no number .*'abc'"):
+        FmiAsset(strange, binding).reset()
 
 
 def test_another_version(repack: Repack) -> None:

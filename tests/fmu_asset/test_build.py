@@ -140,6 +140,11 @@ def test_a_changed_file_is_noticed(fmu: Path, tmp_path: Path) -> None:
             data = source.read(name)
             target.writestr(name, data.replace(b'"mode_count": 6', b'"mode_count": 5'))
     assert any("GUID" in problem for problem in check_fmu(changed).problems)
+    foreign = tmp_path / "foreign.fmu"
+    with zipfile.ZipFile(fmu) as source, zipfile.ZipFile(foreign, "w") as target:
+        for name in source.namelist():
+            target.writestr(name, b"\xff" if name.endswith("slavemodule.txt") else source.read(name))
+    assert any("was changed after its build" in problem for problem in check_fmu(foreign).problems)
 
 
 def test_refuses_what_cannot_be_built(model: ReducedModel, fmu: Path, tmp_path: Path) -> None:
