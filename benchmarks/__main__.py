@@ -21,14 +21,18 @@ def main(names: list[str]) -> int:
     if not chosen:
         console.print(f"no benchmark matches {', '.join(names)}; there are: {', '.join(modules)}")
         return 2
-    table = Table("benchmark", "measured", "bar", "reached", "beside it", "ratio", title="uav-twin benchmarks")
+    table = Table(
+        "benchmark", "measured", "bar", "reached", "beside it", "ratio", title="uav-twin benchmarks"
+    )
     missed = 0
     for module in sorted(chosen):
         with console.status(module):
             measurements: list[Measurement] = importlib.import_module(f"benchmarks.{module}").run()
         for m in measurements:
             ratio = "" if not m.reference_value else f"{m.value / m.reference_value:.3g}"
-            reference = "" if m.reference_value is None else f"{m.reference_name}: {m.reference_value:.3g} {m.unit}"
+            reference = (
+                "" if m.reference_value is None else f"{m.reference_name}: {m.reference_value:.3g} {m.unit}"
+            )
             reached = {None: "", True: "yes", False: "NO"}[m.reached]
             missed += m.reached is False
             bar = "" if m.bar is None else f"{'≥' if m.larger_is_better else '≤'} {m.bar:g} {m.unit}"

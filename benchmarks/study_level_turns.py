@@ -53,8 +53,12 @@ def main() -> int:
     parser.add_argument("--first-seed", type=int, help="by default the seed of the scenario")
     parser.add_argument("--strain-library", type=Path)
     parser.add_argument("--fmu", action="store_true", help="fly the FMU in a worker process")
+    parser.add_argument("--decide-on", choices=("filtered", "predicted"), help="instead of the scenario's")
     given = parser.parse_args()
     scenario = resolve_scenario(load_scenario("level_turns"), Overrides(strain_library=given.strain_library))
+    if given.decide_on:
+        planner = scenario.planner.model_copy(update={"decide_on": given.decide_on})
+        scenario = scenario.model_copy(update={"planner": planner})
     with tempfile.TemporaryDirectory() as folder:
         if given.strain_library or given.fmu:
             source: AssetSource = asset_source(scenario)

@@ -1,1 +1,1 @@
-"""Where simulation and data disagree: reserved for the discrepancy workflow, which this version does not contain."""
+"""Where simulation and data disagree: reserved for a workflow that is not in this version."""

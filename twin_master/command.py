@@ -80,19 +80,19 @@ def _interruptible(fly: Callable[[], RunOutcome], folder: Path) -> RunOutcome:
 
 
 def show_outcome(outcome: RunOutcome) -> None:
-    """Print the figures of a run beside the published ones, and where the report is."""
+    """Print the figures of a run beside their references, and where the report is."""
+    from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False)
-    table = Table("figure", "this run", "published", "by")
+    console = Console(highlight=False, markup=False)
+    table = Table("figure", "this run", "reference", box=box.SIMPLE_HEAD)
+    sources: dict[str, int] = {}
     for figure in outcome.figures:
-        table.add_row(
-            figure.title,
-            _shown(figure.value, figure.unit, "none"),
-            _shown(figure.reference, figure.unit),
-            figure.reference_source,
-        )
+        reference = _shown(figure.reference, figure.unit)
+        if figure.reference_source:
+            reference += f" ({sources.setdefault(figure.reference_source, len(sources) + 1)})"
+        table.add_row(figure.title, _shown(figure.value, figure.unit, "none"), reference)
     for title, key in (
         ("asset, per turn", "asset"),
         ("twin, per turn", "twin"),
@@ -101,10 +101,12 @@ def show_outcome(outcome: RunOutcome) -> None:
         entry = outcome.timing.get(f"{key}_seconds")
         if entry:
             table.add_row(
-                title, f"{1e3 * entry['median']:.3g} ms (largest {1e3 * entry['largest']:.3g} ms)", "", ""
+                title, f"{1e3 * entry['median']:.3g} ms (largest {1e3 * entry['largest']:.3g} ms)", ""
             )
-    table.add_row("whole run", f"{outcome.timing['total_seconds']:.3g} s", "", "")
+    table.add_row("whole run", f"{outcome.timing['total_seconds']:.3g} s", "")
     console.print(table)
+    for source, number in sources.items():
+        console.print(f"  ({number}) {source}")
     console.print(f"Report: {outcome.report}", soft_wrap=True)
 
 
@@ -113,7 +115,7 @@ def _shown(value: float | int | str | None, unit: str, missing: str = "") -> str
         return missing
     if isinstance(value, str):
         return value
-    return f"{value:.4g} {unit}".strip()
+    return f"{value:.5g} {unit}".strip()
 
 
 def guarded(application: Callable[[], None]) -> None:

@@ -53,6 +53,7 @@ class Knowledge:
             self.plan.policy,
             self.scenario.mission.steps,
             self.scenario.mission.prediction_steps,
+            self.scenario.planner.decide_on,
         )
 
     def truth(self, seed: int) -> Truth:

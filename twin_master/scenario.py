@@ -157,6 +157,16 @@ class Planner(Section):
     """Value iteration, eq. (36)."""
 
     gamma: Annotated[float, Field(strict=True, ge=0.0, lt=1.0)]
+    decide_on: Literal["filtered", "predicted"] = "filtered"
+    """Which belief the next control is the most probable one of: D_t, or D_{t+1} as predicted."""
+
+
+class Reference(Section):
+    """What a figure of the summary is printed beside."""
+
+    figure: Name
+    value: Number | str
+    source: str
 
 
 class AssetSection(Section):
@@ -267,6 +277,7 @@ class Scenario(Section):
     asset: AssetSection
     calibration: Calibration
     truth: Truth
+    reference: tuple[Reference, ...] = ()
 
     @property
     def state_names(self) -> tuple[str, ...]:

@@ -1,9 +1,9 @@
-"""The figures of a mission, each beside the published one where there is one."""
+"""The figures of a mission, each beside the one that the scenario gives as its reference."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,12 +13,10 @@ from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws
 from twin_master.results import MissionResult
 from twin_master.rewards import REWARD_NAMES
+from twin_master.scenario import Reference
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-PAPER = "Kapteyn et al. 2021"
-REFERENCE_TWIN = "reference twin on the authors' library, mean of many missions"
 
 _TOLERANCE = 1e-9
 
@@ -38,9 +36,9 @@ class Figure:
     unit : str
         Unit of `value` and `reference`, as printed.
     reference : float, str or None
-        The published figure.
+        What the scenario gives to compare it with.
     reference_source : str
-        Where it was published.
+        Where that comes from.
     """
 
     key: str
@@ -146,15 +144,13 @@ def summarise(result: MissionResult, draws: ParameterDraws, reward_mean: Float) 
         Mean rewards under the filtered belief.
     """
     scenario, flight, model = result.scenario, result.flight, result.model
-    published = scenario.mission.name == "level_turns"
     first = scenario.control_names.index(scenario.mission.first_control)
     fallback = find_fallback(
         model, result.plan.control_index, first, flight.control_index, flight.truth.state
     )
     units = {factor.name: factor.unit for factor in scenario.state}
-    figures = _fallback_figures(fallback, units, published)
+    figures = _fallback_figures(fallback, units)
     errors = filtered_rms_error(model, flight.filtered, flight.truth.state)
-    reference = {"z1": 3.8, "z2": 11.4} if published else {}
     for factor, error in zip(scenario.state, errors, strict=True):
         name, fraction = factor.name, factor.unit == "1"
         figures.append(
@@ -163,21 +159,18 @@ def summarise(result: MissionResult, draws: ParameterDraws, reward_mean: Float) 
                 f"filtered rms error of {name}",
                 (100.0 if fraction else 1.0) * float(error),
                 "points" if fraction else factor.unit,
-                reference.get(name),
-                REFERENCE_TWIN if name in reference else "",
             )
         )
     for index, name in enumerate(REWARD_NAMES):
         known = reward_mean[np.isfinite(reward_mean[:, index]), index]
         mean = float(known.mean()) if len(known) else None
         figures.append(Figure(f"mean_reward_{name}", f"mean reward for {name}", mean))
-    paper = (1.0073, 0.0103) if scenario.calibration.source == "static_test" else (None, None)
-    for key, title, value, printed in (
-        ("mean", "posterior mean", draws.mean, paper[0]),
-        ("standard_deviation", "posterior standard deviation", draws.standard_deviation, paper[1]),
+    label = draws.name.replace("_", " ")
+    for key, title, value in (
+        ("mean", "posterior mean", draws.mean),
+        ("standard_deviation", "posterior standard deviation", draws.standard_deviation),
     ):
-        source = PAPER if printed is not None else ""
-        figures.append(Figure(f"{draws.name}_{key}", f"{title} of {draws.name}", value, "", printed, source))
+        figures.append(Figure(f"{draws.name}_{key}", f"{title} of the {label}", value))
     figures.append(
         Figure("log_evidence", "log evidence of all observations", float(flight.log_evidence.sum()))
     )
@@ -189,10 +182,17 @@ def summarise(result: MissionResult, draws: ParameterDraws, reward_mean: Float) 
                 "strain_error_bound", "worst certified strain error", 1e6 * float(bound.max()), "microstrain"
             )
         )
-    return tuple(figures)
+    references = {entry.figure: entry for entry in scenario.reference}
+    return tuple(_beside(figure, references.get(figure.key)) for figure in figures)
 
 
-def _fallback_figures(fallback: Fallback, units: Mapping[str, str], published: bool) -> list[Figure]:
+def _beside(figure: Figure, reference: Reference | None) -> Figure:
+    if reference is None:
+        return figure
+    return replace(figure, reference=reference.value, reference_source=reference.source)
+
+
+def _fallback_figures(fallback: Fallback, units: Mapping[str, str]) -> list[Figure]:
     level, name = fallback.switch_level, fallback.switch_state
     unit = units.get(name or "", "")
     if level is not None and unit == "1":
@@ -202,24 +202,15 @@ def _fallback_figures(fallback: Fallback, units: Mapping[str, str], published: b
         f"policy leaves the first control from {name}" if name else "policy leaves the first control",
         level if level is not None else "nowhere, or by several states",
         unit,
-        60.0 if published else None,
-        PAPER if published else "",
     )
     if name is None:
         return [switch]
     return [
         switch,
-        Figure("damage_step", "step of the damage that calls for it", fallback.called_for_step),
-        Figure("fallback_step", "step of the fallback", fallback.fallback_step),
-        Figure(
-            "fallback_delay",
-            "delay of the fallback",
-            fallback.delay,
-            "steps",
-            "at most 2 in 98 % of missions" if published else None,
-            "acceptance" if published else "",
-        ),
-        Figure("early_fallback_step", "step of a fallback before the damage", fallback.early_step),
+        Figure("damage_step", "turn of the damage that calls for it", fallback.called_for_step),
+        Figure("fallback_step", "turn of the fallback", fallback.fallback_step),
+        Figure("fallback_delay", "delay of the fallback", fallback.delay, "turns"),
+        Figure("early_fallback_step", "turn of a fallback before the damage", fallback.early_step),
     ]
 
 
@@ -232,7 +223,7 @@ def _sensor_figures(observed: Float) -> list[Figure]:
     if len(blind):
         steps = ", ".join(str(step) for step in blind)
         figures.append(
-            Figure("blind_steps", "steps without any observation (belief follows the dynamics)", steps)
+            Figure("blind_steps", "turns without any observation (belief follows the dynamics)", steps)
         )
     return figures
 

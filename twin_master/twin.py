@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +72,7 @@ class TwinTurn:
     prediction : Predicted
         Beliefs and controls of the steps t + 1 ... t + H.
     next_control : int
-        The most probable control of step t + 1, eq. (39).
+        The control to fly in step t + 1: the most probable one given what the twin decides on.
     """
 
     filtered: Float
@@ -98,6 +99,10 @@ class Twin:
         Largest number of turns.
     prediction_steps : int
         How far to predict.
+    decide_on : {"filtered", "predicted"}
+        The next control is the mode of policy(U | D) averaged over p(D_t | o_0..o_t), so that the policy
+        acts on the state last observed, as in the paper's graph; or over p(D_{t+1} | o_0..o_t), one step
+        ahead, as in the authors' published code.
     """
 
     def __init__(
@@ -108,12 +113,14 @@ class Twin:
         policy: Float,
         steps: int,
         prediction_steps: int,
+        decide_on: Literal["filtered", "predicted"] = "filtered",
     ) -> None:
         self.name = name
         self.model = model
         self.sensor_model = sensor_model
         self.policy = policy
         self.prediction_steps = prediction_steps
+        self.decide_on = decide_on
         size = model.states.size
         self._log_filtered: Float = np.zeros((steps, size))
         self._control: Index = np.zeros(steps, dtype=np.int64)
@@ -158,12 +165,16 @@ class Twin:
         seen = slice(0, step + 1)
         smoothed = smooth(self.model, self._control[seen], self._log_filtered[seen]).smoothed
         prediction = predict(self.model, filtered.filtered, control_index, self.policy, self.prediction_steps)
+        if self.decide_on == "filtered":
+            control_probability = filtered.filtered @ self.policy
+        else:
+            control_probability = prediction.control_probability[0]
         return TwinTurn(
             filtered=filtered.filtered,
             log_evidence=filtered.log_evidence,
             smoothed=smoothed,
             prediction=prediction,
-            next_control=int(np.argmax(prediction.control_probability[0])),
+            next_control=int(np.argmax(control_probability)),
         )
 
     def _worst_residuals(self, observation: Float, control_index: int) -> dict[str, float]:

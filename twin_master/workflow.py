@@ -405,6 +405,6 @@ def _timing(flight: Flight, clock: _Clock) -> dict[str, Any]:
 
 
 def _report(folder: Path) -> Path:
-    from twin_master.report import write_report
+    from twin_master.report.page import write_report
 
     return write_report(folder)

@@ -17,18 +17,16 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from reporting.errors import DiskFullError
 from reporting.figures import to_svg
-from twin_master import (
-    report,
-    report_belief,
-    report_calibration,
-    report_check,
-    report_data,
-    report_mission,
-    report_network,
-)
 from twin_master.errors import RunFolderError
-from twin_master.report_text import duration, lost_ranges, number, turn_ranges
-from twin_master.report_view import choose_sensors, default_now
+from twin_master.report import belief as report_belief
+from twin_master.report import calibration as report_calibration
+from twin_master.report import check as report_check
+from twin_master.report import data as report_data
+from twin_master.report import mission as report_mission
+from twin_master.report import network as report_network
+from twin_master.report import page as report
+from twin_master.report.text import duration, lost_ranges, number, turn_ranges
+from twin_master.report.view import choose_sensors, default_now
 
 # The tests are no package, so the generator beside this file is loaded by its path.
 _specification = importlib.util.spec_from_file_location(

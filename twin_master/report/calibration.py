@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from reporting import figures as style
-from twin_master.report_data import RunRecord
-from twin_master.report_text import number
+from twin_master.report.data import RunRecord
+from twin_master.report.text import number
 
 Float = NDArray[np.floating[Any]]
 

@@ -13,8 +13,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from reporting import figures as style
-from twin_master.report_data import RunRecord
-from twin_master.report_view import (
+from twin_master.report.data import RunRecord
+from twin_master.report.view import (
     Band,
     Course,
     capital,

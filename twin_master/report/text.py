@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twin_master.report_check import PredictiveCheck, assumed_noise
-from twin_master.report_data import RunRecord
-from twin_master.report_view import observation_scale, sensor_word, symbol
+from twin_master.report.check import PredictiveCheck, assumed_noise
+from twin_master.report.data import RunRecord
+from twin_master.report.view import observation_scale, sensor_word, symbol
 
 
 def number(value: Any) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.report_data import Estimate, RunRecord, Uncertain, moments, smoothed_until
+from twin_master.report.data import Estimate, RunRecord, Uncertain, moments, smoothed_until
 
 Float = NDArray[np.floating[Any]]
 

@@ -14,8 +14,8 @@ from scipy.special import ndtr
 from scipy.stats import binom
 
 from reporting import figures as style
-from twin_master.report_data import NORMAL_95, RunRecord
-from twin_master.report_view import sensor_word
+from twin_master.report.data import NORMAL_95, RunRecord
+from twin_master.report.view import sensor_word
 
 Float = NDArray[np.floating[Any]]
 

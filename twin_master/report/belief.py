@@ -13,8 +13,8 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from reporting import figures as style
-from twin_master.report_data import RunRecord
-from twin_master.report_view import capital, symbol
+from twin_master.report.data import RunRecord
+from twin_master.report.view import capital, symbol
 
 Float = NDArray[np.floating[Any]]
 

@@ -14,13 +14,13 @@ from reporting.figures import to_png, to_svg
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.page import Column, Page, Table
 from twin_master.errors import RunFolderError
-from twin_master.report_belief import belief_figure, policy_figure
-from twin_master.report_calibration import calibration_caption, calibration_figure, calibration_view
-from twin_master.report_check import check_figure, predictive_check
-from twin_master.report_data import RunRecord, read_run
-from twin_master.report_mission import mission_figure
-from twin_master.report_network import network_figure
-from twin_master.report_text import (
+from twin_master.report.belief import belief_figure, policy_figure
+from twin_master.report.calibration import calibration_caption, calibration_figure, calibration_view
+from twin_master.report.check import check_figure, predictive_check
+from twin_master.report.data import RunRecord, read_run
+from twin_master.report.mission import mission_figure
+from twin_master.report.network import network_figure
+from twin_master.report.text import (
     belief_caption,
     check_caption,
     duration,
@@ -31,7 +31,7 @@ from twin_master.report_text import (
     policy_caption,
     turn_ranges,
 )
-from twin_master.report_view import choose_sensors, default_now, sensor_word
+from twin_master.report.view import choose_sensors, default_now, sensor_word
 
 REPORT_NAME = "report.html"
 FIGURE_FOLDER = "figures"
