@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import log_ndtr, ndtri
+from scipy.special import ndtri
 
 from .errors import PosteriorError
 
@@ -64,10 +64,6 @@ class GaussianPrior:
     def quantile(self, probability: ArrayLike) -> NDArray[np.float64]:
         """Return quantiles, elementwise."""
         return np.asarray(self.mean + self.standard_deviation * ndtri(np.asarray(probability, dtype=float)))
-
-    def log_probability_below(self, value: ArrayLike) -> NDArray[np.float64]:
-        """Return the logarithm of the distribution function, elementwise."""
-        return np.asarray(log_ndtr((np.asarray(value, dtype=float) - self.mean) / self.standard_deviation))
 
 
 @dataclass(frozen=True, eq=False)

@@ -167,13 +167,6 @@ def build_fmu(
     return _info(model, target, content, content_hash)
 
 
-def content_info(model: ReducedModel, state: DigitalState | None, folder: Path) -> tuple[bytes, FmuInfo]:
-    """Return the archive, and what it would be called in a folder that is ordered by content."""
-    content, content_hash = fmu_bytes(model, state)
-    target = folder / f"uav_wing_{content_hash[:_TAG_LENGTH]}.fmu"
-    return content, _info(model, target, content, content_hash)
-
-
 def _info(model: ReducedModel, path: Path, content: bytes, content_hash: str) -> FmuInfo:
     return FmuInfo(
         path=path,

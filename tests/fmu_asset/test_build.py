@@ -17,7 +17,6 @@ from fmpy.validation import validate_fmu
 from fe.reduced import RUNTIME_FILES, ReducedModel
 from fe.state import DigitalState
 from fmu_asset.build import build_fmu, recorded_content_hash, relative_imports
-from fmu_asset.cache import wing_fmu
 from fmu_asset.check import check_fmu
 from fmu_asset.errors import FmuBuildError
 
@@ -155,10 +154,3 @@ def test_refuses_what_cannot_be_built(model: ReducedModel, fmu: Path, tmp_path: 
     with pytest.raises(FmuBuildError, match=r"start value .* of young_modulus_factor"):
         build_fmu(model, tmp_path / "wing.fmu", state=DigitalState(young_modulus_factor=2.0))
     assert not (tmp_path / "wing.fmu").exists()
-
-
-def test_cache_returns_sound_files_only(model: ReducedModel, fmu: Path, tmp_path: Path) -> None:
-    info = wing_fmu(model, folder=tmp_path)
-    assert info.path.read_bytes() == fmu.read_bytes()
-    info.path.write_bytes(b"half a file")
-    assert wing_fmu(model, folder=tmp_path).path.read_bytes() == fmu.read_bytes()
