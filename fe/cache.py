@@ -35,6 +35,7 @@ MODELLING_FILES = (
     "operators.py",
     "parts.py",
     "reduced.py",
+    "reduced_arrays.py",
     "reduction.py",
     "reduction_settings.py",
     "responses.py",

@@ -145,7 +145,7 @@ def reduce_modes(
     reference : (3,) ndarray
         (e, 1 - z1, 1 - z2) of the norm.
     box : (7, 2) ndarray
-        Validity box, `fe.reduced.PARAMETER_NAMES`.
+        Validity box, `fe.reduced_arrays.PARAMETER_NAMES`.
     nominal_masses : tuple of float
         Servo and pitot mass at which the flapwise modes are named, at e = 1 and no loss [kg].
     settings : ModalSettings

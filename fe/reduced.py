@@ -6,19 +6,17 @@ The offline part, which makes the arrays, is `fe.reduction`; the equations are i
 
 from bisect import bisect_right
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from math import isfinite, sqrt
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numpy import einsum
 from numpy.linalg import solve
 
-from .archive import arrays_from_bytes, arrays_to_bytes, write_bytes_atomically
-from .errors import OutsideModelError, ReducedModelFileError
+from .errors import OutsideModelError
 from .online import OnlineArrays
+from .reduced_arrays import PARAMETER_NAMES, ReducedArrays
 from .responses import Modes, StaticResponse
 
 __all__ = ["PARAMETER_NAMES", "RUNTIME_FILES", "Modes", "ReducedModel", "StaticResponse"]
@@ -33,114 +31,24 @@ RUNTIME_FILES = (
     "damping.py",
     "responses.py",
     "online.py",
+    "reduced_arrays.py",
     "reduced.py",
     "transient.py",
 )
 """Files of this package that evaluate a reduced model; they need the standard library and NumPy only."""
 
-PARAMETER_NAMES = ("young_modulus_factor", "z1", "z2", "load_factor", "tip_force", "servo_mass", "pitot_mass")
-"""The rows of `ReducedModel.validity_box`, in this order."""
-
-FORMAT = 1
-"""Version of the array layout in the file."""
-
 
 @dataclass(frozen=True, repr=False)
-class ReducedModel:
-    """Reduced wing: affine dense matrices, outputs, modal data, error bound, validity.
+class ReducedModel(ReducedArrays):
+    """Reduced wing: `ReducedArrays`, evaluated.
 
-    Terms of the stiffness, in this order: skin (times e), first defect region (times 1 - z1), second defect
-    region (times 1 - z2), everything else (times 1). Terms of the mass: structure, servos (times servo
-    mass), pitot (times pitot mass). Loads: lift at load factor 1, tip force of 1 N. Output rows: the G
-    gauges [1], then the tip displacement [m].
-
-    Attributes
-    ----------
-    design_hash : str
-        Hash of the design that this model was made of.
-    validity_box : (7, 2) ndarray
-        Least and largest value of each of `PARAMETER_NAMES`, SI units.
-    static_stiffness : (4, N, N) ndarray
-        Stiffness terms in the static basis.
-    static_load : (2, N) ndarray
-        Loads in the static basis.
-    static_output : (G + 1, N) ndarray
-        Outputs of the static basis vectors.
-    bound_reference : (3,) ndarray
-        The values of (e, 1 - z1, 1 - z2) whose stiffness is the norm of the error bound.
-    residual_load : (R, 2) ndarray
-        Loads in an orthonormal basis of the residuals (norm dual to the one of `bound_reference`).
-    residual_stiffness : (R, 4, N) ndarray
-        Stiffness terms times static basis vectors, in the same basis.
-    residual_allowance : float
-        Bound of what that basis leaves out of a residual, per unit length of the reduced coordinates.
-    rounding_allowance : float
-        Part of the norm of the strains, and of the tip displacement, added to the bounds for rounding: a
-        multiple of the difference seen where the reduced model holds the full solution itself.
-    dual_split_1, dual_split_2 : (A1 - 1,), (A2 - 1,) ndarray
-        Values of z1 and z2 at which the next approximate dual solution takes over.
-    dual_correction : (A1, A2, G + 1, R) ndarray
-        Approximate dual solutions, applied to the basis of the residuals.
-    dual_residual : (A1, A2, G + 1, 4, 4) ndarray
-        Factors of the dual residuals: their norm is that of the factor times (1, -e, z1 - 1, z2 - 1).
-    modal_stiffness : (4, Nm, Nm) ndarray
-        Stiffness terms in the modal basis.
-    modal_mass : (3, Nm, Nm) ndarray
-        Mass terms in the modal basis.
-    modal_load : (2, Nm) ndarray
-        Loads in the modal basis.
-    modal_output : (G + 1, Nm) ndarray
-        Outputs of the modal basis vectors.
-    cross_mass : (3, Nm, N) ndarray
-        Mass terms between the modal and the static basis.
-    flapwise_reference : (2, Nm) ndarray
-        Shapes that define the first and second flapwise bending, in the modal basis.
-    mode_count : int
-        Number of modes M that `modes` returns.
+    `fe.cache.reduced_model` makes one, `load` and `from_bytes` read one. Fields: those of `ReducedArrays`.
     """
 
-    design_hash: str
-    validity_box: FloatArray
-    static_stiffness: FloatArray
-    static_load: FloatArray
-    static_output: FloatArray
-    bound_reference: FloatArray
-    residual_load: FloatArray
-    residual_stiffness: FloatArray
-    residual_allowance: float
-    rounding_allowance: float
-    dual_split_1: FloatArray
-    dual_split_2: FloatArray
-    dual_correction: FloatArray
-    dual_residual: FloatArray
-    modal_stiffness: FloatArray
-    modal_mass: FloatArray
-    modal_load: FloatArray
-    modal_output: FloatArray
-    cross_mass: FloatArray
-    flapwise_reference: FloatArray
-    mode_count: int
     _online: OnlineArrays = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        for name, expected in self._expected_shapes().items():
-            array = getattr(self, name)
-            if array.shape != expected or array.dtype != np.float64 or not np.isfinite(array).all():
-                raise ReducedModelFileError(
-                    f"The array {name} of a reduced model must hold finite numbers in the shape {expected}, "
-                    f"but it has shape {array.shape} and type {array.dtype}; build the model anew."
-                )
-        if not 1 <= self.mode_count <= self.modal_stiffness.shape[1]:
-            raise ReducedModelFileError(
-                f"A reduced model with {self.modal_stiffness.shape[1]} modal basis vectors cannot have "
-                f"{self.mode_count} modes; build the model anew."
-            )
-        for name in ("residual_allowance", "rounding_allowance"):
-            value = getattr(self, name)
-            if not (isfinite(value) and value >= 0.0):
-                raise ReducedModelFileError(
-                    f"The {name} of a reduced model must not be negative, but is {value!r}; build it anew."
-                )
+        super().__post_init__()
         object.__setattr__(
             self,
             "_online",
@@ -162,33 +70,6 @@ class ReducedModel:
             f"static_basis={len(self.static_load.T)}, modal_basis={len(self.modal_load.T)}, "
             f"modes={self.mode_count})"
         )
-
-    def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
-        n, outputs, r = (
-            self.static_stiffness.shape[-1],
-            self.static_output.shape[0],
-            self.residual_load.shape[0],
-        )
-        a1, a2, m = self.dual_split_1.size + 1, self.dual_split_2.size + 1, self.modal_stiffness.shape[-1]
-        return {
-            "validity_box": (len(PARAMETER_NAMES), 2),
-            "static_stiffness": (4, n, n),
-            "static_load": (2, n),
-            "static_output": (outputs, n),
-            "bound_reference": (3,),
-            "residual_load": (r, 2),
-            "residual_stiffness": (r, 4, n),
-            "dual_split_1": (a1 - 1,),
-            "dual_split_2": (a2 - 1,),
-            "dual_correction": (a1, a2, outputs, r),
-            "dual_residual": (a1, a2, outputs, 4, 4),
-            "modal_stiffness": (4, m, m),
-            "modal_mass": (3, m, m),
-            "modal_load": (2, m),
-            "modal_output": (outputs, m),
-            "cross_mass": (3, m, n),
-            "flapwise_reference": (2, m),
-        }
 
     @property
     def gauge_count(self) -> int:
@@ -468,88 +349,3 @@ class ReducedModel:
         """
         cross = self.cross_mass[0] + servo_mass * self.cross_mass[1] + pitot_mass * self.cross_mass[2]
         return modes.shape.T @ self._modal_mass(servo_mass, pitot_mass), modes.shape.T @ cross
-
-    def to_bytes(self) -> bytes:
-        """Return the model as the bytes of an `.npz` file; the same model gives the same bytes."""
-        arrays: dict[str, npt.NDArray[Any]] = {"format": np.array(FORMAT)}
-        for item in fields(self):
-            if item.init:
-                arrays[item.name] = np.array(getattr(self, item.name))
-        return arrays_to_bytes(arrays)
-
-    @classmethod
-    def from_bytes(cls, content: bytes, where: str = "The reduced model") -> "ReducedModel":
-        """Return the model that `to_bytes` packed.
-
-        Parameters
-        ----------
-        content : bytes
-            An `.npz` archive.
-        where : str
-            What is being read, for the error message.
-
-        Returns
-        -------
-        ReducedModel
-            The model, equal to the last bit.
-
-        Raises
-        ------
-        ReducedModelFileError
-            If the archive is damaged, incomplete or of another format.
-        """
-        names = [item.name for item in fields(cls) if item.init]
-        arrays = arrays_from_bytes(content, where, ("format", *names))
-        if arrays["format"].tolist() != FORMAT:
-            raise ReducedModelFileError(
-                f"{where} has the format {arrays['format']}, but this version reads {FORMAT}; build it anew."
-            )
-        values: dict[str, Any] = {name: arrays[name] for name in names}
-        values["design_hash"] = str(arrays["design_hash"])
-        try:
-            for name in ("residual_allowance", "rounding_allowance"):
-                values[name] = float(arrays[name])
-            values["mode_count"] = int(arrays["mode_count"])
-            return cls(**values)
-        except (TypeError, ValueError, IndexError) as cause:
-            raise ReducedModelFileError(
-                f"{where} does not hold the arrays of a reduced model ({cause}); build it anew."
-            ) from cause
-
-    def save(self, path: str | Path) -> None:
-        """Write the model to one `.npz` file, whole or not at all.
-
-        Parameters
-        ----------
-        path : str or Path
-            The file.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written.
-        """
-        write_bytes_atomically(Path(path), self.to_bytes())
-
-    @classmethod
-    def load(cls, path: str | Path) -> "ReducedModel":
-        """Read a model that `save` wrote.
-
-        Parameters
-        ----------
-        path : str or Path
-            The file.
-
-        Returns
-        -------
-        ReducedModel
-            The model, equal to the last bit.
-
-        Raises
-        ------
-        FileNotFoundError
-            If there is no such file.
-        ReducedModelFileError
-            If it is damaged, incomplete or of another format.
-        """
-        return cls.from_bytes(Path(path).read_bytes(), str(path))

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .modal_reduction import ModalSettings
-from .reduced import PARAMETER_NAMES
+from .reduced_arrays import PARAMETER_NAMES
 
 FloatArray = npt.NDArray[np.float64]
 Range = tuple[float, float]
@@ -51,7 +51,7 @@ class ReductionSettings:
     modal: ModalSettings = field(default_factory=ModalSettings)
 
     def validity_box(self) -> FloatArray:
-        """Return the ranges in the order of `fe.reduced.PARAMETER_NAMES`, (7, 2)."""
+        """Return the ranges in the order of `fe.reduced_arrays.PARAMETER_NAMES`, (7, 2)."""
         ranges = {
             "young_modulus_factor": self.young_modulus_factor,
             "z1": self.stiffness_loss_1,
