@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -102,3 +103,14 @@ def test_no_two_files_import_each_other_in_a_circle() -> None:
 def test_every_package_has_its_own_room_in_the_tests() -> None:
     tested = {p.name for p in (ROOT / "tests").iterdir() if p.is_dir()}
     assert set(MAY_IMPORT) - tested <= {"discrepancy"}
+
+
+def test_every_package_is_distributed() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    found = {
+        ".".join(path.parent.relative_to(ROOT).parts)
+        for package in MAY_IMPORT
+        for pattern in ("__init__.py", "*.toml")
+        for path in (ROOT / package).rglob(pattern)
+    }
+    assert set(settings["tool"]["setuptools"]["packages"]) == found
