@@ -373,7 +373,8 @@ class WorkerInstance:
         if code is None:
             how = "closed its pipe"
         elif code < 0:
-            how = f"was ended by signal {-code} ({signal.Signals(-code).name})"
+            name = {item.value: item.name for item in signal.Signals}.get(-code, "a real-time signal")
+            how = f"was ended by signal {-code} ({name})"
         else:
             how = f"ended with exit status {code}"
         return FmuWorkerError(f"The worker process of the FMU {how} during {what}.", self._last_words())
