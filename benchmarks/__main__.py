@@ -22,7 +22,7 @@ def main(names: list[str]) -> int:
         console.print(f"no benchmark matches {', '.join(names)}; there are: {', '.join(modules)}")
         return 2
     table = Table(
-        "benchmark", "measured", "bar", "reached", "beside it", "ratio", title="uav-twin benchmarks"
+        "benchmark", "measured", "target", "reached", "beside it", "ratio", title="uav-twin benchmarks"
     )
     missed = 0
     for module in sorted(chosen):
@@ -35,10 +35,10 @@ def main(names: list[str]) -> int:
             )
             reached = {None: "", True: "yes", False: "NO"}[m.reached]
             missed += m.reached is False
-            bar = "" if m.bar is None else f"{'≥' if m.larger_is_better else '≤'} {m.bar:g} {m.unit}"
-            table.add_row(m.name, f"{m.value:.3g} {m.unit}", bar, reached, reference, ratio)
+            target = "" if m.target is None else f"{'≥' if m.larger_is_better else '≤'} {m.target:g} {m.unit}"
+            table.add_row(m.name, f"{m.value:.3g} {m.unit}", target, reached, reference, ratio)
     console.print(table)
-    console.print("every bar is reached" if not missed else f"{missed} bar(s) missed")
+    console.print("every target is reached" if not missed else f"{missed} target(s) missed")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""What a benchmark hands on: a measured figure beside its bar and beside a reference of the same run."""
+"""What a benchmark hands on: a measured figure beside its target and beside a reference of the same run."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Measurement:
     value : float
         The figure, in `unit`.
     unit : str
-        Unit of `value` and `bar`.
-    bar : float or None
+        Unit of `value` and `target`.
+    target : float or None
         The figure wanted; None where none was set.
     reference_name, reference_value
         What ran beside it in the same process, and its figure in the same unit, so that the ratio
@@ -33,17 +33,17 @@ class Measurement:
     name: str
     value: float
     unit: str
-    bar: float | None = None
+    target: float | None = None
     reference_name: str = ""
     reference_value: float | None = None
     larger_is_better: bool = False
 
     @property
     def reached(self) -> bool | None:
-        """Whether the bar is reached; None without a bar."""
-        if self.bar is None:
+        """Whether the target is reached; None without a target."""
+        if self.target is None:
             return None
-        return self.value >= self.bar if self.larger_is_better else self.value <= self.bar
+        return self.value >= self.target if self.larger_is_better else self.value <= self.target
 
 
 def median_seconds(function: Callable[[], object], *, repeats: int = 15, inner: int = 1) -> float:

@@ -2,7 +2,7 @@
 
 `python -m benchmarks.study_level_turns --missions 300` flies the reduced model of the shipped wing;
 `--strain-library FOLDER` flies the authors' library instead, `--fmu` the FMU in a worker process.
-Exit code 1 if a bar is missed.
+Exit code 1 if a target is missed.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def table_of(study: Study, states: tuple[str, ...]) -> tuple[Table, bool]:
          study.share_within(2) >= 0.98),
         ("2g before the damage", interval(study.early_share, missions), "<= 8 %", study.early_share <= 0.08),
     ]  # fmt: skip
-    for name, value, bar in zip(states, rms, (4.5, 13.0), strict=True):
+    for name, value, target in zip(states, rms, (4.5, 13.0), strict=True):
         rows.append(
-            (f"filtered rms error of {name}", f"{value:.2f} points", f"<= {bar} points", value <= bar)
+            (f"filtered rms error of {name}", f"{value:.2f} points", f"<= {target} points", value <= target)
         )
     table = Table("figure", "found", "wanted", "reached", title=f"{missions} missions")
     for name, found, wanted, reached in rows:
