@@ -49,6 +49,8 @@ class Flight:
         p(D_{t+h} | o_0..o_t), h = 1..H.
     predicted_joint : (T, H, S, U)
         p(D_{t+h}, U_{t+h} | o_0..o_t).
+    decision_probability : (T, U)
+        What the control of turn t + 1 was decided by: its mode is flown.
     truth : PlantRecord
         What really happened.
     timing : tuple of TurnTiming
@@ -64,6 +66,7 @@ class Flight:
     smoothed: Float
     predicted: Float
     predicted_joint: Float
+    decision_probability: Float
     truth: PlantRecord
     timing: tuple[TurnTiming, ...]
     resumed_at: int = 0
@@ -147,6 +150,7 @@ def fly(
         smoothed=turns[-1].smoothed,
         predicted=np.array([turn.prediction.predicted for turn in turns]),
         predicted_joint=np.array([turn.prediction.joint for turn in turns]),
+        decision_probability=np.array([turn.decision_probability for turn in turns]),
         truth=plant.record(),
         timing=tuple(timing),
         resumed_at=resumed_at,

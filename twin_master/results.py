@@ -216,6 +216,12 @@ def _rewards(
     }
 
 
+_DECIDED_ON = {
+    "filtered": "the filtered belief of the step",
+    "predicted": "the belief predicted for the next step",
+}
+
+
 def _filtered(result: MissionResult, labels: _Labels) -> xr.Dataset:
     flight = result.flight
     joint = known_control(flight.filtered, flight.control_index, len(result.model.controls))
@@ -224,6 +230,13 @@ def _filtered(result: MissionResult, labels: _Labels) -> xr.Dataset:
     deviation = result.scenario.observation.standard_deviation
     residual = (flight.observed - variables["quantity_mean"][1]) / deviation
     variables |= {
+        "decision_probability": (
+            ("step", "control"),
+            flight.decision_probability,
+            "1",
+            f"policy averaged over {_DECIDED_ON[result.scenario.planner.decide_on]}; "
+            "its mode is the control of the next step",
+        ),
         "log_evidence": (("step",), flight.log_evidence, "1", "log p(observation | earlier observations)"),
         "residual": (
             ("step", "sensor"),
@@ -264,7 +277,7 @@ def _predicted(result: MissionResult, labels: _Labels) -> xr.Dataset:
         (*lead, "control"),
         flight.predicted_joint.sum(axis=-2),
         "1",
-        "p(control | observations up to the step)",
+        "p(control | observations up to the step): what the policy asks for in the state predicted",
     )
     return labels.dataset(variables)
 

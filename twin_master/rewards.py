@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from twin_master.errors import InvalidModelError
 from twin_master.quantity import QuantityModel
+from twin_master.scenario import REWARD_NAMES
 
 __all__ = [
     "REWARD_NAMES",
@@ -24,8 +25,6 @@ __all__ = [
 ]
 
 Float = NDArray[np.float64]
-
-REWARD_NAMES = ("health", "control", "error")
 
 
 def health_reward(value: ArrayLike, limit: float) -> Float:

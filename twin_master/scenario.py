@@ -14,6 +14,16 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of probabilities from one, as the graphical model has it."""
+REWARD_NAMES = ("health", "control", "error")
+"""The rewards (9)-(11)."""
+FALLBACK_FIGURES = (
+    "policy_switch_damage",
+    "damage_step",
+    "fallback_step",
+    "fallback_delay",
+    "early_fallback_step",
+)
+"""Figures of the summary that say when the control left that of the first turn."""
 UNIT_DIVISOR = {"percent": 100.0, "microstrain": 1.0e6, "microstrain_per_step": 1.0e6}
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -162,7 +172,7 @@ class Planner(Section):
 
 
 class Reference(Section):
-    """What a figure of the summary is printed beside."""
+    """What a figure of the summary is printed beside, and where that comes from."""
 
     figure: Name
     value: Number | str
@@ -289,6 +299,20 @@ class Scenario(Section):
         """Names of the controls in their order."""
         return tuple(control.name for control in self.control)
 
+    @property
+    def figure_names(self) -> tuple[str, ...]:
+        """Names of all figures that the summary of this scenario can give, and a reference can name."""
+        names = [*FALLBACK_FIGURES]
+        names += [f"filtered_rms_error_{name}" for name in self.state_names]
+        names += [f"mean_reward_{name}" for name in REWARD_NAMES]
+        names += [f"{self.calibration.parameter}_{moment}" for moment in ("mean", "standard_deviation")]
+        names += ["log_evidence"]
+        if any(fault.kind == "dropout" for fault in self.truth.sensor_faults):
+            names += ["lost_observations", "blind_steps"]
+        if self.observation.unit == "1":
+            names += ["strain_error_bound"]
+        return tuple(names)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the scenario as plain data in SI; `Scenario.model_validate` reads it back."""
         return self.model_dump(mode="json")
@@ -311,11 +335,17 @@ class Scenario(Section):
         norm = self.rewards.normalise_error_by
         if norm is not None:
             _known(norm, tuple(sorted(roles)), "rewards.normalise_error_by", "control input")
-            if any(control.values[norm] == 0.0 for control in self.control):
+            if any(control.values[norm] <= 0.0 for control in self.control):
                 raise ValueError(
-                    f"`rewards.normalise_error_by` divides by `{norm}`, which must not be 0 in any control"
+                    f"`rewards.normalise_error_by` divides by `{norm}`, which must be positive in every "
+                    "control"
                 )
         self._check_transition()
+        referred = [entry.figure for entry in self.reference]
+        for name in referred:
+            _known(name, self.figure_names, "reference.figure", "figure of the summary")
+            if referred.count(name) > 1:
+                raise ValueError(f"`reference` gives `{name}` more than once: keep one of them")
         if self.truth.kind == "random_growth" and self.truth.gains:
             raise ValueError("`truth.gains` belongs to the kind `scripted`, and the kind is `random_growth`")
         for gain in self.truth.gains:

@@ -13,7 +13,7 @@ from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws
 from twin_master.results import MissionResult
 from twin_master.rewards import REWARD_NAMES
-from twin_master.scenario import Reference
+from twin_master.scenario import FALLBACK_FIGURES, Reference
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -176,7 +176,7 @@ def summarise(result: MissionResult, draws: ParameterDraws, reward_mean: Float) 
     )
     figures += _sensor_figures(flight.observed)
     bound = flight.truth.monitors.get("strain_error_bound")
-    if bound is not None:
+    if bound is not None and scenario.observation.unit == "1":
         figures.append(
             Figure(
                 "strain_error_bound", "worst certified strain error", 1e6 * float(bound.max()), "microstrain"
@@ -197,8 +197,10 @@ def _fallback_figures(fallback: Fallback, units: Mapping[str, str]) -> list[Figu
     unit = units.get(name or "", "")
     if level is not None and unit == "1":
         level, unit = 100.0 * level, "%"
+    switch_damage, damage_step, fallback_step, fallback_delay, early_step = FALLBACK_FIGURES
+    one = fallback.delay == 1
     switch = Figure(
-        "policy_switch_damage",
+        switch_damage,
         f"policy leaves the first control from {name}" if name else "policy leaves the first control",
         level if level is not None else "nowhere, or by several states",
         unit,
@@ -207,10 +209,10 @@ def _fallback_figures(fallback: Fallback, units: Mapping[str, str]) -> list[Figu
         return [switch]
     return [
         switch,
-        Figure("damage_step", "turn of the damage that calls for it", fallback.called_for_step),
-        Figure("fallback_step", "turn of the fallback", fallback.fallback_step),
-        Figure("fallback_delay", "delay of the fallback", fallback.delay, "turns"),
-        Figure("early_fallback_step", "turn of a fallback before the damage", fallback.early_step),
+        Figure(damage_step, "turn of the damage that calls for it", fallback.called_for_step),
+        Figure(fallback_step, "turn of the fallback", fallback.fallback_step),
+        Figure(fallback_delay, "delay of the fallback", fallback.delay, "turn" if one else "turns"),
+        Figure(early_step, "turn of a fallback before the damage", fallback.early_step),
     ]
 
 

@@ -69,9 +69,12 @@ def _decisions(steps: list[str], groups: Mapping[str, xr.Dataset]) -> Table:
     names = _names(groups["policy"]["control"].values)
     flown = groups["observed"]["control_index"].values
     rewards = groups["filtered"]
+    asked = rewards["decision_probability"].values
     header = ["step", "control", *(f"{name}_reward" for name in rewards["reward"].values)]
-    rows = zip(steps, flown, rewards["reward_mean"].values, strict=True)
-    return header, [[step, names[control], *_numbers(row)] for step, control, row in rows]
+    header += [*(f"decision_probability_{name}" for name in names), "next_control"]
+    values = np.column_stack([rewards["reward_mean"].values, asked])
+    rows = zip(steps, flown, values, asked.argmax(axis=1), strict=True)
+    return header, [[step, names[now], *_numbers(row), names[coming]] for step, now, row, coming in rows]
 
 
 def _policy(groups: Mapping[str, xr.Dataset]) -> Table:

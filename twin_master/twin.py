@@ -71,14 +71,17 @@ class TwinTurn:
         p(D_k | o_0..o_t) for k = 0..t.
     prediction : Predicted
         Beliefs and controls of the steps t + 1 ... t + H.
+    decision_probability : (U,)
+        policy(U | D) averaged over the belief that the twin decides on.
     next_control : int
-        The control to fly in step t + 1: the most probable one given what the twin decides on.
+        Its mode, the first of equals: the control to fly in step t + 1.
     """
 
     filtered: Float
     log_evidence: float
     smoothed: Float
     prediction: Predicted
+    decision_probability: Float
     next_control: int
 
 
@@ -165,16 +168,17 @@ class Twin:
         seen = slice(0, step + 1)
         smoothed = smooth(self.model, self._control[seen], self._log_filtered[seen]).smoothed
         prediction = predict(self.model, filtered.filtered, control_index, self.policy, self.prediction_steps)
-        if self.decide_on == "filtered":
-            control_probability = filtered.filtered @ self.policy
-        else:
-            control_probability = prediction.control_probability[0]
+        decided_on = filtered.filtered
+        if self.decide_on == "predicted":
+            decided_on = filtered.filtered @ self.model.transition.matrix[control_index]
+        decision_probability: Float = decided_on @ self.policy
         return TwinTurn(
             filtered=filtered.filtered,
             log_evidence=filtered.log_evidence,
             smoothed=smoothed,
             prediction=prediction,
-            next_control=int(np.argmax(control_probability)),
+            decision_probability=decision_probability,
+            next_control=int(np.argmax(decision_probability)),
         )
 
     def _worst_residuals(self, observation: Float, control_index: int) -> dict[str, float]:

@@ -274,8 +274,6 @@ def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Pro
             result = _fly(folder, config, knowledge, source, progress)
         with clock.stage("store"), progress.stage("Storing"), _kept(folder):
             figures = _store(folder, config, knowledge, source, result)
-        timing = _timing(result.flight, clock)
-        write_timing(folder, timing)
         with clock.stage("report"), progress.stage("Writing the report"), _kept(folder):
             report = _report(folder)
         timing = _timing(result.flight, clock)

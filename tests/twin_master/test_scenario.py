@@ -27,6 +27,13 @@ def test_units_of_keys_are_honoured_and_everything_inside_is_si() -> None:
     assert load_scenario("failing_gauges").scenario.truth.sensor_faults[-1].rate == 6e-6
 
 
+def test_the_rule_of_decisions_is_a_key_of_the_scenario() -> None:
+    table = tomllib.loads(TEXT)
+    assert parse_scenario(table, "x").planner.decide_on == "filtered"
+    table["planner"]["decide_on"] = "predicted"
+    assert parse_scenario(table, "x").planner.decide_on == "predicted"
+
+
 @pytest.mark.parametrize("name", sorted(scenario_files()))
 def test_resolved_scenario_reads_back(name: str) -> None:
     scenario = load_scenario(name).scenario
@@ -62,6 +69,17 @@ BROKEN = {
     "gains with random growth": ('kind = "scripted"', 'kind = "random_growth"', ["truth.gains", "scripted"]),
     "NaN": ("gamma = 0.6", "gamma = nan", ["planner.gamma"]),
     "no calibration mean": ('source = "static_test"', 'source = "normal"', ["calibration", "mean"]),
+    "divided by a negative input": ("load_factor = 2.0", "load_factor = -2.0", ["load_factor", "positive"]),
+    "unknown decision rule": ("gamma = 0.6", 'gamma = 0.6\ndecide_on = "smoothed"',
+                              ["planner.decide_on", "'filtered' or 'predicted'", "smoothed"]),
+    "reference of no figure": ('figure = "fallback_delay"', 'figure = "fallback_dely"',
+                               ["reference.figure", "fallback_dely", "fallback_delay"]),
+    "reference of a figure that cannot be": ('figure = "fallback_delay"', 'figure = "lost_observations"',
+                                             ["reference.figure", "lost_observations"]),
+    "two references of a figure": ('figure = "fallback_delay"', 'figure = "policy_switch_damage"',
+                                   ["policy_switch_damage", "more than once"]),
+    "reference without a source": ('source = "Kapteyn et al. 2021"\n', "",
+                                   ["reference[1].source", "missing"]),
     "an FMU without a binding": ('binding = "uav_wing"\n', "", ["asset", "binding"]),
 }  # fmt: skip
 

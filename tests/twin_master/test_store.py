@@ -53,6 +53,9 @@ def test_what_is_stored_agrees_with_itself(result: MissionResult) -> None:
     levels = result.model.states.coordinates
     np.testing.assert_allclose(filtered["mean"], filtered["probability"].values @ levels)
     np.testing.assert_allclose(predicted["control_probability"].sum("control"), 1.0)
+    decided = filtered["decision_probability"]
+    np.testing.assert_array_equal(decided.argmax("control")[:-1], result.flight.control_index[1:])
+    assert "filtered belief" in decided.attrs["long_name"]
     # A healthy wing at 3g: the mean over the draws of e is the quantity of interest.
     np.testing.assert_allclose(filtered["quantity_mean"][0], result.sensor_model.mean[0, 1])
     deviation = result.sensor_model.value_per_draw[:, 0, 1].std(axis=0)

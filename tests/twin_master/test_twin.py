@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from scenarios import scenario_files
 from twin_master.asset_source import StrainLibrarySource
@@ -15,7 +18,7 @@ from twin_master.errors import ImpossibleObservation
 from twin_master.inference import filter_sequence, smooth
 from twin_master.scenario_file import load_scenario, parse_scenario
 from twin_master.strain_library import load_strain_library
-from twin_master.twin import build_graphical_model
+from twin_master.twin import TwinTurn, build_graphical_model
 
 
 @pytest.fixture
@@ -83,10 +86,37 @@ def test_turn_by_turn_equals_the_whole_sequence(knowledge: Knowledge) -> None:
     assert turns[3].log_evidence == pytest.approx(0.0, abs=1e-14)
 
 
-def test_the_decision_is_the_mode_of_the_control_node(knowledge: Knowledge) -> None:
-    turn = knowledge.twin().turn(knowledge.sensor_model.mean[0, 1], 1)
-    joint = turn.prediction.predicted[0][:, None] * knowledge.plan.policy
-    assert turn.next_control == int(np.argmax(joint.sum(axis=0)))
+def decided(knowledge: Knowledge, rule: Literal["filtered", "predicted"], turns: int) -> TwinTurn:
+    """Return the last of some turns that follow the dynamics alone at 3g, decided by a rule."""
+    planner = knowledge.scenario.planner.model_copy(update={"decide_on": rule})
+    scenario = knowledge.scenario.model_copy(update={"planner": planner})
+    twin = replace(knowledge, scenario=scenario).twin()
+    blind = np.full(knowledge.sensor_model.sensor_count, np.nan)
+    return [twin.turn(blind, 1) for _ in range(turns)][-1]
+
+
+def test_the_two_rules_of_decision_differ_where_the_belief_tips_within_one_turn(knowledge: Knowledge) -> None:
+    """The policy is 2g from z1 = 60 %, three levels up; nothing is seen, so z1 is binomial with p = 0.1.
+
+    After 26 transitions p(z1 >= 60 %) = 0.489, after 27 it is 0.515.
+    """
+    np.testing.assert_array_equal(knowledge.plan.control_index.reshape(5, 5)[:, 0], [1, 1, 1, 0, 0])
+    gentle = [float(binom.sf(2, count, 0.1)) for count in (25, 26, 27)]
+    assert gentle[1] < 0.5 < gentle[2]
+    for turns, rule, probability, control in (
+        (26, "filtered", gentle[0], 1),
+        (26, "predicted", gentle[1], 1),
+        (27, "filtered", gentle[1], 1),
+        (27, "predicted", gentle[2], 0),
+        (28, "filtered", gentle[2], 0),
+    ):
+        turn = decided(knowledge, rule, turns)
+        np.testing.assert_allclose(turn.decision_probability, [probability, 1.0 - probability], atol=1e-12)
+        assert turn.next_control == control, (turns, rule)
+        # What is predicted does not depend on the rule.
+        np.testing.assert_allclose(
+            turn.prediction.control_probability[0, 0], binom.sf(2, turns, 0.1), atol=1e-12
+        )
 
 
 def test_an_impossible_observation_names_twin_step_and_sensors(knowledge: Knowledge) -> None:

@@ -106,6 +106,8 @@ class RunRecord:
         p(D_t | o_0..o_t), p(D_t | o_0..o_{T-1}), p(D_{t+h} | o_0..o_t).
     control_probability : (T, H, U) or None
         p(U_{t+h} | o_0..o_t).
+    decision_probability : (T, U) or None
+        The policy averaged over the belief that the twin decided on; its mode is the control of t + 1.
     log_evidence : (T,) or None
         log p(o_t | o_0..o_{t-1}).
     policy : PolicyTable or None
@@ -122,7 +124,7 @@ class RunRecord:
         Content of ``calibration.json``; empty if there is none.
     attributes : mapping
         Root attributes of ``run.nc``.
-    config, summary, timing : mapping
+    config, summary : mapping
         The JSON files of the run folder; empty if there is none.
     """
 
@@ -141,6 +143,7 @@ class RunRecord:
     smoothed: Estimate | None
     predicted: Estimate | None
     control_probability: Float | None
+    decision_probability: Float | None
     log_evidence: Float | None
     policy: PolicyTable | None
     truth_state: Float | None
@@ -152,7 +155,6 @@ class RunRecord:
     attributes: Mapping[str, Any]
     config: Mapping[str, Any]
     summary: Mapping[str, Any]
-    timing: Mapping[str, Any]
 
     @property
     def step_count(self) -> int:
@@ -175,6 +177,12 @@ class RunRecord:
             return None
         fits = model.states.names == self.state_names and model.controls == self.controls
         return model.transition.matrix if fits else None
+
+    @property
+    def decides_on_prediction(self) -> bool:
+        """Whether the policy acted on the state predicted for the next turn, not on that just observed."""
+        planner = self.scenario.get("planner")
+        return isinstance(planner, Mapping) and planner.get("decide_on") == "predicted"
 
     @property
     def scenario(self) -> Mapping[str, Any]:
@@ -361,6 +369,7 @@ def _record(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], fol
         smoothed=_estimate(groups.get("smoothed"), "smoothed", coordinates, "step"),
         predicted=_estimate(predicted_group, "predicted", coordinates, "step", "horizon"),
         control_probability=_array(predicted_group, "control_probability", "step", "horizon", "control"),
+        decision_probability=_array(filtered_group, "decision_probability", "step", "control"),
         log_evidence=_array(filtered_group, "log_evidence", "step"),
         policy=policy,
         truth_state=_array(truth, "state", "step", "region"),
@@ -372,7 +381,6 @@ def _record(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], fol
         attributes=attributes,
         config=config,
         summary=_read_json(folder / "summary.json"),
-        timing=_read_json(folder / "timing.json"),
     )
 
 

@@ -23,7 +23,6 @@ from twin_master.report.network import network_figure
 from twin_master.report.text import (
     belief_caption,
     check_caption,
-    duration,
     lost_ranges,
     mission_caption,
     network_caption,
@@ -70,12 +69,12 @@ class ReportFigure:
 def write_report(run_folder: Path, *, now: int | None = None) -> Path:
     """Write ``report.html`` and ``figures/`` of a run; return the path of the page.
 
-    Equal run folders give equal bytes. Wall-clock figures appear if ``timing.json`` is there already.
+    Equal runs give equal bytes: wall-clock figures stay in ``timing.json``.
 
     Parameters
     ----------
     run_folder
-        Holds ``run.nc`` and, where they exist, ``config.json``, ``summary.json`` and ``timing.json``.
+        Holds ``run.nc`` and, where they exist, ``config.json``, ``summary.json`` and ``calibration.json``.
     now
         The present turn of the first figure; by default shortly before the control first changes.
 
@@ -135,7 +134,10 @@ def report_figures(record: RunRecord, now: int) -> list[ReportFigure]:
         figures.append(ReportFigure("calibration", drawing, title, calibration_caption(view)))
     figures.append(
         ReportFigure(
-            "network", network_figure(), "The dynamic decision network for a few turns", network_caption()
+            "network",
+            network_figure(),
+            "The dynamic decision network for a few turns",
+            network_caption(record),
         )
     )
     return figures
@@ -184,28 +186,24 @@ def _add_outcome(page: Page, record: RunRecord) -> None:
     page.add_highlights(_highlights(record))
     for text in _notices(record):
         page.add_notice(text)
-    rows = [
-        (
-            str(figure.get("title", figure.get("key", ""))),
-            number(figure.get("value")),
-            str(figure.get("unit") or ""),
-            "" if figure.get("reference") is None else number(figure["reference"]),
-            str(figure.get("reference_source") or ""),
-        )
-        for figure in _summary_figures(record)
-    ]
+    figures = _summary_figures(record)
+    referred = any(figure.get("reference") is not None for figure in figures)
+    columns = [Column("figure"), Column("this run", numeric=True), Column("unit")]
+    if referred:
+        columns += [Column("reference", numeric=True), Column("source of the reference")]
+    rows = []
+    for figure in figures:
+        row = [str(figure.get("title", figure.get("key", ""))), number(figure.get("value"))]
+        row.append(str(figure.get("unit") or ""))
+        if referred:
+            reference = figure.get("reference")
+            row += ["" if reference is None else number(reference), str(figure.get("reference_source") or "")]
+        rows.append(tuple(row))
     if rows:
-        columns = (
-            Column("figure"),
-            Column("this run", numeric=True),
-            Column("unit"),
-            Column("reference", numeric=True),
-            Column("source of the reference"),
-        )
         page.add_table(
-            Table(columns, rows),
+            Table(tuple(columns), rows),
             "Points are percentage points of stiffness loss. A dash means that it did not happen.",
-            title="Figures of the run, beside published ones where there are any",
+            title="Figures of the run" + (", beside their references" if referred else ""),
         )
 
 
@@ -269,7 +267,7 @@ def _add_run(page: Page, record: RunRecord) -> None:
     page.add_table(
         Table((Column("item"), Column("value")), rows), "From run.nc and config.json.", title="Run"
     )
-    _add_times(page, record.timing)
+    page.add_paragraph("Wall-clock times stand in timing.json, so that equal runs give equal reports.")
     origin = _origin(record)
     if origin:
         page.add_table(
@@ -277,41 +275,6 @@ def _add_run(page: Page, record: RunRecord) -> None:
             "Versions of the software, and the first 12 digits of the SHA-256 of sources and inputs; "
             "config.json has them in full.",
             title="Provenance",
-        )
-
-
-def _add_times(page: Page, timing: Mapping[str, Any]) -> None:
-    """Add the entries of ``timing.json`` whose names end in ``_seconds``: stages, then turns."""
-    stages: list[tuple[str, str]] = []
-    turns: dict[str, Mapping[str, Any]] = {}
-    for key, value in timing.items():
-        name = str(key).removesuffix("_seconds").replace("_", " ")
-        if str(key).endswith("_seconds") and isinstance(value, Mapping) and "median" in value:
-            turns[name] = value
-        elif str(key).endswith("_seconds") and isinstance(value, Mapping):
-            stages += [
-                (str(inner), duration(float(v))) for inner, v in value.items() if isinstance(v, int | float)
-            ]
-        elif str(key).endswith("_seconds") and isinstance(value, int | float):
-            stages.append((name, duration(float(value))))
-    if not stages and not turns:
-        page.add_paragraph("Wall-clock times stand in timing.json, so that equal runs give equal reports.")
-    if stages:
-        page.add_table(
-            Table((Column("stage"), Column("time", numeric=True)), stages),
-            "Wall-clock times of the process that finished the run, up to this page. From timing.json.",
-            title="Times",
-        )
-    if turns:
-        kinds = list(next(iter(turns.values())))
-        rows = [
-            (name, *(duration(float(value[kind])) if kind in value else "" for kind in kinds))
-            for name, value in turns.items()
-        ]
-        page.add_table(
-            Table((Column("part of a turn"), *(Column(str(kind), numeric=True) for kind in kinds)), rows),
-            "Over the turns that the same process flew.",
-            title="Times of the turns",
         )
 
 

@@ -23,14 +23,6 @@ def number(value: Any) -> str:
     return str(value)
 
 
-def duration(seconds: float) -> str:
-    """Return a duration with three significant digits in a unit that suits it."""
-    for limit, factor, unit in ((1e-3, 1e6, "µs"), (1.0, 1e3, "ms")):
-        if abs(seconds) < limit:
-            return f"{factor * seconds:.3g} {unit}"
-    return f"{seconds:.3g} s"
-
-
 def turn_ranges(turns: ArrayLike) -> str:
     """Return increasing turns in words: ``turns 3–4, 12–18``."""
     values = np.asarray(turns, dtype=int)
@@ -84,12 +76,31 @@ def mission_caption(record: RunRecord, now: int) -> str:
         f"95 % intervals, {past}, and observations (dots; {hollow}crosses: lost)."
     )
     later = "" if last else "; triangles: flown later"
-    sentences.append(f"Control: flown (full bars) and predicted probability (height of the bars{later}).")
+    asked = (
+        f" and, for each turn to come, the probability that the policy asks for it in the state predicted "
+        f"(height of the bars{later})"
+        if record.horizon
+        else ""
+    )
+    sentences.append(f"Control: flown (full bars){asked}.{decision_sentence(record, now)}")
     if record.filtered.reward is not None:
         sentences.append(f"Rewards: eqs. (9)–(11), dimensionless, with 95 % intervals, {past}.")
     if record.truth_state is not None:
         sentences.append("The black line is the truth, which the twin never sees.")
     return " ".join(sentences)
+
+
+def decision_sentence(record: RunRecord, turn: int) -> str:
+    """Return what the twin decided at the end of a turn, and by which belief; empty if it was not stored."""
+    if record.decision_probability is None:
+        return ""
+    probability = record.decision_probability[turn]
+    chosen = int(np.argmax(probability))
+    return (
+        f" At the end of turn {turn} the twin decided on {record.controls[chosen]} for the next one: "
+        f"the policy asks for it with probability {probability[chosen]:.2f} in the state "
+        f"{'predicted for that turn' if record.decides_on_prediction else 'as just observed'}."
+    )
 
 
 def belief_caption(record: RunRecord) -> str:
@@ -145,13 +156,19 @@ def check_caption(record: RunRecord, check: PredictiveCheck) -> str:
     return " ".join(sentences)
 
 
-def network_caption() -> str:
+def network_caption(record: RunRecord) -> str:
     """Return the caption of the network."""
+    decided_from = (
+        "the belief predicted from its observation"
+        if record.decides_on_prediction
+        else "the belief that its observation updated"
+    )
     return (
         "Circles are random variables, squares controls, diamonds rewards; grey ones are known at the "
         "present turn. A digital state D follows the one before under the control U in force, "
         "eqs. (28)–(29), and is updated by the observation O, eq. (30); it gives the quantities of interest "
-        "Q, and these the rewards R, eqs. (9)–(11). In the prediction, controls follow the policy. "
+        "Q, and these the rewards R, eqs. (9)–(11). In the prediction, controls follow the policy; in the "
+        f"mission, a control is decided at the end of the turn before, from {decided_from}. "
         "The physical state S is never seen. Arrows show how information flows; the joint distribution is "
         "that of eqs. (1)–(4)."
     )
