@@ -19,9 +19,9 @@ from rich.table import Table
 
 from reporting.progress import RichProgress
 from twin_master.asset_source import AssetSource, ReducedModelSource
+from twin_master.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.scenario_file import load_scenario
 from twin_master.study import Study, fly_many
-from twin_master.workflow import Overrides, asset_source, resolve_scenario
 
 
 def interval(share: float, missions: int) -> str:

@@ -19,9 +19,18 @@ from twin_master.errors import MissingObservationModelError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws, draw_parameter
 from twin_master.scenario import Scenario
+from twin_master.strain_library import FILE_NAME as LIBRARY_NAME
 from twin_master.strain_library import StrainLibrary
 
 Float = NDArray[np.float64]
+
+
+ASSET_FOLDER = "asset"
+"""Folder inside the run folder that holds copies of what is flown, so that a run can be resumed anywhere."""
+BINDING_COPY = f"{ASSET_FOLDER}/binding.toml"
+DESIGN_COPY = f"{ASSET_FOLDER}/design.toml"
+FMU_COPY = f"{ASSET_FOLDER}/asset.fmu"
+LIBRARY_COPY = f"{ASSET_FOLDER}/{LIBRARY_NAME}"
 
 
 class AssetSource(Protocol):
@@ -29,6 +38,9 @@ class AssetSource(Protocol):
 
     def check(self) -> None:
         """Look at what is given before anything is made; raise what is wrong with it."""
+
+    def files(self) -> dict[str, bytes]:
+        """Return the files to copy into the run folder, by their paths in it."""
 
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
         """Make ready what is flown, in the folder of the run; return the hashes of what went in."""
@@ -58,7 +70,7 @@ def wing_observation_table(
     OutsideModelError
         A state, control or draw lies outside the model's validity.
     """
-    check_wing_scenario(wing, scenario)
+    check_wing_scenario(scenario, wing.gauge_count)
     load = scenario.asset.load.get("tip_force", 0.0)
     states = model.states.coordinates
     order = [scenario.state_names.index(name) for name in ("z1", "z2")]
@@ -71,7 +83,7 @@ def wing_observation_table(
     return strains.reshape(*shape, wing.gauge_count)
 
 
-def check_wing_scenario(wing: ReducedModel, scenario: Scenario) -> None:
+def check_wing_scenario(scenario: Scenario, gauge_count: int) -> None:
     """Check that a scenario speaks of what a wing model has.
 
     Raises
@@ -83,7 +95,7 @@ def check_wing_scenario(wing: ReducedModel, scenario: Scenario) -> None:
         "states": (set(scenario.state_names), {"z1", "z2"}),
         "control inputs": (set(scenario.control[0].values), {"load_factor"}),
         "calibrated parameter": ({scenario.calibration.parameter}, {"young_modulus_factor"}),
-        "sensor count": ({scenario.observation.count}, {wing.gauge_count}),
+        "sensor count": ({scenario.observation.count}, {gauge_count}),
     }
     for what, (came, wanted) in expected.items():
         if came != wanted:
@@ -119,6 +131,10 @@ class ReducedModelSource:
     def check(self) -> None:
         """Accept what was read already."""
 
+    def files(self) -> dict[str, bytes]:
+        """Return none: the model is made from the design of the program."""
+        return {}
+
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
         """Return the hash of the design."""
         return {"design": self._wing.design_hash}
@@ -143,7 +159,10 @@ class ReducedModelSource:
 class StrainLibrarySource:
     """A strain library in the format of the authors of Kapteyn et al. 2021, as model and as asset."""
 
-    def __init__(self, scenario: Scenario, library: StrainLibrary, content_hash: str) -> None:
+    def __init__(
+        self, scenario: Scenario, library: StrainLibrary, content_hash: str, path: Path | None = None
+    ) -> None:
+        self._path = path
         self._scenario = scenario
         self._library = library
         self._hash = content_hash
@@ -166,6 +185,10 @@ class StrainLibrarySource:
 
     def check(self) -> None:
         """Accept what was read already."""
+
+    def files(self) -> dict[str, bytes]:
+        """Return the library."""
+        return {} if self._path is None else {LIBRARY_COPY: self._path.read_bytes()}
 
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
         """Return the hash of the library."""

@@ -43,8 +43,9 @@ def run(
 ) -> None:
     """Fly a scenario: model, reduce, pack, calibrate, fly, report."""
     from reporting.progress import RichProgress, SilentProgress
+    from twin_master.resolution import Overrides
     from twin_master.scenario_file import load_scenario
-    from twin_master.workflow import Overrides, new_run, resume_run
+    from twin_master.workflow import new_run, resume_run
 
     overrides = Overrides(seed, fmu, binding, strain_library, in_process)
     progress = SilentProgress() if quiet else RichProgress()

@@ -18,7 +18,13 @@ from fmu_asset.session import FmiAsset
 from reporting.files import atomic_write_bytes, write_error
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.asset_source import wing_observation_table
+from twin_master.asset_source import (
+    BINDING_COPY,
+    DESIGN_COPY,
+    FMU_COPY,
+    check_wing_scenario,
+    wing_observation_table,
+)
 from twin_master.assets import Asset, AssetReading
 from twin_master.errors import MissionInputError
 from twin_master.graphical_model import GraphicalModel
@@ -26,9 +32,6 @@ from twin_master.parameter import ParameterDraws, draw_parameter
 from twin_master.scenario import Scenario
 
 Float = NDArray[np.float64]
-
-INPUT_FOLDER = "asset"
-"""Folder inside the run folder that holds copies of what is flown, so that a run can be resumed anywhere."""
 
 
 class FmuAsset:
@@ -94,7 +97,7 @@ class FmuSource:
     def __init__(self, scenario: Scenario, binding: Path, design: Path | None, fmu: Path | None) -> None:
         self._scenario = scenario
         self._binding = binding
-        self._given = {"binding.toml": binding, "design.toml": design, "asset.fmu": fmu}
+        self._given = {BINDING_COPY: binding, DESIGN_COPY: design, FMU_COPY: fmu}
         self._folder: Path | None = None
         self._wing: ReducedModel | None = None
 
@@ -106,7 +109,7 @@ class FmuSource:
     def _path(self, name: str) -> Path:
         if self._folder is None:
             raise MissionInputError("the asset was not prepared: call `prepare` first.")
-        return self._folder / INPUT_FOLDER / name
+        return self._folder / name
 
     def check(self) -> None:
         """Read binding, design and FMU where they are, without copying or starting anything.
@@ -118,16 +121,42 @@ class FmuSource:
         InvalidDesignError, FmuError
             A design, binding or FMU is wrong, or the binding does not fit the FMU.
         """
-        for path in self._given.values():
-            if path is not None:
-                _content(path)
-        design, fmu = self._given["design.toml"], self._given["asset.fmu"]
+        self.files()
+        design, fmu = self._given[DESIGN_COPY], self._given[FMU_COPY]
         binding = load_binding(self._binding)
         self._observed(binding)
+        self._check_names(binding)
         if design is not None:
-            load_design(design)
+            gauges = len(load_design(design).gauges.positions)
+            if self._scenario.asset.observation_model != "asset":
+                check_wing_scenario(self._scenario, gauges)
         if fmu is not None:
             FmiAsset(fmu, binding, parameters=self._scenario.asset.parameters)
+
+    def files(self) -> dict[str, bytes]:
+        """Return binding, design and FMU as they are given.
+
+        Raises
+        ------
+        MissionInputError
+            A file cannot be read.
+        """
+        return {name: _content(path) for name, path in self._given.items() if path is not None}
+
+    def _check_names(self, binding: Binding) -> None:
+        scenario = self._scenario
+        for what, names, known in (
+            ("control input", scenario.control[0].values, binding.control),
+            ("state", scenario.state_names, binding.health),
+            ("load", scenario.asset.load, binding.load),
+            ("parameter", scenario.asset.parameters, binding.parameter),
+        ):
+            unknown = sorted({*names} - {*known})
+            if unknown:
+                raise MissionInputError(
+                    f"the scenario has the {what} {', '.join(unknown)}, which the binding {binding.name} "
+                    f"does not know; it knows {', '.join(known) or 'none'}."
+                )
 
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
         """Copy what is given into the run folder, reduce the design and pack the FMU; return the hashes.
@@ -143,16 +172,16 @@ class FmuSource:
         for name, path in self._given.items():
             if path is not None and not self._path(name).exists():
                 atomic_write_bytes(self._path(name), _content(path))
-        self._observed(load_binding(self._path("binding.toml")))
-        hashes = {"binding": hash_file(self._path("binding.toml"))}
-        if self._given["design.toml"] is not None:
-            design = load_design(self._path("design.toml"))
+        self._observed(load_binding(self._path(BINDING_COPY)))
+        hashes = {"binding": hash_file(self._path(BINDING_COPY))}
+        if self._given[DESIGN_COPY] is not None:
+            design = load_design(self._path(DESIGN_COPY))
             self._wing = reduced_model(design, progress=progress)
             hashes["design"] = self._wing.design_hash
-            if self._given["asset.fmu"] is None:
+            if self._given[FMU_COPY] is None:
                 with progress.stage("Packing the FMU"):
-                    build_fmu(self._wing, self._path("asset.fmu"), replace=True)
-        hashes["fmu"] = hash_file(self._path("asset.fmu"))
+                    build_fmu(self._wing, self._path(FMU_COPY), replace=True)
+        hashes["fmu"] = hash_file(self._path(FMU_COPY))
         return hashes
 
     def draws(self, seed: int) -> ParameterDraws:
@@ -195,8 +224,8 @@ class FmuSource:
     def _session(self) -> FmiAsset:
         asset = self._scenario.asset
         return FmiAsset(
-            self._path("asset.fmu"),
-            self._path("binding.toml"),
+            self._path(FMU_COPY),
+            self._path(BINDING_COPY),
             isolated=asset.isolated,
             step_timeout=asset.step_timeout,
             parameters=asset.parameters,
@@ -226,7 +255,7 @@ class FmuSource:
         if self._wing is None or {*state} != {"z1", "z2"} or {*control} != {"load_factor"}:
             return False
         asset = self._scenario.asset
-        fields = wing_fields(load_design(self._path("design.toml")))
+        fields = wing_fields(load_design(self._path(DESIGN_COPY)))
         try:
             write_wing_vtu(
                 path,

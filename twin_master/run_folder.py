@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from reporting.files import atomic_write_text, remove_leftovers, write_error
+from reporting.files import atomic_write_bytes, atomic_write_text, remove_leftovers, write_error
 from twin_master.errors import NotResumableError, RunFolderError, RunFolderExistsError
 
 CONFIG_NAME = "config.json"
@@ -36,8 +36,14 @@ def is_run_folder(folder: Path) -> bool:
     return isinstance(record, dict) and record.get("kind") == KIND
 
 
-def create_run_folder(folder: Path, config: Mapping[str, Any], *, replace: bool = False) -> None:
-    """Make a run folder that holds its configuration, in one step.
+def create_run_folder(
+    folder: Path,
+    config: Mapping[str, Any],
+    files: Mapping[str, bytes] | None = None,
+    *,
+    replace: bool = False,
+) -> None:
+    """Make a run folder that holds its configuration and copies of what is flown, in one step.
 
     Parameters
     ----------
@@ -45,6 +51,8 @@ def create_run_folder(folder: Path, config: Mapping[str, Any], *, replace: bool 
         Where; an empty folder is as good as none.
     config
         Content of `config.json`.
+    files
+        Further files: path inside the folder, content.
     replace
         Put the new folder in the place of an existing run folder. Anything else is never replaced.
 
@@ -75,6 +83,8 @@ def create_run_folder(folder: Path, config: Mapping[str, Any], *, replace: bool 
         raise write_error(error, folder) from error
     old: Path | None = None
     try:
+        for name, content in (files or {}).items():
+            atomic_write_bytes(fresh / name, content)
         atomic_write_text(fresh / CONFIG_NAME, to_json(config))
         if occupied:
             old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.old-", dir=folder.parent))
@@ -102,7 +112,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     Raises
     ------
     NotResumableError
-        There is none.
+        There is none, or it is damaged.
     """
     if not folder.is_dir():
         raise NotResumableError(
@@ -111,6 +121,16 @@ def read_config(folder: Path) -> dict[str, Any]:
     if not is_run_folder(folder):
         raise NotResumableError(f"{folder} is no run folder: it holds no {CONFIG_NAME} of a run.")
     config: dict[str, Any] = json.loads((folder / CONFIG_NAME).read_text(encoding="utf-8"))
+    for name in ("scenario", "scenario_file", "provenance"):
+        if not isinstance(config.get(name), dict):
+            raise NotResumableError(
+                f"{folder / CONFIG_NAME} is damaged, its table `{name}` is missing: "
+                "fly the mission again with --replace."
+            )
+    if not isinstance(config.get("inputs", {}), dict):
+        raise NotResumableError(
+            f"{folder / CONFIG_NAME} is damaged, `inputs` is no table: fly the mission again with --replace."
+        )
     return config
 
 

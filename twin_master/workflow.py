@@ -15,15 +15,22 @@ import numpy as np
 
 from reporting.files import atomic_write_text
 from reporting.progress import Progress, SilentProgress
-from reporting.provenance import collect_provenance, hash_file, hash_record
-from scenarios import binding_files
-from twin_master.asset_source import AssetSource, StrainLibrarySource
-from twin_master.checkpoint import read_checkpoint, write_checkpoint
+from reporting.provenance import collect_provenance, hash_record
+from twin_master.asset_source import AssetSource
+from twin_master.checkpoint import CHECKPOINT_NAME, read_checkpoint, write_checkpoint
 from twin_master.crew import Knowledge, prepare_knowledge
-from twin_master.errors import MissionInputError, NotResumableError
+from twin_master.errors import NotResumableError
 from twin_master.mission import Flight, fly
+from twin_master.resolution import (
+    Overrides,
+    asset_source,
+    located_scenario,
+    portable_scenario,
+    resolve_scenario,
+)
 from twin_master.results import MissionResult
 from twin_master.run_folder import (
+    CONFIG_NAME,
     KIND,
     create_run_folder,
     lock_run_folder,
@@ -34,37 +41,12 @@ from twin_master.run_folder import (
 from twin_master.scenario import Scenario
 from twin_master.scenario_file import LoadedScenario, parse_scenario
 from twin_master.store import store_mission, values_of, write_summary, write_timing
-from twin_master.strain_library import FILE_NAME, load_strain_library
 from twin_master.summary import Figure, summarise
 
 REPORT_NAME = "report.html"
 CALIBRATION_NAME = "calibration.json"
-SHIPPED_DESIGN_NAME = "uav_wing"
 HARMLESS_PACKAGES = frozenset({"discrepancy", "reporting", "scenarios", "uav_twin", "matplotlib"})
 """A run may be resumed after a change of these: no stored figure depends on them."""
-
-
-@dataclass(frozen=True)
-class Overrides:
-    """What the command line says otherwise than the scenario file.
-
-    Attributes
-    ----------
-    seed : int or None
-        Seed of the run.
-    fmu, binding : Path or None
-        FMU to fly, and its binding.
-    strain_library : Path or None
-        Fly the library instead of an FMU.
-    in_process : bool
-        Fly the FMU in this process instead of a worker.
-    """
-
-    seed: int | None = None
-    fmu: Path | None = None
-    binding: Path | None = None
-    strain_library: Path | None = None
-    in_process: bool = False
 
 
 @dataclass(frozen=True)
@@ -103,69 +85,6 @@ class _Clock:
         self.stages[name] = time.perf_counter() - begin
 
 
-def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
-    """Return the scenario with the overrides, its paths absolute.
-
-    Relative paths of a scenario file start at the folder of that file.
-
-    Raises
-    ------
-    MissionInputError
-        The overrides contradict each other.
-    ScenarioError
-        The scenario does not hold with them.
-    """
-    table = loaded.scenario.to_dict()
-    asset, folder = table["asset"], loaded.path.resolve().parent
-    if overrides.strain_library and (overrides.fmu or overrides.binding):
-        raise MissionInputError("--strain-library flies no FMU: give either it or --fmu and --binding.")
-    if asset["design"] and asset["design"] != SHIPPED_DESIGN_NAME:
-        asset["design"] = str(folder / asset["design"])
-    if asset["file"]:
-        asset["file"] = str(folder / asset["file"])
-    if asset["binding"] and asset["binding"] not in binding_files():
-        asset["binding"] = str(folder / asset["binding"])
-    if overrides.fmu:
-        asset |= {"kind": "fmu", "file": str(overrides.fmu.resolve())}
-    if overrides.binding:
-        asset["binding"] = str(overrides.binding.resolve())
-    if overrides.strain_library:
-        asset |= {"kind": "strain_library", "file": str(_library_file(overrides.strain_library))}
-        asset |= {"design": None, "binding": None, "observation_model": None}
-    if overrides.in_process:
-        asset["isolated"] = False
-    if overrides.seed is not None:
-        table["mission"]["seed"] = overrides.seed
-    return parse_scenario(table, str(loaded.path))
-
-
-def _library_file(path: Path) -> Path:
-    return (path / FILE_NAME if path.is_dir() else path).resolve()
-
-
-def asset_source(scenario: Scenario) -> AssetSource:
-    """Return where the asset of a resolved scenario comes from.
-
-    Raises
-    ------
-    InvalidStrainLibraryError, MissingObservationModelError
-        The strain library is missing, damaged or does not fit the scenario.
-    """
-    asset = scenario.asset
-    if asset.kind == "strain_library":
-        path = Path(asset.file or "")
-        library = load_strain_library(path)
-        return StrainLibrarySource(scenario, library, hash_file(path))
-    from fe.design import SHIPPED_DESIGN
-    from twin_master.fmu_source import FmuSource
-
-    design = SHIPPED_DESIGN if asset.design == SHIPPED_DESIGN_NAME else asset.design
-    binding = binding_files().get(asset.binding or "", Path(asset.binding or ""))
-    return FmuSource(
-        scenario, binding, Path(design) if design else None, Path(asset.file) if asset.file else None
-    )
-
-
 def new_run(
     loaded: LoadedScenario,
     folder: Path,
@@ -200,13 +119,16 @@ def new_run(
     config = {
         "kind": KIND,
         "format": 1,
-        "scenario": scenario.to_dict(),
+        "scenario": portable_scenario(scenario).to_dict(),
         "scenario_file": {"name": loaded.path.name, "sha256": loaded.content_hash},
         "provenance": collect_provenance(scenario.mission.seed).as_dict(),
     }
-    asset_source(scenario).check()  # what is not there should not cost the user a folder
-    create_run_folder(folder, config, replace=replace)
-    return _run(folder, config, scenario, progress or SilentProgress())
+    source = asset_source(scenario)
+    source.check()  # what is not there should not cost the user a folder
+    create_run_folder(folder, config, source.files(), replace=replace)
+    return _run(
+        folder, config, located_scenario(portable_scenario(scenario), folder), progress or SilentProgress()
+    )
 
 
 def resume_run(
@@ -229,16 +151,12 @@ def resume_run(
         The folder holds no run, or one of another scenario or another version.
     """
     config = read_config(folder)
-    try:
-        scenario = parse_scenario(config["scenario"], str(folder / "config.json"))
-        recorded = config["provenance"]
-    except KeyError as error:
+    scenario = parse_scenario(config["scenario"], str(folder / CONFIG_NAME))
+    recorded = config["provenance"]
+    file = config["scenario_file"]
+    if loaded is not None and file.get("sha256") != loaded.content_hash:
         raise NotResumableError(
-            f"{folder}/config.json lacks {error}: fly the mission again with --replace."
-        ) from error
-    if loaded is not None and config["scenario_file"]["sha256"] != loaded.content_hash:
-        raise NotResumableError(
-            f"{folder} flies another scenario ({scenario.mission.name}, {config['scenario_file']['name']}) "
+            f"{folder} flies another scenario ({scenario.mission.name}, {file.get('name')}) "
             f"than {loaded.path}: resume it without naming a scenario."
         )
     now = collect_provenance(scenario.mission.seed).as_dict()
@@ -246,14 +164,19 @@ def resume_run(
         changed = sorted(
             name
             for name, value in now[what].items()
-            if name not in HARMLESS_PACKAGES and recorded.get(what, {}).get(name) != value
+            if name not in HARMLESS_PACKAGES and _entry(recorded, what, name) != value
         )
         if changed:
             raise NotResumableError(
                 f"{folder} was begun with another version of {', '.join(changed)}, so its results could not "
                 "be the same: fly the mission again with --replace."
             )
-    return _run(folder, config, scenario, progress or SilentProgress())
+    return _run(folder, config, located_scenario(scenario, folder), progress or SilentProgress())
+
+
+def _entry(record: Mapping[str, Any], table: str, name: str) -> object:
+    entries = record.get(table)
+    return entries.get(name) if isinstance(entries, dict) else None
 
 
 def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Progress) -> RunOutcome:
@@ -262,10 +185,14 @@ def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Pro
         tidy(folder)
         clock = _Clock()
         source = asset_source(scenario)
-        with clock.stage("asset"):
+        with _unflown(folder), clock.stage("asset"):
             hashes = source.prepare(folder, progress)
         config = _with_inputs(folder, config, hashes)
-        with clock.stage("calibration"), progress.stage("Calibrating and planning"):
+        with (
+            _unflown(folder),
+            clock.stage("calibration"),
+            progress.stage("Calibrating and planning"),
+        ):
             knowledge = prepare_knowledge(scenario, source, scenario.mission.seed)
             if knowledge.draws.record is not None:
                 text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
@@ -292,8 +219,20 @@ def _kept(folder: Path) -> Iterator[None]:
         raise
     except Exception as error:
         error.add_note(
-            f"What was flown is kept: once mended, continue with `uav-twin run --resume {folder}`."
+            f"What was flown is kept: continue with `uav-twin run --resume {folder}`, or, where the scenario "
+            "itself is to be changed, fly the changed one with --replace."
         )
+        raise
+
+
+@contextmanager
+def _unflown(folder: Path) -> Iterator[None]:
+    """Add to any error before the first turn how to begin anew."""
+    try:
+        yield
+    except Exception as error:
+        if not (folder / CHECKPOINT_NAME).exists():
+            error.add_note("Nothing was flown yet: once this is mended, fly again with --replace.")
         raise
 
 

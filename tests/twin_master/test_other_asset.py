@@ -14,9 +14,10 @@ import xarray as xr
 from fmu_asset.errors import FmuError, FmuFileError
 from twin_master import workflow
 from twin_master.checkpoint import Checkpoint, read_checkpoint
+from twin_master.resolution import Overrides
 from twin_master.run_folder import read_config
 from twin_master.scenario_file import load_scenario
-from twin_master.workflow import Overrides, new_run, resume_run
+from twin_master.workflow import new_run, resume_run
 
 HERE = Path(__file__).with_name("heat_exchanger")
 
@@ -123,7 +124,12 @@ def test_what_does_not_fit_is_named(asset_folder: Path, tmp_path: Path) -> None:
         ("count", "count = 2", "count = 3", "2 values.*expects 3"),
         ("role", 'role = "temperature"', 'role = "strain"', "no observation 'strain'"),
         ("control", "mass_flow = 0.5", "flow = 0.5", "same inputs"),
-        ("parameter", "conductance = 6100.0", "conduction = 6100.0", "no parameter 'conduction'"),
+        (
+            "parameter",
+            "conductance = 6100.0",
+            "conduction = 6100.0",
+            "the parameter conduction.*knows conductance",
+        ),
     ):
         path = changed(asset_folder, f"{name}.toml", old, new)
         with pytest.raises(Exception, match=words) as caught:

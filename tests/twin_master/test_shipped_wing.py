@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from fe.cache import reduced_model
 from fe.reduced import ReducedModel
@@ -54,6 +55,9 @@ def test_the_whole_chain_and_its_resumption(
     figures = {figure.key: figure for figure in outcome.figures}
     assert figures["policy_switch_damage"].value == pytest.approx(60.0)
     assert float(figures["strain_error_bound"].value or 0.0) < 3.0
+    with xr.open_datatree(outcome.folder / "run.nc", engine="h5netcdf") as tree:
+        assert tree["truth"]["tip_displacement"].attrs["units"] == "m"
+        assert tree["truth"]["strain_error_bound"].attrs["units"] == "1"
     config = json.loads((outcome.folder / "config.json").read_text(encoding="utf-8"))
     assert config["inputs"]["design"] == wing.design_hash
     assert (outcome.folder / "wing.vtu").stat().st_size > 10_000

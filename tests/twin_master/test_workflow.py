@@ -23,9 +23,10 @@ from twin_master.errors import (
     RunFolderError,
     RunFolderExistsError,
 )
+from twin_master.resolution import Overrides, resolve_scenario
 from twin_master.run_folder import lock_run_folder
 from twin_master.scenario_file import load_scenario
-from twin_master.workflow import Overrides, new_run, resolve_scenario, resume_run
+from twin_master.workflow import new_run, resume_run
 
 ROOT = Path(__file__).parents[2]
 SAME = ("run.nc", "config.json", "summary.json", "csv/health.csv", "csv/observed.csv", "csv/decisions.csv")
@@ -199,24 +200,66 @@ def test_what_cannot_be_resumed(tmp_path: Path, library_file: Path, monkeypatch:
     resume_run(folder)
 
 
-def test_a_library_that_changed_or_is_gone(
+def test_a_run_needs_nothing_but_its_folder(
     tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    library = tmp_path / "library.json"
+    library = tmp_path / "a library" / "é.json"
+    library.parent.mkdir()
     library.write_bytes(library_file.read_bytes())
+    whole = contents(fly(tmp_path / "whole", library_file).folder)
     with monkeypatch.context() as patch:
         stop_after(patch, 3, KeyboardInterrupt())
         with pytest.raises(KeyboardInterrupt):
-            fly(tmp_path / "run", library)
-    library.write_bytes(library_file.read_bytes() + b"\n")
-    with pytest.raises(NotResumableError, match="strain library changed"):
-        resume_run(tmp_path / "run")
+            fly(tmp_path / "part", library)
     library.unlink()
-    with pytest.raises(InvalidStrainLibraryError, match="cannot read"):
-        resume_run(tmp_path / "run")
+    moved = (tmp_path / "part").rename(tmp_path / "moved é")
+    resume_run(moved)
+    assert contents(moved) == whole
+    for path in moved.rglob("*"):
+        if path.is_file():
+            assert str(tmp_path).encode() not in path.read_bytes(), path
     with pytest.raises(InvalidStrainLibraryError):
         fly(tmp_path / "never", library)
     assert not (tmp_path / "never").exists()
+
+
+def test_a_copy_that_changed_is_refused(
+    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        stop_after(patch, 3, KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            fly(tmp_path / "run", library_file)
+    copy = tmp_path / "run" / "asset" / "UAVconfig.json"
+    content = copy.read_bytes()
+    copy.write_bytes(content + b"\n")
+    with pytest.raises(NotResumableError, match="strain library changed"):
+        resume_run(tmp_path / "run")
+    copy.unlink()
+    with pytest.raises(InvalidStrainLibraryError, match="cannot read"):
+        resume_run(tmp_path / "run")
+
+
+@pytest.mark.parametrize("table", ["scenario", "scenario_file", "provenance", "inputs"])
+def test_a_damaged_configuration_is_one_sentence(tmp_path: Path, library_file: Path, table: str) -> None:
+    folder = fly(tmp_path / "run", library_file).folder
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    for damage in (3, None, []):
+        (folder / "config.json").write_text(json.dumps({**config, table: damage}), encoding="utf-8")
+        with pytest.raises(NotResumableError, match=f"damaged.*`{table}`.*--replace"):
+            resume_run(folder)
+
+
+def test_an_error_before_the_first_turn_says_how_to_begin_anew(
+    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise MissionInputError("the parameter cannot be drawn.")
+
+    monkeypatch.setattr(workflow, "prepare_knowledge", broken)
+    with pytest.raises(MissionInputError) as caught:
+        fly(tmp_path / "run", library_file)
+    assert caught.value.__notes__ == ["Nothing was flown yet: once this is mended, fly again with --replace."]
 
 
 def test_overrides(tmp_path: Path, library_file: Path) -> None:
