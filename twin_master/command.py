@@ -28,8 +28,13 @@ def run(
     ] = None,
     resume: Annotated[Path | None, typer.Option(help="Continue the interrupted run in this folder.")] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the run folder if it exists.")] = False,
-    fmu: Annotated[Path | None, typer.Option(help="Fly this FMU instead of the one of the design.")] = None,
-    binding: Annotated[Path | None, typer.Option(help="Which variable of the FMU plays which role.")] = None,
+    fmu: Annotated[
+        Path | None, typer.Option(help="Fly this FMU; the design of the scenario stays the twin's model.")
+    ] = None,
+    binding: Annotated[
+        Path | None,
+        typer.Option(help="Which variable of the FMU plays which role; by default as in the scenario."),
+    ] = None,
     strain_library: Annotated[
         Path | None,
         typer.Option(
@@ -87,27 +92,24 @@ def show_outcome(outcome: RunOutcome) -> None:
     from rich.table import Table
 
     console = Console(highlight=False, markup=False)
-    table = Table("figure", "this run", "reference", box=box.SIMPLE_HEAD)
+    referred = any(figure.reference is not None for figure in outcome.figures)
+    headings = ("figure", "this run", "reference") if referred else ("figure", "this run")
+    table = Table(*headings, box=box.SIMPLE_HEAD)
     sources: dict[str, int] = {}
     for figure in outcome.figures:
         reference = _shown(figure.reference, figure.unit)
         if figure.reference_source:
             reference += f" ({sources.setdefault(figure.reference_source, len(sources) + 1)})"
-        table.add_row(figure.title, _shown(figure.value, figure.unit, "none"), reference)
-    for title, key in (
-        ("asset, per turn", "asset"),
-        ("twin, per turn", "twin"),
-        ("checkpoint, per turn", "checkpoint"),
-    ):
-        entry = outcome.timing.get(f"{key}_seconds")
+        table.add_row(figure.title, _shown(figure.value, figure.unit, "none"), *[reference] * referred)
+    for part in ("asset", "twin", "checkpoint"):
+        entry = outcome.timing.get(f"{part}_seconds")
         if entry:
-            table.add_row(
-                title, f"{1e3 * entry['median']:.3g} ms (largest {1e3 * entry['largest']:.3g} ms)", ""
-            )
-    table.add_row("whole run", f"{outcome.timing['total_seconds']:.3g} s", "")
+            median, largest = 1e3 * entry["median"], 1e3 * entry["largest"]
+            table.add_row(f"{part}, per turn", f"{median:.3g} ms (largest {largest:.3g} ms)")
+    table.add_row("whole run", f"{outcome.timing['total_seconds']:.3g} s")
     console.print(table)
     for source, number in sources.items():
-        console.print(f"  ({number}) {source}")
+        console.print(f"  ({number}) {source}", soft_wrap=True)
     console.print(f"Report: {outcome.report}", soft_wrap=True)
 
 

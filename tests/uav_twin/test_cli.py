@@ -64,7 +64,8 @@ def test_run_prints_figures_and_report(
     assert call(monkeypatch, *arguments, "--seed", "3") == 0
     text = capsys.readouterr().out
     assert "filtered rms error of z1" in text
-    assert "Kapteyn et al. 2021" in text
+    assert "60 % (1)" in text
+    assert "(1) Kapteyn et al. 2021\n" in text
     assert f"Report: {out / 'report.html'}" in text
     assert call(monkeypatch, *arguments) == 1
     error = capsys.readouterr().err
@@ -74,6 +75,17 @@ def test_run_prints_figures_and_report(
     captured = capsys.readouterr()
     assert captured.out == captured.err == ""
     assert call(monkeypatch, "run", "--resume", str(out), "--quiet") == 0
+
+
+@pytest.mark.usefixtures("no_report")
+def test_a_scenario_without_references_has_no_column_for_them(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, library_file: Path
+) -> None:
+    arguments = ["--out", str(tmp_path / "run"), "--strain-library", str(library_file)]
+    assert call(monkeypatch, "run", "growing_damage", *arguments) == 0
+    text = capsys.readouterr().out
+    assert "filtered rms error of z1" in text
+    assert "reference" not in text
 
 
 def test_usage_errors_end_with_2(
