@@ -25,6 +25,7 @@ from twin_master.report import data as report_data
 from twin_master.report import mission as report_mission
 from twin_master.report import network as report_network
 from twin_master.report import page as report
+from twin_master.report import reading as report_reading
 from twin_master.report.text import (
     lost_ranges,
     mission_caption,
@@ -56,7 +57,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, tree: xr.DataTree) -> Path:
 
 @pytest.fixture(scope="module")
 def record(folder: Path) -> report_data.RunRecord:
-    return report_data.read_run(folder)
+    return report_reading.read_run(folder)
 
 
 @pytest.fixture
@@ -95,7 +96,7 @@ def test_axes_stored_in_another_order_are_put_right(tmp_path: Path, tree: xr.Dat
     changed["predicted"] = xr.DataTree(
         tree["predicted"].to_dataset().transpose("state", "horizon", "step", ...)
     )
-    found = report_data.read_run(synthetic_run.write_run(tmp_path / "run", changed))
+    found = report_reading.read_run(synthetic_run.write_run(tmp_path / "run", changed))
     assert found.predicted is not None
     assert_array_equal(found.predicted.probability, tree["predicted/probability"].values)
 
@@ -371,7 +372,7 @@ def test_the_caption_tells_the_decision_and_what_it_rests_on(
     changed["filtered"] = xr.DataTree(
         tree["filtered"].to_dataset().assign(decision_probability=(("step", "control"), probability))
     )
-    found = report_data.read_run(synthetic_run.write_run(tmp_path / "run", changed))
+    found = report_reading.read_run(synthetic_run.write_run(tmp_path / "run", changed))
     sentence = "At the end of turn 18 the twin decided on 3g for the next one"
     assert f"{sentence}: the policy asks for it with probability 0.75 in the state as just observed." in (
         mission_caption(found, 18)
@@ -433,7 +434,7 @@ def test_other_short_missions(tmp_path: Path, steps: int, horizon: int) -> None:
 @pytest.mark.usefixtures("no_drawing")
 def test_lost_gauges_are_told_and_marked(tmp_path: Path) -> None:
     place = synthetic_run.write_run(tmp_path / "run", synthetic_run.build_tree(lost=True))
-    record = report_data.read_run(place)
+    record = report_reading.read_run(place)
     assert lost_ranges(record) == "gauges 17, 18, 19, 20 at turns 12–18; all gauges at turns 3–4"
     text = report.write_report(place).read_text(encoding="utf-8")
     assert "the belief followed the dynamics alone" in text

@@ -17,9 +17,10 @@ from twin_master.errors import RunFolderError
 from twin_master.report.belief import belief_figure, policy_figure
 from twin_master.report.calibration import calibration_caption, calibration_figure, calibration_view
 from twin_master.report.check import check_figure, predictive_check
-from twin_master.report.data import RunRecord, read_run
+from twin_master.report.data import RunRecord
 from twin_master.report.mission import mission_figure
 from twin_master.report.network import network_figure
+from twin_master.report.reading import read_run
 from twin_master.report.text import (
     belief_caption,
     check_caption,

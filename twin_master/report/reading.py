@@ -1,0 +1,211 @@
+"""Reading a run folder into a `RunRecord`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from twin_master.errors import RunFolderError
+from twin_master.report.data import NORMAL_95, Estimate, PolicyTable, RunRecord, Uncertain, moments
+
+Float = NDArray[np.floating[Any]]
+
+
+def read_run(folder: Path) -> RunRecord:
+    """Read a run folder.
+
+    Raises
+    ------
+    RunFolderError
+        There is no ``run.nc``, it is damaged, or it has another layout.
+    """
+    path = folder / "run.nc"
+    if not path.is_file():
+        raise RunFolderError(
+            f"{folder} holds no run.nc, so there is no run to report: fly or resume the run first."
+        )
+    groups, attributes = _read_groups(path)
+    try:
+        return _record(groups, attributes, folder)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        reason = error.args[0] if error.args else error
+        raise RunFolderError(
+            f"{path} does not have the layout of a run of this version ({reason}): fly the run again."
+        ) from error
+
+
+def _read_groups(path: Path) -> tuple[dict[str, xr.Dataset], dict[str, Any]]:
+    try:
+        with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as tree:
+            groups = {name: tree[name].to_dataset().load() for name in tree.children}
+            attributes = {str(name): value for name, value in tree.attrs.items()}
+    except (OSError, ValueError, KeyError, RuntimeError, AttributeError) as error:
+        raise RunFolderError(f"{path} is damaged and cannot be read ({error}): fly the run again.") from error
+    return groups, attributes
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f"{path} is damaged and cannot be read ({error}): fly the run again.") from error
+    if not isinstance(content, dict):
+        raise RunFolderError(f"{path} must hold one JSON object: fly the run again.")
+    return content
+
+
+def _array(dataset: xr.Dataset | None, name: str, *dimensions: str) -> Float | None:
+    """Return a variable with its axes in the order given, or None if it was not stored."""
+    if dataset is None or name not in dataset:
+        return None
+    variable = dataset[name]
+    if set(variable.dims) != set(dimensions):
+        raise ValueError(f"{name} has the axes {variable.dims} and not {dimensions}")
+    return np.asarray(variable.transpose(*dimensions).values, dtype=np.float64)
+
+
+def _needed(dataset: xr.Dataset | None, group: str, name: str, *dimensions: str) -> Float:
+    values = _array(dataset, name, *dimensions)
+    if values is None:
+        raise ValueError(f"the variable {group}/{name} is missing")
+    return values
+
+
+def _names(groups: Mapping[str, xr.Dataset], dimension: str, fallback: int) -> tuple[str, ...]:
+    for dataset in groups.values():
+        if dimension in dataset.coords and dataset.coords[dimension].dims == (dimension,):
+            return tuple(_text(value) for value in dataset.coords[dimension].values)
+    return tuple(str(index + 1) for index in range(fallback))
+
+
+def _text(value: Any) -> str:
+    return value.decode("utf-8") if isinstance(value, bytes) else str(value)
+
+
+def _estimate(dataset: xr.Dataset | None, group: str, coordinates: Float, *lead: str) -> Estimate | None:
+    if dataset is None or "probability" not in dataset:
+        return None
+    probability = _needed(dataset, group, "probability", *lead, "state")
+    mean, deviation = moments(probability, coordinates)
+    stored_mean = _array(dataset, "mean", *lead, "region")
+    stored_deviation = _array(dataset, "standard_deviation", *lead, "region")
+    return Estimate(
+        probability=probability,
+        mean=mean if stored_mean is None else stored_mean,
+        standard_deviation=deviation if stored_deviation is None else stored_deviation,
+        quantity=_uncertain(dataset, "quantity", *lead, "sensor"),
+        quantity_standard_deviation=_array(dataset, "quantity_standard_deviation", *lead, "sensor"),
+        reward=_uncertain(dataset, "reward", *lead, "reward"),
+    )
+
+
+def _uncertain(dataset: xr.Dataset, name: str, *dimensions: str) -> Uncertain | None:
+    """Read mean and 95 % interval; without stored bounds they are those of a normal distribution."""
+    mean, lower, upper, deviation = (
+        _array(dataset, f"{name}_{part}", *dimensions)
+        for part in ("mean", "lower", "upper", "standard_deviation")
+    )
+    if mean is None:
+        return None
+    half = np.zeros_like(mean) if deviation is None else NORMAL_95 * deviation
+    return Uncertain(mean, mean - half if lower is None else lower, mean + half if upper is None else upper)
+
+
+def _coordinates(groups: Mapping[str, xr.Dataset], names: tuple[str, ...]) -> Float:
+    for dataset in groups.values():
+        if all(name in dataset.coords and dataset.coords[name].dims == ("state",) for name in names):
+            return np.stack([np.asarray(dataset.coords[name].values, dtype=float) for name in names], axis=-1)
+    raise ValueError(f"the states have no coordinates {', '.join(names)}")
+
+
+def _record(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], folder: Path) -> RunRecord:
+    config = _read_json(folder / "config.json")
+    observed, filtered_group, predicted_group = (
+        groups.get(name) for name in ("observed", "filtered", "predicted")
+    )
+    control_index = _needed(observed, "observed", "control_index", "step").astype(np.int64)
+    role = _role(observed, config)
+    observation = _array(observed, role, "step", "sensor")
+    names = _names(groups, "region", 0)
+    if not names or not len(control_index):
+        raise ValueError("the axis `region` has no names" if not names else "it holds no step")
+    coordinates = _coordinates(groups, names)
+    filtered = _estimate(filtered_group, "filtered", coordinates, "step")
+    if filtered is None:
+        raise ValueError("the variable filtered/probability is missing")
+    policy_group, truth, draws_group = (groups.get(name) for name in ("policy", "truth", "calibration"))
+    chosen = _array(policy_group, "control_index", "state")
+    policy = None
+    if chosen is not None:
+        policy = PolicyTable(
+            chosen.astype(np.int64), _array(policy_group, "action_value", "state", "control")
+        )
+    sensor_count = 0 if observation is None else observation.shape[1]
+    sensors = np.asarray([int(name) for name in _names(groups, "sensor", sensor_count)], dtype=np.int64)
+    unit = "1" if observed is None or role not in observed else str(observed[role].attrs.get("units", "1"))
+    control_count = int(control_index.max()) + 1
+    return RunRecord(
+        state_names=names,
+        state_titles=_titles(config, names),
+        levels=tuple(np.unique(coordinates[:, k]) for k in range(len(names))),
+        coordinates=coordinates,
+        sensors=sensors,
+        controls=_names(groups, "control", control_count),
+        rewards=_names(groups, "reward", 0),
+        observation=observation,
+        observation_name=role,
+        observation_unit=unit,
+        control_index=control_index,
+        filtered=filtered,
+        smoothed=_estimate(groups.get("smoothed"), "smoothed", coordinates, "step"),
+        predicted=_estimate(predicted_group, "predicted", coordinates, "step", "horizon"),
+        control_probability=_array(predicted_group, "control_probability", "step", "horizon", "control"),
+        decision_probability=_array(filtered_group, "decision_probability", "step", "control"),
+        log_evidence=_array(filtered_group, "log_evidence", "step"),
+        policy=policy,
+        truth_state=_array(truth, "state", "step", "region"),
+        truth_observation=_array(truth, role, "step", "sensor"),
+        monitors=_monitors(truth),
+        parameter_name="" if draws_group is None else _text(draws_group.attrs.get("parameter", "parameter")),
+        parameter_draws=_array(draws_group, "draw_value", "draw"),
+        calibration=_read_json(folder / "calibration.json"),
+        attributes=attributes,
+        config=config,
+        summary=_read_json(folder / "summary.json"),
+    )
+
+
+def _monitors(truth: xr.Dataset | None) -> dict[str, tuple[Float, str]]:
+    """Return the variables of `truth` with one value a step, and their units."""
+    if truth is None:
+        return {}
+    return {
+        str(name): (np.asarray(variable.values, dtype=np.float64), str(variable.attrs.get("units", "1")))
+        for name, variable in truth.data_vars.items()
+        if variable.dims == ("step",) and variable.dtype.kind == "f"
+    }
+
+
+def _role(observed: xr.Dataset | None, config: Mapping[str, Any]) -> str:
+    """Return the name of the observed variable: as the scenario has it, else the only one of each sensor."""
+    scenario = config.get("scenario")
+    section = scenario.get("observation") if isinstance(scenario, Mapping) else None
+    if isinstance(section, Mapping) and "role" in section:
+        return str(section["role"])
+    names = [] if observed is None else [str(n) for n, v in observed.data_vars.items() if "sensor" in v.dims]
+    return names[0] if names else "strain"
+
+
+def _titles(config: Mapping[str, Any], names: tuple[str, ...]) -> tuple[str, ...]:
+    scenario = config.get("scenario")
+    factors = scenario.get("state", []) if isinstance(scenario, Mapping) else []
+    titles = {f.get("name"): f.get("title") for f in factors if isinstance(f, Mapping)} if factors else {}
+    return tuple(str(titles.get(name) or name) for name in names)
