@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 from reporting.figures import (
     OBSERVED,
@@ -115,7 +116,11 @@ def _draw_amplitudes(frequency: Axes, damping: Axes, trials: RingDownTrials) -> 
     ):
         axes.axhline(averaged.mean * scale, color=PAST, lw=1.0, label="whole record")
         axes.set_xlabel("amplitude of the first mode (mV)")
-        axes.legend(loc="best")
+        axes.xaxis.set_major_formatter(ScalarFormatter())
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_minor_locator(NullLocator())
+    frequency.legend(loc="upper right")
+    damping.legend(loc="lower right")
     frequency.set_ylabel("natural frequency (Hz)")
     damping.set_ylabel("damping ratio (%)")
     panel_label(frequency, "c", "First mode within windows of 0.8 s")

@@ -41,7 +41,6 @@ def calibrate_static(
     curve: StiffnessCurve = PUBLISHED_LINE
     if design is not None:
         from fe.cache import reduced_model
-
         from fe.design import load_design
         from reporting.progress import RichProgress
 

@@ -37,6 +37,10 @@ def calibrate_ringdown(
         bool,
         typer.Option("--fitted", help="Fit the frequencies too; by default those of the spectral peaks."),
     ] = False,
+    extremes: Annotated[
+        bool,
+        typer.Option("--extremes", help="Fit the extremes of records read off a plot, not the middle."),
+    ] = False,
     start: Annotated[
         float | None, typer.Option(min=0.0, help="Where records are cropped [s]; the first peak by default.")
     ] = None,
@@ -49,6 +53,10 @@ def calibrate_ringdown(
 
     procedure = Frequencies.FITTED if fitted else Frequencies.PEAKS
     trials = fit_trials(read_records(data), procedure, start=FIRST_PEAK if start is None else start)
+    if extremes:
+        from calibration.ringdown_extremes import refine_by_extremes
+
+        trials = refine_by_extremes(trials)
     rows = ring_down_rows(trials)
     _show(rows)
     if out is not None:
@@ -89,10 +97,14 @@ def calibrate_dynamics(
         factors = read_factor_samples(data)
     targets = DynamicTargets()
     if measured and data is not None:
+        from calibration.ringdown_extremes import refine_by_extremes
         from calibration.ringdown_records import read_records
         from calibration.ringdown_trials import fit_trials
 
-        trials = fit_trials(read_records(data))
+        records = read_records(data)
+        trials = fit_trials(records)
+        if all(record.lowest is not None for record in records):
+            trials = refine_by_extremes(trials)
         targets = DynamicTargets(trials.target_frequencies, trials.target_damping_ratios)
     model = reduced_model(None if design is None else load_design(design), progress=RichProgress())
     result = calibrate_dynamics(model, factors, targets)
