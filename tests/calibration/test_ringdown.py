@@ -86,6 +86,14 @@ def test_a_fast_record_is_decimated_and_cropped() -> None:
     assert fit.modes[1].damping_ratio == pytest.approx(0.0717, rel=1e-2)
 
 
+def test_a_time_printed_to_few_digits_is_even_enough() -> None:
+    time = np.arange(0, 400_000) / 100_000.0
+    rounded = RingDownRecord(np.round(time, 4), ring_down(time))
+    fit = fit_ring_down(rounded, Frequencies.FITTED)
+    assert fit.modes[0].frequency == pytest.approx(5.65, rel=1e-4)
+    assert fit.modes[1].frequency == pytest.approx(29.97, rel=1e-3)
+
+
 def test_standard_errors_are_those_of_repetitions_and_scale_with_the_noise() -> None:
     time = np.arange(0.0, 4.0, 1.0 / 250.0)
     clean = ring_down(time)
@@ -244,6 +252,8 @@ def test_bad_records_are_told_in_one_sentence() -> None:
     uneven[100:] += 0.1
     with pytest.raises(ExperimentDataError, match="after sample 100"):
         RingDownRecord(uneven, good)
+    with pytest.raises(ExperimentDataError, match="even steps"):
+        RingDownRecord(TIME[::-1], good)
     with pytest.raises(ExperimentDataError, match="as long as time"):
         RingDownRecord(TIME, good[1:])
     with pytest.raises(RingDownError, match="remain"):
