@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+_GREATEST_GROWTH = 50.0  # exponent at the end of a record; an iteration may pass through growing waves
+
 
 class Solution(NamedTuple):
     """The fitted signal at given decay rates and frequencies.
@@ -76,7 +78,7 @@ class DampedCosines:
     def _basis(self, decay: NDArray[np.float64], omega: NDArray[np.float64]) -> NDArray[np.float64]:
         columns = []
         for d, w in zip(decay, omega, strict=True):
-            s = -d + 1j * w
+            s = -max(d, -_GREATEST_GROWTH / self._time[-1]) + 1j * w
             wave = self._gain(s) * np.exp(s * self._time)
             columns += [wave.real, wave.imag]
         return np.column_stack([*columns, self._line])

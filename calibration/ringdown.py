@@ -17,7 +17,7 @@ from scipy.signal import decimate, detrend, find_peaks
 
 from .damped_cosine import DampedCosines
 from .errors import RingDownError
-from .ringdown_records import RingDownRecord
+from .ringdown_records import MINIMUM_COUNT, RingDownRecord
 
 FIRST_PEAK = 0.00548
 """Instant of the first peak in the published records, at which the authors crop them [s]."""
@@ -115,11 +115,16 @@ def prepare(record: RingDownRecord, start: float | None = FIRST_PEAK) -> RingDow
     Raises
     ------
     RingDownError
-        If less than a quarter of the record remains.
+        If the record is too short, or less than a quarter of it remains.
     """
     time, signal = record.time, record.signal
     lowest, highest = record.lowest, record.highest
     factor = int(record.sampling_rate / WORKING_RATE + 0.5)
+    if factor > 1 and record.count // factor < MINIMUM_COUNT:
+        raise RingDownError(
+            f"{record.source}: {record.count} samples at {record.sampling_rate:.4g} Hz last "
+            f"{record.time[-1] - record.time[0]:.3g} s, too short for a ring-down; is the time in s?"
+        )
     while factor > 1:
         stage = max(divisor for divisor in range(1, 11) if factor % divisor == 0)
         if stage == 1:
@@ -173,8 +178,14 @@ def spectral_peaks(record: RingDownRecord, band: tuple[float, float] = SEARCH_BA
     Raises
     ------
     RingDownError
-        If fewer than two peaks rise by 2 % of the highest amplitude and by 3.5 times the median noise.
+        If the record is sampled too slowly, or fewer than two peaks rise by 2 % of the highest amplitude
+        and by 3.5 times the median noise.
     """
+    if 0.5 * record.sampling_rate < 4.0 * band[0]:
+        raise RingDownError(
+            f"{record.source}: a sampling rate of {record.sampling_rate:.3g} Hz shows nothing above "
+            f"{0.5 * record.sampling_rate:.3g} Hz; is the time in s?"
+        )
     frequency, amplitude = spectrum(record, band)
     needed = max(_PROMINENCE * _noise_floor(record, band), _SMALLEST_PEAK * float(amplitude.max()))
     places, found = find_peaks(amplitude, prominence=needed)
@@ -220,8 +231,8 @@ def fit_ring_down(
     """
     record = prepare(record, start)
     _refuse_steady(record)
-    frequency, amplitude = spectrum(record, band)
     peaks = np.array(spectral_peaks(record, band))
+    frequency, amplitude = spectrum(record, band)
     model = DampedCosines(record.time, record.signal, record.averaging_width)
     omega = 2.0 * math.pi * peaks
     fixed = procedure is Frequencies.PEAKS

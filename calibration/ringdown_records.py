@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,6 +150,10 @@ def _read_record(file: Path) -> RingDownRecord:
     delimiter = "," if "," in first else None
     header = _header(first)
     table = _table(file, delimiter, skip=0 if header is None or first.startswith("#") else 1)
+    if header is not None:
+        header = header[: table.shape[1]]
+        _refuse_other_time(file, header)
+        header = [_name(cell) for cell in header]
     if header is None:
         if table.shape[1] < 2:
             raise ExperimentFileError(
@@ -165,13 +170,18 @@ def _read_record(file: Path) -> RingDownRecord:
 
 def _header(first: str) -> list[str] | None:
     """Return the names of the columns, or None if the first line holds numbers only."""
-    text = first.lstrip("#").partition("(")[0].strip()
+    text = first.lstrip("#").strip()
     cells = [cell.strip() for cell in (next(csv.reader([text])) if "," in text else text.split())]
     try:
         [float(cell) for cell in cells]
     except ValueError:
         return cells
     return None
+
+
+def _name(cell: str) -> str:
+    """Return the name in a header's cell without unit or remark in brackets."""
+    return re.split(r"\s*[(\[]", cell, maxsplit=1)[0]
 
 
 def _table(file: Path, delimiter: str | None, skip: int) -> NDArray[np.float64]:
@@ -193,11 +203,17 @@ def _column(
     for name in names:
         if name in header:
             place = header.index(name)
-            if place < table.shape[1]:
-                return table[:, place]
+            return table[:, place]
     raise ExperimentFileError(
         f"{file} lacks the column {' or '.join(names)}; its columns are {', '.join(header)}."
     )
+
+
+def _refuse_other_time(file: Path, header: list[str]) -> None:
+    for cell in header:
+        unit = re.search(r"[(\[]\s*(\w+)\s*[)\]]", cell)
+        if _name(cell) in _TIME_NAMES and unit and unit[1] not in ("s", "sec", "second", "seconds"):
+            raise ExperimentDataError(f"{file} gives {_name(cell)} in {unit[1]}: give it in s.")
 
 
 def _refuse_clipped(record: RingDownRecord) -> None:

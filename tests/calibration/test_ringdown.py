@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from calibration.damped_cosine import DampedCosines
-from calibration.errors import ExperimentDataError, ExperimentFileError, RingDownError
+from calibration.errors import CalibrationError, ExperimentDataError, ExperimentFileError, RingDownError
 from calibration.ringdown import FIRST_PEAK, Frequencies, fit_ring_down, prepare, spectrum
 from calibration.ringdown_records import RingDownRecord, read_records
 from calibration.ringdown_trials import amplitude_dependence, fit_trials
@@ -256,8 +256,35 @@ def test_bad_records_are_told_in_one_sentence() -> None:
         RingDownRecord(TIME[::-1], good)
     with pytest.raises(ExperimentDataError, match="as long as time"):
         RingDownRecord(TIME, good[1:])
+    for scale, words in ((1e3, "shows nothing above"), (1e-6, "too short")):
+        with pytest.raises(RingDownError, match=words):
+            fit_ring_down(RingDownRecord(scale * TIME, good), start=None)
     with pytest.raises(RingDownError, match="remain"):
         fit_ring_down(RingDownRecord(TIME, good), start=3.5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    rates=st.tuples(st.floats(-3.0, 30.0), st.floats(-3.0, 30.0)),
+    noise=st.sampled_from([0.0, 1e-3, 0.1]),
+    procedure=st.sampled_from(list(Frequencies)),
+)
+def test_any_record_is_fitted_or_refused(
+    seed: int, rates: tuple[float, float], noise: float, procedure: Frequencies
+) -> None:
+    generator = np.random.default_rng(seed)
+    time = np.arange(0.0, 3.0, 1.0 / 125.0)
+    signal = noise * generator.standard_normal(time.size)
+    for rate, frequency in zip(rates, generator.uniform(0.5, 60.0, 2), strict=True):
+        signal = signal + np.exp(-rate * time) * np.cos(2.0 * np.pi * frequency * time)
+    try:
+        fit = fit_ring_down(RingDownRecord(time, signal), procedure, start=None)
+    except CalibrationError:
+        return
+    assert all(0.0 < mode.damping_ratio < 1.0 for mode in fit.modes)
+    assert np.all(np.isfinite(fit.fitted))
+    amplitude_dependence(fit)
 
 
 def text_of(columns: list[NDArray[np.float64]], separator: str) -> str:
@@ -274,7 +301,9 @@ def test_the_three_layouts_of_files(tmp_path: Path) -> None:
     assert len(read_records(tmp_path / "raw")) == 2
     assert len(read_records(tmp_path / "raw" / "step3")) == 2
     named = tmp_path / "trial.csv"
-    named.write_text("chordwise,time,spanwise\n" + text_of([0.1 * good, TIME, good], ","), encoding="utf-8")
+    named.write_text(
+        "chordwise (V),time (s),spanwise [V]\n" + text_of([0.1 * good, TIME, good], ","), encoding="utf-8"
+    )
     plot = tmp_path / "plot.csv"
     plot.write_text(
         "# t_s,V_low,V_mid,V_high  (from a plot)\n" + text_of([TIME, good - 1e-4, good, good + 1e-4], ","),
@@ -293,6 +322,7 @@ def test_the_three_layouts_of_files(tmp_path: Path) -> None:
         ("time,spanwise\n", ExperimentFileError, "no sample"),
         ("time,strain\n0,1\n1,2\n", ExperimentFileError, "lacks the column spanwise"),
         ("t_s,V_mid\n0,1\n1,2\n", ExperimentFileError, "lacks the column V_low"),
+        ("time (ms),spanwise (V)\n0,1\n1,2\n", ExperimentDataError, "give it in s"),
         ("seconds,spanwise\n0,1\n1,2\n", ExperimentFileError, "lacks the column time"),
         ("0.0\n0.1\n", ExperimentFileError, "one column"),
         ("time,spanwise\n0,1\n1,two\n", ExperimentDataError, "one table of numbers"),
