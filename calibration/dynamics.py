@@ -179,7 +179,7 @@ def fit_masses(
     Raises
     ------
     MassConstraintError
-        If no masses within the range keep the total.
+        If no masses within the range keep the total, or the best lie at the limit of the range.
     ExperimentDataError
         If there is no sample of e, or a target is not positive and finite, or the damping ratios need a
         negative Rayleigh coefficient.
@@ -209,6 +209,12 @@ def fit_masses(
             options={"xatol": 1e-9, "fatol": 1e-12, "maxiter": 400},
         )
         servo[place] = found.x[0]
+        if min(servo[place] - lower, upper - servo[place]) < 1e-6:
+            raise MassConstraintError(
+                f"at e = {factor:g} the masses nearest to {targets.frequency[0]:.4g} and "
+                f"{targets.frequency[1]:.4g} Hz lie at the limit of the model, {servo[place]:.4g} kg for a "
+                f"servo under a total of {total_mass:g} kg; check the measured frequencies and the total."
+            )
         pair = frequencies(factor, float(servo[place]), total_mass - 2.0 * float(servo[place]))
         frequency[place] = pair
         damping[place] = damping_coefficients(pair, targets.damping_ratio)

@@ -107,6 +107,8 @@ def test_refusals() -> None:
         fit_masses(line_model, one, MASSES, total_mass=2.0)
     with pytest.raises(MassConstraintError, match="cannot weigh nan"):
         fit_masses(line_model, one, MASSES, total_mass=math.nan)
+    with pytest.raises(MassConstraintError, match="at the limit of the model"):
+        fit_masses(line_model, one, MASSES, DynamicTargets((7.0, 29.9)))
     with pytest.raises(ExperimentDataError, match="at least one sample"):
         fit_masses(line_model, np.array([]), MASSES)
     with pytest.raises(ExperimentDataError, match="must be finite"):
