@@ -31,3 +31,11 @@ class DegenerateFilterError(CalibrationError, RuntimeError):
 
 class CalibrationRecordError(CalibrationError, ValueError):
     """A stored calibration cannot be read back."""
+
+
+class RingDownError(CalibrationError, ValueError):
+    """A ring-down record does not show two decaying modes, or was cut off by the range of its recorder."""
+
+
+class MassConstraintError(CalibrationError, ValueError):
+    """No masses within the range of the model keep the weighed total."""

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from uav_twin import calibrate_steps
+
 calibrate_app = typer.Typer(no_args_is_help=True, help="Tailor the model to the real wing.")
 
 
@@ -54,3 +56,8 @@ def calibrate_static(
     console.print(table)
     if out is not None:
         console.print(f"Report: {result_files(out).report}", soft_wrap=True)
+
+
+calibrate_app.command("geometry")(calibrate_steps.calibrate_geometry)
+calibrate_app.command("ringdown")(calibrate_steps.calibrate_ringdown)
+calibrate_app.command("dynamics")(calibrate_steps.calibrate_dynamics)

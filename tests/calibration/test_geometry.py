@@ -1,0 +1,106 @@
+"""Calibration step 1: conjugate posterior, published lengths, bad files."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibration.errors import ExperimentDataError, ExperimentFileError
+from calibration.geometry import MeasuredLength, published_lengths, read_lengths
+
+REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference" / "uav_experimental_calibration"
+
+
+def test_the_published_lengths() -> None:
+    result = published_lengths()
+    for length, measured in zip(result.lengths, (1.828, 0.433, 0.260), strict=True):
+        assert length.prior.standard_deviation == pytest.approx(2.54e-3 / 1.96)
+        # The tolerance is 12.7 times the reading's: the posterior is the measurement within 0.02 mm.
+        assert length.posterior.mean == pytest.approx(measured, abs=0.02e-3)
+        assert length.posterior.standard_deviation == pytest.approx(0.1017e-3, rel=1e-3)
+    assert result.geometry.semi_span == pytest.approx(1.828005, abs=1e-6)
+    assert max(abs(length.score) for length in result.lengths) == pytest.approx(2.01, abs=0.01)
+
+
+def test_posterior_by_quadrature() -> None:
+    length = published_lengths().root_chord
+    grid = np.linspace(0.432, 0.436, 40001)
+    density = np.exp(
+        -0.5 * ((grid - 0.43561) / (2.54e-3 / 1.96)) ** 2 - 0.5 * ((grid - 0.433) / (0.2e-3 / 1.96)) ** 2
+    )
+    density /= density.sum()
+    mean = float(np.sum(grid * density))
+    deviation = math.sqrt(float(np.sum((grid - mean) ** 2 * density)))
+    assert length.posterior.mean == pytest.approx(mean, rel=1e-9)
+    assert length.posterior.standard_deviation == pytest.approx(deviation, rel=1e-6)
+
+
+@given(
+    designed=st.floats(0.1, 5.0),
+    shift=st.floats(-0.05, 0.05),
+    tolerance=st.floats(1e-6, 1e-1),
+    reading=st.floats(1e-6, 1e-1),
+)
+def test_posterior_lies_between_and_is_narrower(
+    designed: float, shift: float, tolerance: float, reading: float
+) -> None:
+    length = MeasuredLength("semi_span", designed, designed * (1.0 + shift), tolerance, reading)
+    low, high = sorted((length.designed, length.measured))
+    assert low - 1e-12 <= length.posterior.mean <= high + 1e-12
+    assert length.posterior.standard_deviation <= min(tolerance, reading) / 1.96 * (1.0 + 1e-12)
+    assert 0.0 <= length.uncertainty_reduction < 1.0
+
+
+def test_the_published_file_gives_the_published_figures() -> None:
+    if not REFERENCE.is_dir():
+        pytest.skip("the reference data are not beside the project")
+    for read, published in zip(read_lengths(REFERENCE).lengths, published_lengths().lengths, strict=True):
+        assert read.designed == pytest.approx(published.designed, rel=1e-12)
+        assert read.measured == pytest.approx(published.measured, rel=1e-12)
+
+
+GOOD = """parameter,designed,manufactured
+length,1828.8,1828.0
+chord_{root},435.61,433.0
+chord_{tip},261.112,260.0
+"""
+
+
+def test_a_file_of_its_own(tmp_path: Path) -> None:
+    file = tmp_path / "lengths.csv"
+    file.write_text(GOOD, encoding="utf-8")
+    for read, published in zip(read_lengths(file).lengths, published_lengths().lengths, strict=True):
+        assert read.posterior.mean == pytest.approx(published.posterior.mean, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "words"),
+    [
+        ("", ExperimentFileError, "is empty"),
+        (GOOD.replace("manufactured", "as_built"), ExperimentFileError, "lacks the column manufactured"),
+        (GOOD.replace("chord_{tip}", "chord_end"), ExperimentFileError, "lacks the row chord_{tip}"),
+        (GOOD.replace("433.0", "nan"), ExperimentDataError, "manufactured of chord_{root} is 'nan'"),
+        (GOOD.replace("433.0", ""), ExperimentDataError, "positive finite length"),
+        (GOOD.replace("1828.0", "1.828"), ExperimentDataError, "looks like m"),
+        (GOOD.replace("1828.0", "182.8"), ExperimentDataError, "more than 10 % apart"),
+    ],
+)
+def test_bad_files_are_told_in_one_sentence(
+    tmp_path: Path, text: str, error: type[Exception], words: str
+) -> None:
+    file = tmp_path / "lengths.csv"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(error, match=words):
+        read_lengths(file)
+
+
+def test_missing_files(tmp_path: Path) -> None:
+    with pytest.raises(ExperimentFileError, match="does not hold"):
+        read_lengths(tmp_path)
+    with pytest.raises(ExperimentFileError, match="does not exist"):
+        read_lengths(tmp_path / "nothing")

@@ -1,0 +1,100 @@
+"""`uav-twin calibrate geometry`, `ringdown` and `dynamics` on the command line."""
+
+from __future__ import annotations
+
+import csv
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uav_twin import cli
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Run the command line in this process and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["uav-twin", "calibrate", *arguments])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    code = caught.value.code
+    return 0 if code is None else int(code)
+
+
+def figures(file: Path) -> dict[str, float]:
+    with file.open(encoding="utf-8", newline="") as stream:
+        return {row["figure"]: float(row["found"]) for row in csv.DictReader(stream)}
+
+
+@pytest.fixture
+def plots(tmp_path: Path) -> Path:
+    """Three records read off a plot, and samples of e, in the authors' layout."""
+    folder = tmp_path / "data" / "step3"
+    folder.mkdir(parents=True)
+    width = 0.0081
+    fine = np.arange(0.0, 6.4, width / 32.0)
+    signal = sum(
+        amplitude * np.exp(-rate * fine) * np.cos(2.0 * math.pi * frequency * fine + 1.0)
+        for frequency, rate, amplitude in ((5.65, 1.0, 0.0115), (29.9, 13.0, 0.018))
+    )
+    columns = fine.size // 32
+    table = np.asarray(signal)[: 32 * columns].reshape(columns, 32)
+    time = width * (np.arange(columns) + 0.5)
+    low, high = table.min(axis=1) - 2e-4, table.max(axis=1) + 2e-4
+    for trial in (1, 2, 3):
+        np.savetxt(
+            folder / f"ringdown_trial{trial}_digitised.csv",
+            np.column_stack([time, low, 0.5 * (low + high), high]),
+            delimiter=",",
+            header="t_s,V_low,V_mid,V_high  (drawn)",
+        )
+    (folder / "e_samples.csv").write_text("0.99\n1.0\n1.01\n", encoding="utf-8")
+    return tmp_path / "data"
+
+
+def test_geometry(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert call(monkeypatch, "geometry", "--out", str(tmp_path)) == 0
+    assert "root chord, posterior mean" in capsys.readouterr().out
+    assert figures(tmp_path / "geometry.csv")["semi span, posterior mean"] == pytest.approx(
+        1828.005, abs=1e-3
+    )
+
+
+@pytest.mark.parametrize("options", [(), ("--extremes",), ("--fitted",)])
+def test_ringdown(
+    monkeypatch: pytest.MonkeyPatch, plots: Path, tmp_path: Path, options: tuple[str, ...]
+) -> None:
+    out = tmp_path / "out"
+    assert call(monkeypatch, "ringdown", "--data", str(plots), "--out", str(out), *options) == 0
+    found = figures(out / "ringdown.csv")
+    assert found["mode 1, natural frequency"] == pytest.approx(5.65, rel=5e-3)
+    assert found["mode 2, natural frequency"] == pytest.approx(29.9, rel=2e-2)
+    assert (out / "figures" / "ringdown.svg").is_file()
+    assert (out / "figures" / "ringdown.png").is_file()
+
+
+@pytest.mark.slow
+def test_dynamics(monkeypatch: pytest.MonkeyPatch, plots: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert call(monkeypatch, "dynamics", "--data", str(plots), "--out", str(out)) == 0
+    found = figures(out / "dynamics.csv")
+    assert found["mass of a servo, mean"] == pytest.approx(171.5, abs=1.5)
+    assert found["f1 of the model, mean"] == pytest.approx(5.6492, rel=1e-5)
+    assert len((out / "dynamics_samples.csv").read_text(encoding="utf-8").splitlines()) == 4
+    assert (out / "figures" / "dynamics.svg").is_file()
+    assert call(monkeypatch, "dynamics", "--data", str(plots), "--measured", "--out", str(out)) == 0
+    assert figures(out / "dynamics.csv")["f1 measured"] == pytest.approx(5.65, rel=2e-3)
+
+
+def test_what_is_wrong_is_said_in_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    for command in ("geometry", "ringdown", "dynamics"):
+        assert call(monkeypatch, command, "--data", str(tmp_path / "nothing")) == 1
+        assert "does not exist" in capsys.readouterr().err
+    assert call(monkeypatch, "dynamics", "--measured") == 2
+    assert "--measured needs --data" in capsys.readouterr().err
