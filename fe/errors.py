@@ -35,3 +35,7 @@ class ReducedModelFileError(FiniteElementError, RuntimeError):
 
 class ReductionError(FiniteElementError, RuntimeError):
     """The reduced model did not reach the accuracy that was asked for."""
+
+
+class CalculixError(FiniteElementError, RuntimeError):
+    """CalculiX is not installed, did not finish, or printed something unexpected."""

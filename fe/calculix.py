@@ -1,0 +1,383 @@
+"""The same wing in CalculiX: write its input, run it, read its results.
+
+CalculiX (`ccx`, Debian package calculix-ccx) is an independent finite element code. It gets the identical
+mesh as C3D20 elements, local material constants with an orientation for each cell, the rigid root rib as
+equations on a reference node that sits on springs, the point masses as blocks tied to the skins, and the
+nodal loads; it integrates, assembles and solves on its own. The gauges are nodes whose displacement is the
+strain, by an equation, because the printed displacements hold seven digits only.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from skfem import ElementHexS2
+
+from .assembly import cell_axes, rotate_elasticity
+from .errors import CalculixError
+from .fields import _VTK_NODES, _order
+from .mesh import DEFECT_1, DEFECT_2, SKIN
+from .operators import ROOT_UNKNOWNS, AffineOperators, cell_density, cell_elasticity
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+PROGRAM = "ccx"
+_PER_LINE = 4
+_BLOCK = 0.01  # side of the block that stands for a point mass [m]
+_TIME_LIMIT = 3600.0
+
+
+def calculix_program() -> str | None:
+    """Return the path of CalculiX, or nothing where it is not installed."""
+    return shutil.which(PROGRAM)
+
+
+@dataclass(frozen=True)
+class CalculixModel:
+    """The wing in one state, as input for CalculiX.
+
+    Attributes
+    ----------
+    operators : AffineOperators
+        Mesh and free unknowns.
+    young_modulus_factor : float
+        e [1].
+    stiffness_loss : tuple of float
+        (z1, z2), fractions.
+    servo_mass, pitot_mass : float
+        Masses of one servo and of the pitot [kg].
+    damping_alpha, damping_beta : float
+        Rayleigh coefficients [1/s], [s].
+    """
+
+    operators: AffineOperators
+    young_modulus_factor: float = 1.0
+    stiffness_loss: tuple[float, float] = (0.0, 0.0)
+    servo_mass: float = 0.169
+    pitot_mass: float = 0.134
+    damping_alpha: float = 0.0
+    damping_beta: float = 0.0
+
+    @property
+    def node_count(self) -> int:
+        """Number of nodes of the mesh; the root's reference node follows them."""
+        return len(self.operators.discretisation.node_points)
+
+    @property
+    def probes(self) -> FloatArray:
+        """Outputs (2 + gauges, n): displacement at the test load, at the tip, then the gauge strains."""
+        operators = self.operators
+        return np.vstack(
+            (
+                operators.displacement_output,
+                operators.tip_displacement_output,
+                operators.gauge_output.toarray(),
+            )
+        )
+
+    def definition(self) -> Iterator[str]:
+        """Yield the lines of the model definition, before the first step."""
+        yield "*HEADING"
+        yield f"wing, design {self.operators.design_hash[:12]}"
+        yield from self._nodes_and_cells()
+        yield from self._materials()
+        yield from self._root()
+        yield from self._masses()
+        yield from self._probe_nodes()
+
+    def static_steps(self, loads: Sequence[FloatArray]) -> str:
+        """Input of one linear static step for each load (n,) of the free unknowns; prints all nodes."""
+        lines = [*self.definition()]
+        for load in loads:
+            lines += ["*STEP", "*STATIC", *self._load_lines(load), "*NODE PRINT, NSET=NALL", "U"]
+            lines += ["*NODE PRINT, NSET=NPROBES", "U", "*EL PRINT, ELSET=EALL, GLOBAL=YES", "E", "*END STEP"]
+        return "\n".join(lines) + "\n"
+
+    def frequency_step(self, count: int) -> str:
+        """Input of the lowest undamped modes."""
+        return "\n".join([*self.definition(), "*STEP", "*FREQUENCY", str(count), "*END STEP"]) + "\n"
+
+    def ring_down_steps(self, load: FloatArray, increment: float, steps: int) -> str:
+        """Input of a static load (n,) and its sudden removal: direct integration by the trapezoidal rule.
+
+        Parameters
+        ----------
+        load : (n,) N
+            Load that is removed at time zero.
+        increment : float
+            Fixed time increment [s].
+        steps : int
+            Number of increments.
+        """
+        lines = [*self.definition(), "*STEP", "*STATIC", *self._load_lines(load)]
+        # CalculiX balances energy in a dynamic step and wants it asked for from the first step on.
+        lines += ["*EL PRINT, ELSET=E0", "ENER", "*END STEP"]
+        lines += [f"*STEP, INC={steps + 10}", "*DYNAMIC, DIRECT, ALPHA=0."]
+        lines += [f"{increment:.12E},{increment * steps:.12E}"]
+        lines += [*self._load_lines(0.0 * load), "*NODE PRINT, NSET=NPROBES, FREQUENCY=1", "U", "*END STEP"]
+        return "\n".join(lines) + "\n"
+
+    def _nodes_and_cells(self) -> Iterator[str]:
+        body = self.operators.discretisation
+        yield "*NODE, NSET=NALL"
+        for number, point in enumerate(body.node_points, start=1):
+            yield f"{number},{_numbers(point)}"
+        yield "*ELEMENT, TYPE=C3D20, ELSET=EALL"
+        order = _order(_VTK_NODES, ElementHexS2().doflocs)
+        for number, nodes in enumerate(body.cell_nodes[:, order] + 1, start=1):
+            text = [str(node) for node in nodes]
+            yield f"{number},{','.join(text[:12])},"
+            yield ",".join(text[12:])
+
+    def _materials(self) -> Iterator[str]:
+        mesh = self.operators.wing_mesh
+        axes = cell_axes(mesh.corners)
+        # Constants in the cell's own axes; CalculiX turns them by the orientation.
+        local = rotate_elasticity(cell_elasticity(mesh), np.swapaxes(axes, 1, 2))
+        factor = np.ones(len(mesh.cells))
+        factor[mesh.region == SKIN] = self.young_modulus_factor
+        for region, loss in zip((DEFECT_1, DEFECT_2), self.stiffness_loss, strict=True):
+            factor[mesh.region == region] = 1.0 - loss
+        constants = np.column_stack(
+            [local[:, row, column] for row, column in _ORTHOTROPIC] + [cell_density(mesh) / factor]
+        )
+        constants *= factor[:, None]
+        rounded = [tuple(f"{value:.10E}" for value in row) for row in constants]
+        materials = {key: number for number, key in enumerate(dict.fromkeys(rounded))}
+        for key, number in materials.items():
+            first = constants[rounded.index(key)]
+            yield f"*MATERIAL, NAME=M{number}"
+            yield "*ELASTIC, TYPE=ORTHO"
+            yield _numbers(first[:8])
+            yield f"{_numbers(first[8:9])},293."
+            yield "*DENSITY"
+            yield _numbers(first[9:])
+            if self.damping_alpha or self.damping_beta:
+                yield f"*DAMPING, ALPHA={self.damping_alpha:.12E}, BETA={self.damping_beta:.12E}"
+        for cell, key in enumerate(rounded):
+            yield f"*ORIENTATION, NAME=O{cell}, SYSTEM=RECTANGULAR"
+            yield _numbers(axes[cell, :2].ravel())
+            yield f"*ELSET, ELSET=E{cell}"
+            yield str(cell + 1)
+            yield f"*SOLID SECTION, ELSET=E{cell}, MATERIAL=M{materials[key]}, ORIENTATION=O{cell}"
+
+    def _root(self) -> Iterator[str]:
+        """Yield the reference node, whose displacements are heave, flap and yaw, its springs and the rib."""
+        points, root = self.operators.discretisation.node_points, self.operators.wing_mesh.design.root
+        reference = self.node_count + 1
+        yield "*NODE"
+        yield f"{reference},0.,0.,0."
+        springs = (root.transverse_spring, root.flap_spring, root.yaw_spring)
+        for number, spring in enumerate(springs, start=1):
+            yield f"*ELEMENT, TYPE=SPRING1, ELSET=SPRING{number}"
+            yield f"{len(self.operators.wing_mesh.cells) + number},{reference}"
+            yield f"*SPRING, ELSET=SPRING{number}"
+            yield str(number)
+            yield f"{spring:.13E}"
+        on_root = np.flatnonzero(np.abs(points[:, 1]) < 1e-9 * self.operators.wing_mesh.design.planform.semi_span)
+        for node in on_root:
+            yield from _equation([(node + 1, 3, -1.0), (reference, 1, 1.0)])
+            terms = [(node + 1, 2, -1.0), (reference, 2, -points[node, 2]), (reference, 3, points[node, 0])]
+            yield from _equation(term for term in terms if term[2] != 0.0)
+        yield "*BOUNDARY"
+        for node in on_root:
+            yield f"{node + 1},1"
+
+    def _masses(self) -> Iterator[str]:
+        """Yield a block for each point mass, all its nodes tied to the mean of the two skins.
+
+        The block only translates, so that its elasticity does not count. CalculiX 2.20 ends with an error in
+        `add_sm_st` when an element of type MASS sits on a node that depends on others.
+        """
+        mesh, body = self.operators.wing_mesh, self.operators.discretisation
+        design = mesh.design
+        first_element = len(mesh.cells) + ROOT_UNKNOWNS + 1
+        for number, place in enumerate(design.point_masses):
+            first = self.node_count + 2 + 8 * number
+            distance = place.station * design.planform.semi_span
+            behind = place.chord * design.planform.chord(place.station)
+            weights: dict[int, float] = {}
+            for upper in (True, False):
+                point = mesh.skin_point(distance, behind, upper=upper)
+                for other, value in zip(*body.point_values(point.cell, point.local), strict=True):
+                    if value != 0.0:
+                        weights[int(other)] = weights.get(int(other), 0.0) + 0.5 * float(value)
+            mass = self.servo_mass if place.kind == "servo" else self.pitot_mass
+            if mass <= 0.0:
+                continue
+            yield "*NODE"
+            for corner, (x, y, z) in enumerate(_VTK_NODES[:8] * _BLOCK):
+                yield f"{first + corner},{_numbers((x, distance + y, z))}"
+            yield f"*ELEMENT, TYPE=C3D8, ELSET=MASS{number}"
+            yield ",".join(str(n) for n in (first_element + number, *range(first, first + 8)))
+            yield f"*MATERIAL, NAME=MASS{number}"
+            yield "*ELASTIC"
+            yield "1.E6,0."
+            yield "*DENSITY"
+            yield f"{mass / _BLOCK**3:.13E}"
+            yield f"*SOLID SECTION, ELSET=MASS{number}, MATERIAL=MASS{number}"
+            for node in range(first, first + 8):
+                for component in (1, 2, 3):
+                    yield from _equation(
+                        [(node, component, -1.0), *((n + 1, component, w) for n, w in weights.items())]
+                    )
+
+    def _probe_nodes(self) -> Iterator[str]:
+        first = self.node_count + 2 + 8 * len(self.operators.wing_mesh.design.point_masses)
+        probes = self.probes
+        nodes = range(first, first + (len(probes) + 2) // 3)
+        yield "*NODE, NSET=NPROBES"
+        for node in nodes:
+            yield f"{node},0.,0.,0."
+        for number, weights in enumerate(probes):
+            yield from _equation([(first + number // 3, number % 3 + 1, -1.0), *self._terms(weights)])
+
+    def _terms(self, free: FloatArray) -> Iterator[tuple[int, int, float]]:
+        """Yield (node, direction, value) of the values (n,) of free unknowns that are not zero."""
+        places = np.asarray(self.operators.expansion[:, :-ROOT_UNKNOWNS].tocsc().indices)
+        for unknown in np.flatnonzero(free):
+            if unknown < len(places):
+                node, component = divmod(int(places[unknown]), 3)
+                yield node + 1, component + 1, float(free[unknown])
+            else:
+                yield self.node_count + 1, int(unknown) - len(places) + 1, float(free[unknown])
+
+    def _load_lines(self, load: FloatArray) -> Iterator[str]:
+        yield "*CLOAD, OP=NEW"
+        if not load.any():
+            yield f"{self.node_count},3,0."
+        for node, direction, value in self._terms(load):
+            yield f"{node},{direction},{value:.13E}"
+
+
+_ORTHOTROPIC = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (5, 5), (4, 4), (3, 3))
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return ",".join(f"{value:.13E}" for value in values)  # at most 20 characters, as CalculiX reads
+
+
+def _equation(terms: Iterable[tuple[int, int, float]]) -> Iterator[str]:
+    text = [f"{node},{direction},{value:.13E}" for node, direction, value in terms]
+    yield "*EQUATION"
+    yield str(len(text))
+    for start in range(0, len(text), _PER_LINE):
+        yield ",".join(text[start : start + _PER_LINE])
+
+
+class PrintedBlock(NamedTuple):
+    """A table of a `.dat` file: what it is, of which set, at which time [s], and its rows."""
+
+    quantity: str
+    set_name: str
+    time: float
+    rows: FloatArray
+
+
+_HEADER = re.compile(r"^ *(\w[\w ]*?) \(.*\) for set (\w+) and time +(\S+)$")
+
+
+def read_tables(text: str) -> list[PrintedBlock]:
+    """Read the tables of nodes and integration points of a `.dat` file.
+
+    Raises
+    ------
+    CalculixError
+        If a table holds something other than numbers.
+    """
+    blocks: list[PrintedBlock] = []
+    rows: list[list[float]] = []
+    head: tuple[str, str, float] | None = None
+    for line in [*text.splitlines(), " end (of file) for set NONE and time 0"]:
+        match = _HEADER.match(line)
+        if match:
+            if head is not None:
+                blocks.append(PrintedBlock(*head, np.array(rows)))
+            head, rows = (match[1], match[2], float(match[3])), []
+        elif head is not None and line.strip():
+            try:
+                rows.append([float(value) for value in line.split()])
+            except ValueError:
+                raise CalculixError(
+                    f"The table of {head[0]} that CalculiX printed holds the line {line.strip()!r}, which is "
+                    "not a row of numbers; its version may print another format (2.20 is known)."
+                ) from None
+    return blocks
+
+
+def read_frequencies(text: str) -> FloatArray:
+    """Read the frequencies [Hz] of the table of eigenvalues in a `.dat` file.
+
+    Raises
+    ------
+    CalculixError
+        If there is no such table.
+    """
+    _, found, table = text.partition("E I G E N V A L U E   O U T P U T")
+    frequencies = []
+    for line in table.splitlines():
+        parts = line.split()
+        if len(parts) == 5 and parts[0].isdigit():
+            frequencies.append(float(parts[3]))
+        elif frequencies:
+            break
+    if not found or not frequencies:
+        raise CalculixError("CalculiX printed no eigenvalues; see its messages in the folder of the job.")
+    return np.array(frequencies)
+
+
+def run_calculix(text: str, folder: Path, name: str) -> str:
+    """Run CalculiX on an input and return the content of its `.dat` file.
+
+    Parameters
+    ----------
+    text : str
+        The input.
+    folder : Path
+        Where input, results and messages (`NAME.log`) are written; it is made if it is not there.
+    name : str
+        Name of the job.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX is not installed, ends with an error or takes more than an hour.
+    """
+    program = calculix_program()
+    if program is None:
+        raise CalculixError(
+            f"CalculiX ('{PROGRAM}') is not installed; on Debian and Ubuntu: apt-get install calculix-ccx."
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.inp").write_text(text, encoding="ascii")
+    try:
+        done = subprocess.run(
+            [program, "-i", name],
+            cwd=folder,
+            env={"OMP_NUM_THREADS": "1", **os.environ},
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=_TIME_LIMIT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise CalculixError(f"CalculiX took more than {_TIME_LIMIT:g} s for {folder / name}.inp.") from None
+    except OSError as error:
+        raise CalculixError(f"CalculiX ({program}) cannot be run: {error.strerror}.") from None
+    log = folder / f"{name}.log"
+    log.write_text(done.stdout + done.stderr, encoding="utf-8")
+    result = folder / f"{name}.dat"
+    if done.returncode != 0 or "Job finished" not in done.stdout or not result.is_file():
+        complaints = [line.strip() for line in done.stdout.splitlines() if "*ERROR" in line]
+        said = f" ({complaints[0]})" if complaints else ""
+        raise CalculixError(f"CalculiX did not finish {folder / name}.inp{said}; its messages are in {log}.")
+    return result.read_text(encoding="ascii", errors="replace")
