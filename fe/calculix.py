@@ -22,7 +22,6 @@ from skfem import ElementHexS2
 
 from .assembly import cell_axes, rotate_elasticity
 from .errors import CalculixError
-from .fields import _VTK_NODES, _order
 from .mesh import DEFECT_1, DEFECT_2, SKIN
 from .operators import ROOT_UNKNOWNS, AffineOperators, cell_density, cell_elasticity
 
@@ -33,6 +32,16 @@ PROGRAM = "ccx"
 _PER_LINE = 4
 _BLOCK = 0.01  # side of the block that stands for a point mass [m]
 _TIME_LIMIT = 3600.0
+
+_CORNERS = np.array(
+    [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], dtype=np.float64
+)
+_EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
+C3D20_NODES = np.concatenate((_CORNERS, [0.5 * (_CORNERS[a] + _CORNERS[b]) for a, b in _EDGES]))
+"""Local places (20, 3) in 0..1 of the nodes of a C3D20 element."""
+_LINE = 0.5 + 0.5 * np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0])
+INTEGRATION_POINTS = np.array([(x, y, z) for z in _LINE for y in _LINE for x in _LINE])
+"""Local places (27, 3) in 0..1 of the integration points of a C3D20 element, in the order of its output."""
 
 
 def calculix_program() -> str | None:
@@ -83,6 +92,17 @@ class CalculixModel:
             )
         )
 
+    @property
+    def gauge_cells(self) -> IntArray:
+        """Numbers of the cells that hold the middle of a gauge."""
+        mesh = self.operators.wing_mesh
+        plan = mesh.design.planform
+        cells = [
+            mesh.skin_point(distance, chord * plan.chord(distance / plan.semi_span)).cell
+            for distance, chord in mesh.design.gauges.positions
+        ]
+        return np.unique(cells)
+
     def definition(self) -> Iterator[str]:
         """Yield the lines of the model definition, before the first step."""
         yield "*HEADING"
@@ -94,11 +114,15 @@ class CalculixModel:
         yield from self._probe_nodes()
 
     def static_steps(self, loads: Sequence[FloatArray]) -> str:
-        """Input of one linear static step for each load (n,) of the free unknowns; prints all nodes."""
+        """Input of one linear static step for each load (n,) of the free unknowns.
+
+        It prints the displacement of all nodes, the probes and the strain of `gauge_cells`.
+        """
         lines = [*self.definition()]
         for load in loads:
             lines += ["*STEP", "*STATIC", *self._load_lines(load), "*NODE PRINT, NSET=NALL", "U"]
-            lines += ["*NODE PRINT, NSET=NPROBES", "U", "*EL PRINT, ELSET=EALL, GLOBAL=YES", "E", "*END STEP"]
+            lines += ["*NODE PRINT, NSET=NPROBES", "U"]
+            lines += ["*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E", "*END STEP"]
         return "\n".join(lines) + "\n"
 
     def frequency_step(self, count: int) -> str:
@@ -131,11 +155,14 @@ class CalculixModel:
         for number, point in enumerate(body.node_points, start=1):
             yield f"{number},{_numbers(point)}"
         yield "*ELEMENT, TYPE=C3D20, ELSET=EALL"
-        order = _order(_VTK_NODES, ElementHexS2().doflocs)
+        given = ElementHexS2().doflocs
+        order = [int(np.flatnonzero(np.all(np.equal(given, place), axis=1))[0]) for place in C3D20_NODES]
         for number, nodes in enumerate(body.cell_nodes[:, order] + 1, start=1):
             text = [str(node) for node in nodes]
             yield f"{number},{','.join(text[:12])},"
             yield ",".join(text[12:])
+        yield "*ELSET, ELSET=EGAUGES"
+        yield from (str(cell + 1) for cell in self.gauge_cells)
 
     def _materials(self) -> Iterator[str]:
         mesh = self.operators.wing_mesh
@@ -214,7 +241,7 @@ class CalculixModel:
             if mass <= 0.0:
                 continue
             yield "*NODE"
-            for corner, (x, y, z) in enumerate(_VTK_NODES[:8] * _BLOCK):
+            for corner, (x, y, z) in enumerate(C3D20_NODES[:8] * _BLOCK):
                 yield f"{first + corner},{_numbers((x, distance + y, z))}"
             yield f"*ELEMENT, TYPE=C3D8, ELSET=MASS{number}"
             yield ",".join(str(n) for n in (first_element + number, *range(first, first + 8)))

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.optimize import brentq
 from skfem import MeshHex
 
 from .assembly import (
@@ -369,3 +370,25 @@ def mesh_convergence(
         convergence_row(assemble(design.changed(mesh={"refinement": refinement})))
         for refinement in refinements
     )
+
+
+def observed_order(refinements: Sequence[float], values: Sequence[float]) -> float:
+    """Order p of v = v_0 + c refinement^-p through the last three of a sequence of meshes.
+
+    Returns
+    -------
+    float
+        The order; NaN where the values do not approach a limit from one side with an order of 0.05 to 12.
+    """
+    coarse, middle, fine = (1.0 / refinement for refinement in refinements[-3:])
+    first, second = values[-2] - values[-3], values[-1] - values[-2]
+    if first * second <= 0.0:
+        return float("nan")
+
+    def mismatch(order: float) -> float:
+        return float((coarse**order - middle**order) * second - (middle**order - fine**order) * first)
+
+    ends = 0.05, 12.0
+    if mismatch(ends[0]) * mismatch(ends[1]) > 0.0:
+        return float("nan")
+    return float(brentq(mismatch, *ends))
