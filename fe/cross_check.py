@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .assembly import global_gradients, strain_matrix
-from .calculix import INTEGRATION_POINTS, CalculixModel, read_frequencies, read_tables, run_calculix
+from .calculix import INTEGRATION_POINTS, CalculixModel
+from .calculix_job import read_frequencies, read_tables, run_calculix
 from .errors import CalculixError
 from .modes import eigenmodes
 from .operators import AffineOperators
@@ -84,8 +85,7 @@ def static_agreement(
     loads = {"tip force": operators.load(0.0, TEST_FORCE), "lift": operators.load(turn)}
     tables = read_tables(run_calculix(model.static_steps(tuple(loads.values())), folder, "static"))
     nodes, probes, strains = (
-        [table.rows for table in tables if table.set_name == name]
-        for name in ("NALL", "NPROBES", "EGAUGES")
+        [table.rows for table in tables if table.set_name == name] for name in ("NALL", "NPROBES", "EGAUGES")
     )
     if not len(nodes) == len(probes) == len(strains) == len(loads):
         raise CalculixError(f"CalculiX printed {len(nodes)} static solutions instead of {len(loads)}.")
@@ -254,4 +254,5 @@ def ring_down_agreement(
     theirs = np.array([table.rows[0, 2] for table in tables if table.set_name == "NPROBES"])
     if len(theirs) != steps:
         raise CalculixError(f"CalculiX printed {len(theirs)} increments of the ring-down instead of {steps}.")
-    return RingDownAgreement(increment * np.arange(1, steps + 1), ours, theirs, initial, period)
+    time = np.asarray(increment * np.arange(1, steps + 1), dtype=np.float64)
+    return RingDownAgreement(time, ours, theirs, initial, period)

@@ -9,7 +9,7 @@ from twin_master.command import run as run_command
 from uav_twin.calibrate import calibrate_app
 from uav_twin.fmu import fmu_app
 from uav_twin.scenarios import list_scenarios
-from uav_twin.wing import wing
+from uav_twin.wing import wing_app
 
 app = typer.Typer(
     add_completion=False,
@@ -18,8 +18,8 @@ app = typer.Typer(
     help="A predictive structural digital twin of a UAV wing.",
 )
 app.command("run")(run_command)
-app.command("wing")(wing)
 app.command("scenarios")(list_scenarios)
+app.add_typer(wing_app, name="wing")
 app.add_typer(calibrate_app, name="calibrate")
 app.add_typer(fmu_app, name="fmu")
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from uav_twin.verify import verify
+
 if TYPE_CHECKING:
     from fe.design import WingDesign
     from fe.reduced import Modes
@@ -18,7 +20,13 @@ PUBLISHED = {
 }
 
 
+wing_app = typer.Typer(no_args_is_help=False)
+wing_app.command("verify")(verify)
+
+
+@wing_app.callback(invoke_without_command=True)
 def wing(
+    context: typer.Context,
     design: Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")] = None,
     vtu: Annotated[
         Path | None,
@@ -26,6 +34,10 @@ def wing(
     ] = None,
 ) -> None:
     """Say what the wing weighs, how it vibrates and how stiff its tip is."""
+    if context.invoked_subcommand is not None:
+        if design is not None or vtu is not None:
+            raise typer.BadParameter(f"options go behind the command: wing {context.invoked_subcommand} ...")
+        return
     from rich.console import Console
     from rich.table import Table
 

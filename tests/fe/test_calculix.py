@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe.calculix import CalculixModel, calculix_program, read_frequencies, read_tables, run_calculix
+from fe.calculix import CalculixModel
+from fe.calculix_job import calculix_program, read_frequencies, read_tables, run_calculix
 from fe.cross_check import modal_agreement, ring_down_agreement, static_agreement
 from fe.errors import CalculixError
 from fe.operators import AffineOperators
@@ -58,7 +59,7 @@ def test_a_ring_down_agrees(coarse_operators: AffineOperators, tmp_path: Path) -
 
 @needs_calculix
 def test_an_input_that_calculix_refuses_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(CalculixError, match="did not finish .*bad.inp.*bad.log"):
+    with pytest.raises(CalculixError, match=r"did not finish .*bad\.inp.*bad\.log"):
         run_calculix("*NONSENSE\n*STEP\n*STATIC\n*END STEP\n", tmp_path, "bad")
 
 

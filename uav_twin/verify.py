@@ -1,0 +1,233 @@
+"""`uav-twin wing verify`."""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from fe.design import WingDesign
+    from fe.operators import AffineOperators
+
+DAMAGED = (0.4, 0.6)
+REFINEMENTS = (0.5, 1.0, 2.0)
+QUICK_REFINEMENTS = (0.25, 0.5, 1.0)
+RING_DOWN_REFINEMENT = 0.25
+# R. H. MacNeal and R. L. Harder (1985), table 3, HEX20: in plane and out of plane.
+MACNEAL_HARDER = {"regular": (0.970, 0.961), "trapezoid": (0.886, 0.920), "parallelogram": (0.967, 0.941)}
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the verification: what, what came, and the bar that it must keep, if it has one.
+
+    Attributes
+    ----------
+    group, name : str
+        What is checked.
+    value : float
+        What came.
+    bar : float, optional
+        Largest allowed value; None for a figure that is only reported.
+    note : str
+        What stands beside the figure.
+    """
+
+    group: str
+    name: str
+    value: float
+    bar: float | None = None
+    note: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the bar is kept."""
+        return self.bar is None or self.value <= self.bar
+
+
+def verify(
+    design: Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the record and the jobs of CalculiX; it must be empty.")
+    ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick",
+            help="Coarser meshes, no bar on their convergence, and a quarter of a period of ring-down.",
+        ),
+    ] = False,
+) -> None:
+    """Check the finite element model: known answers, balances, convergence, and CalculiX where installed."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from fe.calculix_job import calculix_program
+    from fe.design import load_design
+    from reporting.errors import FileNotWrittenError
+    from reporting.files import atomic_write_text
+    from reporting.progress import RichProgress
+
+    wing_design = load_design(design)
+    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FileNotWrittenError(f"{out} exists and is not an empty folder: choose another --out.")
+    checks: list[Check] = []
+    with tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch:
+        jobs = (out or Path(scratch)) / "calculix"
+        with RichProgress().stage("Verifying") as stage:
+            for check in all_checks(wing_design, jobs, quick=quick):
+                checks.append(check)
+                stage.advance(detail=check.name)
+    console = Console(highlight=False)
+    table = Table("check", "figure", "found", "bar", "")
+    for check in checks:
+        bar = "" if check.bar is None else f"{check.bar:.3g}"
+        verdict = "" if check.bar is None else "kept" if check.passed else "BROKEN"
+        found = f"{check.value:.3g}" + (f" {check.note}" if check.note else "")
+        table.add_row(check.group, check.name, found, bar, verdict)
+    console.print(table)
+    if calculix_program() is None:
+        console.print("CalculiX is not installed (apt-get install calculix-ccx): its checks are left out.")
+    if out is not None:
+        rows = [
+            {**asdict(check), "value": check.value if math.isfinite(check.value) else None}
+            | {"passed": check.passed}
+            for check in checks
+        ]
+        record = {"design": wing_design.name, "design_hash": wing_design.hash, "checks": rows}
+        path = atomic_write_text(out / "verification.json", json.dumps(record, indent=2) + "\n")
+        console.print(f"Wrote {path}", soft_wrap=True)
+    broken = [check for check in checks if not check.passed]
+    if broken:
+        names = "; ".join(f"{check.group}, {check.name}" for check in broken)
+        typer.echo(f"{len(broken)} of {len(checks)} checks broke their bar: {names}.", err=True)
+        raise typer.Exit(1)
+
+
+def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> Iterator[Check]:
+    """Yield every check of a design; those against CalculiX where it is installed.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The wing.
+    jobs : Path
+        Where CalculiX works.
+    quick : bool
+        Coarser meshes and a short ring-down.
+    """
+    from fe.calculix_job import calculix_program
+    from fe.operators import assemble
+
+    yield from element_checks()
+    mesh = assemble(design.changed(mesh={"refinement": QUICK_REFINEMENTS[0]}) if quick else design)
+    yield from balance_checks(mesh)
+    yield from convergence_checks(design, QUICK_REFINEMENTS if quick else REFINEMENTS, barred=not quick)
+    if calculix_program() is not None:
+        yield from calculix_checks(mesh, jobs)
+        coarse = assemble(design.changed(mesh={"refinement": RING_DOWN_REFINEMENT}))
+        yield from ring_down_checks(coarse, jobs, periods=0.25 if quick else 5.0)
+
+
+def element_checks() -> Iterator[Check]:
+    """Yield the checks of the element and the assembly on bodies of their own."""
+    from fe.verification import cantilever_check, macneal_harder_beam, patch_test, rigid_body_check
+
+    patch = patch_test()
+    yield Check("patch test", "displacement", patch.displacement_error, 1e-12)
+    yield Check("patch test", "strain", patch.strain_error, 1e-12)
+    rigid = rigid_body_check()
+    yield Check("unsupported body", "zero eigenvalues, difference to 6", abs(rigid.count - 6), 0.0)
+    yield Check("unsupported body", "sixth eigenvalue over the largest", rigid.largest_zero, 1e-12)
+    yield Check("cantilever", "against Timoshenko's beam", abs(cantilever_check().relative_error), 1e-3)
+    for shape, published in MACNEAL_HARDER.items():
+        for across, value in zip((True, False), published, strict=True):
+            found = macneal_harder_beam(shape, across_depth=across)
+            name = f"{shape}, {'in' if across else 'out of'} plane, against HEX20"
+            yield Check("MacNeal-Harder", name, abs(found - value), 6e-4, f"({found:.4f}, {value:.3f})")
+
+
+def balance_checks(operators: AffineOperators) -> Iterator[Check]:
+    """Yield the sums that must agree for the wing at the load factor of its lift."""
+    from fe.verification import rigid_body_residual, wing_balance
+
+    yield Check("wing", "force of a rigid motion", rigid_body_residual(operators), 1e-12)
+    balance = wing_balance(operators, operators.wing_mesh.design.lift.load_factor)
+    for name, found, expected, bar, unit in (
+        ("mass", balance.structural_mass, balance.volume_mass, 1e-10, "kg"),
+        ("reaction", balance.spring_force, balance.lift, 1e-5, "N"),
+        ("root moment", balance.spring_moment, balance.lift_moment, 1e-5, "N m"),
+        ("energy and work", balance.strain_energy, balance.work, 1e-5, "J"),
+    ):
+        yield Check("wing", name, abs(found / expected - 1.0), bar, f"({found:.5g} {unit})")
+
+
+def convergence_checks(
+    design: WingDesign, refinements: tuple[float, ...], *, barred: bool = True
+) -> Iterator[Check]:
+    """Yield the change between the two finest meshes and the observed order of every result.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The wing.
+    refinements : tuple of float
+        At least three, from coarse to fine, with equal ratios.
+    barred : bool
+        Hold the changes to their bars, which are made for `REFINEMENTS`.
+    """
+    import numpy as np
+
+    from fe.verification import mesh_convergence, observed_order
+
+    rows = mesh_convergence(design, refinements)
+    group = f"mesh x{refinements[-2]:g} to x{refinements[-1]:g}"
+
+    def order(values: list[float]) -> str:
+        found = observed_order(refinements, values)
+        return "not monotone" if math.isnan(found) else f"order {found:.2f}"
+
+    bar = 0.01 if barred else None
+    for name, unit in (("tip_stiffness", "N/m"), ("first_bending", "Hz"), ("second_bending", "Hz")):
+        values = [float(getattr(row, name)) for row in rows]
+        note = f"({values[-1]:.5g} {unit}, {order(values)})"
+        yield Check(group, name.replace("_", " "), abs(values[-1] / values[-2] - 1.0), bar, note)
+    strain = np.array([row.strain for row in rows])
+    change = np.abs(strain[-1] / strain[-2] - 1.0)
+    yield Check(group, "gauges, rms", float(np.sqrt(np.mean(change**2))), bar)
+    for gauge, value in enumerate(change):
+        note = f"({1e6 * strain[-1, gauge]:.0f} microstrain, {order(strain[:, gauge].tolist())})"
+        yield Check(group, f"gauge {gauge}", float(value), None, note)
+    yield Check(group, "unknowns of the finest mesh", rows[-1].unknowns)
+
+
+def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:
+    """Yield the differences to CalculiX on the identical mesh: statics and six modes."""
+    from fe.cross_check import modal_agreement, static_agreement
+    from fe.state import DigitalState
+
+    for health, loss in (("healthy", (0.0, 0.0)), ("damaged", DAMAGED)):
+        group = f"CalculiX, {health}"
+        for case in static_agreement(operators, jobs / health, 1.0, loss):
+            yield Check(group, f"{case.load}: displacement of all nodes", case.displacement, 1e-5)
+            yield Check(group, f"{case.load}: strain of the gauges", case.gauge, 1e-3)
+            yield Check(group, f"{case.load}: strain at integration points", case.tensor, 1e-3)
+        modes = modal_agreement(operators, jobs / health, DigitalState(stiffness_loss=loss))
+        yield Check(group, f"frequencies 1 to {len(modes.ours)}", modes.relative, 1e-5)
+
+
+def ring_down_checks(operators: AffineOperators, jobs: Path, periods: float) -> Iterator[Check]:
+    """Yield the difference of a ring-down to direct integration by CalculiX."""
+    from fe.cross_check import ring_down_agreement
+    from fe.state import DigitalState
+
+    agreement = ring_down_agreement(operators, jobs / "ring_down", DigitalState(), periods)
+    note = f"({len(agreement.time)} increments, {operators.unknowns} unknowns)"
+    yield Check("CalculiX", f"ring-down over {periods:g} periods", agreement.relative, 0.01, note)
