@@ -231,3 +231,4 @@ def ring_down_checks(operators: AffineOperators, jobs: Path, periods: float) -> 
     agreement = ring_down_agreement(operators, jobs / "ring_down", DigitalState(), periods)
     note = f"({len(agreement.time)} increments, {operators.unknowns} unknowns)"
     yield Check("CalculiX", f"ring-down over {periods:g} periods", agreement.relative, 0.01, note)
+    yield Check("CalculiX", "the same, both by the trapezoidal rule", agreement.relative_same_rule, 1e-3)
