@@ -9,8 +9,9 @@ import pytest
 from fe.calculix import CalculixModel
 from fe.calculix_job import calculix_program, read_frequencies, read_tables, run_calculix
 from fe.cross_check import modal_agreement, ring_down_agreement, static_agreement
+from fe.design import WingDesign
 from fe.errors import CalculixError
-from fe.operators import AffineOperators
+from fe.operators import AffineOperators, assemble
 from fe.state import DigitalState
 
 needs_calculix = pytest.mark.skipif(
@@ -40,6 +41,17 @@ def test_frequencies_agree(
     agreement = modal_agreement(coarse_operators, tmp_path, state)
     assert len(agreement.ours) == 6
     assert agreement.relative < 1e-5
+
+
+@needs_calculix
+def test_a_wing_with_a_rod_and_no_wall_at_its_nose_agrees(coarse_design: WingDesign, tmp_path: Path) -> None:
+    rod = {"web": 1, "reach": 0.25, "diameter": 0.012, "young_modulus": 120e9, "density": 1600.0}
+    design = coarse_design.changed(rods=[rod], skin={"closed_leading_edge": False})
+    operators = assemble(design)
+    for case in static_agreement(operators, tmp_path):
+        assert case.displacement < 1e-5
+        assert case.tensor < 2e-5
+    assert modal_agreement(operators, tmp_path, DigitalState(), 3).relative < 1e-5
 
 
 @needs_calculix
