@@ -26,7 +26,7 @@ MACNEAL_HARDER = {"regular": (0.970, 0.961), "trapezoid": (0.886, 0.920), "paral
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the verification: what, what came, and the bar that it must keep, if it has one.
+    """One line of the verification: what, what came, and the limit that it must keep, if it has one.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Check:
         What is checked.
     value : float
         What came.
-    bar : float, optional
+    limit : float, optional
         Largest allowed value; None for a figure that is only reported.
     note : str
         What stands beside the figure.
@@ -43,13 +43,13 @@ class Check:
     group: str
     name: str
     value: float
-    bar: float | None = None
+    limit: float | None = None
     note: str = ""
 
     @property
     def passed(self) -> bool:
-        """Whether the bar is kept."""
-        return self.bar is None or self.value <= self.bar
+        """Whether the limit is kept."""
+        return self.limit is None or self.value <= self.limit
 
 
 def verify(
@@ -61,7 +61,7 @@ def verify(
         bool,
         typer.Option(
             "--quick",
-            help="Coarser meshes, no bar on their convergence, and a quarter of a period of ring-down.",
+            help="Coarser meshes, no limit on their convergence, and a quarter of a period of ring-down.",
         ),
     ] = False,
 ) -> None:
@@ -86,12 +86,12 @@ def verify(
                 checks.append(check)
                 stage.advance(detail=check.name)
     console = Console(highlight=False)
-    table = Table("check", "figure", "found", "bar", "")
+    table = Table("check", "figure", "found", "limit", "")
     for check in checks:
-        bar = "" if check.bar is None else f"{check.bar:.3g}"
-        verdict = "" if check.bar is None else "kept" if check.passed else "BROKEN"
+        limit = "" if check.limit is None else f"{check.limit:.3g}"
+        verdict = "" if check.limit is None else "kept" if check.passed else "BROKEN"
         found = f"{check.value:.3g}" + (f" {check.note}" if check.note else "")
-        table.add_row(check.group, check.name, found, bar, verdict)
+        table.add_row(check.group, check.name, found, limit, verdict)
     console.print(table)
     if calculix_program() is None:
         console.print("CalculiX is not installed (apt-get install calculix-ccx): its checks are left out.")
@@ -107,7 +107,7 @@ def verify(
     broken = [check for check in checks if not check.passed]
     if broken:
         names = "; ".join(f"{check.group}, {check.name}" for check in broken)
-        typer.echo(f"{len(broken)} of {len(checks)} checks broke their bar: {names}.", err=True)
+        typer.echo(f"{len(broken)} of {len(checks)} checks broke their limit: {names}.", err=True)
         raise typer.Exit(1)
 
 
@@ -160,13 +160,13 @@ def balance_checks(operators: AffineOperators) -> Iterator[Check]:
 
     yield Check("wing", "force of a rigid motion", rigid_body_residual(operators), 1e-12)
     balance = wing_balance(operators, operators.wing_mesh.design.lift.load_factor)
-    for name, found, expected, bar, unit in (
+    for name, found, expected, limit, unit in (
         ("mass", balance.structural_mass, balance.volume_mass, 1e-10, "kg"),
         ("reaction", balance.spring_force, balance.lift, 1e-5, "N"),
         ("root moment", balance.spring_moment, balance.lift_moment, 1e-5, "N m"),
         ("energy and work", balance.strain_energy, balance.work, 1e-5, "J"),
     ):
-        yield Check("wing", name, abs(found / expected - 1.0), bar, f"({found:.5g} {unit})")
+        yield Check("wing", name, abs(found / expected - 1.0), limit, f"({found:.5g} {unit})")
 
 
 def convergence_checks(
@@ -194,14 +194,14 @@ def convergence_checks(
         found = observed_order(refinements, values)
         return "not monotone" if math.isnan(found) else f"order {found:.2f}"
 
-    bar = 0.01 if barred else None
+    limit = 0.01 if barred else None
     for name, unit in (("tip_stiffness", "N/m"), ("first_bending", "Hz"), ("second_bending", "Hz")):
         values = [float(getattr(row, name)) for row in rows]
         note = f"({values[-1]:.5g} {unit}, {order(values)})"
-        yield Check(group, name.replace("_", " "), abs(values[-1] / values[-2] - 1.0), bar, note)
+        yield Check(group, name.replace("_", " "), abs(values[-1] / values[-2] - 1.0), limit, note)
     strain = np.array([row.strain for row in rows])
     change = np.abs(strain[-1] / strain[-2] - 1.0)
-    yield Check(group, "gauges, rms", float(np.sqrt(np.mean(change**2))), bar)
+    yield Check(group, "gauges, rms", float(np.sqrt(np.mean(change**2))), limit)
     for gauge, value in enumerate(change):
         note = f"({1e6 * strain[-1, gauge]:.0f} microstrain, {order(strain[:, gauge].tolist())})"
         yield Check(group, f"gauge {gauge}", float(value), None, note)

@@ -76,7 +76,7 @@ def test_every_check_of_the_elements_and_of_a_coarse_wing_is_kept() -> None:
         "MacNeal-Harder",
         "wing",
     }
-    assert all(check.bar is not None for check in checks)
+    assert all(check.limit is not None for check in checks)
     assert [check.name for check in checks if not check.passed] == []
 
 
