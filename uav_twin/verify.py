@@ -129,7 +129,7 @@ def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> Iterat
     yield from element_checks()
     mesh = assemble(design.changed(mesh={"refinement": QUICK_REFINEMENTS[0]}) if quick else design)
     yield from balance_checks(mesh)
-    yield from convergence_checks(design, QUICK_REFINEMENTS if quick else REFINEMENTS, barred=not quick)
+    yield from convergence_checks(design, QUICK_REFINEMENTS if quick else REFINEMENTS, limited=not quick)
     if calculix_program() is not None:
         yield from calculix_checks(mesh, jobs)
         coarse = assemble(design.changed(mesh={"refinement": RING_DOWN_REFINEMENT}))
@@ -170,7 +170,7 @@ def balance_checks(operators: AffineOperators) -> Iterator[Check]:
 
 
 def convergence_checks(
-    design: WingDesign, refinements: tuple[float, ...], *, barred: bool = True
+    design: WingDesign, refinements: tuple[float, ...], *, limited: bool = True
 ) -> Iterator[Check]:
     """Yield the change between the two finest meshes and the observed order of every result.
 
@@ -180,7 +180,7 @@ def convergence_checks(
         The wing.
     refinements : tuple of float
         At least three, from coarse to fine, with equal ratios.
-    barred : bool
+    limited : bool
         Hold the changes to their bars, which are made for `REFINEMENTS`.
     """
     import numpy as np
@@ -194,7 +194,7 @@ def convergence_checks(
         found = observed_order(refinements, values)
         return "not monotone" if math.isnan(found) else f"order {found:.2f}"
 
-    limit = 0.01 if barred else None
+    limit = 0.01 if limited else None
     for name, unit in (("tip_stiffness", "N/m"), ("first_bending", "Hz"), ("second_bending", "Hz")):
         values = [float(getattr(row, name)) for row in rows]
         note = f"({values[-1]:.5g} {unit}, {order(values)})"

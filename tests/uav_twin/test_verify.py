@@ -46,14 +46,14 @@ def test_checks_are_listed_and_kept(
     assert "not an empty folder" in capsys.readouterr().err.replace("\n", " ")
 
 
-def test_a_broken_bar_is_told_and_ends_with_1(
+def test_a_broken_limit_is_told_and_ends_with_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     checks_of(monkeypatch, Check("wing", "mass", 1e-3, 1e-10), Check("wing", "energy", float("nan"), 1e-5))
     assert call(monkeypatch, "verify") == 1
     captured = capsys.readouterr()
     assert captured.out.count("BROKEN") == 2
-    assert "2 of 2 checks broke their bar: wing, mass; wing, energy." in captured.err
+    assert "2 of 2 checks broke their limit: wing, mass; wing, energy." in captured.err
 
 
 def test_wrong_calls(
