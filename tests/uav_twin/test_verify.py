@@ -83,7 +83,7 @@ def test_every_check_of_the_elements_and_of_a_coarse_wing_is_kept() -> None:
 def test_convergence_names_every_gauge() -> None:
     # Three coarse meshes: the names and the kind of figures, not their size.
     design = load_design().changed(mesh={"refinement": 0.25})
-    checks = list(verify.convergence_checks(design, (0.25, 0.3, 0.36), barred=False))
+    checks = list(verify.convergence_checks(design, (0.25, 0.3, 0.36), limited=False))
     names = [check.name for check in checks]
     assert names[:3] == ["tip stiffness", "first bending", "second bending"]
     assert [name for name in names if name.startswith("gauge ")] == [f"gauge {n}" for n in range(24)]
