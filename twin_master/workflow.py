@@ -197,7 +197,7 @@ def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Pro
             if knowledge.draws.record is not None:
                 text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
                 atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
-            # A turn without observations on a twin of its own: the inner loops are compiled before the flight.
+            # A turn without observations on a twin of its own compiles the inner loops before the flight.
             knowledge.twin().turn(np.full(scenario.observation.count, np.nan), 0)
         with clock.stage("mission"), _kept(folder):
             result = _fly(folder, config, knowledge, source, progress)
