@@ -160,7 +160,10 @@ def lock_run_folder(folder: Path) -> int:
 
 def tidy(folder: Path) -> None:
     """Remove what killed processes left half-written."""
+    for path in list(folder.glob(f".{FIELD_NAME}.*")):  # the finite elements write in a folder of their own
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
     for place in [folder, *(path for path in folder.rglob("*") if path.is_dir())]:
         remove_leftovers(place)
-    for path in folder.glob(f".{FIELD_NAME}.*"):  # the finite elements have temporary names of their own
-        path.unlink(missing_ok=True)
