@@ -6,6 +6,7 @@ The workflow knows a source only by its protocol: FMU of a wing design, FMU of a
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -33,8 +34,29 @@ FMU_COPY = f"{ASSET_FOLDER}/asset.fmu"
 LIBRARY_COPY = f"{ASSET_FOLDER}/{LIBRARY_NAME}"
 
 
+@dataclass(frozen=True)
+class Origin:
+    """What is flown and what the twin believes, in words.
+
+    Attributes
+    ----------
+    asset, model : str
+        What is flown, and what predicts its observations.
+    differ : bool
+        Whether they are known to be different models.
+    """
+
+    asset: str
+    model: str
+    differ: bool = False
+
+
 class AssetSource(Protocol):
     """Everything that a mission needs to know of its asset."""
+
+    @property
+    def origin(self) -> Origin:
+        """What is flown and what the twin believes, in words."""
 
     def check(self) -> None:
         """Look at what is given before anything is made; raise what is wrong with it."""
@@ -128,6 +150,11 @@ class ReducedModelSource:
         self._scenario = scenario
         self._wing = wing
 
+    @property
+    def origin(self) -> Origin:
+        """The reduced model, twice."""
+        return Origin("reduced model of the wing", "reduced model of the wing")
+
     def check(self) -> None:
         """Accept what was read already."""
 
@@ -173,6 +200,11 @@ class StrainLibrarySource:
                 f"{', '.join(library.states.names)}, and the scenario asks for {scenario.observation.count} "
                 f"and {', '.join(scenario.state_names)}."
             )
+
+    @property
+    def origin(self) -> Origin:
+        """The library, twice."""
+        return Origin("strain library", "strain library")
 
     def _find_controls(self) -> list[int]:
         missing = [name for name in self._scenario.control_names if name not in self._library.controls]

@@ -121,10 +121,10 @@ class PredictiveCheck:
 class GaussianSensorModel(QuantityModel):
     """Sensors that show a value plus independent Gaussian noise.
 
-    Where the twin doubts its model, the error of the model is added to the noise of each sensor in quadrature,
-    sqrt(standard_deviation² + (model_error * mean)²) with the mean over the draws, for each state and control:
-    an error of the model that is drawn anew for each sensor and step. A real one stays the same from step to
-    step, so that this is a safeguard and no description of it.
+    Where the twin doubts its model, an error of the model is added to the noise in quadrature for each
+    state, control and sensor: sqrt(standard_deviation² + (model_error * mean)²), the mean over the draws. It
+    is an error that is drawn anew for each sensor and step; a real one stays the same from step to step, so
+    that the term is a safeguard and no description of it.
 
     Parameters
     ----------
@@ -270,6 +270,10 @@ class GaussianSensorModel(QuantityModel):
         )
         return result
 
+    def noise(self, joint: ArrayLike) -> Float:
+        """Return the standard deviation (..., G) of noise and model error under beliefs (..., S, U), SI."""
+        return np.asarray(np.sqrt(np.tensordot(self._weights(joint), self._total_deviation**2, axes=2)))
+
     def observed_count(self, observations: ArrayLike) -> Index:
         """Return how many sensors report: (..., G) -> (...). Zero flags a step that follows the dynamics."""
         result: Index = np.sum(~np.isnan(self._checked(observations)), axis=-1)
@@ -293,8 +297,7 @@ class GaussianSensorModel(QuantityModel):
                 f"got {mean.shape[:-1]} and {observation.shape[:-1]}"
             )
         weights = self._weights(joint).reshape(-1, self.state_count, self.control_count)
-        noise = np.einsum("bsu,sug->bg", weights, self._total_deviation**2).reshape(mean.shape)
-        deviation = np.sqrt(spread**2 + noise)
+        deviation = np.sqrt(spread**2 + self.noise(joint) ** 2)
         rows = observation.reshape(-1, self.sensor_count)
         transform = np.empty_like(rows)
         for row, (weight, seen) in enumerate(zip(weights, rows, strict=True)):
