@@ -119,11 +119,14 @@ def check_wing_scenario(scenario: Scenario, gauge_count: int) -> None:
         "calibrated parameter": ({scenario.calibration.parameter}, {"young_modulus_factor"}),
         "sensor count": ({scenario.observation.count}, {gauge_count}),
     }
+    advice = "set `asset.observation_model` to `asset` to use the asset itself"
+    if scenario.asset.kind == "strain_library":
+        advice = "leave out `asset.design` and `asset.observation_model` to use the library itself"
     for what, (came, wanted) in expected.items():
         if came != wanted:
             raise MissingObservationModelError(
                 f"the design's model predicts observations for the {what} {_names(wanted)}, and the scenario "
-                f"has {_names(came)}: set `asset.observation_model` to `asset` to use the asset itself."
+                f"has {_names(came)}: {advice}."
             )
 
 
