@@ -51,11 +51,12 @@ class ScaledSource(MismatchedSource):
     """A twin whose model was scaled, gauge by gauge, to what the undamaged asset shows without noise."""
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
+        """Return the scaled predictions (E, S, U, G)."""
         table = super().observation_table(draws, model)
         controls = load_scenario("level_turns").scenario.control
         undamaged = dict(zip(model.states.names, model.states.coordinates[0].tolist(), strict=True))
         shown = self.open().step(controls[-1].values, undamaged).values
-        return table * (shown / table[:, 0, -1].mean(axis=0))
+        return np.asarray(table * (shown / table[:, 0, -1].mean(axis=0)))
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ from twin_master.scenario_file import LoadedScenario, parse_scenario
 from twin_master.strain_library import FILE_NAME, load_strain_library
 
 SHIPPED_DESIGN_NAME = "uav_wing"
+REPOSITORY = "https://github.com/michaelkapteyn/UAV-Digital-Twin"
+"""Where the authors of Kapteyn et al. 2021 published their strain library."""
 
 
 @dataclass(frozen=True)
@@ -149,8 +151,9 @@ def _library_source(scenario: Scenario) -> StrainLibrarySource:
     if scenario.asset.file is None:
         raise MissionInputError(
             f"the scenario {scenario.mission.name} flies the strain library of the paper's authors, which "
-            f"does not come with this program: clone their public repository UAV-Digital-Twin and name its "
-            f"file {FILE_NAME} by `--strain-library FILE`, or as `asset.file` in a copy of the scenario."
+            f"does not come with this program: clone their public repository UAV-Digital-Twin "
+            f"({REPOSITORY}) and name its file {FILE_NAME} by `--strain-library FILE`, or as `asset.file` in a "
+            f"copy of the scenario."
         )
     path = Path(scenario.asset.file)
     return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from twin_master.twin import build_graphical_model
 from twin_master.workflow import new_run, resume_run
 from uav_twin import cli
 
+ROOT = Path(__file__).parents[2]
 TEXT = scenario_files()["model_mismatch"].read_text(encoding="utf-8")
 SAME = ("run.nc", "config.json", "summary.json", "calibration.json", "wing.vtu", "csv/health.csv")
 
@@ -398,6 +400,27 @@ class TestOnTheWing:
         for path in moved.rglob("*"):
             if path.is_file():
                 assert str(place).encode() not in path.read_bytes(), path
+
+    def test_the_study_prints_its_table(self, wing: ReducedModel, twisted: Path) -> None:
+        """Scaled gauge by gauge, the model of the twin is that of this library, and is as good as the own."""
+        result = subprocess.run(
+            [sys.executable, "-m", "benchmarks.study_level_turns", "--combinations", "--strain-library",
+             str(twisted), "--missions", "3", "--first-seed", "0", "--model-error", "0", "scaled",
+             "--markdown"],
+            cwd=ROOT, capture_output=True, text=True, check=False, timeout=600,
+        )  # fmt: skip
+        assert result.returncode in (0, 1), result.stderr
+        rows = [line.strip("| ").split(" | ") for line in result.stdout.splitlines() if line.startswith("|")]
+        assert [len(row) for row in rows] == [8] * 10 + [12] * 8
+        found = {
+            tuple(row[:3]): [float(cell.strip("*").split()[0]) for cell in row[6:11]] for row in rows[12:]
+        }
+        assert len(found) == 6
+        own = found["our wing", "our wing", "none"]
+        np.testing.assert_allclose(
+            found["library", "our wing", "none, gauges scaled"], own, atol=1.0
+        )  # between the levels the library is interpolated
+        assert found["library", "our wing", "none"][-1] < own[-1] - 1.0
 
     def test_study_on_the_published_library(self, wing: ReducedModel, published_library: Path) -> None:
         """Our model holds the wing of the authors well enough to steer it; bounds for 30 missions."""
