@@ -152,8 +152,8 @@ def _library_source(scenario: Scenario) -> StrainLibrarySource:
         raise MissionInputError(
             f"the scenario {scenario.mission.name} flies the strain library of the paper's authors, which "
             f"does not come with this program: clone their public repository UAV-Digital-Twin "
-            f"({REPOSITORY}) and name its file {FILE_NAME} by `--strain-library FILE`, or as `asset.file` in a "
-            f"copy of the scenario."
+            f"({REPOSITORY}) and name its file {FILE_NAME} by `--strain-library FILE`, or as `asset.file` in "
+            f"a copy of the scenario."
         )
     path = Path(scenario.asset.file)
     return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)
