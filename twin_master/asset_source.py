@@ -6,6 +6,7 @@ The workflow knows a source only by its protocol: FMU of a wing design, FMU of a
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -33,8 +34,29 @@ FMU_COPY = f"{ASSET_FOLDER}/asset.fmu"
 LIBRARY_COPY = f"{ASSET_FOLDER}/{LIBRARY_NAME}"
 
 
+@dataclass(frozen=True)
+class Origin:
+    """What is flown and what the twin believes, in words.
+
+    Attributes
+    ----------
+    asset, model : str
+        What is flown, and what predicts its observations.
+    differ : bool
+        Whether they are known to be different models.
+    """
+
+    asset: str
+    model: str
+    differ: bool = False
+
+
 class AssetSource(Protocol):
     """Everything that a mission needs to know of its asset."""
+
+    @property
+    def origin(self) -> Origin:
+        """What is flown and what the twin believes, in words."""
 
     def check(self) -> None:
         """Look at what is given before anything is made; raise what is wrong with it."""
@@ -97,11 +119,14 @@ def check_wing_scenario(scenario: Scenario, gauge_count: int) -> None:
         "calibrated parameter": ({scenario.calibration.parameter}, {"young_modulus_factor"}),
         "sensor count": ({scenario.observation.count}, {gauge_count}),
     }
+    advice = "set `asset.observation_model` to `asset` to use the asset itself"
+    if scenario.asset.kind == "strain_library":
+        advice = "leave out `asset.design` and `asset.observation_model` to use the library itself"
     for what, (came, wanted) in expected.items():
         if came != wanted:
             raise MissingObservationModelError(
                 f"the design's model predicts observations for the {what} {_names(wanted)}, and the scenario "
-                f"has {_names(came)}: set `asset.observation_model` to `asset` to use the asset itself."
+                f"has {_names(came)}: {advice}."
             )
 
 
@@ -127,6 +152,11 @@ class ReducedModelSource:
     def __init__(self, scenario: Scenario, wing: ReducedModel) -> None:
         self._scenario = scenario
         self._wing = wing
+
+    @property
+    def origin(self) -> Origin:
+        """The reduced model, twice."""
+        return Origin("reduced model of the wing", "reduced model of the wing")
 
     def check(self) -> None:
         """Accept what was read already."""
@@ -173,6 +203,11 @@ class StrainLibrarySource:
                 f"{', '.join(library.states.names)}, and the scenario asks for {scenario.observation.count} "
                 f"and {', '.join(scenario.state_names)}."
             )
+
+    @property
+    def origin(self) -> Origin:
+        """The library, twice."""
+        return Origin("strain library", "strain library")
 
     def _find_controls(self) -> list[int]:
         missing = [name for name in self._scenario.control_names if name not in self._library.controls]

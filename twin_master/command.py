@@ -38,7 +38,8 @@ def run(
     strain_library: Annotated[
         Path | None,
         typer.Option(
-            help="Fly the authors' strain library (UAVconfig.json or its folder) as model and asset."
+            help="Fly the authors' strain library (UAVconfig.json or its folder) as model and asset; in a "
+            "scenario that flies a library, its file."
         ),
     ] = None,
     in_process: Annotated[
@@ -108,6 +109,12 @@ def show_outcome(outcome: RunOutcome) -> None:
             table.add_row(f"{part}, per turn", f"{median:.3g} ms (largest {largest:.3g} ms)")
     table.add_row("whole run", f"{outcome.timing['total_seconds']:.3g} s")
     console.print(table)
+    if outcome.origin.differ:
+        console.print(
+            f"Asset and twin's model differ: flown was the {outcome.origin.asset}, and the twin believes the "
+            f"{outcome.origin.model}.",
+            soft_wrap=True,
+        )
     for source, number in sources.items():
         console.print(f"  ({number}) {source}", soft_wrap=True)
     console.print(f"Report: {outcome.report}", soft_wrap=True)

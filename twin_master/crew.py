@@ -85,6 +85,7 @@ def prepare_knowledge(scenario: Scenario, source: AssetSource, seed: int) -> Kno
         source.observation_table(draws, model),
         scenario.observation.standard_deviation,
         average=scenario.observation.average_over_draws,
+        model_error=scenario.observation.model_error,
     )
     rewards = RewardModel(sensor_model, reward_settings(scenario))
     plan = value_iteration(

@@ -8,24 +8,25 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.cache import reduced_model, wing_fields
+from fe.cache import reduced_model
 from fe.design import load_design
-from fe.fields import write_wing_vtu
 from fe.reduced import ReducedModel
 from fmu_asset.binding import Binding, load_binding
 from fmu_asset.build import build_fmu
 from fmu_asset.session import FmiAsset
-from reporting.files import atomic_write_bytes, write_error
+from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.asset_source import (
     BINDING_COPY,
     DESIGN_COPY,
     FMU_COPY,
+    Origin,
     check_wing_scenario,
     wing_observation_table,
 )
 from twin_master.assets import Asset, AssetReading
+from twin_master.design_source import read_content, write_design_field
 from twin_master.errors import MissionInputError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws, draw_parameter
@@ -100,6 +101,19 @@ class FmuSource:
         self._given = {BINDING_COPY: binding, DESIGN_COPY: design, FMU_COPY: fmu}
         self._folder: Path | None = None
         self._wing: ReducedModel | None = None
+        self._design_name = ""
+
+    @property
+    def origin(self) -> Origin:
+        """The FMU, and the model of the design or the FMU itself.
+
+        An FMU that is given may hold any model, also that of the design: whether they differ is not known.
+        """
+        design = self._given[DESIGN_COPY]
+        model = f"reduced model of the design {self._design_name}".rstrip()
+        if design is None or self._scenario.asset.observation_model == "asset":
+            return Origin("FMU", "FMU")
+        return Origin("FMU" if self._given[FMU_COPY] else f"FMU of the {model}", model)
 
     @property
     def wing(self) -> ReducedModel | None:
@@ -141,7 +155,7 @@ class FmuSource:
         MissionInputError
             A file cannot be read.
         """
-        return {name: _content(path) for name, path in self._given.items() if path is not None}
+        return {name: read_content(path) for name, path in self._given.items() if path is not None}
 
     def _check_names(self, binding: Binding) -> None:
         scenario = self._scenario
@@ -171,11 +185,12 @@ class FmuSource:
         self._folder = folder
         for name, path in self._given.items():
             if path is not None and not self._path(name).exists():
-                atomic_write_bytes(self._path(name), _content(path))
+                atomic_write_bytes(self._path(name), read_content(path))
         self._observed(load_binding(self._path(BINDING_COPY)))
         hashes = {"binding": hash_file(self._path(BINDING_COPY))}
         if self._given[DESIGN_COPY] is not None:
             design = load_design(self._path(DESIGN_COPY))
+            self._design_name = design.name
             self._wing = reduced_model(design, progress=progress)
             hashes["design"] = self._wing.design_hash
             if self._given[FMU_COPY] is None:
@@ -252,26 +267,7 @@ class FmuSource:
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write displacement and strain of the wing as VTU, with the parameters of the scenario."""
-        if self._wing is None or {*state} != {"z1", "z2"} or {*control} != {"load_factor"}:
+        if self._wing is None:
             return False
-        asset = self._scenario.asset
-        fields = wing_fields(load_design(self._path(DESIGN_COPY)))
-        try:
-            write_wing_vtu(
-                path,
-                fields,
-                young_modulus_factor=asset.parameters.get("young_modulus_factor", 1.0),
-                stiffness_loss=(state["z1"], state["z2"]),
-                load_factor=control["load_factor"],
-                tip_force=asset.load.get("tip_force", 0.0),
-            )
-        except OSError as error:
-            raise write_error(error, path) from error
-        return True
-
-
-def _content(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise MissionInputError(f"{path} cannot be read: {error.strerror or error}.") from error
+        e = self._scenario.asset.parameters.get("young_modulus_factor", 1.0)
+        return write_design_field(path, self._scenario, self._path(DESIGN_COPY), e, state, control)

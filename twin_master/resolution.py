@@ -17,11 +17,14 @@ from twin_master.asset_source import (
     StrainLibrarySource,
 )
 from twin_master.errors import MissionInputError
+from twin_master.mismatch import MismatchedSource, check_load_factors
 from twin_master.scenario import Scenario
 from twin_master.scenario_file import LoadedScenario, parse_scenario
 from twin_master.strain_library import FILE_NAME, load_strain_library
 
 SHIPPED_DESIGN_NAME = "uav_wing"
+REPOSITORY = "https://github.com/michaelkapteyn/UAV-Digital-Twin"
+"""Where the authors of Kapteyn et al. 2021 published their strain library."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,8 @@ class Overrides:
     fmu, binding : Path or None
         FMU to fly, and its binding.
     strain_library : Path or None
-        Fly the library instead of an FMU.
+        Fly the library instead of an FMU, as asset and model; where the scenario flies a library anyway, the
+        file of that library.
     in_process : bool
         Fly the FMU in this process instead of a worker.
     """
@@ -74,8 +78,10 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
     if overrides.binding:
         asset["binding"] = str(overrides.binding.resolve())
     if overrides.strain_library:
-        asset |= {"kind": "strain_library", "file": str(_library_file(overrides.strain_library))}
-        asset |= {"design": None, "binding": None, "observation_model": None}
+        if asset["kind"] != "strain_library":
+            asset |= {"kind": "strain_library", "design": None, "binding": None, "observation_model": None}
+            asset["parameters"] = {}  # those of the FMU
+        asset["file"] = str(_library_file(overrides.strain_library))
     if overrides.in_process:
         asset["isolated"] = False
     if overrides.seed is not None:
@@ -117,18 +123,37 @@ def asset_source(scenario: Scenario) -> AssetSource:
 
     Raises
     ------
+    MissionInputError
+        The scenario flies a strain library and names none.
     InvalidStrainLibraryError, MissingObservationModelError
         The strain library is missing, damaged or does not fit the scenario.
     """
     asset = scenario.asset
     if asset.kind == "strain_library":
-        path = Path(asset.file or "")
-        return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)
+        library = _library_source(scenario)
+        if not asset.model_of_the_design:
+            return library
     from fe.design import SHIPPED_DESIGN
+    from twin_master.design_source import DesignSource
     from twin_master.fmu_source import FmuSource
 
     design = SHIPPED_DESIGN if asset.design == SHIPPED_DESIGN_NAME else asset.design
+    if asset.kind == "strain_library":
+        check_load_factors(scenario)
+        return MismatchedSource(library, DesignSource(scenario, Path(design or "")))
     binding = binding_files().get(asset.binding or "", Path(asset.binding or ""))
     return FmuSource(
         scenario, binding, Path(design) if design else None, Path(asset.file) if asset.file else None
     )
+
+
+def _library_source(scenario: Scenario) -> StrainLibrarySource:
+    if scenario.asset.file is None:
+        raise MissionInputError(
+            f"the scenario {scenario.mission.name} flies the strain library of the paper's authors, which "
+            f"does not come with this program: clone their public repository UAV-Digital-Twin "
+            f"({REPOSITORY}) and name its file {FILE_NAME} by `--strain-library FILE`, or as `asset.file` in "
+            f"a copy of the scenario."
+        )
+    path = Path(scenario.asset.file)
+    return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)

@@ -227,8 +227,7 @@ def _filtered(result: MissionResult, labels: _Labels) -> xr.Dataset:
     joint = known_control(flight.filtered, flight.control_index, len(result.model.controls))
     variables = _belief(result, ("step",), flight.filtered, joint, "observations up to the step")
     variables |= _rewards(result, ("step",), joint, flight.observed)
-    deviation = result.scenario.observation.standard_deviation
-    residual = (flight.observed - variables["quantity_mean"][1]) / deviation
+    residual = (flight.observed - variables["quantity_mean"][1]) / result.sensor_model.noise(joint)
     variables |= {
         "decision_probability": (
             ("step", "control"),

@@ -10,7 +10,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from twin_master.scenario_section import (
+    Count,
+    Flag,
+    Name,
+    NotNegative,
+    Number,
+    Positive,
+    Probability,
+    Section,
+    Step,
+)
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of probabilities from one, as the graphical model has it."""
@@ -24,60 +36,8 @@ FALLBACK_FIGURES = (
     "early_fallback_step",
 )
 """Figures of the summary that say when the control left that of the first turn."""
-UNIT_DIVISOR = {"percent": 100.0, "microstrain": 1.0e6, "microstrain_per_step": 1.0e6}
-
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
-Probability = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=1.0)]
-Count = Annotated[int, Field(strict=True, ge=1)]
-Step = Annotated[int, Field(strict=True, ge=0)]
-Flag = Annotated[bool, Field(strict=True)]
-Name = Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_.\-]+$")]
-
-
-def _in_si(value: object, divisor: float) -> object:
-    if isinstance(value, bool) or not isinstance(value, int | float | list | tuple):
-        return value
-    if isinstance(value, list | tuple):
-        return [_in_si(item, divisor) for item in value]
-    return value / divisor
-
-
-def _check_percent(key: object, value: object) -> None:
-    for item in value if isinstance(value, list | tuple) else [value]:
-        if isinstance(item, int | float) and not isinstance(item, bool) and not -100 <= item <= 100:
-            raise ValueError(f"`{key}` is in percent, at most 100, and {item} came")
-
-
-class Section(BaseModel):
-    """A table of the file: unknown keys are refused, and a unit in a key's name is honoured."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    units: ClassVar[Mapping[str, str]] = {}
-    """The unit that each key may carry in its name."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _convert_units(cls, table: object) -> object:
-        if not isinstance(table, Mapping):
-            return table
-        converted: dict[object, object] = {}
-        for key, value in table.items():
-            base, unit = cls.split_unit(str(key))
-            if base in table and unit:
-                raise ValueError(f"`{base}` and `{key}` were both given: keep one of them")
-            if unit == "percent":
-                _check_percent(key, value)
-            converted[base] = _in_si(value, UNIT_DIVISOR[unit]) if unit else value
-        return converted
-
-    @classmethod
-    def split_unit(cls, key: str) -> tuple[str, str]:
-        """Return the key without its unit, and the unit (empty without one)."""
-        for base, unit in cls.units.items():
-            if key == f"{base}_{unit}":
-                return base, unit
-        return key, ""
+MISFIT_FIGURES = ("model_misfit_rms", "model_misfit_largest")
+"""Figures of the summary that say by how much asset and twin's model differ."""
 
 
 class Mission(Section):
@@ -130,12 +90,15 @@ class Control(Section):
 class ObservationSection(Section):
     """What is observed (a role of the binding) and the sensor noise that the twin assumes."""
 
-    units: ClassVar[Mapping[str, str]] = {"standard_deviation": "microstrain"}
+    units: ClassVar[Mapping[str, str]] = {"standard_deviation": "microstrain", "model_error": "percent"}
     role: Name = "strain"
     count: Count
     unit: str = "1"
     """Unit of the observed values; a dimensionless one is a strain, printed in microstrain."""
     standard_deviation: Positive
+    model_error: NotNegative | tuple[NotNegative, ...] = 0.0
+    """Standard deviation of the predicted value as a share of it, one for all sensors or one for each; added
+    to the noise in quadrature."""
     average_over_draws: Literal["outside", "inside"] = "outside"
     """Where the average over the draws of the parameter stands: outside the product over the sensors as in
     the integral (30), or inside it as eq. (32) is printed."""
@@ -145,9 +108,9 @@ class Transition(Section):
     """How the state moves in one step under each control; factors move independently given the control."""
 
     kind: Literal["independent_worsening", "independent_tables"]
-    probability: dict[str, Probability | dict[str, Probability]] = {}
+    probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
     """`independent_worsening`: probability of one level up, for each control (or control and state)."""
-    tables: dict[str, dict[str, tuple[tuple[Probability, ...], ...]]] = {}
+    tables: dict[str, dict[str, tuple[tuple[Probability, ...], ...]]] = Field(default_factory=dict)
     """`independent_tables`: for each control and state a square table, rows from, columns to."""
 
 
@@ -188,18 +151,46 @@ class AssetSection(Section):
     binding: str | None = None
     isolated: Flag = True
     step_timeout: Positive = 60.0
-    parameters: dict[str, Number] = {}
-    load: dict[str, Number] = {}
+    parameters: dict[str, Number] = Field(default_factory=dict)
+    load: dict[str, Number] = Field(default_factory=dict)
     observation_model: Literal["design", "asset"] | None = None
-    """Where the twin's predicted observations come from: the model of the design, or the asset itself."""
+    """Where the twin's predicted observations come from: the model of the design (the default where there is
+    one), or the asset itself."""
+
+    @property
+    def model_of_the_design(self) -> bool:
+        """Whether the twin believes the model of the design."""
+        return self.design is not None and self.observation_model != "asset"
+
+    @property
+    def another_model(self) -> bool:
+        """Whether what is flown is known to be another model than the one that the twin believes."""
+        return self.kind == "strain_library" and self.model_of_the_design
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.kind == "strain_library" and not self.file:
-            raise ValueError("a strain library needs `file`, the library's path")
         if self.kind == "fmu" and (not self.binding or not (self.design or self.file)):
             raise ValueError("an FMU asset needs `binding` and one of `design` and `file`")
+        if self.observation_model == "design" and self.design is None:
+            raise ValueError(
+                '`observation_model = "design"` needs `design`, the wing whose model the twin believes'
+            )
+        if self.kind == "strain_library":
+            self._check_library()
         return self
+
+    def _check_library(self) -> None:
+        for key in ("binding", "parameters", "load"):
+            if getattr(self, key):
+                raise ValueError(
+                    f"`{key}` belongs to an FMU, and the asset is a strain library, which is what it is: "
+                    f"leave `{key}` out"
+                )
+        if self.design is not None and self.observation_model == "asset":
+            raise ValueError(
+                "a strain library that is both asset and model leaves nothing to do for `design`: leave it "
+                'out, or set `observation_model = "design"`'
+            )
 
 
 class Calibration(Section):
@@ -309,6 +300,8 @@ class Scenario(Section):
         names += ["log_evidence"]
         if any(fault.kind == "dropout" for fault in self.truth.sensor_faults):
             names += ["lost_observations", "blind_steps"]
+        if self.asset.another_model:
+            names += [*MISFIT_FIGURES]
         if self.observation.unit == "1":
             names += ["strain_error_bound"]
         return tuple(names)
@@ -350,6 +343,7 @@ class Scenario(Section):
             raise ValueError("`truth.gains` belongs to the kind `scripted`, and the kind is `random_growth`")
         for gain in self.truth.gains:
             _known(gain.state, states, "truth.gains.state", "state")
+        self._check_model_error()
         for fault in self.truth.sensor_faults:
             if fault.sensors != "all" and max(fault.sensors) > self.observation.count:
                 raise ValueError(
@@ -357,6 +351,14 @@ class Scenario(Section):
                     f"and {max(fault.sensors)} came"
                 )
         return self
+
+    def _check_model_error(self) -> None:
+        error = self.observation.model_error
+        if isinstance(error, tuple) and len(error) != self.observation.count:
+            raise ValueError(
+                f"`observation.model_error_percent` must be one number or one for each of the "
+                f"{self.observation.count} sensors, and {len(error)} came"
+            )
 
     def _check_transition(self) -> None:
         transition = self.transition

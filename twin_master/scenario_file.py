@@ -14,7 +14,8 @@ from pydantic import ValidationError
 
 from scenarios import scenario_files
 from twin_master.errors import ScenarioError, UnknownScenarioError
-from twin_master.scenario import Scenario, Section
+from twin_master.scenario import Scenario
+from twin_master.scenario_section import Section
 
 _SHOWN_LENGTH = 60
 

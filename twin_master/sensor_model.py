@@ -45,33 +45,38 @@ def _log_likelihood(
     control: Index,
     value: Float,
     inverse_deviation: Float,
+    log_scale: Float,
     log_weight: Float,
     inside: bool,
     result: Float,
 ) -> None:
-    """Fill result (T, S); value is (U, S, G, E) so that the loop over the draws is contiguous."""
+    """Fill result (T, S); value is (U, S, G, E) so that the loop over the draws is contiguous.
+
+    inverse_deviation and log_scale = log inverse_deviation are (U, S, G).
+    """
     steps, sensors = observation.shape
     states, draws = value.shape[1], value.shape[3]
     exponent = np.empty(draws)
     for t in range(steps):
-        constant = 0.0
+        u = control[t]
         observed = 0
         for g in range(sensors):
             if not np.isnan(observation[t, g]):
-                constant += np.log(inverse_deviation[g]) - LOG_ROOT_TWO_PI
                 observed += 1
         for s in range(states):
             if observed == 0:
                 result[t, s] = 0.0
                 continue
-            total = constant
+            total = 0.0
             exponent[:] = 0.0
             for g in range(sensors):
                 seen = observation[t, g]
                 if np.isnan(seen):
                     continue
+                scale = inverse_deviation[u, s, g]
+                total += log_scale[u, s, g] - LOG_ROOT_TWO_PI
                 for e in range(draws):
-                    residual = (seen - value[control[t], s, g, e]) * inverse_deviation[g]
+                    residual = (seen - value[u, s, g, e]) * scale
                     exponent[e] -= 0.5 * residual * residual
                 if inside:
                     total += _log_mean_exp(exponent, log_weight)
@@ -88,7 +93,7 @@ class PredictiveCheck:
     Attributes
     ----------
     mean, standard_deviation : (..., G)
-        Of p(o_g), sensor noise included, SI.
+        Of p(o_g), sensor noise and model error included, SI.
     residual : (..., G) dimensionless
         (observation - mean) / standard deviation; NaN where the sensor is lost.
     probability_integral_transform : (..., G) dimensionless
@@ -116,6 +121,11 @@ class PredictiveCheck:
 class GaussianSensorModel(QuantityModel):
     """Sensors that show a value plus independent Gaussian noise.
 
+    Where the twin doubts its model, an error of the model is added to the noise in quadrature for each
+    state, control and sensor: sqrt(standard_deviation² + (model_error * mean)²), the mean over the draws. It
+    is an error that is drawn anew for each sensor and step; a real one stays the same from step to step, so
+    that the term is a safeguard and no description of it.
+
     Parameters
     ----------
     strain_per_draw : (E, S, U, G)
@@ -128,11 +138,13 @@ class GaussianSensorModel(QuantityModel):
         Where the average over the draws stands. "outside", the default, is the integral (30):
         mean over e of the product over sensors. "inside" is eq. (32) as printed: the product over sensors of
         the mean over e, as if each sensor had parameters of its own.
+    model_error : float or (G,) dimensionless
+        Standard deviation of the predicted value as a share of it; none by default.
 
     Raises
     ------
     InvalidModelError, InvalidDistributionError
-        If shapes do not fit, a value is not finite or a standard deviation not positive.
+        If shapes do not fit, a value is not finite, a standard deviation not positive or an error negative.
     """
 
     def __init__(
@@ -141,6 +153,7 @@ class GaussianSensorModel(QuantityModel):
         standard_deviation: ArrayLike,
         draw_weight: ArrayLike | None = None,
         average: Literal["outside", "inside"] = "outside",
+        model_error: ArrayLike = 0.0,
     ) -> None:
         super().__init__(strain_per_draw, draw_weight)
         deviation = np.array(standard_deviation, dtype=np.float64)
@@ -151,9 +164,24 @@ class GaussianSensorModel(QuantityModel):
                 f"expected one positive noise standard deviation, or one for each of {self.sensor_count} "
                 f"sensors, got {deviation}"
             )
+        error = np.array(model_error, dtype=np.float64)
+        if error.shape not in ((), (self.sensor_count,)) or not np.all(np.isfinite(error) & (error >= 0.0)):
+            raise InvalidModelError(
+                f"expected one relative model error that is not negative, or one for each of "
+                f"{self.sensor_count} sensors, got {error}"
+            )
         if average not in ("outside", "inside"):
             raise InvalidModelError(f"expected average 'outside' or 'inside', got {average!r}")
         self._deviation: Float = np.broadcast_to(deviation, (self.sensor_count,)).copy()
+        self._model_error: Float = np.broadcast_to(error, (self.sensor_count,)).copy()
+        # Through the root only where there is an error: x is not always sqrt(x²) to the last bit.
+        total = np.where(
+            self._model_error > 0.0, np.hypot(self._deviation, self._model_error * self.mean), self._deviation
+        )
+        total.setflags(write=False)
+        self._total_deviation: Float = total
+        by_control = np.ascontiguousarray(1.0 / total.transpose(1, 0, 2))
+        self._inverse_deviation, self._log_scale = by_control, np.log(by_control)
         self._inside = average == "inside"
         with np.errstate(divide="ignore"):
             self._log_weight: Float = np.log(self.draw_weight)
@@ -163,6 +191,16 @@ class GaussianSensorModel(QuantityModel):
     def standard_deviation(self) -> Float:
         """Noise standard deviation of each sensor (G,), SI."""
         return self._deviation.copy()
+
+    @property
+    def model_error(self) -> Float:
+        """Relative standard deviation of the predicted value of each sensor (G,), dimensionless."""
+        return self._model_error.copy()
+
+    @property
+    def total_standard_deviation(self) -> Float:
+        """Noise and model error of each state, control and sensor (S, U, G), SI, read-only."""
+        return self._total_deviation
 
     def _checked(self, observation: ArrayLike) -> Float:
         """Return observations (..., G) in which NaN stands for a lost sensor."""
@@ -224,12 +262,17 @@ class GaussianSensorModel(QuantityModel):
             observations,
             control,
             self._by_control,
-            1.0 / self._deviation,
+            self._inverse_deviation,
+            self._log_scale,
             self._log_weight,
             self._inside,
             result,
         )
         return result
+
+    def noise(self, joint: ArrayLike) -> Float:
+        """Return the standard deviation (..., G) of noise and model error under beliefs (..., S, U), SI."""
+        return np.asarray(np.sqrt(np.tensordot(self._weights(joint), self._total_deviation**2, axes=2)))
 
     def observed_count(self, observations: ArrayLike) -> Index:
         """Return how many sensors report: (..., G) -> (...). Zero flags a step that follows the dynamics."""
@@ -253,13 +296,15 @@ class GaussianSensorModel(QuantityModel):
                 f"expected one belief for each observation, "
                 f"got {mean.shape[:-1]} and {observation.shape[:-1]}"
             )
-        deviation = np.sqrt(spread**2 + self._deviation**2)
         weights = self._weights(joint).reshape(-1, self.state_count, self.control_count)
+        deviation = np.sqrt(spread**2 + self.noise(joint) ** 2)
         rows = observation.reshape(-1, self.sensor_count)
         transform = np.empty_like(rows)
         for row, (weight, seen) in enumerate(zip(weights, rows, strict=True)):
             state, control = np.nonzero(weight)
-            below = ndtr((seen - self.value_per_draw[:, state, control]) / self._deviation)
+            below = ndtr(
+                (seen - self.value_per_draw[:, state, control]) / self._total_deviation[state, control]
+            )
             transform[row] = np.einsum("e,p,epg->g", self.draw_weight, weight[state, control], below)
         return PredictiveCheck(
             mean=mean,

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.graphical_model import GraphicalModel
+from twin_master.mismatch import Misfit
 from twin_master.parameter import ParameterDraws
 from twin_master.results import MissionResult
 from twin_master.rewards import REWARD_NAMES
-from twin_master.scenario import FALLBACK_FIGURES, Reference
+from twin_master.scenario import FALLBACK_FIGURES, MISFIT_FIGURES, Reference
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -131,7 +132,9 @@ def filtered_rms_error(model: GraphicalModel, filtered: Float, true_state: Float
     return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
 
 
-def summarise(result: MissionResult, draws: ParameterDraws, reward_mean: Float) -> tuple[Figure, ...]:
+def summarise(
+    result: MissionResult, draws: ParameterDraws, reward_mean: Float, misfit: Misfit | None = None
+) -> tuple[Figure, ...]:
     """Return the figures of a mission; all of them are the same for the same seed.
 
     Parameters
@@ -142,6 +145,8 @@ def summarise(result: MissionResult, draws: ParameterDraws, reward_mean: Float) 
         The calibrated parameter.
     reward_mean : (T, R)
         Mean rewards under the filtered belief.
+    misfit
+        Of the twin's model, where the asset is known to be another one.
     """
     scenario, flight, model = result.scenario, result.flight, result.model
     first = scenario.control_names.index(scenario.mission.first_control)
@@ -175,6 +180,8 @@ def summarise(result: MissionResult, draws: ParameterDraws, reward_mean: Float) 
         Figure("log_evidence", "log evidence of all observations", float(flight.log_evidence.sum()))
     )
     figures += _sensor_figures(flight.observed)
+    if misfit is not None:
+        figures += _misfit_figures(misfit)
     bound = flight.truth.monitors.get("strain_error_bound")
     if bound is not None and scenario.observation.unit == "1":
         figures.append(
@@ -228,6 +235,15 @@ def _sensor_figures(observed: Float) -> list[Figure]:
             Figure("blind_steps", "turns without any observation (belief follows the dynamics)", steps)
         )
     return figures
+
+
+def _misfit_figures(misfit: Misfit) -> list[Figure]:
+    rms, largest = MISFIT_FIGURES
+    value, sensor = misfit.largest
+    return [
+        Figure(rms, "misfit of the twin's model, rms over sensors and states", 100 * misfit.rms, "%"),
+        Figure(largest, f"largest misfit, at sensor {sensor + 1}", 100.0 * value, "%"),
+    ]
 
 
 def to_record(figures: Sequence[Figure], heading: Mapping[str, Any]) -> dict[str, Any]:

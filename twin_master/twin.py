@@ -184,8 +184,9 @@ class Twin:
     def _worst_residuals(self, observation: Float, control_index: int) -> dict[str, float]:
         """Return the sensors that fit worst in the state that fits best, in standard deviations."""
         predicted = self.sensor_model.mean[:, control_index]
+        deviation = self.sensor_model.total_standard_deviation[:, control_index]
         with np.errstate(over="ignore"):  # an absurd observation is what this is for
-            residual = (observation - predicted) / self.sensor_model.standard_deviation
+            residual = (observation - predicted) / deviation
             distance = np.nan_to_num(np.abs(residual), nan=0.0)
             best = int(np.argmin(distance.sum(axis=1)))
         order = np.argsort(-distance[best])[:_WORST_SHOWN]

@@ -16,10 +16,11 @@ import numpy as np
 from reporting.files import atomic_write_text
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance, hash_record
-from twin_master.asset_source import AssetSource
+from twin_master.asset_source import AssetSource, Origin
 from twin_master.checkpoint import CHECKPOINT_NAME, read_checkpoint, write_checkpoint
 from twin_master.crew import Knowledge, prepare_knowledge
 from twin_master.errors import NotResumableError
+from twin_master.mismatch import Misfit, find_misfit
 from twin_master.mission import Flight, fly
 from twin_master.resolution import (
     Overrides,
@@ -63,12 +64,15 @@ class RunOutcome:
         The summary.
     timing : dict
         Content of `timing.json`.
+    origin : Origin
+        What was flown and what the twin believed, in words.
     """
 
     folder: Path
     report: Path
     figures: tuple[Figure, ...]
     timing: Mapping[str, Any]
+    origin: Origin
 
 
 @dataclass
@@ -207,7 +211,7 @@ def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Pro
             report = _report(folder)
         timing = _timing(result.flight, clock)
         write_timing(folder, timing)
-        return RunOutcome(folder, report, figures, timing)
+        return RunOutcome(folder, report, figures, timing, source.origin)
     finally:
         os.close(lock)
 
@@ -301,15 +305,28 @@ def _store(
         "observed_quantity": knowledge.scenario.observation.role,
         "parameter": knowledge.draws.name,
         "parameter_source": knowledge.draws.source,
+        "asset": source.origin.asset,
+        "twin_model": source.origin.model,
     }
     tree = store_mission(folder, result, attributes, _field_writer(knowledge, source, result))
-    figures = summarise(result, knowledge.draws, values_of(tree, "filtered", "reward_mean"))
-    write_summary(
-        folder,
-        figures,
-        {"scenario": mission.name, "title": mission.title, "seed": mission.seed, "steps": mission.steps},
+    figures = summarise(
+        result, knowledge.draws, values_of(tree, "filtered", "reward_mean"), _misfit(knowledge, source)
     )
+    heading = {"scenario": mission.name, "title": mission.title, "seed": mission.seed, "steps": mission.steps}
+    origin = {"asset": source.origin.asset, "twin_model": source.origin.model}
+    write_summary(folder, figures, heading | origin | {"asset_and_model_differ": source.origin.differ})
     return figures
+
+
+def _misfit(knowledge: Knowledge, source: AssetSource) -> Misfit | None:
+    """Return by how much the twin's model differs from the asset, where they are known to differ."""
+    if not source.origin.differ:
+        return None
+    asset = source.open()
+    try:
+        return find_misfit(knowledge.scenario, knowledge.model, knowledge.sensor_model, asset)
+    finally:
+        asset.close()
 
 
 def _field_writer(

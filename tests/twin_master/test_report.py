@@ -27,6 +27,7 @@ from twin_master.report import network as report_network
 from twin_master.report import page as report
 from twin_master.report import reading as report_reading
 from twin_master.report.text import (
+    check_caption,
     lost_ranges,
     mission_caption,
     network_caption,
@@ -255,6 +256,42 @@ def test_predictive_check_by_hand(record: report_data.RunRecord) -> None:
     assert 1.0 < check.standard_deviation < 1.25
     assert check.transform.min() >= 0.0
     assert check.transform.max() <= 1.0
+
+
+@pytest.mark.parametrize("error", [0.03, [0.01 * (gauge % 3) for gauge in range(24)]])
+def test_a_model_error_counts_in_the_predictive_check(
+    record: report_data.RunRecord, error: float | list[float]
+) -> None:
+    def assuming(value: object) -> report_data.RunRecord:
+        observation = {**record.scenario["observation"], "model_error": value}
+        return replace(record, config={"scenario": {**record.scenario, "observation": observation}})
+
+    without, doubting = report_check.predictive_check(record), assuming(error)
+    check = report_check.predictive_check(doubting)
+    assert check is not None
+    assert without is not None
+    assert record.filtered.quantity is not None
+    assert record.filtered.quantity_standard_deviation is not None
+    variance = 125e-6**2 + record.filtered.quantity_standard_deviation**2
+    wider = variance + (np.asarray(error) * record.filtered.quantity.mean) ** 2
+    assert_allclose(check.residual, without.residual * np.sqrt(variance / wider))
+    share = "3 %" if isinstance(error, float) else "0 to 2 %"
+    assert f"and an error of its model of {share} of the predicted" in check_caption(doubting, check)
+    assert "error of its model" not in check_caption(record, without)
+    for damaged in ("a", [0.1], None, {}):
+        unchanged = report_check.predictive_check(assuming(damaged))
+        assert unchanged is not None
+        assert_array_equal(unchanged.residual, without.residual)
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_another_model_is_told_before_anything_else(tmp_path: Path, tree: xr.DataTree) -> None:
+    place = synthetic_run.write_run(tmp_path / "run", tree)
+    assert "model differ" not in report.write_report(place).read_text(encoding="utf-8")
+    origin = {"asset": "strain library", "twin_model": "reduced model", "asset_and_model_differ": True}
+    (place / "summary.json").write_text(json.dumps(synthetic_run.summary() | origin))
+    text = report.write_report(place).read_text(encoding="utf-8")
+    assert "differ: flown was the strain library, and the twin believes the reduced model." in text
 
 
 def test_predictive_check_of_a_right_twin_is_uniform(record: report_data.RunRecord) -> None:

@@ -116,6 +116,59 @@ def test_predictive_check_of_a_model_that_holds():
     np.testing.assert_allclose(check.coverage(0.5), 0.5, atol=0.04)
 
 
+@settings(deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    lost=st.lists(st.booleans(), min_size=SENSORS, max_size=SENSORS),
+    average=st.sampled_from(["outside", "inside"]),
+)
+def test_a_model_error_widens_each_density_by_a_share_of_the_prediction(seed, lost, average):
+    rng, values, weight, deviation, observation = random_case(seed)
+    observation[lost] = np.nan
+    error = rng.uniform(0.0, 0.5, SENSORS)
+    mean = np.einsum("e,esug->sug", weight, values)
+    total = np.sqrt(deviation**2 + (error * mean) ** 2)
+    model = GaussianSensorModel(values, deviation, weight, average, model_error=error)
+    np.testing.assert_allclose(model.total_standard_deviation, total, rtol=1e-13)
+    seen = ~np.isnan(observation)
+    density = norm.logpdf(observation, values[:, :, 1], total[:, 1])[..., seen]  # (E, S, G)
+    if average == "outside":
+        expected = logsumexp(density.sum(axis=2), b=weight[:, None], axis=0)
+    else:
+        expected = logsumexp(density, b=weight[:, None, None], axis=0).sum(axis=1)
+    if not seen.any():
+        expected = np.zeros(STATES)
+    np.testing.assert_allclose(model.log_likelihood(observation, 1), expected, rtol=1e-12, atol=1e-12)
+    joint = rng.dirichlet(np.ones(STATES * CONTROLS), 3).reshape(3, STATES, CONTROLS)
+    noise = np.sqrt(np.einsum("bsu,sug->bg", joint, total**2))
+    np.testing.assert_allclose(model.noise(joint), noise, rtol=1e-13)
+
+
+def test_no_model_error_changes_not_a_bit():
+    _, values, weight, deviation, observation = random_case(9)
+    without = GaussianSensorModel(values, deviation, weight)
+    zero = GaussianSensorModel(values, deviation, weight, model_error=np.zeros(SENSORS))
+    np.testing.assert_array_equal(zero.log_likelihood(observation, 0), without.log_likelihood(observation, 0))
+    one = GaussianSensorModel(values, deviation, weight, model_error=0.1)
+    each = GaussianSensorModel(values, deviation, weight, model_error=np.full(SENSORS, 0.1))
+    np.testing.assert_array_equal(one.log_likelihood(observation, 0), each.log_likelihood(observation, 0))
+    np.testing.assert_array_equal(one.model_error, np.full(SENSORS, 0.1))
+
+
+def test_predictive_check_of_a_model_with_the_error_that_it_assumes():
+    rng, values, weight, deviation, _ = random_case(8)
+    model = GaussianSensorModel(values, deviation, weight, model_error=0.4)
+    steps = 4000
+    belief = rng.dirichlet(np.ones(STATES))
+    draw, state = rng.choice(DRAWS, steps, p=weight), rng.choice(STATES, steps, p=belief)
+    total = model.total_standard_deviation[state, 1]
+    observations = values[draw, state, 1] + rng.normal(size=(steps, SENSORS)) * total
+    check = model.predictive_check(known_control(np.tile(belief, (steps, 1)), 1, CONTROLS), observations)
+    for sensor in range(SENSORS):
+        assert kstest(check.probability_integral_transform[:, sensor], "uniform").pvalue > 1e-3
+    np.testing.assert_allclose(check.residual.std(axis=0), 1.0, atol=0.05)
+
+
 def test_predictive_check_leaves_lost_sensors_out():
     _, values, weight, deviation, observation = random_case(6)
     observation[2] = np.nan
@@ -135,6 +188,9 @@ def test_bad_input_is_refused():
     for bad in (0.0, -1.0, np.nan, np.ones(SENSORS + 1), np.r_[deviation[:-1], np.inf]):
         with pytest.raises(InvalidModelError, match="positive noise standard deviation"):
             GaussianSensorModel(values, bad, weight)
+    for bad in (-0.1, np.nan, np.inf, np.ones(SENSORS + 1)):
+        with pytest.raises(InvalidModelError, match="relative model error"):
+            GaussianSensorModel(values, deviation, weight, model_error=bad)
     with pytest.raises(InvalidModelError, match="'outside' or 'inside'"):
         GaussianSensorModel(values, deviation, weight, average="both")
     with pytest.raises(InvalidObservationError, match=f"expected {SENSORS} sensor values"):

@@ -51,7 +51,7 @@ def test_commands_are_listed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
 def test_scenarios(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert call(monkeypatch, "scenarios") == 0
     text = capsys.readouterr().out
-    for name in ("level_turns", "growing_damage", "failing_gauges"):
+    for name in ("level_turns", "growing_damage", "failing_gauges", "model_mismatch"):
         assert name in text
 
 

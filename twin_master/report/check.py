@@ -64,6 +64,18 @@ def assumed_noise(record: RunRecord) -> float | None:
     return float(value) if isinstance(value, int | float) and value > 0.0 else None
 
 
+def assumed_model_error(record: RunRecord) -> Float | None:
+    """Return the relative model error that the twin assumes, one or (G,); None where it assumes none."""
+    section = record.scenario.get("observation")
+    value = section.get("model_error") if isinstance(section, dict) else None
+    try:
+        error = np.asarray(0.0 if value is None else value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    fits = error.shape in ((), (len(record.sensors),)) and np.all(np.isfinite(error))
+    return error if fits and np.any(error > 0.0) else None
+
+
 def predictive_check(record: RunRecord) -> PredictiveCheck | None:
     """Compare observations with their posterior predictive distribution; None if something is missing."""
     noise, quantity = assumed_noise(record), record.filtered.quantity
@@ -71,6 +83,9 @@ def predictive_check(record: RunRecord) -> PredictiveCheck | None:
         return None
     spread = record.filtered.quantity_standard_deviation
     total = np.hypot(noise, 0.0 if spread is None else spread)
+    error = assumed_model_error(record)
+    if error is not None:
+        total = np.hypot(total, error * quantity.mean)
     residual = (record.observation - quantity.mean) / total
     known = np.isfinite(residual)
     count = known.sum(axis=0)

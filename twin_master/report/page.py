@@ -233,6 +233,19 @@ def _highlights(record: RunRecord) -> list[tuple[str, str]]:
 
 
 def _notices(record: RunRecord) -> list[str]:
+    """Return what a reader must not miss: another model, lost observations."""
+    notices = _loss_notices(record)
+    if record.summary.get("asset_and_model_differ") is True:
+        asset, model = record.summary.get("asset"), record.summary.get("twin_model")
+        notices.insert(
+            0,
+            f"The asset and the twin's model differ: flown was the {asset}, and the twin believes the "
+            f"{model}. Its intervals hold as far as that model holds.",
+        )
+    return notices
+
+
+def _loss_notices(record: RunRecord) -> list[str]:
     if record.observation is None:
         return ["The run holds no observations, so the figures show the twin's beliefs only."]
     lost = np.isnan(record.observation)
@@ -257,6 +270,9 @@ def _add_run(page: Page, record: RunRecord) -> None:
         (f"{sensor_word(record).lower()}s", str(len(record.sensors))),
         ("seed", _seed(record)),
     ]
+    for title, key in (("asset", "asset"), ("model that the twin believes", "twin_model")):
+        if key in record.attributes:
+            rows.append((title, str(record.attributes[key])))
     if record.log_evidence is not None:
         rows.append(("log evidence of all observations", f"{float(np.sum(record.log_evidence)):.2f}"))
     for name, (values, unit) in record.monitors.items():

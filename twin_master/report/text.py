@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twin_master.report.check import PredictiveCheck, assumed_noise
+from twin_master.report.check import PredictiveCheck, assumed_model_error, assumed_noise
 from twin_master.report.data import RunRecord
 from twin_master.report.view import observation_scale, sensor_word, symbol
 
@@ -152,8 +152,17 @@ def check_caption(record: RunRecord, check: PredictiveCheck) -> str:
             f"Lowest coverage: {word} {record.sensors[lowest]}, {100.0 * check.coverage[lowest]:.0f} %."
         )
     if noise is not None:
-        sentences.append(f"The twin assumes a noise of {scale * noise:.4g} {unit}.")
+        sentences.append(f"The twin assumes a noise of {scale * noise:.4g} {unit}{_model_error(record)}.")
     return " ".join(sentences)
+
+
+def _model_error(record: RunRecord) -> str:
+    error = assumed_model_error(record)
+    if error is None:
+        return ""
+    low, high = 100.0 * float(error.min()), 100.0 * float(error.max())
+    share = f"{low:.3g} %" if low == high else f"{low:.3g} to {high:.3g} %"
+    return f" and an error of its model of {share} of the predicted value"
 
 
 def network_caption(record: RunRecord) -> str:

@@ -1,0 +1,64 @@
+"""A table of a scenario file: what all tables have in common, and the kinds of values that they hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+UNIT_DIVISOR = {"percent": 100.0, "microstrain": 1.0e6, "microstrain_per_step": 1.0e6}
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
+Probability = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=1.0)]
+Count = Annotated[int, Field(strict=True, ge=1)]
+Step = Annotated[int, Field(strict=True, ge=0)]
+Flag = Annotated[bool, Field(strict=True)]
+Name = Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_.\-]+$")]
+
+
+def _in_si(value: object, divisor: float) -> object:
+    if isinstance(value, bool) or not isinstance(value, int | float | list | tuple):
+        return value
+    if isinstance(value, list | tuple):
+        return [_in_si(item, divisor) for item in value]
+    return value / divisor
+
+
+def _check_percent(key: object, value: object) -> None:
+    for item in value if isinstance(value, list | tuple) else [value]:
+        if isinstance(item, int | float) and not isinstance(item, bool) and not -100 <= item <= 100:
+            raise ValueError(f"`{key}` is in percent, at most 100, and {item} came")
+
+
+class Section(BaseModel):
+    """A table of the file: unknown keys are refused, and a unit in a key's name is honoured."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    units: ClassVar[Mapping[str, str]] = {}
+    """The unit that each key may carry in its name."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _convert_units(cls, table: object) -> object:
+        if not isinstance(table, Mapping):
+            return table
+        converted: dict[object, object] = {}
+        for key, value in table.items():
+            base, unit = cls.split_unit(str(key))
+            if base in table and unit:
+                raise ValueError(f"`{base}` and `{key}` were both given: keep one of them")
+            if unit == "percent":
+                _check_percent(key, value)
+            converted[base] = _in_si(value, UNIT_DIVISOR[unit]) if unit else value
+        return converted
+
+    @classmethod
+    def split_unit(cls, key: str) -> tuple[str, str]:
+        """Return the key without its unit, and the unit (empty without one)."""
+        for base, unit in cls.units.items():
+            if key == f"{base}_{unit}":
+                return base, unit
+        return key, ""
