@@ -1,7 +1,8 @@
 """Packing a reduced model as the wing FMU: FMI 2.0 co-simulation, reproducible to the byte.
 
-What goes into the compiled kind is in `compiled`. Of the Python kind, the slave base class and the binaries are pythonfmu's. The archive is packed here and not by its builder,
-which stamps times, a random GUID and module names that two FMUs in one process would share.
+What goes into the compiled kind is in `compiled`. Of the Python kind, slave base class and binaries are
+pythonfmu's; the archive is packed here and not by its builder, which stamps times, a random GUID and module
+names that two FMUs in one process would share.
 """
 
 from __future__ import annotations
@@ -152,7 +153,7 @@ def build_fmu(
     state : DigitalState, optional
         Start values of parameters and health; the digital state's defaults if absent.
     kind : {"python", "compiled", "source"}
-        What evaluates the model: Python inside the host, C compiled now, or C that is to be compiled elsewhere.
+        What evaluates the model: Python in the host, C compiled now, or C to be compiled elsewhere.
     replace : bool
         Whether an existing file may be replaced.
 

@@ -60,8 +60,8 @@ def find_compiler() -> list[str]:
             return [program, *command[1:]]
     looked_for = f"CC={os.environ['CC']}" if given else ", ".join(COMPILERS)
     raise FmuBuildError(
-        f"A compiled FMU needs a C compiler, but none was found (looked for: {looked_for}); install one (such "
-        "as the package gcc) or set CC, or build with --kind source and compile the FMU elsewhere."
+        f"A compiled FMU needs a C compiler, but none was found (looked for: {looked_for}); install one "
+        "(such as the package gcc) or set CC, or build with --kind source and compile the FMU elsewhere."
     )
 
 
@@ -87,8 +87,8 @@ def compile_library(sources: Mapping[str, bytes], *, extra_flags: Sequence[str] 
     """
     if fmi_platform != PLATFORM:
         raise FmuBuildError(
-            f"Compiled FMUs are built on {PLATFORM} only, but this is {fmi_platform}; build with --kind source "
-            "and compile the FMU with `fmpy compile`."
+            f"Compiled FMUs are built on {PLATFORM} only, but this is {fmi_platform}; build with --kind "
+            "source and compile the FMU with `fmpy compile`."
         )
     compiler = find_compiler()
     with tempfile.TemporaryDirectory(prefix="uav-twin-cc-") as folder:
@@ -107,7 +107,7 @@ def compile_library(sources: Mapping[str, bytes], *, extra_flags: Sequence[str] 
         if done.returncode != 0 or not library.is_file():
             lines = (done.stderr or done.stdout).strip().splitlines()[:_SHOWN_ERROR_LINES]
             raise FmuBuildError(
-                f"The C compiler {compiler[0]} failed with exit code {done.returncode}; set CC to another one. "
-                "It says:\n  " + "\n  ".join(lines)
+                f"The C compiler {compiler[0]} failed with exit code {done.returncode}; set CC to another "
+                "one. It says:\n  " + "\n  ".join(lines)
             )
         return library.read_bytes()

@@ -1,4 +1,4 @@
-"""The data file of the compiled FMU: the arrays of a reduced model, as `sources/wing_data.h` describes them."""
+"""The data file of the compiled FMU: arrays of a reduced model, in the layout of `sources/wing_data.h`."""
 
 from __future__ import annotations
 

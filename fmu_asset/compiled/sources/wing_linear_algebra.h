@@ -1,4 +1,4 @@
-/* Dense linear algebra of a few dozen unknowns. Matrices are row by row; none of the arguments overlap. */
+/* Dense linear algebra of a few dozen unknowns. Matrices are row by row; what is written overlaps with nothing. */
 #ifndef WING_LINEAR_ALGEBRA_H
 #define WING_LINEAR_ALGEBRA_H
 
@@ -11,11 +11,11 @@
 /* sum += factor * vector */
 void wing_add(double *restrict sum, size_t size, double factor, const double *restrict vector);
 
-/* sum += sum over c of coefficient[c] * column[c], the columns (count, size) one after another */
-void wing_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t count,
-                      const double *restrict coefficients);
+/* sum += sum over c of coefficient[c] * column[c]; a column of `size` numbers begins `stride` after the last one */
+void wing_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
+                      size_t count, const double *restrict coefficients);
 
-double wing_dot(const double *restrict first, const double *restrict second, size_t size);
+double wing_dot(const double *first, const double *second, size_t size);
 
 double wing_norm(const double *vector, size_t size);
 
@@ -23,13 +23,12 @@ double wing_norm(const double *vector, size_t size);
 void wing_multiply(double *restrict result, const double *restrict matrix, size_t rows, size_t size,
                    const double *restrict vector);
 
-/* result = sum over the terms of theta[k] * terms[k], of matrices (size, size). Only the upper triangle is
-   written. */
+/* result = sum over the terms of theta[k] * terms[k], of matrices (size, size) one after another */
 void wing_sum_terms(double *restrict result, size_t size, const double *restrict terms, size_t count,
                     const double *restrict theta);
 
 /* Replace the upper triangle of a symmetric positive definite matrix A by the upper factor U, A = U' U; false
-   if it is not positive definite. The rest of the matrix is neither read nor written. */
+   if it is not positive definite. The lower triangle is not read, and is used for intermediate numbers. */
 bool wing_cholesky(double *matrix, size_t size);
 
 /* Replace `right` (size) by the solution of U' y = right, then of U x = y, then of both. */

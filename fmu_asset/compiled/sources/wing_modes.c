@@ -20,14 +20,6 @@ void wing_modes_lay_out(wing_modes *modes, const wing_model *model, wing_arena *
     modes->work = wing_take(arena, 3 * size);
 }
 
-static void mirror_upper(double *matrix, size_t size) {
-    for (size_t i = 0; i < size; ++i) {
-        for (size_t j = 0; j < i; ++j) {
-            matrix[i * size + j] = matrix[j * size + i];
-        }
-    }
-}
-
 static void transpose_square(double *matrix, size_t size) {
     for (size_t i = 0; i < size; ++i) {
         for (size_t j = 0; j < i; ++j) {
@@ -60,7 +52,6 @@ bool wing_modes_find(wing_modes *modes, const double key[WING_MODE_KEYS], wing_p
     const double mass_theta[WING_MASS_TERMS] = {1.0, key[3], key[4]};
     wing_sum_terms(modes->factor, size, model->modal_stiffness, WING_STIFFNESS_TERMS, theta);
     wing_sum_terms(modes->mass, size, model->modal_mass, WING_MASS_TERMS, mass_theta);
-    mirror_upper(modes->mass, size);
     if (!wing_cholesky(modes->factor, size)) {
         return wing_fail(problem, "the modal stiffness at e = %g, z1 = %g, z2 = %g is not positive definite",
                          key[0], key[1], key[2]);

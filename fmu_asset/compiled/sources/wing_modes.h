@@ -19,7 +19,7 @@ typedef struct {
     double *shape;             /* (M, Nm), mass-normalised, the tip moves upwards */
     double *output;            /* (M, G + 1) per unit of modal coordinate */
     double *participation;     /* (M, 2) modal force per unit of load */
-    double *mass;              /* (Nm, Nm), upper triangle and diagonal */
+    double *mass;              /* (Nm, Nm) */
     double *factor, *matrix, *vectors; /* (Nm, Nm) */
     double *values, *work;     /* (Nm), (3 Nm) */
 } wing_modes;

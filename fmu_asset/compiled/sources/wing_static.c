@@ -54,7 +54,7 @@ const wing_unit_response *wing_static_unit(wing_static *wing, size_t load) {
         wing_solve_lower(wing->factor, n, unit->coordinates);
         wing_solve_upper(wing->factor, n, unit->coordinates);
         memset(unit->output, 0, outputs * sizeof *unit->output);
-        wing_add_columns(unit->output, outputs, model->output_columns, n, unit->coordinates);
+        wing_add_columns(unit->output, outputs, model->output_columns, outputs, n, unit->coordinates);
         unit->solved = true;
     }
     return unit;
@@ -110,11 +110,11 @@ static void bound_unit(wing_static *wing, size_t load) {
         for (size_t i = 0; i < n; ++i) {
             wing->work[i] = wing->theta[k] * unit->coordinates[i];
         }
-        wing_add_columns(unit->residual, r, model->stiffness_residual + k * n * r, n, wing->work);
+        wing_add_columns(unit->residual, r, model->stiffness_residual + k * n * r, r, n, wing->work);
     }
     memset(unit->correction, 0, outputs * sizeof *unit->correction);
-    wing_add_columns(unit->correction, outputs, model->correction_columns + anchor_of(wing) * r * outputs, r,
-                     unit->residual);
+    wing_add_columns(unit->correction, outputs, model->correction_columns + anchor_of(wing) * r * outputs, outputs,
+                     r, unit->residual);
     unit->bounded = true;
 }
 

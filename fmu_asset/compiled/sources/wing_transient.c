@@ -134,14 +134,14 @@ void wing_integrator_take_over(wing_integrator *integrator, wing_integrator *for
         deviation[i] = before->displacement[i] - deviation[i];
     }
     memset(modal, 0, size * sizeof *modal);
-    wing_add_columns(modal, size, former->modes.shape, count, deviation);
+    wing_add_columns(modal, size, former->modes.shape, size, count, deviation);
     memset(steady, 0, n * sizeof *steady);
     for (size_t load = 0; load < WING_LOADS; ++load) {
         wing_add(steady, n, before->load[load], wing_static_unit(&former->steady, load)->coordinates);
     }
     wing_modes_project(&integrator->modes, modal, steady, after->displacement, scratch);
     memset(modal, 0, size * sizeof *modal);
-    wing_add_columns(modal, size, former->modes.shape, count, before->velocity);
+    wing_add_columns(modal, size, former->modes.shape, size, count, before->velocity);
     memset(steady, 0, n * sizeof *steady);
     wing_modes_project(&integrator->modes, modal, steady, after->velocity, scratch);
     memcpy(after->load, before->load, sizeof after->load);
@@ -150,7 +150,7 @@ void wing_integrator_take_over(wing_integrator *integrator, wing_integrator *for
 void wing_integrator_output(const wing_integrator *integrator, const wing_motion *motion, double *output) {
     const size_t outputs = integrator->model->output_count;
     memset(output, 0, outputs * sizeof *output);
-    wing_add_columns(output, outputs, integrator->modes.output, integrator->model->mode_count,
+    wing_add_columns(output, outputs, integrator->modes.output, outputs, integrator->model->mode_count,
                      motion->displacement);
-    wing_add_columns(output, outputs, integrator->correction, WING_LOADS, motion->load);
+    wing_add_columns(output, outputs, integrator->correction, outputs, WING_LOADS, motion->load);
 }
