@@ -249,7 +249,8 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
         GUIDs.
     """
     with zipfile.ZipFile(path) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
+        # Archives that other tools have packed again list their folders too.
+        members = {name: archive.read(name) for name in archive.namelist() if not name.endswith("/")}
     root = members["modelDescription.xml"].decode("utf-8")
     if DATA_FILE in members:
         members = {name: data for name, data in members.items() if not name.startswith("binaries/")}
