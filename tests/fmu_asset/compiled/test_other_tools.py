@@ -1,4 +1,4 @@
-"""The wing in other masters: libcosim with both FMUs side by side, OMSimulator where it is installed."""
+"""The wing in other hosts: a program in C, libcosim with both FMUs, OMSimulator where it is installed."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import json
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fe.reduced import ReducedModel
+from fmu_asset.archive import read_fmu
 
 COURSE = [(1.0 + 0.25 * k, 0.1 * (k // 3), 0.2, -5.0 if k % 2 else 0.0) for k in range(9)]
 
@@ -39,6 +41,32 @@ for inputs in course:
     seen.append([observer.last_real_values(slave, list(range(11, 37))) for slave in slaves])
 print("SEEN" + json.dumps(seen))
 """
+
+
+def test_a_host_without_python_needs_nothing_else(
+    compiled_fmu: Path, compiler: list[str], model: ReducedModel, tmp_path: Path
+) -> None:
+    with zipfile.ZipFile(compiled_fmu) as archive:
+        archive.extractall(tmp_path)
+    host = tmp_path / "host"
+    source = Path(__file__).with_name("host.c")
+    subprocess.run(
+        [*compiler, "-Wall", "-Wextra", "-Werror", f"-I{tmp_path / 'sources'}", source, "-o", host, "-ldl"],
+        check=True,
+    )
+    library = next((tmp_path / "binaries" / "linux64").glob("*.so"))
+    # In a folder whose name must be encoded in the URI.
+    resources = (tmp_path / "resources").rename(tmp_path / "resources of é 100%")
+    done = subprocess.run(
+        [host, library, read_fmu(compiled_fmu).guid, resources.as_uri(), "3", *map(str, range(11, 35))],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={},
+    )
+    assert done.returncode == 0, done.stdout
+    expected = model.static_response(1.0, (0.0, 0.0), 1.0).strain
+    np.testing.assert_allclose([float(line) for line in done.stdout.split()], expected, rtol=1e-12)
 
 
 def test_both_fmus_fly_in_libcosim(compiled_fmu: Path, fmu: Path, model: ReducedModel) -> None:
