@@ -411,11 +411,11 @@ fmi2Status fmi2GetIntegerStatus(fmi2Component c, const fmi2StatusKind s, fmi2Int
 }
 
 fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind s, fmi2Boolean *value) {
-    (void)c;
     if (s != fmi2Terminated) {
         return fmi2Discard;
     }
-    *value = fmi2False;
+    /* A host that asks this after a refused step has no other inputs to try, and would try the same ones for ever. */
+    *value = instance_of(c)->discarded ? fmi2True : fmi2False;
     return fmi2OK;
 }
 

@@ -72,6 +72,7 @@ void wing_instance_reset(wing_instance *instance) {
     wing_behaviour_reset(&instance->behaviour);
     instance->phase = WING_INSTANTIATED;
     instance->time = 0.0;
+    instance->discarded = false;
     for (size_t i = 0; i < WING_VARIABLE_COUNT; ++i) {
         instance->values[i] = wing_variables[i].start;
     }
@@ -205,6 +206,7 @@ static const char *phase_name(wing_phase phase) {
 }
 
 fmi2Status wing_step(wing_instance *instance, double time, double step_size) {
+    instance->discarded = true; /* until it is done */
     if (instance->phase != WING_READY) {
         return wing_refuse(instance, WING_STATUS_BAD_CALL, "a step was asked for %s", phase_name(instance->phase));
     }
@@ -232,6 +234,7 @@ fmi2Status wing_step(wing_instance *instance, double time, double step_size) {
                            problem.text);
     }
     instance->time = time + step_size;
+    instance->discarded = false;
     accept_outputs(instance);
     return fmi2OK;
 }
@@ -338,6 +341,7 @@ fmi2Status wing_restore(wing_instance *instance, const wing_saved_state *saved) 
     }
     instance->phase = (wing_phase)(int)body[0];
     instance->time = body[1];
+    instance->discarded = false;
     instance->stale_response = body[2] != 0.0;
     instance->stale_bound = body[3] != 0.0;
     instance->stale_modal = body[4] != 0.0;

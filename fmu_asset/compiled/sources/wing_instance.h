@@ -29,6 +29,7 @@ typedef struct {
     wing_behaviour behaviour;
     wing_phase phase;
     double time;
+    bool discarded; /* the last step was refused */
     double values[WING_VARIABLE_COUNT]; /* by value reference */
     double outputs[WING_GAUGE_COUNT + 1];
     /* Outputs that are computed when somebody reads them, since most masters do not. */

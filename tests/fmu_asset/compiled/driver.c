@@ -179,6 +179,8 @@ static void refuse(const char *resources) {
     CHECK(fmi2GetRealStatus(wing, fmi2LastSuccessfulTime, reals) == fmi2OK && reals[0] == 0.0);
     CHECK(fmi2GetRealStatus(wing, fmi2Terminated, reals) == fmi2Discard);
     CHECK(fmi2GetIntegerStatus(wing, fmi2DoStepStatus, integers) == fmi2Discard);
+    CHECK(fmi2GetBooleanStatus(wing, fmi2Terminated, booleans) == fmi2OK && booleans[0] == fmi2True);
+    CHECK(fmi2Reset(wing) == fmi2OK);
     CHECK(fmi2GetBooleanStatus(wing, fmi2Terminated, booleans) == fmi2OK && booleans[0] == fmi2False);
     CHECK(fmi2GetBooleanStatus(wing, fmi2DoStepStatus, booleans) == fmi2Discard);
     CHECK(fmi2GetStringStatus(wing, fmi2PendingStatus, strings) == fmi2Discard);

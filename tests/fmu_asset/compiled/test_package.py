@@ -235,3 +235,20 @@ def test_the_command_line_builds_each_kind(compiler: list[str], tmp_path: Path) 
         names = members(tmp_path / f"{kind}.fmu")
         assert {name.split("/")[1] for name in names if name.startswith("binaries/")} == platforms
     assert build("fortran").returncode != 0
+
+
+def test_fmpy_ends_a_simulation_at_a_refused_step(compiled_fmu: Path, fmu: Path) -> None:
+    """In a process with a time limit: a host that is not told to end repeats the refused step for ever."""
+    program = (
+        "import sys, numpy as np; from fmpy import simulate_fmu\n"
+        "course = np.array([(0.0, 1.0), (3.0, 99.0)], dtype=[('time', 'f8'), ('load_factor', 'f8')])\n"
+        "seen = simulate_fmu(sys.argv[1], stop_time=5.0, step_size=1.0, output_interval=1.0, input=course,"
+        " output=['strain[1]'])\n"
+        "print(seen['time'].tolist())"
+    )
+    for path in (compiled_fmu, fmu):
+        done = subprocess.run(
+            [sys.executable, "-c", program, path], capture_output=True, text=True, timeout=60, check=True
+        )
+        assert done.stdout.splitlines()[-1] == "[0.0, 1.0, 1.0]"
+        assert path == fmu or "load_factor = 33.6" in done.stdout
