@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from importlib.metadata import distribution, version
 from importlib.resources import files
@@ -77,6 +78,7 @@ def compiled_members(
         ),
         "documentation/index.html": documentation_page(table, description, host=HOST),
         DATA_FILE: data_file_bytes(model),
+        "resources/design.json": (json.dumps({"design_hash": model.design_hash}) + "\n").encode(),
         **{f"sources/{name}": content for name, content in sources.items()},
         **{f"sources/{name}": content for name, content in fmi_headers().items()},
     }

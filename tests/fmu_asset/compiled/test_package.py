@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -59,6 +60,7 @@ def test_the_sources_alone_are_the_same_fmu_without_a_binary(
     whole = members(compiled_fmu)
     assert members(sources.path) == {n: c for n, c in whole.items() if not n.startswith("binaries/")}
     assert len(whole) == len(members(sources.path)) + 1
+    assert json.loads(whole["resources/design.json"]) == {"design_hash": model.design_hash}
     with pytest.raises(FmuUnsupportedError, match="no binary for this platform"):
         FmiAsset(sources.path, binding)
 
