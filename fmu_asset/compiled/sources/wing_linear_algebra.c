@@ -35,7 +35,15 @@ static void add_columns(double *restrict sum, size_t size, const double *restric
             sum[i] += (fa * a[i] + fb * b[i]) + (fd * d[i] + fe * e[i]);
         }
     }
-    for (; c < count; ++c) {
+    if (c + 2 <= count) {
+        const double *a = columns + c * stride, *b = a + stride;
+        const double fa = coefficients[c], fb = coefficients[c + 1];
+        for (size_t i = 0; i < size; ++i) {
+            sum[i] += fa * a[i] + fb * b[i];
+        }
+        c += 2;
+    }
+    if (c < count) {
         wing_add(sum, size, coefficients[c], columns + c * stride);
     }
 }
@@ -87,8 +95,8 @@ bool wing_cholesky(double *matrix, size_t size) {
         if (!(row[k] > 0.0)) { /* also NaN */
             return false;
         }
-        const double pivot = sqrt(row[k]), scale = 1.0 / pivot;
-        row[k] = pivot;
+        const double scale = 1.0 / sqrt(row[k]);
+        row[k] = scale;
         for (size_t j = k + 1; j < size; ++j) {
             row[j] *= scale;
         }
@@ -99,7 +107,7 @@ bool wing_cholesky(double *matrix, size_t size) {
 void wing_solve_lower(const double *restrict factor, size_t size, double *restrict right) {
     for (size_t k = 0; k < size; ++k) {
         const double *row = factor + k * size;
-        right[k] /= row[k];
+        right[k] *= row[k];
         wing_add(right + k + 1, size - k - 1, -right[k], row + k + 1);
     }
 }
@@ -107,14 +115,14 @@ void wing_solve_lower(const double *restrict factor, size_t size, double *restri
 void wing_solve_upper(const double *restrict factor, size_t size, double *restrict right) {
     for (size_t k = size; k-- > 0;) {
         const double *row = factor + k * size;
-        right[k] = (right[k] - wing_dot(row + k + 1, right + k + 1, size - k - 1)) / row[k];
+        right[k] = (right[k] - wing_dot(row + k + 1, right + k + 1, size - k - 1)) * row[k];
     }
 }
 
 void wing_solve_lower_columns(const double *restrict factor, size_t size, double *restrict right) {
     for (size_t k = 0; k < size; ++k) {
         const double *row = factor + k * size;
-        const double scale = 1.0 / row[k];
+        const double scale = row[k];
         double *solved = right + k * size;
         for (size_t j = 0; j < size; ++j) {
             solved[j] *= scale;

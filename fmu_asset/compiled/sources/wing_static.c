@@ -12,6 +12,8 @@ static double smaller(double first, double second) { return first < second ? fir
 void wing_static_lay_out(wing_static *wing, const wing_model *model, wing_arena *arena) {
     const size_t n = model->static_size, outputs = model->output_count, r = model->residual_size;
     wing->model = model;
+    wing->lasting_stiffness = wing_take(arena, n * n);
+    wing->lasting_residual = wing_take(arena, n * r);
     wing->factor = wing_take(arena, n * n);
     wing->dual_norm = wing_take(arena, outputs);
     for (size_t load = 0; load < WING_LOADS; ++load) {
@@ -21,6 +23,12 @@ void wing_static_lay_out(wing_static *wing, const wing_model *model, wing_arena 
         wing->unit[load].correction = wing_take(arena, outputs);
     }
     wing->work = wing_take(arena, 2 * larger(n, larger(r, outputs)));
+}
+
+/* sum = e * first + last, of the four terms of an array (4, size) */
+static void join_lasting(double *sum, const double *terms, size_t size, double skin) {
+    memcpy(sum, terms + 3 * size, size * sizeof *sum);
+    wing_add(sum, size, skin, terms);
 }
 
 bool wing_static_prepare(wing_static *wing, const double health[3], wing_problem *problem) {
@@ -37,9 +45,16 @@ bool wing_static_prepare(wing_static *wing, const double health[3], wing_problem
     for (size_t load = 0; load < WING_LOADS; ++load) {
         wing->unit[load].solved = wing->unit[load].bounded = false;
     }
-    wing_sum_terms(wing->factor, model->static_size, model->static_stiffness, WING_STIFFNESS_TERMS,
-                   wing->theta);
-    wing->factorised = wing_cholesky(wing->factor, model->static_size);
+    const size_t n = model->static_size;
+    if (!wing->lasting_known || wing->lasting_skin != health[0]) {
+        join_lasting(wing->lasting_stiffness, model->static_stiffness, n * n, health[0]);
+        join_lasting(wing->lasting_residual, model->stiffness_residual, n * model->residual_size, health[0]);
+        wing->lasting_skin = health[0];
+        wing->lasting_known = true;
+    }
+    memcpy(wing->factor, wing->lasting_stiffness, n * n * sizeof *wing->factor);
+    wing_add_columns(wing->factor, n * n, model->static_stiffness + n * n, n * n, 2, wing->theta + 1);
+    wing->factorised = wing_cholesky(wing->factor, n);
     return wing->factorised ||
            wing_fail(problem, "the stiffness at e = %g, z1 = %g, z2 = %g is not positive definite", health[0],
                      health[1], health[2]);
@@ -106,12 +121,13 @@ static void bound_unit(wing_static *wing, size_t load) {
     wing_unit_response *unit = &wing->unit[load];
     const size_t n = model->static_size, r = model->residual_size, outputs = model->output_count;
     memcpy(unit->residual, model->load_residual + load * r, r * sizeof *unit->residual);
-    for (size_t k = 0; k < WING_STIFFNESS_TERMS; ++k) {
-        for (size_t i = 0; i < n; ++i) {
-            wing->work[i] = wing->theta[k] * unit->coordinates[i];
-        }
-        wing_add_columns(unit->residual, r, model->stiffness_residual + k * n * r, r, n, wing->work);
+    wing_add_columns(unit->residual, r, wing->lasting_residual, r, n, unit->coordinates);
+    /* The two defect regions, whose columns lie one after another. */
+    for (size_t i = 0; i < n; ++i) {
+        wing->work[i] = wing->theta[1] * unit->coordinates[i];
+        wing->work[n + i] = wing->theta[2] * unit->coordinates[i];
     }
+    wing_add_columns(unit->residual, r, model->stiffness_residual + n * r, r, 2 * n, wing->work);
     memset(unit->correction, 0, outputs * sizeof *unit->correction);
     wing_add_columns(unit->correction, outputs, model->correction_columns + anchor_of(wing) * r * outputs, outputs,
                      r, unit->residual);

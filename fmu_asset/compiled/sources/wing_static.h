@@ -28,6 +28,11 @@ typedef struct {
     bool dual_known;
     double health[3];                 /* e, z1, z2 of the factor */
     double theta[WING_STIFFNESS_TERMS]; /* e, 1 - z1, 1 - z2, 1 */
+    /* Skin and everything else together, since e hardly ever changes: e times the first term plus the last. */
+    bool lasting_known;
+    double lasting_skin;              /* e of these */
+    double *lasting_stiffness;        /* (N, N) */
+    double *lasting_residual;         /* (N, R) */
     double *factor;                   /* (N, N) */
     double *dual_norm;                /* (G + 1) */
     wing_unit_response unit[WING_LOADS];
