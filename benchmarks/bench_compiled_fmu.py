@@ -19,8 +19,9 @@ from fe.cache import reduced_model
 from fmu_asset.archive import extract_fmu, read_fmu
 from fmu_asset.binding import Binding, load_binding
 from fmu_asset.build import build_fmu
-from fmu_asset.compiled.compiler import compile_library
+from fmu_asset.compiled.compiler import compile_library, find_compiler
 from fmu_asset.compiled.package import fmi_headers
+from fmu_asset.errors import FmuBuildError
 from fmu_asset.session import FmiAsset
 
 BINDING = Path(__file__).parents[1] / "scenarios" / "bindings" / "uav_wing.toml"
@@ -32,6 +33,11 @@ SIMULATED_STEPS = 10_000
 
 def run() -> list[Measurement]:
     """Measure a step with another health at every step, and what it consists of."""
+    try:
+        find_compiler()
+    except FmuBuildError as error:
+        print(error)
+        return []
     model = reduced_model()
     binding = load_binding(BINDING)
     with tempfile.TemporaryDirectory() as place:

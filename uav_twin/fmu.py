@@ -24,11 +24,14 @@ def build(
     from fe.cache import reduced_model
     from fe.design import load_design
     from fmu_asset.build import build_fmu
+    from fmu_asset.compiled.compiler import find_compiler
     from fmu_asset.errors import FmuBuildError
     from reporting.progress import RichProgress
 
     if out.exists() and not replace:
         raise FmuBuildError(f"{out} exists: choose another --out or give --replace.")
+    if kind == "compiled":
+        find_compiler()  # before the wing is modelled, which can take a minute
     model = reduced_model(load_design(design), progress=RichProgress())
     info = build_fmu(model, out, kind=kind, replace=replace)
     typer.echo(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
