@@ -180,8 +180,11 @@ def reduce_modes(
         _refine(working, theta, mass_theta, count, settings)
         advance()
     basis = _compress(working, compression_states(box), count, settings)
-    stiffness = basis.T @ working.stiffness @ basis
-    mass = basis.T @ working.mass @ basis
+    stiffness, mass = (
+        # What rounding made of the symmetry of large entries is averaged out.
+        0.5 * (terms + terms.transpose(0, 2, 1))
+        for terms in (basis.T @ working.stiffness @ basis, basis.T @ working.mass @ basis)
+    )
     data = ModalData(working.basis.vectors @ basis, stiffness, mass, np.empty((2, 0)), settings.mode_count)
     shapes = _flapwise(data, system, nominal_masses)
     return ModalData(data.basis, stiffness, mass, shapes, settings.mode_count)

@@ -302,9 +302,12 @@ class ReducedModel(ReducedArrays):
         theta = np.array((young_modulus_factor, 1.0 - z1, 1.0 - z2, 1.0))
         stiffness = (theta @ self.modal_stiffness.reshape(4, -1)).reshape(size)
         mass = self._modal_mass(servo_mass, pitot_mass)
-        to_standard = np.linalg.inv(np.linalg.cholesky(mass))
-        square, vectors = np.linalg.eigh(to_standard @ stiffness @ to_standard.T)
-        shape = to_standard.T @ vectors[:, : self.mode_count]
+        # M x = K x / omega^2: the stiffness is well conditioned in this basis, the mass is not, and the low
+        # modes are the largest eigenvalues, which keep all their digits.
+        to_standard = np.linalg.inv(np.linalg.cholesky(stiffness))
+        inverse_square, vectors = np.linalg.eigh(to_standard @ mass @ to_standard.T)
+        inverse_square = inverse_square[::-1][: self.mode_count]
+        shape = to_standard.T @ vectors[:, ::-1][:, : self.mode_count] / np.sqrt(inverse_square)
         shape = shape * np.where(self.modal_output[-1] @ shape < 0.0, -1.0, 1.0)
         output = self.modal_output @ shape
         force = self.modal_load @ shape
@@ -314,7 +317,7 @@ class ReducedModel(ReducedArrays):
         ]
         first, second = (int(i) for i in assurance.argmax(axis=1))
         return Modes(
-            frequency=np.sqrt(square[: self.mode_count]) / (2.0 * np.pi),
+            frequency=1.0 / (2.0 * np.pi * np.sqrt(inverse_square)),
             shape=shape,
             tip_displacement=output[-1],
             strain=output[:-1],

@@ -1,7 +1,8 @@
-"""Packing a reduced model as the wing FMU: FMI 2.0 co-simulation through pythonfmu, reproducible to the byte.
+"""Packing a reduced model as the wing FMU: FMI 2.0 co-simulation, reproducible to the byte.
 
-The slave base class and the binaries are pythonfmu's. The archive is packed here and not by its builder,
-which stamps times, a random GUID and module names that two FMUs in one process would share.
+What goes into the compiled kind is in `compiled`. Of the Python kind, slave base class and binaries are
+pythonfmu's; the archive is packed here and not by its builder, which stamps times, a random GUID and module
+names that two FMUs in one process would share.
 """
 
 from __future__ import annotations
@@ -17,14 +18,19 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distribution, version
 from importlib.resources import files
 from pathlib import Path
+from typing import Literal
 
 from fe.reduced import RUNTIME_FILES, ReducedModel
 from fe.state import STIFFNESS_LOSS_NAMES, DigitalState
 from reporting.files import atomic_write_bytes
 
+from .compiled.package import DATA_FILE, binary_of, compiled_members
 from .description import documentation_page, model_description
 from .errors import FmuBuildError
 from .variables import FmuVariable, variable_table
+
+FmuKind = Literal["python", "compiled", "source"]
+"""Run by Python, compiled for this machine, or the sources of the compiled one alone."""
 
 PYTHONFMU_VERSION = "0.7.0"
 """The only version whose wrapper these FMUs were tried with; its conventions are not a public interface."""
@@ -41,7 +47,9 @@ _OWN_FILES = ("behaviour.py", "slave.py", "variables.py")
 _PLACEHOLDER = "0_content_0_"
 _TAG_LENGTH = len(_PLACEHOLDER)
 _DATE = (1980, 1, 1, 0, 0, 0)
-_TEXT_SUFFIXES = (".py", ".xml", ".txt", ".html", ".json")
+_TEXT_SUFFIXES = (".py", ".xml", ".txt", ".html", ".json", ".c", ".h")
+# Where the GUID itself stands, between these two; elsewhere the placeholder stands for the tag.
+_GUID_PLACES = {"modelDescription.xml": 'guid="{}"', "sources/wing_variables.h": 'WING_GUID "{}"'}
 
 _SCRIPT = '''"""Loaded by the FMI wrapper; everything is in the package beside it."""
 from uav_wing_0_content_0__runtime.entry import Fmi2Slave, WingSlave, keep_alive
@@ -131,6 +139,7 @@ def build_fmu(
     path: str | os.PathLike[str],
     *,
     state: DigitalState | None = None,
+    kind: FmuKind = "python",
     replace: bool = False,
 ) -> FmuInfo:
     """Pack a reduced model as an FMU; equal input gives equal bytes.
@@ -143,6 +152,8 @@ def build_fmu(
         Where to write, with the suffix .fmu.
     state : DigitalState, optional
         Start values of parameters and health; the digital state's defaults if absent.
+    kind : {"python", "compiled", "source"}
+        What evaluates the model: Python in the host, C compiled now, or C to be compiled elsewhere.
     replace : bool
         Whether an existing file may be replaced.
 
@@ -154,15 +165,15 @@ def build_fmu(
     Raises
     ------
     FmuBuildError
-        If the file exists, the suffix is wrong, a start value lies outside the model's validity box, or
-        the wrong pythonfmu is installed.
+        If the file exists, the suffix is wrong, a start value lies outside the model's validity box, the
+        wrong pythonfmu is installed, or there is no C compiler for a compiled one.
     """
     target = Path(path)
     if target.suffix != ".fmu":
         raise FmuBuildError(f"An FMU must have the suffix .fmu, but {target} was given.")
     if target.exists() and not replace:
         raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
-    content, content_hash = fmu_bytes(model, state)
+    content, content_hash = fmu_bytes(model, state, kind)
     atomic_write_bytes(target, content)
     return _info(model, target, content, content_hash)
 
@@ -178,7 +189,9 @@ def _info(model: ReducedModel, path: Path, content: bytes, content_hash: str) ->
     )
 
 
-def fmu_bytes(model: ReducedModel, state: DigitalState | None = None) -> tuple[bytes, str]:
+def fmu_bytes(
+    model: ReducedModel, state: DigitalState | None = None, kind: FmuKind = "python"
+) -> tuple[bytes, str]:
     """Return the archive and its content hash; see `build_fmu`."""
     start = start_values(state or DigitalState())
     mode_count = min(MODE_COUNT, model.mode_count)
@@ -186,11 +199,23 @@ def fmu_bytes(model: ReducedModel, state: DigitalState | None = None) -> tuple[b
         gauge_count=model.gauge_count, mode_count=mode_count, validity=model.validity, start=start
     )
     _check_start(table)
-    template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start})
+    if kind == "python":
+        template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start})
+    else:
+        template = compiled_members(
+            model,
+            table,
+            identifier=f"uav_wing_{_PLACEHOLDER}",
+            guid=_PLACEHOLDER,
+            content_tag=_PLACEHOLDER,
+            description=DESCRIPTION,
+        )
     content_hash = _hash(template)
     members = {
         _named(name, content_hash): _filled(name, data, content_hash) for name, data in template.items()
     }
+    if kind == "compiled":
+        members |= binary_of(members, f"uav_wing_{content_hash[:_TAG_LENGTH]}")
     return _archive(members), content_hash
 
 
@@ -210,7 +235,8 @@ def start_values(state: DigitalState) -> dict[str, float]:
 def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
     """Return the GUID that an FMU of ours declares, and the GUID that its content has today.
 
-    The two differ when the file was changed after it was built.
+    The two differ when the file was changed after it was built. A compiled binary is not part of the content,
+    since every compiler makes another one of the same sources.
 
     Parameters
     ----------
@@ -223,9 +249,14 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
         GUIDs.
     """
     with zipfile.ZipFile(path) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    tag = members["resources/slavemodule.txt"].decode("ascii").strip().removeprefix("uav_wing_")
+        # Archives that other tools have packed again list their folders too.
+        members = {name: archive.read(name) for name in archive.namelist() if not name.endswith("/")}
     root = members["modelDescription.xml"].decode("utf-8")
+    if DATA_FILE in members:
+        members = {name: data for name, data in members.items() if not name.startswith("binaries/")}
+        tag = root.split('modelIdentifier="uav_wing_', 1)[1].split('"', 1)[0]
+    else:
+        tag = members["resources/slavemodule.txt"].decode("ascii").strip().removeprefix("uav_wing_")
     declared = root.split('guid="', 1)[1].split('"', 1)[0]
     template = {
         name.replace(tag, _PLACEHOLDER): _emptied(name, data, tag, declared) for name, data in members.items()
@@ -339,16 +370,18 @@ def _named(name: str, content_hash: str) -> str:
 def _filled(name: str, data: bytes, content_hash: str) -> bytes:
     if not name.endswith(_TEXT_SUFFIXES):
         return data
-    if name == "modelDescription.xml":
-        data = data.replace(f'guid="{_PLACEHOLDER}"'.encode(), f'guid="{_guid(content_hash)}"'.encode())
+    place = _GUID_PLACES.get(name)
+    if place is not None:
+        data = data.replace(place.format(_PLACEHOLDER).encode(), place.format(_guid(content_hash)).encode())
     return data.replace(_PLACEHOLDER.encode(), content_hash[:_TAG_LENGTH].encode())
 
 
 def _emptied(name: str, data: bytes, tag: str, guid: str) -> bytes:
     if not name.endswith(_TEXT_SUFFIXES):
         return data
-    if name == "modelDescription.xml":
-        data = data.replace(f'guid="{guid}"'.encode(), f'guid="{_PLACEHOLDER}"'.encode())
+    place = _GUID_PLACES.get(name)
+    if place is not None:
+        data = data.replace(place.format(guid).encode(), place.format(_PLACEHOLDER).encode())
     return data.replace(tag.encode(), _PLACEHOLDER.encode())
 
 

@@ -69,8 +69,10 @@ def check_fmu(path: str | os.PathLike[str]) -> FmuCheck:
 
 def _content_problems(description: FmuDescription) -> list[str]:
     with zipfile.ZipFile(description.path) as archive:
-        ours = {"resources/start.json", "resources/reduced_model.npz"} <= set(archive.namelist())
-    if not ours:
+        names = set(archive.namelist())
+    ours = {"resources/start.json", "resources/reduced_model.npz"}
+    ours_compiled = {"resources/reduced_model.bin", "sources/wing_variables.h"}
+    if not (ours <= names or ours_compiled <= names):
         return []
     try:
         declared, actual = recorded_content_hash(description.path)

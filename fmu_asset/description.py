@@ -30,6 +30,7 @@ def model_description(
     description: str,
     version: str,
     generation_tool: str,
+    source_files: Sequence[str] = (),
 ) -> bytes:
     """Return modelDescription.xml of an FMI 2.0 co-simulation FMU.
 
@@ -43,6 +44,8 @@ def model_description(
         The variables, in order of their value reference.
     description, version, generation_tool : str
         Attributes of the root element. There is no generation date: equal content gives equal bytes.
+    source_files : sequence of str
+        C sources in the folder `sources`; an FMU with none needs Python to run.
 
     Returns
     -------
@@ -60,11 +63,11 @@ def model_description(
         variableNamingConvention="structured",
         numberOfEventIndicators="0",
     )
-    SubElement(
+    interface = SubElement(
         root,
         "CoSimulation",
         modelIdentifier=identifier,
-        needsExecutionTool="true",
+        needsExecutionTool="false" if source_files else "true",
         canHandleVariableCommunicationStepSize="true",
         canInterpolateInputs="false",
         canBeInstantiatedOnlyOncePerProcess="false",
@@ -72,6 +75,10 @@ def model_description(
         canGetAndSetFMUstate="true",
         canSerializeFMUstate="true",
     )
+    if source_files:
+        listed = SubElement(interface, "SourceFiles")
+        for name in source_files:
+            SubElement(listed, "File", name=name)
     units = SubElement(root, "UnitDefinitions")
     for unit in UNITS:
         element = SubElement(units, "Unit", name=unit.name)
@@ -131,7 +138,12 @@ def _scalar_variable(row: FmuVariable) -> Element:
     return element
 
 
-def documentation_page(table: Sequence[FmuVariable], description: str) -> bytes:
+def documentation_page(
+    table: Sequence[FmuVariable],
+    description: str,
+    *,
+    host: str = "It runs in a Python host that has NumPy.",
+) -> bytes:
     """Return documentation/index.html: what the FMU is and its variables, as UTF-8 without any request."""
     rows = []
     for row in table:
@@ -153,7 +165,7 @@ def documentation_page(table: Sequence[FmuVariable], description: str) -> bytes:
 <style>body{{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}}
 td,th{{text-align:left;padding:.2em .8em .2em 0;border-bottom:1px solid #ddd}}</style></head><body>
 <h1>uav_wing</h1><p>{escape(description)}</p>
-<p>FMI 2.0 co-simulation. It runs in a Python host that has NumPy. A call that is refused logs why, sets
+<p>FMI 2.0 co-simulation. {escape(host)} A call that is refused logs why, sets
 <code>status</code> and leaves state and outputs as they were; a refused step returns fmi2Discard.</p>
 <table><tr><th>variable</th><th>causality</th><th>unit</th><th>range</th><th>start</th><th>meaning</th></tr>
 {body}

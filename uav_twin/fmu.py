@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -14,19 +14,26 @@ fmu_app = typer.Typer(no_args_is_help=True, help="Build, describe and check FMUs
 def build(
     out: Annotated[Path, typer.Option(help="The file to write.")] = Path("uav_wing.fmu"),
     design: Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")] = None,
+    kind: Annotated[
+        Literal["python", "compiled", "source"],
+        typer.Option(help="Run by Python, compiled C, or C sources to be compiled elsewhere."),
+    ] = "python",
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Pack the wing as an FMI 2.0 co-simulation FMU; equal designs give equal bytes."""
     from fe.cache import reduced_model
     from fe.design import load_design
     from fmu_asset.build import build_fmu
+    from fmu_asset.compiled.compiler import find_compiler
     from fmu_asset.errors import FmuBuildError
     from reporting.progress import RichProgress
 
     if out.exists() and not replace:
         raise FmuBuildError(f"{out} exists: choose another --out or give --replace.")
+    if kind == "compiled":
+        find_compiler()  # before the wing is modelled, which can take a minute
     model = reduced_model(load_design(design), progress=RichProgress())
-    info = build_fmu(model, out, replace=replace)
+    info = build_fmu(model, out, kind=kind, replace=replace)
     typer.echo(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
 
 

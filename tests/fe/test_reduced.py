@@ -210,6 +210,28 @@ def test_modes_are_orthonormal_in_the_mass(model: ReducedModel) -> None:
     assert np.all(modes.tip_displacement >= 0)
 
 
+def test_low_modes_keep_their_digits(model: ReducedModel) -> None:
+    """Another orthonormal basis of the same space gives the same frequencies, to rounding."""
+    size = model.modal_load.shape[1]
+    turn = np.linalg.qr(np.random.default_rng(4).normal(size=(size, size)))[0]
+    turned = replace(
+        model,
+        modal_stiffness=turn.T @ model.modal_stiffness @ turn,
+        modal_mass=turn.T @ model.modal_mass @ turn,
+        modal_load=model.modal_load @ turn,
+        modal_output=model.modal_output @ turn,
+        flapwise_reference=model.flapwise_reference @ turn,
+    )
+    for name in ("modal_stiffness", "modal_mass"):
+        terms = getattr(model, name)
+        np.testing.assert_array_equal(terms, terms.transpose(0, 2, 1))
+    for state in ((1.0, (0.0, 0.0), 0.169, 0.134), (0.9, (0.8, 0.3), 0.05, 0.0), (1.1, (0.5, 0.8), 0.3, 0.3)):
+        one, other = model.modes(*state), turned.modes(*state)
+        np.testing.assert_allclose(other.frequency, one.frequency, rtol=2e-13)
+        np.testing.assert_allclose(other.flapwise_mac, one.flapwise_mac, rtol=1e-11)
+        assert other.flapwise == one.flapwise
+
+
 def test_modal_compliance_adds_up_to_the_static_one(model: ReducedModel) -> None:
     modes = model.modes(1.0, (0.2, 0.2), 0.169, 0.134)
     terms = modes.tip_participation**2 / (2 * np.pi * modes.frequency) ** 2

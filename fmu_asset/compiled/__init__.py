@@ -1,0 +1,1 @@
+"""The wing as a compiled FMU: the reduced model evaluated in C, with its sources inside the FMU."""

@@ -1,0 +1,113 @@
+"""Making a shared library of C sources with the compiler at hand."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from fmpy import platform as fmi_platform
+
+from ..errors import FmuBuildError
+
+COMPILERS = ("cc", "gcc", "clang")
+"""Tried in this order where the environment variable CC names none."""
+
+PLATFORM = "linux64"
+"""The only platform that is compiled for here; other platforms compile the sources inside the FMU."""
+
+FLAGS = (
+    "-std=c11",
+    "-O3",
+    "-fPIC",
+    "-shared",
+    "-fvisibility=hidden",
+    # Fused multiplications would make the last bit depend on the processor that is compiled for.
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    # Nothing that depends on the place or the time of the build.
+    "-Wl,--build-id=none",
+    "-Wl,-s",
+)
+
+LIBRARIES = ("-lm",)
+
+_LONGEST_BUILD = 300.0
+_SHOWN_ERROR_LINES = 12
+
+
+def find_compiler() -> list[str]:
+    """Return the command of a C compiler: `$CC` if it is set, else the first of `COMPILERS` that is there.
+
+    Returns
+    -------
+    list of str
+        The command, such as ["/usr/bin/cc"]; `$CC` may hold arguments.
+
+    Raises
+    ------
+    FmuBuildError
+        If there is none.
+    """
+    given = shlex.split(os.environ.get("CC", ""))
+    for command in [given] if given else [[name] for name in COMPILERS]:
+        program = shutil.which(command[0])
+        if program is not None:
+            return [program, *command[1:]]
+    looked_for = f"CC={os.environ['CC']}" if given else ", ".join(COMPILERS)
+    raise FmuBuildError(
+        f"A compiled FMU needs a C compiler, but none was found (looked for: {looked_for}); install one "
+        "(such as the package gcc) or set CC, or build with --kind source and compile the FMU elsewhere."
+    )
+
+
+def compile_library(sources: Mapping[str, bytes], *, extra_flags: Sequence[str] = ()) -> bytes:
+    """Return the shared library of C sources; the same sources and compiler give the same bytes.
+
+    Parameters
+    ----------
+    sources : mapping of str to bytes
+        Content of the sources and headers by file name, all in one folder.
+    extra_flags : sequence of str
+        Flags after the usual ones.
+
+    Returns
+    -------
+    bytes
+        The library.
+
+    Raises
+    ------
+    FmuBuildError
+        If there is no compiler, this is not 64-bit Linux, or the compiler fails.
+    """
+    if fmi_platform != PLATFORM:
+        raise FmuBuildError(
+            f"Compiled FMUs are built on {PLATFORM} only, but this is {fmi_platform}; build with --kind "
+            "source and compile the FMU with `fmpy compile`."
+        )
+    compiler = find_compiler()
+    with tempfile.TemporaryDirectory(prefix="uav-twin-cc-") as folder:
+        for name, content in sources.items():
+            (Path(folder) / name).write_bytes(content)
+        units = sorted(name for name in sources if name.endswith(".c"))
+        # Names relative to the working folder, so that no path gets into the library.
+        command = [*compiler, *FLAGS, *extra_flags, "-o", "library.so", *units, *LIBRARIES]
+        try:
+            done = subprocess.run(
+                command, cwd=folder, capture_output=True, text=True, timeout=_LONGEST_BUILD, check=False
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise FmuBuildError(f"The C compiler {compiler[0]} could not be run ({error}).") from error
+        library = Path(folder) / "library.so"
+        if done.returncode != 0 or not library.is_file():
+            lines = (done.stderr or done.stdout).strip().splitlines()[:_SHOWN_ERROR_LINES]
+            raise FmuBuildError(
+                f"The C compiler {compiler[0]} failed with exit code {done.returncode}; set CC to another "
+                "one. It says:\n  " + "\n  ".join(lines)
+            )
+        return library.read_bytes()

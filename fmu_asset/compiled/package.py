@@ -1,0 +1,129 @@
+"""What goes into the compiled FMU: description, sources, FMI headers, data file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib.metadata import distribution, version
+from importlib.resources import files
+from pathlib import Path
+
+from fe.reduced_arrays import ReducedArrays
+
+from ..description import documentation_page, model_description
+from ..errors import FmuBuildError
+from ..variables import FmuVariable
+from .compiler import PLATFORM, compile_library
+from .data_file import data_file_bytes
+from .variable_header import variable_sources
+
+DATA_FILE = "resources/reduced_model.bin"
+
+FMI_HEADERS = ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h")
+"""The headers of FMI 2.0 as fmpy ships them, with their licence (2-clause BSD) in them."""
+
+HOST = "It is compiled C and needs nothing but the C library; its sources are inside."
+
+
+def compiled_members(
+    model: ReducedArrays,
+    table: Sequence[FmuVariable],
+    *,
+    identifier: str,
+    guid: str,
+    content_tag: str,
+    description: str,
+) -> dict[str, bytes]:
+    """Return the files of a compiled FMU, all but its binary.
+
+    Parameters
+    ----------
+    model : ReducedArrays
+        The reduced wing.
+    table : sequence of FmuVariable
+        The variables, in order of their value reference.
+    identifier : str
+        Model identifier.
+    guid, content_tag : str
+        GUID, and the mark of saved states; placeholders, as long as the content is not known.
+    description : str
+        One sentence for people.
+
+    Returns
+    -------
+    dict of str to bytes
+        Content by name in the archive.
+
+    Raises
+    ------
+    FmuBuildError
+        If fmpy's headers are missing.
+    """
+    sources = {
+        entry.name: entry.read_bytes()
+        for entry in (files("fmu_asset.compiled") / "sources").iterdir()
+        if entry.name.endswith((".c", ".h"))
+    }
+    made = variable_sources(table, guid=guid, content_tag=content_tag)
+    sources |= {name: text.encode() for name, text in made.items()}
+    return {
+        "modelDescription.xml": model_description(
+            identifier=identifier,
+            guid=guid,
+            table=table,
+            description=description,
+            version=version("uav-twin"),
+            generation_tool="uav-twin",
+            source_files=sorted(name for name in sources if name.endswith(".c")),
+        ),
+        "documentation/index.html": documentation_page(table, description, host=HOST),
+        DATA_FILE: data_file_bytes(model),
+        "resources/design.json": (json.dumps({"design_hash": model.design_hash}) + "\n").encode(),
+        **{f"sources/{name}": content for name, content in sources.items()},
+        **{f"sources/{name}": content for name, content in fmi_headers().items()},
+    }
+
+
+def fmi_headers() -> dict[str, bytes]:
+    """Return the headers of FMI 2.0 by name, from the installed fmpy.
+
+    Raises
+    ------
+    FmuBuildError
+        If they are missing from the installation.
+    """
+    folder = Path(str(distribution("fmpy").locate_file("fmpy"))) / "c-code"
+    try:
+        return {name: (folder / name).read_bytes() for name in FMI_HEADERS}
+    except OSError as error:
+        raise FmuBuildError(
+            f"The FMI header {error.filename} is missing from the installation of fmpy; install it again."
+        ) from error
+
+
+def binary_of(members: Mapping[str, bytes], identifier: str) -> dict[str, bytes]:
+    """Return the binary of a compiled FMU, made of the sources among its files.
+
+    Parameters
+    ----------
+    members : mapping of str to bytes
+        The files of the FMU.
+    identifier : str
+        Model identifier.
+
+    Returns
+    -------
+    dict of str to bytes
+        The binary under its name in the archive.
+
+    Raises
+    ------
+    FmuBuildError
+        If it cannot be compiled.
+    """
+    sources = {
+        name.removeprefix("sources/"): content
+        for name, content in members.items()
+        if name.startswith("sources/")
+    }
+    return {f"binaries/{PLATFORM}/{identifier}.so": compile_library(sources)}

@@ -1,0 +1,223 @@
+#include "wing_behaviour.h"
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define STATE_HEAD (2 + WING_INPUTS)
+
+static void lay_out(wing_behaviour *wing, wing_arena *arena) {
+    for (size_t i = 0; i < 2; ++i) {
+        wing_integrator_lay_out(&wing->integrators[i], wing->model, arena);
+        wing_motion_lay_out(&wing->motions[i], wing->model, arena);
+    }
+}
+
+bool wing_behaviour_make(wing_behaviour *wing, const wing_model *model, wing_problem *problem) {
+    memset(wing, 0, sizeof *wing);
+    wing->model = model;
+    wing_arena count = {NULL, 0};
+    lay_out(wing, &count);
+    wing->memory = calloc(count.used, sizeof *wing->memory);
+    if (wing->memory == NULL) {
+        return wing_fail(problem, "there is no memory for an instance");
+    }
+    wing_arena arena = {wing->memory, 0};
+    lay_out(wing, &arena);
+    return true;
+}
+
+void wing_behaviour_free(wing_behaviour *wing) {
+    free(wing->memory);
+    memset(wing, 0, sizeof *wing);
+}
+
+void wing_behaviour_reset(wing_behaviour *wing) { wing->started = wing->moving = false; }
+
+static void loads_of(const double inputs[WING_INPUTS], double load[WING_LOADS]) {
+    load[0] = inputs[0];
+    load[1] = inputs[3];
+}
+
+static void key_of(const wing_parameters *parameters, const double inputs[WING_INPUTS],
+                   double key[WING_MODE_KEYS]) {
+    key[0] = parameters->young_modulus_factor;
+    key[1] = inputs[1];
+    key[2] = inputs[2];
+    key[3] = parameters->servo_mass;
+    key[4] = parameters->pitot_mass;
+}
+
+/* Static response, with the integrator in use, whose static part follows the inputs. */
+static bool find_equilibrium(wing_behaviour *wing, const wing_parameters *parameters,
+                             const double inputs[WING_INPUTS], double *output, wing_problem *problem) {
+    wing_static *steady = &wing->integrators[wing->integrator].steady;
+    const double health[3] = {parameters->young_modulus_factor, inputs[1], inputs[2]};
+    double load[WING_LOADS];
+    loads_of(inputs, load);
+    if (!wing_static_prepare(steady, health, problem)) {
+        return false;
+    }
+    wing_static_response(steady, load, output);
+    return true;
+}
+
+/* Bring an integrator to the state of health of these inputs. */
+static bool prepare(wing_integrator *integrator, const wing_parameters *parameters,
+                    const double inputs[WING_INPUTS], wing_problem *problem) {
+    double key[WING_MODE_KEYS];
+    key_of(parameters, inputs, key);
+    return wing_integrator_prepare(integrator, key, parameters->damping_alpha, parameters->damping_beta,
+                                   problem);
+}
+
+bool wing_behaviour_start(wing_behaviour *wing, const wing_parameters *parameters,
+                          const double inputs[WING_INPUTS], double *output, wing_problem *problem) {
+    if (!parameters->transient) {
+        if (!find_equilibrium(wing, parameters, inputs, output, problem)) {
+            return false;
+        }
+        wing->moving = false;
+    } else {
+        const size_t next = 1 - wing->integrator;
+        wing_integrator *integrator = &wing->integrators[next];
+        wing_motion *motion = &wing->motions[1 - wing->motion];
+        double load[WING_LOADS];
+        loads_of(inputs, load);
+        if (!prepare(integrator, parameters, inputs, problem)) {
+            return false;
+        }
+        wing_integrator_release(integrator, parameters->initial_tip_displacement, load, motion);
+        wing_integrator_output(integrator, motion, output);
+        wing->integrator = next;
+        wing->motion = 1 - wing->motion;
+        wing->moving = true;
+    }
+    wing->parameters = *parameters;
+    memcpy(wing->inputs, inputs, sizeof wing->inputs);
+    wing->started = true;
+    return true;
+}
+
+bool wing_behaviour_advance(wing_behaviour *wing, const double inputs[WING_INPUTS], double duration,
+                            double *output, wing_problem *problem) {
+    if (!wing->started) {
+        return wing_fail(problem, "the wing was not initialised");
+    }
+    if (!wing->moving) {
+        if (!find_equilibrium(wing, &wing->parameters, inputs, output, problem)) {
+            return false;
+        }
+    } else {
+        wing_integrator *integrator = &wing->integrators[wing->integrator];
+        wing_motion *motion = &wing->motions[wing->motion], *other = &wing->motions[1 - wing->motion];
+        double load[WING_LOADS];
+        loads_of(inputs, load);
+        if (memcmp(inputs + 1, wing->inputs + 1, 2 * sizeof *inputs) != 0) {
+            wing_integrator *next = &wing->integrators[1 - wing->integrator];
+            if (!prepare(next, &wing->parameters, inputs, problem)) {
+                return false;
+            }
+            /* The former motion is not needed again, because nothing after this can fail. */
+            wing_integrator_take_over(next, integrator, motion, other);
+            wing->integrator = 1 - wing->integrator;
+            integrator = next;
+            wing_integrator_advance(integrator, other, duration, load, load, motion);
+        } else {
+            wing_integrator_advance(integrator, motion, duration, load, load, other);
+            wing->motion = 1 - wing->motion;
+            motion = other;
+        }
+        wing_integrator_output(integrator, motion, output);
+    }
+    memcpy(wing->inputs, inputs, sizeof wing->inputs);
+    return true;
+}
+
+bool wing_behaviour_error_bound(wing_behaviour *wing, double *bound, wing_problem *problem) {
+    if (!wing->started) {
+        return wing_fail(problem, "the wing was not initialised");
+    }
+    wing_static *steady = &wing->integrators[wing->integrator].steady;
+    const double health[3] = {wing->parameters.young_modulus_factor, wing->inputs[1], wing->inputs[2]};
+    double load[WING_LOADS];
+    loads_of(wing->inputs, load);
+    if (!wing_static_prepare(steady, health, problem)) {
+        return false;
+    }
+    *bound = wing_static_error_bound(steady, load);
+    return true;
+}
+
+bool wing_behaviour_modal_data(wing_behaviour *wing, size_t count, double *frequency, double *damping_ratio,
+                               wing_problem *problem) {
+    if (!wing->started) {
+        return wing_fail(problem, "the wing was not initialised");
+    }
+    wing_integrator *integrator = &wing->integrators[wing->integrator];
+    double key[WING_MODE_KEYS];
+    key_of(&wing->parameters, wing->inputs, key);
+    if (!wing_modes_find(&integrator->modes, key, problem)) {
+        return false;
+    }
+    wing_integrator_damp(integrator, wing->parameters.damping_alpha, wing->parameters.damping_beta);
+    const double two_pi = 6.283185307179586;
+    for (size_t i = 0; i < count; ++i) {
+        frequency[i] = integrator->modes.angular_frequency[i] / two_pi;
+        damping_ratio[i] = integrator->damping_ratio[i];
+    }
+    return true;
+}
+
+size_t wing_behaviour_state_size(const wing_behaviour *wing) {
+    return STATE_HEAD + 2 * wing->model->mode_count + WING_LOADS;
+}
+
+size_t wing_behaviour_save(const wing_behaviour *wing, double *state) {
+    const size_t count = wing->model->mode_count;
+    state[0] = wing->started ? 1.0 : 0.0;
+    state[1] = wing->moving ? 1.0 : 0.0;
+    for (size_t i = 0; i < WING_INPUTS; ++i) {
+        state[2 + i] = wing->started ? wing->inputs[i] : 0.0;
+    }
+    if (!wing->moving) {
+        return STATE_HEAD;
+    }
+    const wing_motion *motion = &wing->motions[wing->motion];
+    double *rest = state + STATE_HEAD;
+    memcpy(rest, motion->displacement, count * sizeof *rest);
+    memcpy(rest + count, motion->velocity, count * sizeof *rest);
+    memcpy(rest + 2 * count, motion->load, sizeof motion->load);
+    return STATE_HEAD + 2 * count + WING_LOADS;
+}
+
+bool wing_behaviour_restore(wing_behaviour *wing, const wing_parameters *parameters, const double *state,
+                            size_t count, wing_problem *problem) {
+    const size_t modes = wing->model->mode_count;
+    const bool moving = count > 1 && state[1] != 0.0;
+    if (count != STATE_HEAD + (moving ? 2 * modes + WING_LOADS : 0)) {
+        return wing_fail(problem, "it holds %lu numbers of motion, which does not fit", (unsigned long)count);
+    }
+    for (size_t i = 0; i < count; ++i) {
+        if (!isfinite(state[i])) {
+            return wing_fail(problem, "it holds a number that is not finite");
+        }
+    }
+    if (moving) {
+        const size_t next = 1 - wing->integrator;
+        const double *rest = state + STATE_HEAD;
+        if (!prepare(&wing->integrators[next], parameters, state + 2, problem)) {
+            return false;
+        }
+        wing_motion *motion = &wing->motions[wing->motion];
+        memcpy(motion->displacement, rest, modes * sizeof *rest);
+        memcpy(motion->velocity, rest + modes, modes * sizeof *rest);
+        memcpy(motion->load, rest + 2 * modes, sizeof motion->load);
+        wing->integrator = next;
+    }
+    wing->started = state[0] != 0.0;
+    wing->moving = moving;
+    wing->parameters = *parameters;
+    memcpy(wing->inputs, state + 2, sizeof wing->inputs);
+    return true;
+}

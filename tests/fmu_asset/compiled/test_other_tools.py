@@ -1,0 +1,120 @@
+"""The wing in other hosts: a program in C, libcosim with both FMUs, OMSimulator where it is installed."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe.reduced import ReducedModel
+from fmu_asset.archive import read_fmu
+
+COURSE = [(1.0 + 0.25 * k, 0.1 * (k // 3), 0.2, -5.0 if k % 2 else 0.0) for k in range(9)]
+
+# In a process of its own: libcosim is native code with threads, and writes its log to the terminal.
+LIBCOSIM = """
+import json, sys
+from libcosimpy.CosimExecution import CosimExecution
+from libcosimpy.CosimManipulator import CosimManipulator
+from libcosimpy.CosimObserver import CosimObserver
+from libcosimpy.CosimSlave import CosimLocalSlave
+
+files, course = sys.argv[1:3], json.loads(sys.argv[3])
+execution = CosimExecution.from_step_size(step_size=int(0.5e9))
+observer, manipulator = CosimObserver.create_last_value(), CosimManipulator.create_override()
+assert execution.add_observer(observer) and execution.add_manipulator(manipulator)
+slaves = [execution.add_local_slave(CosimLocalSlave(fmu_path=file, instance_name=f"wing{number}"))
+          for number, file in enumerate(files)]
+seen = []
+for inputs in course:
+    for slave in slaves:
+        assert manipulator.slave_real_values(slave, [0, 1, 2, 3], inputs)
+    assert execution.step()
+    seen.append([observer.last_real_values(slave, list(range(11, 37))) for slave in slaves])
+print("SEEN" + json.dumps(seen))
+"""
+
+
+def test_a_host_without_python_needs_nothing_else(
+    compiled_fmu: Path, compiler: list[str], model: ReducedModel, tmp_path: Path
+) -> None:
+    with zipfile.ZipFile(compiled_fmu) as archive:
+        archive.extractall(tmp_path)
+    host = tmp_path / "host"
+    source = Path(__file__).with_name("host.c")
+    subprocess.run(
+        [*compiler, "-Wall", "-Wextra", "-Werror", f"-I{tmp_path / 'sources'}", source, "-o", host, "-ldl"],
+        check=True,
+    )
+    library = next((tmp_path / "binaries" / "linux64").glob("*.so"))
+    # In a folder whose name must be encoded in the URI.
+    resources = (tmp_path / "resources").rename(tmp_path / "resources of é 100%")
+    done = subprocess.run(
+        [host, library, read_fmu(compiled_fmu).guid, resources.as_uri(), "3", *map(str, range(11, 35))],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={},
+    )
+    assert done.returncode == 0, done.stdout
+    expected = model.static_response(1.0, (0.0, 0.0), 1.0).strain
+    np.testing.assert_allclose([float(line) for line in done.stdout.split()], expected, rtol=1e-12)
+
+
+def test_both_fmus_fly_in_libcosim(compiled_fmu: Path, fmu: Path, model: ReducedModel) -> None:
+    if importlib.util.find_spec("libcosimpy") is None:
+        pytest.skip("libcosimpy is not installed")
+    done = subprocess.run(
+        [sys.executable, "-c", LIBCOSIM, compiled_fmu, fmu, json.dumps(COURSE)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    seen = json.loads(done.stdout.split("SEEN", 1)[1].splitlines()[0])
+    assert len(seen) == len(COURSE)
+    for (load_factor, z1, z2, force), (compiled, python) in zip(COURSE, seen, strict=True):
+        expected = model.static_response(1.0, (z1, z2), load_factor, force)
+        np.testing.assert_allclose(compiled[:24], expected.strain, rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(compiled, python, rtol=1e-9, atol=1e-15)
+
+
+def test_the_compiled_fmu_runs_in_omsimulator(
+    compiled_fmu: Path, model: ReducedModel, tmp_path: Path
+) -> None:
+    simulator = shutil.which("OMSimulator")
+    if simulator is None:
+        pytest.skip("OMSimulator is not installed")
+    result = tmp_path / "result.csv"
+    done = subprocess.run(
+        [
+            simulator,
+            compiled_fmu,
+            "--stopTime=3",
+            "--stepSize=1",
+            f"--resultFile={result}",
+            f"--tempDir={tmp_path}",
+        ],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    with result.open(newline="") as lines:
+        last = list(csv.DictReader(lines))[-1]
+    strain = {name: float(value) for name, value in last.items() if "strain[" in name}
+    assert len(strain) == 24
+    expected = model.static_response(1.0, (0.0, 0.0), 1.0).strain
+    for name, value in strain.items():
+        assert value == pytest.approx(
+            expected[int(name.split("[")[1].split("]")[0]) - 1], rel=1e-9, abs=1e-15
+        )

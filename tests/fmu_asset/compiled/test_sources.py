@@ -1,0 +1,176 @@
+"""The C sources: clean under strict warnings and sanitizers; no damaged data file gets past their reader."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import subprocess
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe.reduced import ReducedModel
+from fmu_asset.compiled.data_file import MAGIC, NAME_BYTES, data_file_bytes, pack_arrays
+
+DRIVER = Path(__file__).with_name("driver.c")
+WARNINGS = (
+    *("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wcast-qual", "-Wstrict-prototypes"),
+    "-Werror",
+)
+
+
+@pytest.fixture(scope="module")
+def extracted(compiled_fmu: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sources")
+    with zipfile.ZipFile(compiled_fmu) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+def compile_driver(
+    compiler: list[str], extracted: Path, target: Path, *flags: str
+) -> subprocess.CompletedProcess[str]:
+    sources = sorted((extracted / "sources").glob("*.c"))
+    return subprocess.run(
+        [*compiler, "-std=c11", *flags, f"-I{extracted / 'sources'}", *sources, DRIVER, "-o", target, "-lm"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def arrays_of(content: bytes) -> dict[str, np.ndarray]:
+    """Read a data file as its description says, independently of the C reader."""
+    assert content[:8] == MAGIC
+    assert struct.unpack("<I", content[-4:])[0] == zlib.crc32(content[:-4])
+    version, count = struct.unpack_from("<II", content, 8)
+    assert version == 1
+    at, arrays = 16, {}
+    for _ in range(count):
+        name = content[at : at + NAME_BYTES].rstrip(b"\0").decode()
+        dimensions, zero = struct.unpack_from("<II", content, at + NAME_BYTES)
+        assert zero == 0
+        at += NAME_BYTES + 8
+        shape = struct.unpack_from(f"<{dimensions}Q", content, at)
+        at += 8 * dimensions
+        size = int(np.prod(shape))
+        arrays[name] = np.frombuffer(content, "<f8", size, at).reshape(shape)
+        at += 8 * size
+    assert at == len(content) - 4
+    return arrays
+
+
+def test_the_data_file_holds_the_arrays_of_the_model(model: ReducedModel) -> None:
+    content = data_file_bytes(model)
+    assert data_file_bytes(ReducedModel.from_bytes(model.to_bytes())) == content
+    arrays = arrays_of(content)
+    for name in ("static_stiffness", "dual_correction", "cross_mass", "dual_split_1", "validity_box"):
+        np.testing.assert_array_equal(arrays[name], getattr(model, name))
+    assert arrays["mode_count"] == model.mode_count
+    assert pack_arrays(arrays) == content
+
+
+def damaged(content: bytes) -> dict[str, bytes]:
+    """Return data files that are wrong, most of them with a right checksum."""
+
+    def sealed(body: bytes) -> bytes:
+        return body + struct.pack("<I", zlib.crc32(body))
+
+    def without(name: str) -> bytes:
+        return pack_arrays({key: array for key, array in arrays.items() if key != name})
+
+    def with_array(name: str, array: np.ndarray) -> bytes:
+        return pack_arrays(arrays | {name: array})
+
+    arrays = arrays_of(content)
+    body = content[:-4]
+    files = {
+        "empty": b"",
+        "short": content[:20],
+        "flipped": content[:5000] + bytes([content[5000] ^ 1]) + content[5001:],
+        "magic": sealed(b"X" + body[1:]),
+        "version": sealed(body[:8] + struct.pack("<I", 2) + body[12:]),
+        "longer": sealed(body + b"\0" * 8),
+        "no_arrays": sealed(body[:12] + struct.pack("<I", 0) + body[16:]),
+        "many_arrays": sealed(body[:12] + struct.pack("<I", 2**32 - 1) + body[16:]),
+        "name": sealed(body[:16] + b"x" * NAME_BYTES + body[16 + NAME_BYTES :]),
+        "dimensions": sealed(body[:48] + struct.pack("<I", 99) + body[52:]),
+        "extent": sealed(body[:56] + struct.pack("<Q", 2**63) + body[64:]),
+        "nan": with_array("static_load", np.full_like(arrays["static_load"], np.nan)),
+        "modes": with_array("mode_count", np.array(1e300)),
+        "fewer_modes": with_array("mode_count", np.array(2.0)),
+        "gauges": with_array("static_output", arrays["static_output"][:-1]),
+        "overflow": with_array("dual_residual", np.zeros((1, 1, 25, 4, 4))),
+    }
+    files |= {
+        f"without_{name}": without(name)
+        for name in arrays
+        if name not in ("validity_box", "flapwise_reference")
+    }
+    files |= {f"cut_{length}": sealed(body[:length]) for length in range(16, len(body), len(body) // 40)}
+    return files
+
+
+def test_driven_in_c_under_sanitizers(
+    compiler: list[str], extracted: Path, model: ReducedModel, tmp_path: Path
+) -> None:
+    """Every FMI function, garbage as states, damaged files: no error of memory, no undefined behaviour."""
+    driver = tmp_path / "driver"
+    sanitized = "-fsanitize=address,undefined"
+    done = compile_driver(compiler, extracted, driver, "-O1", "-g", sanitized, "-fno-sanitize-recover=all")
+    if done.returncode != 0 and ("sanitize" in done.stderr or "asan" in done.stderr):
+        pytest.skip(f"{compiler[0]} has no sanitizers: {done.stderr.splitlines()[0]}")
+    assert done.returncode == 0, done.stderr
+    folders = []
+    for name, content in damaged(data_file_bytes(model)).items():
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "reduced_model.bin").write_bytes(content)
+        folders.append(folder.as_uri())
+    run = subprocess.run(
+        [driver, (extracted / "resources").as_uri(), *folders],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "ASAN_OPTIONS": "detect_leaks=1:allocator_may_return_null=1"},
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+
+
+def test_driven_in_c_without_a_lost_byte(compiler: list[str], extracted: Path, tmp_path: Path) -> None:
+    """The same, optimised and warned of as much as the compiler can, under valgrind."""
+    driver = tmp_path / "driver"
+    done = compile_driver(compiler, extracted, driver, "-O2", "-g", *WARNINGS)
+    assert done.returncode == 0, done.stderr
+    valgrind = shutil.which("valgrind")
+    if valgrind is None:
+        pytest.skip("valgrind is not installed")
+    run = subprocess.run(
+        [
+            valgrind,
+            "--error-exitcode=9",
+            "--leak-check=full",
+            "--quiet",
+            driver,
+            (extracted / "resources").as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+
+
+def test_nothing_but_the_fmi_functions_is_exported(compiled_fmu: Path, extracted: Path) -> None:
+    nm = shutil.which("nm")
+    if nm is None:
+        pytest.skip("nm is not installed")
+    library = next((extracted / "binaries" / "linux64").glob("*.so"))
+    listed = subprocess.run([nm, "-D", "--defined-only", library], capture_output=True, text=True, check=True)
+    names = {line.split()[-1] for line in listed.stdout.splitlines()}
+    assert {"fmi2DoStep", "fmi2Instantiate"} <= names
+    assert not {name for name in names if not name.startswith("fmi2")}
