@@ -1,4 +1,4 @@
-"""The sandwich plate of `fe.plate` against closed forms: a square plate, its frequency, a cantilever strip."""
+"""The sandwich plate of `fe.plate` against closed forms: a square plate and a cantilever strip."""
 
 from dataclasses import dataclass
 
