@@ -114,7 +114,7 @@ class Plate:
     @cached_property
     def points(self) -> FloatArray:
         """Places (cells, q, 2) of the integration points [m]."""
-        return np.moveaxis(np.asarray(self._basis.global_coordinates().value), 0, -1)
+        return np.moveaxis(np.asarray(self._basis.global_coordinates()), 0, -1)
 
     @cached_property
     def weights(self) -> FloatArray:
@@ -130,7 +130,7 @@ class Plate:
     def _shapes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Values and x- and y-derivatives (cells, q, 9) of the shape functions at the integration points."""
         shape = self.weights.shape
-        values = [np.broadcast_to(self._basis.basis[n][0].value, shape) for n in range(NODES)]
+        values = [np.broadcast_to(np.asarray(self._basis.basis[n][0]), shape) for n in range(NODES)]
         slopes = [self._basis.basis[n][0].grad for n in range(NODES)]
         return (
             np.stack(values, axis=-1),
@@ -228,7 +228,9 @@ class Plate:
         cells = mesh.element_finder(mapping=mapping)(*places.T)
         local = mapping.invF(places.T[:, :, None], tind=cells)
         parts = [ElementQuad2().gbasis(mapping, local, n, tind=cells)[0] for n in range(NODES)]
-        values = np.stack([np.broadcast_to(part.value, (len(places), 1))[:, 0] for part in parts], axis=-1)
+        values = np.stack(
+            [np.broadcast_to(np.asarray(part), (len(places), 1))[:, 0] for part in parts], axis=-1
+        )
         slopes = [np.stack([part.grad[k][:, 0] for part in parts], axis=-1) for k in range(2)]
         return self._cell_dofs[cells], values, slopes[0], slopes[1]
 

@@ -19,6 +19,8 @@ DAMAGE = 0.8
 """Stiffness loss of either defect at which its effect is compared."""
 FACTOR_STEP = 0.02
 """Step in e of the central differences."""
+MODES = 6
+"""Number of modes compared."""
 
 
 class WingModel(Protocol):
@@ -61,8 +63,10 @@ class WingResults:
         Of the static test at e = 1 [N/m].
     tip_stiffness_slope : float
         d ln k / d ln e at e = 1.
+    frequency : (6,) Hz
+        Lowest frequencies at the nominal masses.
     first_bending, second_bending : float
-        Flapwise bending frequencies at the nominal masses [Hz].
+        Those of the flapwise bending modes [Hz].
     strain : (gauges,) dimensionless
         At the load factor of the design's lift.
     strain_slope : (gauges,)
@@ -74,6 +78,7 @@ class WingResults:
     unknowns: int
     tip_stiffness: float
     tip_stiffness_slope: float
+    frequency: FloatArray
     first_bending: float
     second_bending: float
     strain: FloatArray
@@ -166,12 +171,14 @@ def wing_results(model: WingModel, design: WingDesign, bending_shapes: FloatArra
     (k_low, low), (k_high, high) = (response(1.0 + sign * FACTOR_STEP) for sign in (-1.0, 1.0))
     step = float(np.log((1.0 + FACTOR_STEP) / (1.0 - FACTOR_STEP)))
     mass = model.mass(design.masses.servo, design.masses.pitot)
-    values, shapes = lowest_eigenpairs(model.stiffness(), mass, 4)
-    first, second = np.sqrt(values[track(bending_shapes, shapes, mass)]) / (2.0 * np.pi)
+    values, shapes = lowest_eigenpairs(model.stiffness(), mass, MODES)
+    frequency = np.sqrt(values) / (2.0 * np.pi)
+    first, second = frequency[track(bending_shapes, shapes, mass)]
     return WingResults(
         unknowns=model.unknowns,
         tip_stiffness=stiffness,
         tip_stiffness_slope=float(np.log(k_high / k_low)) / step,
+        frequency=frequency,
         first_bending=float(first),
         second_bending=float(second),
         strain=strain,

@@ -99,13 +99,16 @@ class PlateLayout:
         table[i, j] = np.arange(len(i))
         return table
 
+    def skin_modulus_at(self, station: FloatArray) -> FloatArray:
+        """Young's modulus (...,) of the skin [Pa] at fractions (...,) of the semi-span."""
+        bands = self.design.skin.bands
+        ends = np.array([band.end for band in bands[:-1]])
+        return np.array([band.young_modulus for band in bands])[np.searchsorted(ends, station)]
+
     @cached_property
     def skin_modulus(self) -> FloatArray:
-        """Young's modulus (cells, q) of the skin [Pa]."""
-        bands = self.design.skin.bands
-        station = self.plate.points[..., 1] / self.design.planform.semi_span
-        band = np.searchsorted([band.end for band in bands], station)
-        return np.array([band.young_modulus for band in bands])[band]
+        """Young's modulus (cells, q) of the skin [Pa] at the integration points."""
+        return self.skin_modulus_at(self.plate.points[..., 1] / self.design.planform.semi_span)
 
     @cached_property
     def added_density(self) -> FloatArray:

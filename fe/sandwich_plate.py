@@ -2,7 +2,8 @@
 
 Skins are the faces, at the section's height; webs, ribs and the leading-edge wall are solid cores where they
 stand. Between them there is no core: the deflection runs straight from web to web along the chord, and the
-faces' own bending is left out. Every number is the design's own. The operators are affine as those of the
+skins bend on their own only as the beams of a frame (`fe.plate_frame`). Every number is the design's own. The
+operators are affine as those of the
 box, K(e, z) = e K_skin + (1 - z1) K_1 + (1 - z2) K_2 + K_0, with the same three root unknowns last.
 """
 
@@ -16,6 +17,7 @@ from .design import WingDesign
 from .lift import DISTRIBUTIONS
 from .operators import ROOT_UNKNOWNS, AffineOperators
 from .plate import FIELDS, A, B, Plate, Surface, U, V, W, plane_stress, surface_strain
+from .plate_frame import frame_stiffness
 from .plate_layout import PlateLayout
 from .subspace import affine_sum
 
@@ -193,6 +195,7 @@ def _stiffness_terms(layout: PlateLayout) -> tuple[sparse.csr_array, ...]:
         return plate.face_stiffness(every, upper, skin.thickness, sheet * where[..., None, None])
 
     whole = upper_skin(~(first | second)) + plate.face_stiffness(every, lower, skin.thickness, sheet)
+    whole = whole + frame_stiffness(layout)
     half_height = layout.surface(plate.points, skin.thickness).height
     wall = np.flatnonzero(layout.wall)
     whole = whole + plate.core_stiffness(
