@@ -17,8 +17,6 @@ FloatArray = NDArray[np.float64]
 
 DAMAGE = 0.8
 """Stiffness loss of either defect at which its effect is compared."""
-FACTOR_STEP = 0.02
-"""Step in e of the central differences."""
 MODES = 6
 """Number of modes compared."""
 
@@ -29,6 +27,10 @@ class WingModel(Protocol):
     @property
     def unknowns(self) -> int:
         """Number n of free unknowns."""
+
+    @property
+    def stiffness_terms(self) -> tuple[Any, ...]:
+        """Four matrices, csr (n, n) [N/m]; e scales the first."""
 
     @property
     def load_lift(self) -> FloatArray:
@@ -161,29 +163,33 @@ def wing_results(model: WingModel, design: WingDesign, bending_shapes: FloatArra
     bending_shapes : (n, 2)
         First and second bending shape of a uniform cantilever, by which the modes are told apart.
     """
+    loads = np.column_stack((model.load_tip, design.lift.load_factor * model.load_lift))
 
-    def response(factor: float, loss: tuple[float, float] = (0.0, 0.0)) -> tuple[float, FloatArray]:
-        loads = np.column_stack((model.load_tip, design.lift.load_factor * model.load_lift))
-        found = Factorisation(model.stiffness(factor, loss)).solve(loads)
-        return 1.0 / float(model.load_tip @ found[:, 0]), np.asarray(model.gauge_output @ found[:, 1])
+    def strain(found: FloatArray) -> FloatArray:
+        return np.asarray(model.gauge_output @ found[:, 1])
 
-    stiffness, strain = response(1.0)
-    (k_low, low), (k_high, high) = (response(1.0 + sign * FACTOR_STEP) for sign in (-1.0, 1.0))
-    step = float(np.log((1.0 + FACTOR_STEP) / (1.0 - FACTOR_STEP)))
+    def damaged(loss: tuple[float, float]) -> FloatArray:
+        return strain(Factorisation(model.stiffness(1.0, loss)).solve(loads))
+
+    factors = Factorisation(model.stiffness())
+    found = factors.solve(loads)
+    # K = e K_skin + ...: the derivative of the solution with respect to e, at e = 1
+    slope = -factors.solve(model.stiffness_terms[0] @ found)
+    tip, healthy = float(model.load_tip @ found[:, 0]), strain(found)
     mass = model.mass(design.masses.servo, design.masses.pitot)
     values, shapes = lowest_eigenpairs(model.stiffness(), mass, MODES)
     frequency = np.sqrt(values) / (2.0 * np.pi)
     first, second = frequency[track(bending_shapes, shapes, mass)]
     return WingResults(
         unknowns=model.unknowns,
-        tip_stiffness=stiffness,
-        tip_stiffness_slope=float(np.log(k_high / k_low)) / step,
+        tip_stiffness=1.0 / tip,
+        tip_stiffness_slope=-float(model.load_tip @ slope[:, 0]) / tip,
         frequency=frequency,
         first_bending=float(first),
         second_bending=float(second),
-        strain=strain,
-        strain_slope=np.log(high / low) / step,
-        damage_ratio=np.stack([response(1.0, loss)[1] / strain for loss in ((DAMAGE, 0.0), (0.0, DAMAGE))]),
+        strain=healthy,
+        strain_slope=strain(slope) / healthy,
+        damage_ratio=np.stack([damaged(loss) / healthy for loss in ((DAMAGE, 0.0), (0.0, DAMAGE))]),
     )
 
 

@@ -3,7 +3,7 @@ import pytest
 
 from fe.operators import assemble
 from fe.plate import FIELDS, A, B, U, V, W
-from fe.plate_comparison import compare_with_plate, plate_bending_shapes
+from fe.plate_comparison import compare_with_plate, plate_bending_shapes, wing_results
 from fe.plate_layout import PlateLayout
 from fe.sandwich_plate import assemble_plate
 from fe.statics import Factorisation
@@ -113,6 +113,22 @@ def test_bending_shapes_are_clamped(plate):
     tip = np.isclose(y, plate.design.planform.semi_span)
     assert first[W][tip] == pytest.approx(2.0)  # clamped-free shapes end at 2
     assert np.all(first[A] == 0.0)
+
+
+def test_slopes_in_e_are_those_of_differences(plate, coarse_design):
+    found = wing_results(plate, coarse_design, plate_bending_shapes(plate))
+    tip, strain = [], []
+    for factor in (0.99, 1.01):
+        solution = Factorisation(plate.stiffness(factor)).solve(
+            np.column_stack((plate.load_tip, plate.load_lift))
+        )
+        tip.append(plate.load_tip @ solution[:, 0])
+        strain.append(plate.gauge_output @ solution[:, 1])
+    step = np.log(1.01 / 0.99)
+    assert found.tip_stiffness_slope == pytest.approx(np.log(tip[0] / tip[1]) / step, abs=1e-4)
+    assert found.strain_slope == pytest.approx(np.log(strain[1] / strain[0]) / step, abs=1e-4)
+    assert np.all(np.diff(found.frequency) > 0.0)
+    assert found.first_bending == found.frequency[0]
 
 
 @pytest.fixture(scope="module")
