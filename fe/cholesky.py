@@ -12,7 +12,7 @@ Transactions on Mathematical Software 9 (1983).
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,6 +131,31 @@ def _expanded(groups: IntArray, size: IntArray, offset: IntArray) -> IntArray:
     return np.asarray(np.repeat(offset[groups] - before, count) + np.arange(count.sum()))
 
 
+class _Pattern:
+    """Places of the entries of a matrix, to know it again: equal where the places are."""
+
+    def __init__(self, matrix: sparse.csr_array) -> None:
+        self.starts, self.columns = matrix.indptr.copy(), matrix.indices.copy()
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, _Pattern)
+            and np.array_equal(self.starts, other.starts)
+            and np.array_equal(self.columns, other.columns)
+        )
+
+    def __hash__(self) -> int:
+        return hash((len(self.starts), len(self.columns)))
+
+
+@lru_cache(maxsize=2)
+def _analysed(pattern: _Pattern) -> Elimination:
+    """Analyse a pattern; a matrix of the same unknowns with other values, as after damage, asks again."""
+    size = len(pattern.starts) - 1
+    values = np.ones(len(pattern.columns), dtype=np.int8)
+    return analyse(sparse.csr_array((values, pattern.columns, pattern.starts), shape=(size, size)))
+
+
 @cache
 def _threads() -> ThreadpoolController:
     return ThreadpoolController()
@@ -159,7 +184,7 @@ class Cholesky:
                 f"A matrix of {matrix.shape[0]} unknowns is not positive definite: it has a diagonal entry "
                 "that is not positive."
             )
-        elimination = analyse(matrix)
+        elimination = _analysed(_Pattern(matrix))
         self._order, self._fronts = elimination.order, elimination.fronts
         self._factors: list[tuple[FloatArray, FloatArray]] = []
         with _threads().limit(limits=1):

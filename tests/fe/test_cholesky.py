@@ -169,3 +169,21 @@ def test_a_structure_that_is_not_held_is_refused():
     right = np.arange(48.0)
     with pytest.raises(SolutionError, match=r"nearly singular|not held"):
         Factorisation(sparse.csr_array(free)).solve(right)
+
+
+def test_a_pattern_met_before_is_not_analysed_again(monkeypatch):
+    calls = []
+    monkeypatch.setattr(cholesky, "analyse", lambda matrix: calls.append(1) or analyse(matrix))
+    first = grid(9, 7, 3)
+    second = first.copy()
+    second.data = second.data * np.where(second.data < 0.0, 0.5, 2.0)
+    third = grid(7, 9, 3)
+    right = np.arange(189.0)
+    for matrix in (first, second, third, first):
+        assert matrix @ Cholesky(matrix).solve(right) == pytest.approx(right, abs=1e-10)
+    assert len(calls) == 2
+    second.indices[:] = third.indices  # what is kept does not follow a matrix that is changed in place
+    second.indptr[:] = third.indptr
+    second.data[:] = third.data
+    assert second @ Cholesky(second).solve(right) == pytest.approx(right, abs=1e-10)
+    assert len(calls) == 2
