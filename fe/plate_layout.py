@@ -23,6 +23,8 @@ class PlateLayout:
     ----------
     design : WingDesign
         The wing.
+    straight_section : bool
+        Whether the section is straight between mesh lines, as that of the box is, or the true one.
 
     Attributes
     ----------
@@ -41,9 +43,10 @@ class PlateLayout:
         If two mesh lines that the design asks for nearly coincide.
     """
 
-    def __init__(self, design: WingDesign) -> None:
-        self.design = design
+    def __init__(self, design: WingDesign, *, straight_section: bool = False) -> None:
+        self.design, self._straight_section = design, straight_section
         self.across, along = span_lines(design), chord_lines(design)
+        self._along = along
         root = design.planform.root_chord
         columns, rows = len(along) - 1, len(self.across) - 1
         grid = tensor_mesh(columns, rows)
@@ -83,13 +86,36 @@ class PlateLayout:
 
     def surface(self, places: FloatArray, depth: float = 0.0) -> Surface:
         """Upper surface at places (..., 2), `depth` [m] below the outer one, measured across it."""
+        chord = self._chord(places[..., 1])
+        if self._straight_section:
+            height, slope = self._straight(places, depth)
+        else:
+            height, slope = self._section(self.chord_fraction(places), chord, depth)
         plan = self.design.planform
-        ratio, chord = self.design.airfoil.thickness_ratio, self._chord(places[..., 1])
-        xi = self.chord_fraction(places)
-        half, slope = four_digit_half_thickness(xi, ratio), four_digit_slope(xi, ratio)
         taper = (plan.tip_chord - plan.root_chord) / plan.semi_span
-        height = half * chord - depth * np.sqrt(1.0 + slope**2)
-        return Surface(height, slope, taper * (half - slope * places[..., 0] / chord))
+        # The section shrinks with the chord: z = c f(x / c); that the skin does not, counts for nothing here.
+        return Surface(height, slope, taper * (height - slope * places[..., 0]) / chord)
+
+    def _section(
+        self, chord_fraction: FloatArray, chord: FloatArray, depth: float
+    ) -> tuple[FloatArray, FloatArray]:
+        ratio = self.design.airfoil.thickness_ratio
+        slope = four_digit_slope(chord_fraction, ratio)
+        outer = four_digit_half_thickness(chord_fraction, ratio) * chord
+        return outer - depth * np.sqrt(1.0 + slope**2), slope
+
+    def _straight(self, places: FloatArray, depth: float) -> tuple[FloatArray, FloatArray]:
+        """Height and slope (...,) of a section that is straight between the mesh lines."""
+        chord = self._chord(places[..., 1])
+        behind = self.chord_fraction(places) * chord
+        lines = np.stack([line.fraction * chord + line.offset for line in self._along], axis=-1)
+        before = np.clip((lines <= behind[..., None]).sum(axis=-1) - 1, 0, lines.shape[-1] - 2)
+        start, end = (
+            np.take_along_axis(lines, (before + step)[..., None], axis=-1)[..., 0] for step in (0, 1)
+        )
+        first, second = (self._section(place / chord, chord, depth)[0] for place in (start, end))
+        slope = (second - first) / (end - start)
+        return first + slope * (behind - start), slope
 
     @cached_property
     def half_grid(self) -> IntArray:

@@ -103,15 +103,22 @@ class PlateOperators:
         return np.concatenate((fields.ravel()[self.kept], np.zeros(ROOT_UNKNOWNS)))
 
 
-def assemble_plate(design: WingDesign) -> PlateOperators:
+def assemble_plate(design: WingDesign, *, straight_section: bool = False) -> PlateOperators:
     """Mesh a design in plan and assemble its plate.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The wing.
+    straight_section : bool
+        Whether the section is straight between mesh lines, as that of the box is, or the true one.
 
     Raises
     ------
     MeshError
         If two mesh lines that the design asks for nearly coincide.
     """
-    layout = PlateLayout(design)
+    layout = PlateLayout(design, straight_section=straight_section)
     plate = layout.plate
     expansion, kept = _expansion(layout)
     restriction = expansion.T.tocsr()

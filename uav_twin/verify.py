@@ -230,29 +230,28 @@ def plate_checks(operators: AffineOperators, *, limited: bool = True) -> Iterato
         ("strip, tip deflection", cantilever_strip),
     ):
         yield Check("sandwich plate", name, abs(closed_form(8).relative_error), 1e-3)
-    found = compare_with_plate(operators.wing_mesh.design, operators)
-    group = "plate against box"
-
-    def check(name: str, value: float, limit: float | None, note: str = "") -> Check:
-        return Check(group, name, value, limit if limited else None, note)
-
-    for name, unit in (("tip_stiffness", "N/m"), ("first_bending", "Hz"), ("second_bending", "Hz")):
-        note = f"({getattr(found.plate, name):.5g}, {getattr(found.box, name):.5g} {unit})"
-        yield check(name.replace("_", " "), abs(found.relative(name)), 0.02, note)
-    slopes = f"({found.plate.tip_stiffness_slope:.4f}, {found.box.tip_stiffness_slope:.4f})"
-    yield check("d ln k / d ln e", abs(found.tip_stiffness_slope), 0.02, slopes)
-    for name, difference, limit in (
-        ("gauges", found.strain, 0.03),
-        ("d ln strain / d ln e", found.strain_slope, 0.03),
-        (f"strain ratio, z1 = {DAMAGE:g}", found.damage_ratio[0], 0.03),
-        (f"strain ratio, z2 = {DAMAGE:g}", found.damage_ratio[1], 0.03),
-    ):
-        yield check(f"{name}, rms", float(np.sqrt(np.mean(difference**2))), limit)
-        worst = int(np.abs(difference).argmax())
-        yield check(f"{name}, largest", float(np.abs(difference[worst])), None, f"(gauge {worst})")
-    yield check(
-        "unknowns of the plate over those of the box", found.plate.unknowns / found.box.unknowns, None
-    )
+    for straight, group in ((False, "plate against box"), (True, "plate of the box's section")):
+        found = compare_with_plate(operators.wing_mesh.design, operators, straight_section=straight)
+        for name, unit in (("tip_stiffness", "N/m"), ("first_bending", "Hz"), ("second_bending", "Hz")):
+            note = f"({getattr(found.plate, name):.5g}, {getattr(found.box, name):.5g} {unit})"
+            limit = (0.01 if straight else 0.02) if limited else None
+            yield Check(group, name.replace("_", " "), abs(found.relative(name)), limit, note)
+        slopes = f"({found.plate.tip_stiffness_slope:.4f}, {found.box.tip_stiffness_slope:.4f})"
+        limit = 0.02 if limited else None
+        yield Check(group, "d ln k / d ln e", abs(found.tip_stiffness_slope), limit, slopes)
+        for name, difference in (
+            ("gauges", found.strain),
+            ("d ln strain / d ln e", found.strain_slope),
+            (f"strain ratio, z1 = {DAMAGE:g}", found.damage_ratio[0]),
+            (f"strain ratio, z2 = {DAMAGE:g}", found.damage_ratio[1]),
+        ):
+            rms, worst = float(np.sqrt(np.mean(difference**2))), int(np.abs(difference).argmax())
+            note = f"(largest {abs(difference[worst]):.2g}, gauge {worst})"
+            yield Check(group, f"{name}, rms", rms, 0.03 if limited else None, note)
+        ratio = found.plate.frequency[3:] / found.box.frequency[3:] - 1.0
+        note = f"({', '.join(f'{100 * value:+.1f} %' for value in ratio)})"
+        yield Check(group, f"frequencies 4 to {3 + len(ratio)}", float(np.abs(ratio).max()), None, note)
+        yield Check(group, "unknowns, over those of the box", found.plate.unknowns / found.box.unknowns)
 
 
 def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:
