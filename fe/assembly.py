@@ -6,8 +6,9 @@ faster than one bilinear form after the other. Strains are in Voigt order 11, 22
 engineering shear strains.
 """
 
+import itertools
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -35,17 +36,32 @@ def gauss_points(order: int, dimensions: int = 3) -> tuple[FloatArray, FloatArra
     )
 
 
+@cache
+def _monomials() -> tuple[IntArray, FloatArray]:
+    """Exponents (20, 3) of the element's monomials and their coefficients (20, 20) in its shape functions.
+
+    The space is that of D. N. Arnold and G. Awanou, "The serendipity family of finite elements" (2011):
+    monomials whose degree, factors of degree one not counted, is at most two. Each shape function is one at
+    its own node of scikit-fem's `ElementHexS2` and zero at the others.
+    """
+    every = np.array(list(itertools.product(range(3), repeat=3)))
+    exponents = every[np.where(every > 1, every, 0).sum(axis=1) <= 2]
+    nodes = np.asarray(ElementHexS2.doflocs, dtype=np.float64)
+    coefficients = np.linalg.inv(np.prod(nodes[:, None, :] ** exponents, axis=2))
+    return exponents, np.rint(coefficients)  # whole numbers on the unit cube
+
+
 def shape_functions(local: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Values (q, 20) and local gradients (q, 20, 3) of the shape functions at local points (q, 3)."""
-    element = ElementHexS2()
-    points = np.ascontiguousarray(local.T)
-    values = np.empty((len(local), NODES))
+    exponents, coefficients = _monomials()
+    powers = np.stack((np.ones_like(local), local, local**2), axis=2)
+    slopes = np.stack((np.zeros_like(local), np.ones_like(local), 2.0 * local), axis=2)
+    factors = [powers[:, axis, exponents[:, axis]] for axis in range(3)]
     gradients = np.empty((len(local), NODES, 3))
-    for node in range(NODES):
-        value, gradient = element.lbasis(points, node)
-        values[:, node] = value
-        gradients[:, node] = np.broadcast_to(gradient, points.shape).T
-    return values, gradients
+    for axis in range(3):
+        first, second = (factors[other] for other in range(3) if other != axis)
+        gradients[:, :, axis] = (slopes[:, axis, exponents[:, axis]] * first * second) @ coefficients
+    return factors[0] * factors[1] * factors[2] @ coefficients, gradients
 
 
 def _corner_functions(local: FloatArray) -> tuple[FloatArray, FloatArray]:

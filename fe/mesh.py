@@ -82,7 +82,7 @@ class WingMesh:
         """The same mesh as a scikit-fem `MeshHex`."""
         return MeshHex(np.ascontiguousarray(self.points.T), np.ascontiguousarray(self.cells.T))
 
-    @property
+    @cached_property
     def corners(self) -> FloatArray:
         """Corner coordinates of the cells (nc, 8, 3) [m]."""
         return self.points[self.cells]

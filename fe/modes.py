@@ -1,5 +1,6 @@
 """Eigenmodes of the full model: Kapteyn et al. 2021, eq. (16), tracked by their shapes."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,6 +71,27 @@ def track(reference: FloatArray, shapes: FloatArray, mass: sparse.sparray) -> In
     return result
 
 
+def cantilever_bending(
+    distance: FloatArray, span: float, count: int = 2
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield deflection and slope (n,) of the bending shapes of a uniform cantilever, Euler and Bernoulli's.
+
+    Parameters
+    ----------
+    distance : (n,)
+        From the clamp [m].
+    span : float
+        Length [m].
+    count : int
+        Number of shapes, at most 3.
+    """
+    for wave in _CANTILEVER_WAVE_NUMBERS[:count]:
+        s = wave * distance / span
+        ratio = (np.cosh(wave) + np.cos(wave)) / (np.sinh(wave) + np.sin(wave))
+        deflection = np.cosh(s) - np.cos(s) - ratio * (np.sinh(s) - np.sin(s))
+        yield deflection, wave / span * (np.sinh(s) + np.sin(s) - ratio * (np.cosh(s) - np.cos(s)))
+
+
 def cantilever_bending_shapes(operators: AffineOperators, count: int = 2) -> FloatArray:
     """Flapwise bending shapes (n, count) of a uniform cantilever on the nodes of the wing.
 
@@ -79,11 +101,7 @@ def cantilever_bending_shapes(operators: AffineOperators, count: int = 2) -> Flo
     span = operators.wing_mesh.design.planform.semi_span
     free = operators.expansion[:, : operators.unknowns - ROOT_UNKNOWNS]
     shapes = np.zeros((operators.unknowns, count))
-    for number, wave in enumerate(_CANTILEVER_WAVE_NUMBERS[:count]):
-        s = wave * points[:, 1] / span
-        ratio = (np.cosh(wave) + np.cos(wave)) / (np.sinh(wave) + np.sin(wave))
-        deflection = np.cosh(s) - np.cos(s) - ratio * (np.sinh(s) - np.sin(s))
-        slope = wave / span * (np.sinh(s) + np.sin(s) - ratio * (np.cosh(s) - np.cos(s)))
+    for number, (deflection, slope) in enumerate(cantilever_bending(points[:, 1], span, count)):
         full = np.zeros(3 * len(points))
         full[1::3], full[2::3] = -points[:, 2] * slope, deflection
         # Rows of held unknowns are empty, so that the transpose picks the free ones.

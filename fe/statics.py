@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import SuperLU, norm, splu
+from scipy.sparse.linalg import norm
 
+from .cholesky import Cholesky
 from .errors import SolutionError
 from .operators import AffineOperators
 
@@ -32,28 +33,23 @@ class Factorisation:
     Raises
     ------
     SolutionError
-        If the matrix is singular.
+        If the matrix is not positive definite.
     """
 
     def __init__(self, matrix: sparse.sparray) -> None:
-        self._matrix = matrix.tocsc()
+        self._matrix = matrix.tocsr()
         self._norm = float(norm(self._matrix, np.inf))
         try:
-            self._factors: SuperLU = splu(
-                self._matrix,
-                permc_spec="MMD_AT_PLUS_A",
-                diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True},
-            )
-        except RuntimeError as error:
+            self._factors = Cholesky(self._matrix)
+        except SolutionError as error:
             raise SolutionError(
-                f"The stiffness matrix of {matrix.shape[0]} unknowns cannot be factorised ({error}); "
-                "some part of the structure is not held or has no stiffness."
+                "The stiffness matrix cannot be factorised; some part of the structure is not held or has no "
+                f"stiffness. {error}"
             ) from None
 
     def raw_solve(self, right_hand_side: FloatArray) -> FloatArray:
         """Solution (n,) or (n, k) without the residual check, for iterations that check their own."""
-        return np.asarray(self._factors.solve(right_hand_side))
+        return self._factors.solve(right_hand_side)
 
     def solve(self, right_hand_side: FloatArray) -> FloatArray:
         """Solution (n,) or (n, k), refined once, its backward error and its accuracy checked.

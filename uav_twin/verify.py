@@ -129,6 +129,7 @@ def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> Iterat
     yield from element_checks()
     mesh = assemble(design.changed(mesh={"refinement": QUICK_REFINEMENTS[0]}) if quick else design)
     yield from balance_checks(mesh)
+    yield from plate_checks(mesh, limited=not quick)
     yield from convergence_checks(design, QUICK_REFINEMENTS if quick else REFINEMENTS, limited=not quick)
     if calculix_program() is not None:
         yield from calculix_checks(mesh, jobs)
@@ -206,6 +207,51 @@ def convergence_checks(
         note = f"({1e6 * strain[-1, gauge]:.0f} microstrain, {order(strain[:, gauge].tolist())})"
         yield Check(group, f"gauge {gauge}", float(value), None, note)
     yield Check(group, "unknowns of the finest mesh", rows[-1].unknowns)
+
+
+def plate_checks(operators: AffineOperators, *, limited: bool = True) -> Iterator[Check]:
+    """Yield the closed forms of the sandwich plate, and its differences to the box of the same design.
+
+    Parameters
+    ----------
+    operators : AffineOperators
+        The box.
+    limited : bool
+        Hold the differences to their limits, which are made for the mesh of the design.
+    """
+    import numpy as np
+
+    from fe.plate_comparison import DAMAGE, compare_with_plate
+    from fe.plate_verification import cantilever_strip, square_plate_deflection, square_plate_frequency
+
+    for name, closed_form in (
+        ("square plate, deflection", square_plate_deflection),
+        ("square plate, first frequency", square_plate_frequency),
+        ("strip, tip deflection", cantilever_strip),
+    ):
+        yield Check("sandwich plate", name, abs(closed_form(8).relative_error), 1e-3)
+    for straight, group in ((False, "plate against box"), (True, "plate of the box's section")):
+        found = compare_with_plate(operators.wing_mesh.design, operators, straight_section=straight)
+        for name, unit in (("tip_stiffness", "N/m"), ("first_bending", "Hz"), ("second_bending", "Hz")):
+            note = f"({getattr(found.plate, name):.5g}, {getattr(found.box, name):.5g} {unit})"
+            limit = (0.01 if straight else 0.02) if limited else None
+            yield Check(group, name.replace("_", " "), abs(found.relative(name)), limit, note)
+        slopes = f"({found.plate.tip_stiffness_slope:.4f}, {found.box.tip_stiffness_slope:.4f})"
+        limit = 0.02 if limited else None
+        yield Check(group, "d ln k / d ln e", abs(found.tip_stiffness_slope), limit, slopes)
+        for name, difference in (
+            ("gauges", found.strain),
+            ("d ln strain / d ln e", found.strain_slope),
+            (f"strain ratio, z1 = {DAMAGE:g}", found.damage_ratio[0]),
+            (f"strain ratio, z2 = {DAMAGE:g}", found.damage_ratio[1]),
+        ):
+            rms, worst = float(np.sqrt(np.mean(difference**2))), int(np.abs(difference).argmax())
+            note = f"(largest {abs(difference[worst]):.2g}, gauge {worst})"
+            yield Check(group, f"{name}, rms", rms, 0.03 if limited else None, note)
+        ratio = found.plate.frequency[3:] / found.box.frequency[3:] - 1.0
+        note = f"({', '.join(f'{100 * value:+.1f} %' for value in ratio)})"
+        yield Check(group, f"frequencies 4 to {3 + len(ratio)}", float(np.abs(ratio).max()), None, note)
+        yield Check(group, "unknowns, over those of the box", found.plate.unknowns / found.box.unknowns)
 
 
 def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:

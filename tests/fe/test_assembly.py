@@ -64,3 +64,14 @@ def test_nodes_lie_where_scikit_fem_puts_them():
     body = brick((1.0, 0.5, 0.7), (2, 2, 1), distortion=0.1)
     basis = Basis(body.mesh, ELEMENT, intorder=2)
     assert pytest.approx(body.node_points) == basis.doflocs[:, ::3].T
+
+
+def test_shape_functions_are_those_of_scikit_fem():
+    points = np.random.default_rng(8).uniform(-0.1, 1.1, (40, 3))
+    values, gradients = shape_functions(points)
+    for node in range(20):
+        value, gradient = ElementHexS2().lbasis(points.T, node)
+        assert values[:, node] == pytest.approx(value, abs=1e-14)
+        assert gradients[:, node] == pytest.approx(np.stack(np.broadcast_arrays(*gradient)).T, abs=1e-14)
+    at_nodes, _ = shape_functions(np.asarray(ElementHexS2.doflocs, dtype=float))
+    assert np.array_equal(at_nodes, np.eye(20))
