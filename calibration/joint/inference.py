@@ -13,9 +13,8 @@ from ..errors import ExperimentDataError, MassConstraintError, PosteriorError
 from ..errors_in_variables import exact_posterior
 from ..experiments import LoadDisplacementData
 from ..posterior import child_seed
-from ..stiffness_curve import StiffnessCurve, stiffness_curve_of
 from .density import JointDensity, masses_of
-from .frequency_table import FrequencyTable, tabulate_frequencies
+from .frequency_table import WingTables, tabulate_wing
 from .measurement import ModalMeasurement
 from .prior import JointPrior, ModelError, WeighedMass
 from .result import JointDiagnostics, JointPosterior
@@ -32,14 +31,14 @@ LEAST_EFFECTIVE_SAMPLE_SIZE = 200.0
 """A posterior that the weighted draws describe with fewer effective ones is refused."""
 
 _ADAPTATION_ROUNDS = 3
-_ADAPTATION_COUNT = 2000
+_ADAPTATION_COUNT = 1000
 _PROPOSALS_PER_SAMPLE = 20
-_FEWEST_PROPOSALS = 10_000
+_FEWEST_PROPOSALS = 4_000
 _PURPOSE_PRIOR, _PURPOSE_POSTERIOR = 21, 22
 
 
 def joint_posterior(
-    model: ReducedModel,
+    model: ReducedModel | WingTables,
     static: LoadDisplacementData,
     modal: ModalMeasurement,
     *,
@@ -57,8 +56,8 @@ def joint_posterior(
 
     Parameters
     ----------
-    model : ReducedModel
-        The wing.
+    model : ReducedModel or WingTables
+        The wing; the tables of `tabulate_wing` spare a fifth of a second where many posteriors are wanted.
     static : LoadDisplacementData
         The load test.
     modal : ModalMeasurement
@@ -86,34 +85,14 @@ def joint_posterior(
         If `count` is not positive, or the measurements contradict each other so much that the sampler
         finds no posterior.
     """
-    return _joint_posterior(
-        tabulate_frequencies(model),
-        stiffness_curve_of(model),
-        static,
-        modal,
-        prior=prior or JointPrior(),
-        total_mass=WeighedMass() if total_mass is None else total_mass,
-        model_error=ModelError() if model_error is None else model_error,
-        seed=seed,
-        count=count,
-    )
-
-
-def _joint_posterior(
-    table: FrequencyTable,
-    curve: StiffnessCurve,
-    static: LoadDisplacementData,
-    modal: ModalMeasurement,
-    *,
-    prior: JointPrior,
-    total_mass: WeighedMass,
-    model_error: ModelError,
-    seed: int,
-    count: int,
-) -> JointPosterior:
+    prior = prior or JointPrior()
+    total_mass = WeighedMass() if total_mass is None else total_mass
+    model_error = ModelError() if model_error is None else model_error
     if count < 1:
         raise PosteriorError(f"the number of samples must be positive, but {count} were asked for.")
     _check(total_mass, model_error)
+    tables = model if isinstance(model, WingTables) else tabulate_wing(model)
+    table, curve = tables.frequency, tables.stiffness
     density = JointDensity(table, curve, static, modal, total_mass, prior, model_error)
     validity = {
         name: (float(low), float(high))
