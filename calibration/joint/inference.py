@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fe.reduced import ReducedModel
 
-from ..errors import ExperimentDataError, MassConstraintError, PosteriorError
+from ..errors import ExperimentDataError, MassConstraintError, OutsideValidityError, PosteriorError
 from ..errors_in_variables import exact_posterior
 from ..experiments import LoadDisplacementData
 from ..posterior import child_seed
@@ -30,6 +30,8 @@ from .sampler import (
 LEAST_EFFECTIVE_SAMPLE_SIZE = 200.0
 """A posterior that the weighted draws describe with fewer effective ones is refused."""
 
+_LIMIT_MARGIN = 0.01  # of the range of e
+_LARGEST_SHARE_AT_LIMIT = 0.05
 _ADAPTATION_ROUNDS = 3
 _ADAPTATION_COUNT = 1000
 _PROPOSALS_PER_SAMPLE = 20
@@ -80,7 +82,8 @@ def joint_posterior(
     ExperimentDataError
         If weighed total or model error make no sense, or the damping ratios need negative coefficients.
     OutsideValidityError
-        If the load test alone puts e outside the model.
+        If the load test alone puts e outside the model, or all measurements together press it against the
+        end of the model's range.
     PosteriorError
         If `count` is not positive, or the measurements contradict each other so much that the sampler
         finds no posterior.
@@ -135,6 +138,7 @@ def joint_posterior(
             "the model a larger error of its frequencies."
         )
     quantities = np.column_stack([masses_of(points), coefficients])
+    _refuse_limit(quantities[:, 0], weight, limits[0])
     mean = weight @ quantities
     spread = np.sqrt(weight @ (quantities - mean) ** 2)
     chosen = systematic_resampling(weight, generator, count)
@@ -171,6 +175,20 @@ def _log_density(density: JointDensity, points: NDArray[np.float64]) -> NDArray[
     if inside.any():
         value[inside] = density.log_density(points[inside])[0]
     return value
+
+
+def _refuse_limit(
+    factor: NDArray[np.float64], weight: NDArray[np.float64], limits: NDArray[np.float64]
+) -> None:
+    margin = _LIMIT_MARGIN * float(limits[1] - limits[0])
+    for limit in limits.tolist():
+        share = float(weight[np.abs(factor - limit) < margin].sum())
+        if share > _LARGEST_SHARE_AT_LIMIT:
+            raise OutsideValidityError(
+                f"{share:.0%} of the joint posterior of e is pressed against {limit:g}, where the model "
+                "ends: load test and frequencies contradict each other; check them, or allow the model a "
+                "larger error of its frequencies."
+            )
 
 
 def _check(total_mass: WeighedMass, model_error: ModelError) -> None:

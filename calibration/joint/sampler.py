@@ -20,6 +20,8 @@ DEGREES_OF_FREEDOM = 6.0
 
 _NEWTON_STEPS = 50
 _DIFFERENCE = 1e-2  # step of the central differences, in rough standard deviations
+_TEMPERED_SHARE = 0.1
+_MOST_ROUNDS = 60
 _INFLATION = 1.15  # of the proposal's covariance over the posterior's
 
 
@@ -98,6 +100,8 @@ def _derivatives(
     signs = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
     shifts = [a * unit[i] + b * unit[j] for i in range(size) for j in range(size) for a, b in signs]
     values = log_density(centre + scale * np.array([*unit, *-unit, *shifts]))
+    if not np.all(np.isfinite(values)):
+        return np.full(size, np.nan), np.full((size, size), np.nan)
     slope = (values[:size] - values[size : 2 * size]) / (2.0 * _DIFFERENCE)
     corner = values[2 * size :].reshape(size, size, 4)
     return slope, (corner @ np.array([1.0, -1.0, -1.0, 1.0])) / (4.0 * _DIFFERENCE**2)
@@ -106,19 +110,44 @@ def _derivatives(
 def adapted_proposal(
     log_density: LogDensity, start: Laplace, generator: np.random.Generator, *, rounds: int, count: int
 ) -> StudentT:
-    """Return a proposal whose centre and scale follow the density, by rounds of weighted draws."""
+    """Return a proposal whose centre and scale follow the density, by rounds of weighted draws.
+
+    Where the draws of a round say too little of the density (its mode may lie at the end of the region, where
+    Laplace's approximation is none), their weights are tempered, w^g with g < 1, so that a tenth of them
+    counts; the next round then begins closer.
+    """
     centre, covariance = start.mode, start.covariance
-    for _ in range(rounds):
+    least = _TEMPERED_SHARE * count
+    good = 0
+    for _ in range(_MOST_ROUNDS):
         proposal = StudentT(centre, _INFLATION * covariance)
         points, log_proposal = proposal.draw(generator, count)
-        weight, _ = normalised(log_density(points) - log_proposal)
-        if effective_sample_size(weight) < 10.0 * centre.size:
-            covariance = 4.0 * covariance  # the proposal is too narrow to be improved from: look around
+        log_weight = log_density(points) - log_proposal
+        if np.count_nonzero(np.isfinite(log_weight)) <= least:
+            covariance = 0.25 * covariance  # most draws lie outside the region
             continue
+        power = _tempering(log_weight, least)
+        weight, _ = normalised(power * log_weight)
         centre = weight @ points
         deviation = points - centre
         covariance = (deviation * weight[:, None]).T @ deviation
+        good += power == 1.0
+        if good == rounds:
+            break
     return StudentT(centre, _INFLATION * covariance)
+
+
+def _tempering(log_weight: FloatArray, least: float) -> float:
+    """Return the greatest power g up to 1 at which weights w^g have an effective sample size of `least`."""
+    low, high = 0.0, 1.0
+    if effective_sample_size(normalised(log_weight)[0]) >= least:
+        return 1.0
+    finite = log_weight[np.isfinite(log_weight)]
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        enough = effective_sample_size(normalised(middle * finite)[0]) >= least
+        low, high = (middle, high) if enough else (low, middle)
+    return low
 
 
 def normalised(log_weight: FloatArray) -> tuple[FloatArray, float]:
