@@ -149,6 +149,30 @@ bool wing_behaviour_error_bound(wing_behaviour *wing, double *bound, wing_proble
     return true;
 }
 
+bool wing_behaviour_load_point(wing_behaviour *wing, double *displacement, wing_problem *problem) {
+    if (!wing->started) {
+        return wing_fail(problem, "the wing was not initialised");
+    }
+    wing_integrator *integrator = &wing->integrators[wing->integrator];
+    if (wing->moving) {
+        *displacement = wing_integrator_load_point(integrator, &wing->motions[wing->motion]);
+        return true;
+    }
+    const double health[3] = {wing->parameters.young_modulus_factor, wing->inputs[1], wing->inputs[2]};
+    double load[WING_LOADS];
+    loads_of(wing->inputs, load);
+    if (!wing_static_prepare(&integrator->steady, health, problem)) {
+        return false;
+    }
+    *displacement = 0.0;
+    for (size_t k = 0; k < WING_LOADS; ++k) {
+        if (load[k] != 0.0) {
+            *displacement += load[k] * wing_static_load_point(&integrator->steady, k);
+        }
+    }
+    return true;
+}
+
 bool wing_behaviour_modal_data(wing_behaviour *wing, size_t count, double *frequency, double *damping_ratio,
                                wing_problem *problem) {
     if (!wing->started) {

@@ -56,6 +56,9 @@ bool wing_behaviour_advance(wing_behaviour *wing, const double inputs[WING_INPUT
 /* Certified bound of the static strains under the last inputs. */
 bool wing_behaviour_error_bound(wing_behaviour *wing, double *bound, wing_problem *problem);
 
+/* Displacement of the point where the tip force acts [m]. */
+bool wing_behaviour_load_point(wing_behaviour *wing, double *displacement, wing_problem *problem);
+
 /* Natural frequencies [Hz] and damping ratios [1] of the first `count` modes under the last inputs. */
 bool wing_behaviour_modal_data(wing_behaviour *wing, size_t count, double *frequency, double *damping_ratio,
                                wing_problem *problem);

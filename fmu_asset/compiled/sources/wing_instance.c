@@ -270,10 +270,11 @@ const wing_variable *wing_readable(wing_instance *instance, unsigned int referen
 
 fmi2Status wing_update(wing_instance *instance, const unsigned int *references, size_t count) {
     unsigned int highest = 0;
-    bool bound = false;
+    bool bound = false, load_point = false;
     for (size_t i = 0; i < count; ++i) {
         highest = references[i] > highest ? references[i] : highest;
         bound = bound || references[i] == WING_STRAIN_ERROR_BOUND;
+        load_point = load_point || references[i] == WING_LOAD_POINT_DISPLACEMENT;
     }
     if (highest < WING_FIRST_OUTPUT) {
         return fmi2OK;
@@ -294,6 +295,10 @@ fmi2Status wing_update(wing_instance *instance, const unsigned int *references, 
             return wing_refuse(instance, WING_STATUS_INTERNAL, "values could not be read: %s", problem.text);
         }
         instance->stale_bound = false;
+    }
+    if (load_point && !wing_behaviour_load_point(&instance->behaviour,
+                                                 &instance->values[WING_LOAD_POINT_DISPLACEMENT], &problem)) {
+        return wing_refuse(instance, WING_STATUS_INTERNAL, "values could not be read: %s", problem.text);
     }
     if (highest >= WING_FREQUENCY_1 && instance->stale_modal) {
         double *frequency = instance->values + WING_FREQUENCY_1;

@@ -75,6 +75,17 @@ const wing_unit_response *wing_static_unit(wing_static *wing, size_t load) {
     return unit;
 }
 
+double wing_static_load_point(wing_static *wing, size_t load) {
+    const size_t n = wing->model->static_size;
+    const double *coordinates = wing_static_unit(wing, load)->coordinates;
+    const double *output = wing->model->static_load + n; /* the tip force's load vector, by reciprocity */
+    double sum = 0.0;
+    for (size_t i = 0; i < n; ++i) {
+        sum += output[i] * coordinates[i];
+    }
+    return sum;
+}
+
 /* sum (size) = load factor times what one unit of lift gives, plus tip force times what 1 N gives */
 static void superpose(double *sum, size_t size, const double load[WING_LOADS],
                       const double *const given[WING_LOADS]) {

@@ -47,6 +47,9 @@ bool wing_static_prepare(wing_static *wing, const double health[3], wing_problem
 /* Return the response to one unit of a load. */
 const wing_unit_response *wing_static_unit(wing_static *wing, size_t load);
 
+/* Displacement of the point where the tip force acts under one unit of a load [m]. */
+double wing_static_load_point(wing_static *wing, size_t load);
+
 /* Write strains and tip displacement (G + 1) under load factor [1] and tip force [N]. */
 void wing_static_response(wing_static *wing, const double load[WING_LOADS], double *output);
 

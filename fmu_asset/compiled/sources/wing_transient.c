@@ -154,3 +154,23 @@ void wing_integrator_output(const wing_integrator *integrator, const wing_motion
                      motion->displacement);
     wing_add_columns(output, outputs, integrator->correction, outputs, WING_LOADS, motion->load);
 }
+
+double wing_integrator_load_point(wing_integrator *integrator, const wing_motion *motion) {
+    const wing_model *model = integrator->model;
+    const size_t count = model->mode_count;
+    /* How far a mode moves the point is its participation in a force there. */
+    const double *participation = integrator->modes.participation;
+    double sum = 0.0;
+    for (size_t i = 0; i < count; ++i) {
+        sum += participation[i * WING_LOADS + 1] * motion->displacement[i];
+    }
+    for (size_t load = 0; load < WING_LOADS; ++load) {
+        const double *modal_static = integrator->modal_static + load * count;
+        double correction = wing_static_load_point(&integrator->steady, load);
+        for (size_t i = 0; i < count; ++i) {
+            correction -= participation[i * WING_LOADS + 1] * modal_static[i];
+        }
+        sum += correction * motion->load[load];
+    }
+    return sum;
+}

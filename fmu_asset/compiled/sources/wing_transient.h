@@ -57,6 +57,9 @@ void wing_integrator_take_over(wing_integrator *integrator, wing_integrator *for
 /* Write strains and tip displacement (G + 1). */
 void wing_integrator_output(const wing_integrator *integrator, const wing_motion *motion, double *output);
 
+/* Displacement of the point where the tip force acts [m]. */
+double wing_integrator_load_point(wing_integrator *integrator, const wing_motion *motion);
+
 #if defined(__GNUC__) && !defined(_WIN32)
 #pragma GCC visibility pop
 #endif

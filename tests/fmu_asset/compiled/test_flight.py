@@ -28,7 +28,7 @@ from fmu_asset.variables import (
 )
 
 OK, DISCARD, ERROR = 0, 2, 3
-STRAIN, TIP, BOUND, MODAL = slice(10, 34), 34, 35, slice(36, 48)
+STRAIN, TIP, BOUND, LOAD_POINT, MODAL = slice(10, 34), 34, 35, 36, slice(37, 49)
 """Places in `everything()`, the real variables in order."""
 
 
@@ -65,7 +65,8 @@ class Comparison:
         self.strain = max(self.strain, *map(abs, expected[STRAIN]))
         self.tip = max(self.tip, abs(expected[TIP]))
         # The bound is made of strains that cancel, so that its digits end where those of the strains do.
-        for place, scale in ((STRAIN, self.strain), (BOUND, self.strain), (TIP, self.tip)):
+        scales = ((STRAIN, self.strain), (BOUND, self.strain), (TIP, self.tip), (LOAD_POINT, self.tip))
+        for place, scale in scales:
             np.testing.assert_allclose(ours[place], expected[place], rtol=0.0, atol=1e-12 * scale)
         np.testing.assert_allclose(ours[MODAL], expected[MODAL], rtol=1e-12)
 
