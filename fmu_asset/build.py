@@ -131,6 +131,8 @@ def build_fmu(
     path: str | os.PathLike[str],
     *,
     state: DigitalState | None = None,
+    note: str = "",
+    resources: Mapping[str, bytes] | None = None,
     replace: bool = False,
 ) -> FmuInfo:
     """Pack a reduced model as an FMU; equal input gives equal bytes.
@@ -143,6 +145,11 @@ def build_fmu(
         Where to write, with the suffix .fmu.
     state : DigitalState, optional
         Start values of parameters and health; the digital state's defaults if absent.
+    note : str
+        Added to the description, such as what the wing was calibrated with; XML text without control
+        characters.
+    resources : mapping of str to bytes, optional
+        Further files of the archive's folder `resources`, by name.
     replace : bool
         Whether an existing file may be replaced.
 
@@ -154,15 +161,15 @@ def build_fmu(
     Raises
     ------
     FmuBuildError
-        If the file exists, the suffix is wrong, a start value lies outside the model's validity box, or
-        the wrong pythonfmu is installed.
+        If the file exists, the suffix is wrong, a start value lies outside the model's validity box, a
+        resource would take the place of another file, or the wrong pythonfmu is installed.
     """
     target = Path(path)
     if target.suffix != ".fmu":
         raise FmuBuildError(f"An FMU must have the suffix .fmu, but {target} was given.")
     if target.exists() and not replace:
         raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
-    content, content_hash = fmu_bytes(model, state)
+    content, content_hash = fmu_bytes(model, state, note=note, resources=resources)
     atomic_write_bytes(target, content)
     return _info(model, target, content, content_hash)
 
@@ -178,7 +185,13 @@ def _info(model: ReducedModel, path: Path, content: bytes, content_hash: str) ->
     )
 
 
-def fmu_bytes(model: ReducedModel, state: DigitalState | None = None) -> tuple[bytes, str]:
+def fmu_bytes(
+    model: ReducedModel,
+    state: DigitalState | None = None,
+    *,
+    note: str = "",
+    resources: Mapping[str, bytes] | None = None,
+) -> tuple[bytes, str]:
     """Return the archive and its content hash; see `build_fmu`."""
     start = start_values(state or DigitalState())
     mode_count = min(MODE_COUNT, model.mode_count)
@@ -186,7 +199,12 @@ def fmu_bytes(model: ReducedModel, state: DigitalState | None = None) -> tuple[b
         gauge_count=model.gauge_count, mode_count=mode_count, validity=model.validity, start=start
     )
     _check_start(table)
-    template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start})
+    description = f"{DESCRIPTION} {note}".strip()
+    template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start}, description)
+    for name, content in (resources or {}).items():
+        if f"resources/{name}" in template or "/" in name or not name:
+            raise FmuBuildError(f"A resource of an FMU cannot have the name {name!r}; choose another one.")
+        template[f"resources/{name}"] = content
     content_hash = _hash(template)
     members = {
         _named(name, content_hash): _filled(name, data, content_hash) for name, data in template.items()
@@ -246,7 +264,9 @@ def _check_start(table: Iterable[FmuVariable]) -> None:
             )
 
 
-def _members(model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str, object]) -> dict[str, bytes]:
+def _members(
+    model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str, object], description: str
+) -> dict[str, bytes]:
     """Return the files of the archive, with the placeholder wherever the content hash will stand."""
     try:
         installed = version("pythonfmu")
@@ -266,7 +286,7 @@ def _members(model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str,
             identifier=module,
             guid=_PLACEHOLDER,
             table=table,
-            description=DESCRIPTION,
+            description=description,
             version=version("uav-twin"),
             generation_tool=f"uav-twin with PythonFMU {installed}",
         ),
@@ -276,7 +296,7 @@ def _members(model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str,
         f"binaries/win64/{module}.dll": (
             wrapper / "resources/binaries/win64/pythonfmu-export.dll"
         ).read_bytes(),
-        "documentation/index.html": documentation_page(table, DESCRIPTION),
+        "documentation/index.html": documentation_page(table, description),
         "documentation/licenses/pythonfmu.txt": _licence("pythonfmu"),
         "resources/reduced_model.npz": model,
         "resources/start.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode(),

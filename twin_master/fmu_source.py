@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.result import CalibrationResult
 from fe.cache import reduced_model, wing_fields
-from fe.design import load_design
+from fe.design import WingDesign, load_design
 from fe.fields import write_wing_vtu
 from fe.reduced import ReducedModel
 from fmu_asset.binding import Binding, load_binding
@@ -20,12 +21,14 @@ from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.asset_source import (
     BINDING_COPY,
+    CALIBRATION_COPY,
     DESIGN_COPY,
     FMU_COPY,
     check_wing_scenario,
     wing_observation_table,
 )
 from twin_master.assets import Asset, AssetReading
+from twin_master.calibrated_asset import pack_calibrated_wing
 from twin_master.errors import MissionInputError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws, draw_parameter
@@ -92,13 +95,34 @@ class FmuSource:
         Wing design: the twin's model, and what is packed where no FMU is given.
     fmu : Path or None
         The FMU to fly.
+    calibration : Path or None
+        Calibration file of the wing.
+    tailored : bool
+        Whether the design is that of the calibration file.
     """
 
-    def __init__(self, scenario: Scenario, binding: Path, design: Path | None, fmu: Path | None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        binding: Path,
+        design: Path | None,
+        fmu: Path | None,
+        *,
+        calibration: Path | None = None,
+        tailored: bool = False,
+    ) -> None:
         self._scenario = scenario
         self._binding = binding
-        self._given = {BINDING_COPY: binding, DESIGN_COPY: design, FMU_COPY: fmu}
+        self._tailored = tailored
+        self._given = {
+            BINDING_COPY: binding,
+            DESIGN_COPY: design,
+            FMU_COPY: fmu,
+            CALIBRATION_COPY: calibration,
+        }
         self._folder: Path | None = None
+        self._design: WingDesign | None = None
+        self._calibration: CalibrationResult | None = None
         self._wing: ReducedModel | None = None
 
     @property
@@ -112,7 +136,7 @@ class FmuSource:
         return self._folder / name
 
     def check(self) -> None:
-        """Read binding, design and FMU where they are, without copying or starting anything.
+        """Read binding, design, calibration and FMU where they are, without copying or starting anything.
 
         Raises
         ------
@@ -120,21 +144,23 @@ class FmuSource:
             A file cannot be read, or the binding observes another number of values than the scenario.
         InvalidDesignError, FmuError
             A design, binding or FMU is wrong, or the binding does not fit the FMU.
+        CalibrationRecordError
+            The calibration file is damaged or of another kind, or has no samples of the parameter.
         """
+        calibration = self._read_calibration(self._given[CALIBRATION_COPY])
         self.files()
-        design, fmu = self._given[DESIGN_COPY], self._given[FMU_COPY]
+        design, fmu = self._read_design(self._given[DESIGN_COPY], calibration), self._given[FMU_COPY]
         binding = load_binding(self._binding)
         self._observed(binding)
         self._check_names(binding)
         if design is not None:
-            gauges = len(load_design(design).gauges.positions)
             if self._scenario.asset.observation_model != "asset":
-                check_wing_scenario(self._scenario, gauges)
+                check_wing_scenario(self._scenario, len(design.gauges.positions))
         if fmu is not None:
             FmiAsset(fmu, binding, parameters=self._scenario.asset.parameters)
 
     def files(self) -> dict[str, bytes]:
-        """Return binding, design and FMU as they are given.
+        """Return binding, design, calibration and FMU as they are given.
 
         Raises
         ------
@@ -142,6 +168,18 @@ class FmuSource:
             A file cannot be read.
         """
         return {name: _content(path) for name, path in self._given.items() if path is not None}
+
+    def _read_calibration(self, path: Path | None) -> CalibrationResult | None:
+        if path is None:
+            return None
+        calibration = CalibrationResult.load(path)
+        calibration.draws_of(self._scenario.calibration.parameter)
+        return calibration
+
+    def _read_design(self, path: Path | None, calibration: CalibrationResult | None) -> WingDesign | None:
+        if self._tailored and calibration is not None:
+            return calibration.design
+        return None if path is None else load_design(path)
 
     def _check_names(self, binding: Binding) -> None:
         scenario = self._scenario
@@ -174,15 +212,26 @@ class FmuSource:
                 atomic_write_bytes(self._path(name), _content(path))
         self._observed(load_binding(self._path(BINDING_COPY)))
         hashes = {"binding": hash_file(self._path(BINDING_COPY))}
-        if self._given[DESIGN_COPY] is not None:
-            design = load_design(self._path(DESIGN_COPY))
-            self._wing = reduced_model(design, progress=progress)
+        if self._given[CALIBRATION_COPY] is not None:
+            self._calibration = self._read_calibration(self._path(CALIBRATION_COPY))
+            hashes["calibration"] = hash_file(self._path(CALIBRATION_COPY))
+        copy = None if self._given[DESIGN_COPY] is None else self._path(DESIGN_COPY)
+        self._design = self._read_design(copy, self._calibration)
+        if self._design is not None:
+            self._wing = reduced_model(self._design, progress=progress)
             hashes["design"] = self._wing.design_hash
             if self._given[FMU_COPY] is None:
                 with progress.stage("Packing the FMU"):
-                    build_fmu(self._wing, self._path(FMU_COPY), replace=True)
+                    self._pack(self._wing)
         hashes["fmu"] = hash_file(self._path(FMU_COPY))
         return hashes
+
+    def _pack(self, wing: ReducedModel) -> None:
+        """Pack the wing as the FMU to fly; where the scenario names no parameter, its start value is flown."""
+        if self._tailored and self._calibration is not None:
+            pack_calibrated_wing(wing, self._calibration, self._path(FMU_COPY), replace=True)
+        else:
+            build_fmu(wing, self._path(FMU_COPY), replace=True)
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the calibrated parameter."""
@@ -252,15 +301,16 @@ class FmuSource:
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write displacement and strain of the wing as VTU, with the parameters of the scenario."""
-        if self._wing is None or {*state} != {"z1", "z2"} or {*control} != {"load_factor"}:
+        if self._design is None or {*state} != {"z1", "z2"} or {*control} != {"load_factor"}:
             return False
         asset = self._scenario.asset
-        fields = wing_fields(load_design(self._path(DESIGN_COPY)))
+        fields = wing_fields(self._design)
+        start = 1.0 if self._calibration is None else self._calibration.mean("young_modulus_factor")
         try:
             write_wing_vtu(
                 path,
                 fields,
-                young_modulus_factor=asset.parameters.get("young_modulus_factor", 1.0),
+                young_modulus_factor=asset.parameters.get("young_modulus_factor", start),
                 stiffness_loss=(state["z1"], state["z2"]),
                 load_factor=control["load_factor"],
                 tip_force=asset.load.get("tip_force", 0.0),
