@@ -1,0 +1,143 @@
+r"""The density of the joint posterior.
+
+Unknown are e, the servo mass s, the pitot mass p and the Rayleigh coefficients a = (alpha, beta). Known are
+the load test, the weighed total T of 2 s + p, and frequencies y and damping ratios z of two modes. With the
+model's frequencies f_i(e, s, p) and relative model errors delta_i ~ N(0, tau_i^2),
+
+    T ~ N(2 s + p, s_T^2),   y_i ~ N(f_i (1 + delta_i), s_i^2),   z ~ N(A a, R),
+
+    A = [[1 / (2 omega_1), omega_1 / 2], [1 / (2 omega_2), omega_2 / 2]],   omega_i = 2 pi f_i,
+
+the last by Kapteyn et al. 2021, eq. (18), at the model's own frequencies, as in eq. (25): the coefficients
+belong to the model and give *its* modes the measured damping. Two unknowns leave in closed form:
+
+- delta_i: y_i ~ N(f_i, s_i^2 + tau_i^2 f_i^2);
+- a, whose prior N(a_0, P) is cut off at zero: without the cut, z ~ N(A a_0, R + A P A') and
+  a | z ~ N(a_0 + G (z - A a_0), P - G A P) with the gain G = P A' (R + A P A')^-1. Drawn from it and dropped
+  where it is negative, a follows its distribution exactly.
+
+What is left is a density in three quantities, e, s and t = 2 s + p; t takes the place of p (with the same
+density), because the weighed total makes s and p nearly one quantity.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors_in_variables import log_likelihood
+from ..experiments import LoadDisplacementData
+from ..posterior import GaussianPrior
+from ..stiffness_curve import StiffnessCurve
+from .frequency_table import FrequencyTable
+from .modal_measurement import ModalMeasurement
+from .prior import JointPrior, ModelError, WeighedMass
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DampingGiven:
+    """The Gaussian of (alpha, beta) at given frequencies, before it is cut off at zero.
+
+    `mean` (N, 2) and `covariance` (N, 2, 2) in [1/s], [s]; `log_likelihood` (N,) of the damping ratios.
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    log_likelihood: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class JointDensity:
+    """The posterior density of (e, s, t) up to its normaliser, and of (alpha, beta) given them.
+
+    Attributes
+    ----------
+    table : FrequencyTable
+        Frequencies of the model.
+    curve : StiffnessCurve
+        k(e) of the same model.
+    static, modal, total_mass
+        What was measured.
+    prior, model_error
+        What is assumed.
+    """
+
+    table: FrequencyTable
+    curve: StiffnessCurve
+    static: LoadDisplacementData
+    modal: ModalMeasurement
+    total_mass: WeighedMass
+    prior: JointPrior
+    model_error: ModelError
+
+    def inside(self, reduced: FloatArray) -> NDArray[np.bool_]:
+        """Return which rows (e, s, t) of (N, 3) lie within the model's range."""
+        limits = self.table.limits
+        quantities = masses_of(reduced)
+        return np.asarray(((quantities >= limits[:, 0]) & (quantities <= limits[:, 1])).all(axis=1))
+
+    def log_density(self, reduced: FloatArray) -> tuple[FloatArray, FloatArray, DampingGiven]:
+        """Return the log of prior times likelihood, the frequencies, and the damping given them.
+
+        The priors enter as whole Gaussians, not normalised for their limits.
+
+        Parameters
+        ----------
+        reduced : (N, 3) array
+            e, s, t, all within the model's range.
+
+        Returns
+        -------
+        (N,) array, (N, 2) array [Hz], DampingGiven
+        """
+        quantities = masses_of(reduced)
+        frequency = self.table.frequency(quantities)
+        damping = self.damping(frequency)
+        total = np.asarray(log_likelihood(self.curve, self.static, quantities[:, 0]) + damping.log_likelihood)
+        for place, prior in enumerate(self.prior.marginals[:3]):
+            total += prior.log_density(quantities[:, place])
+        total += GaussianPrior(*self.total_mass).log_density(reduced[:, 2])
+        error = np.array(self.modal.frequency_standard_deviation)
+        variance = error**2 + (np.array(self.model_error.frequency) * frequency) ** 2
+        residual = np.array(self.modal.frequency) - frequency
+        total -= 0.5 * np.sum(residual**2 / variance + np.log(2.0 * math.pi * variance), axis=1)
+        return total, frequency, damping
+
+    def damping(self, frequency: FloatArray) -> DampingGiven:
+        """Return the Gaussian of alpha and beta given frequencies (N, 2) [Hz] and the damping ratios."""
+        omega = 2.0 * math.pi * frequency
+        design = np.stack([0.5 / omega, 0.5 * omega], axis=2)  # (N, mode, coefficient)
+        alpha, beta = self.prior.damping_alpha, self.prior.damping_beta
+        centre = np.array([alpha.mean, beta.mean])
+        scale = np.array([alpha.standard_deviation, beta.standard_deviation])
+        # Coefficients in units of their prior: alpha and beta differ by four decades.
+        design = design * scale
+        ratio, error = (
+            np.array(self.modal.damping_ratio),
+            np.array(self.modal.damping_ratio_standard_deviation),
+        )
+        across = np.swapaxes(design, 1, 2)
+        variance = design @ across + np.diag(error**2)
+        residual = ratio - design @ (centre / scale)
+        gain = across @ np.linalg.inv(variance)
+        mean = centre / scale + (gain @ residual[..., None])[..., 0]
+        # Joseph's form, which stays symmetric and positive.
+        left = np.eye(2) - gain @ design
+        covariance = left @ np.swapaxes(left, 1, 2)
+        covariance = covariance + gain @ np.diag(error**2) @ np.swapaxes(gain, 1, 2)
+        solved = np.linalg.solve(variance, residual[..., None])[..., 0]
+        misfit = np.sum(residual * solved, axis=1)
+        determinant = np.linalg.slogdet(2.0 * math.pi * variance)[1]
+        return DampingGiven(mean * scale, covariance * np.outer(scale, scale), -0.5 * (misfit + determinant))
+
+
+def masses_of(reduced: FloatArray) -> FloatArray:
+    """Return (N, 3) rows e, s, p of rows e, s, t."""
+    quantities = reduced.copy()
+    quantities[:, 2] = reduced[:, 2] - 2.0 * reduced[:, 1]
+    return quantities
