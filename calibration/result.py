@@ -204,7 +204,8 @@ class CalibrationResult:
         return tuple(self._state(row) for row in self.samples)
 
     def _state(self, row: Float) -> DigitalState:
-        return DigitalState(self.design.geometry, *(float(value) for value in row))
+        factor, servo, pitot, alpha, beta = row.tolist()
+        return DigitalState(self.design.geometry, factor, servo, pitot, alpha, beta)
 
     def step(self, number: int) -> CalibrationStep:
         """Return the record of step 1, 2 or 3; of step 3 that of the samples' procedure."""

@@ -220,16 +220,14 @@ def _result(groups: Mapping[str, xr.Dataset], root: Mapping[str, Any]) -> Calibr
     if design.hash != root["design_hash"]:
         raise CalibrationRecordError("its design does not match its hash")
     figures = {name: lengths[name].values.tolist() for name in _LENGTH_FIGURES}
+    span, root_chord, tip_chord = (
+        MeasuredLength(name, **{key: values[index] for key, values in figures.items()})
+        for index, name in enumerate(LENGTH_NAMES)
+    )
     return CalibrationResult(
         asset=str(root["asset"]),
         design=design,
-        geometry=GeometryCalibration(
-            *(
-                MeasuredLength(name, **{key: values[index] for key, values in figures.items()})
-                for index, name in enumerate(LENGTH_NAMES)
-            ),
-            source=str(root["geometry_source"]),
-        ),
+        geometry=GeometryCalibration(span, root_chord, tip_chord, source=str(root["geometry_source"])),
         procedure=root["procedure"],
         samples=_columns(groups["posterior"], STATE),
         prior_samples=_columns(groups["prior"], STATE),

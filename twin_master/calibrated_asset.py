@@ -157,4 +157,3 @@ def _density(values: NDArray[np.float64]) -> dict[str, list[float]]:
         return {}
     grid = np.linspace(values.min() - spread, values.max() + spread, _GRID_POINTS)
     return {"grid": grid.tolist(), "density": gaussian_kde(values)(grid).tolist()}
-

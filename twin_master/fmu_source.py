@@ -153,9 +153,8 @@ class FmuSource:
         binding = load_binding(self._binding)
         self._observed(binding)
         self._check_names(binding)
-        if design is not None:
-            if self._scenario.asset.observation_model != "asset":
-                check_wing_scenario(self._scenario, len(design.gauges.positions))
+        if design is not None and self._scenario.asset.observation_model != "asset":
+            check_wing_scenario(self._scenario, len(design.gauges.positions))
         if fmu is not None:
             FmiAsset(fmu, binding, parameters=self._scenario.asset.parameters)
 
@@ -227,7 +226,7 @@ class FmuSource:
         return hashes
 
     def _pack(self, wing: ReducedModel) -> None:
-        """Pack the wing as the FMU to fly; where the scenario names no parameter, its start value is flown."""
+        """Pack the FMU to fly; where the scenario names no parameter, the start value is flown."""
         if self._tailored and self._calibration is not None:
             pack_calibrated_wing(wing, self._calibration, self._path(FMU_COPY), replace=True)
         else:

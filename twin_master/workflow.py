@@ -194,6 +194,7 @@ def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Pro
             progress.stage("Calibrating and planning"),
         ):
             knowledge = prepare_knowledge(scenario, source, scenario.mission.seed)
+            _tell_of_another_truth(knowledge, progress)
             if knowledge.draws.record is not None:
                 text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
                 atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
@@ -210,6 +211,21 @@ def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Pro
         return RunOutcome(folder, report, figures, timing)
     finally:
         os.close(lock)
+
+
+def _tell_of_another_truth(knowledge: Knowledge, progress: Progress) -> None:
+    """Say so where the true wing of the scenario is not the one that the calibration file describes."""
+    draws, scenario = knowledge.draws, knowledge.scenario
+    truth = scenario.asset.parameters.get(draws.name)
+    if scenario.calibration.source != "file" or truth is None:
+        return
+    off = abs(truth - draws.mean)
+    if off > 3.0 * draws.standard_deviation:
+        progress.note(
+            f"The scenario's true {draws.name} is {truth:.5g}, but the calibration says {draws.mean:.5g} "
+            f"± {draws.standard_deviation:.2g}: the twin flies with the model of another wing. To fly the "
+            "calibrated wing, leave it out of `parameters` in the scenario's table `asset`."
+        )
 
 
 @contextmanager

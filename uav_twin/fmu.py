@@ -14,19 +14,34 @@ fmu_app = typer.Typer(no_args_is_help=True, help="Build, describe and check FMUs
 def build(
     out: Annotated[Path, typer.Option(help="The file to write.")] = Path("uav_wing.fmu"),
     design: Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="Tailor it to a wing: the calibration.nc of `uav-twin calibrate`."),
+    ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
-    """Pack the wing as an FMI 2.0 co-simulation FMU; equal designs give equal bytes."""
+    """Pack the wing as an FMI 2.0 co-simulation FMU; equal designs and calibrations give equal bytes."""
     from fe.cache import reduced_model
     from fe.design import load_design
     from fmu_asset.build import build_fmu
     from fmu_asset.errors import FmuBuildError
     from reporting.progress import RichProgress
 
+    if calibration is not None and design is not None:
+        raise typer.BadParameter("the calibration holds its design: give either it or --design.")
     if out.exists() and not replace:
         raise FmuBuildError(f"{out} exists: choose another --out or give --replace.")
-    model = reduced_model(load_design(design), progress=RichProgress())
-    info = build_fmu(model, out, replace=replace)
+    if calibration is None:
+        model = reduced_model(load_design(design), progress=RichProgress())
+        info = build_fmu(model, out, replace=replace)
+    else:
+        from calibration.result import CalibrationResult
+        from twin_master.calibrated_asset import pack_calibrated_wing
+
+        wing = CalibrationResult.load(calibration)
+        model = reduced_model(wing.design, progress=RichProgress())
+        info = pack_calibrated_wing(model, wing, out, replace=replace)
+        typer.echo(f"Calibrated for {wing.asset}.")
     typer.echo(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
 
 
