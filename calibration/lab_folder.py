@@ -18,6 +18,7 @@ from .experiments import (
     read_measurements,
 )
 from .geometry import GEOMETRY_FILE, GeometryCalibration, published_lengths, read_lengths
+from .joint import WeighedMass
 from .ringdown_extremes import refine_by_extremes
 from .ringdown_records import STEP_FOLDER, find_records, read_records
 from .ringdown_trials import RingDownTrials, fit_trials
@@ -46,6 +47,8 @@ class LabData:
         Step 1.
     pairs : LoadDisplacementData
         Step 2.
+    total_mass : WeighedMass
+        Weighed mass of two servos and the pitot tube.
     trials : RingDownTrials or None
         Step 3, fitted; None where the published frequencies and damping ratios stand in.
     authors : DynamicCalibration or None
@@ -58,6 +61,7 @@ class LabData:
 
     lengths: GeometryCalibration
     pairs: LoadDisplacementData
+    total_mass: WeighedMass
     trials: RingDownTrials | None
     authors: DynamicCalibration | None
     origins: tuple[Origin, ...]
@@ -70,6 +74,7 @@ def published_data() -> LabData:
     return LabData(
         lengths=lengths,
         pairs=pairs,
+        total_mass=WeighedMass(),
         trials=None,
         authors=None,
         origins=tuple(Origin(step, False, text) for step, text in _PUBLISHED.items()),
@@ -129,13 +134,19 @@ def read_lab_folder(path: Path, targets: Targets | None = None) -> LabData:
     if records and targets != "published":
         trials = _fitted(path)
         hashes |= {f"ring_down_{number}": hash_file(file) for number, file in enumerate(records, start=1)}
-        count = f"{len(records)} record{'s' if len(records) > 1 else ''}"
-        origins[3] = Origin(
-            3, True, f"{count} read, {records[0].name}" + (" ..." if len(records) > 1 else "")
-        )
+        names = records[0].name if len(records) == 1 else f"{records[0].name} to {records[-1].name}"
+        origins[3] = Origin(3, True, f"{names} read")
     elif records:
         origins[3] = Origin(3, False, "records left aside as asked; " + _PUBLISHED[3])
-    return LabData(lengths, pairs, trials, _authors(path), tuple(origins[step] for step in (1, 2, 3)), hashes)
+    return LabData(
+        lengths=lengths,
+        pairs=pairs,
+        total_mass=published.total_mass,
+        trials=trials,
+        authors=_authors(path),
+        origins=tuple(origins[step] for step in (1, 2, 3)),
+        input_hashes=hashes,
+    )
 
 
 _PUBLISHED = {

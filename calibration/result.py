@@ -16,7 +16,7 @@ from fe.state import DigitalState
 from .errors import CalibrationRecordError
 from .experiments import LoadDisplacementData
 from .geometry import GeometryCalibration
-from .joint import ModalMeasurement
+from .joint import ModalMeasurement, WeighedMass
 from .posterior import Seed, child_seed
 from .steps import CalibrationStep, deviation
 
@@ -55,6 +55,21 @@ QUANTITIES = (
 """Quantities of interest, in the order of `CalibrationResult.quantity_samples`."""
 
 
+def check_name(asset: str) -> str:
+    """Return the name of an asset if it can be printed.
+
+    Raises
+    ------
+    CalibrationRecordError
+        If it is empty, too long or holds control characters.
+    """
+    if not (0 < len(asset) <= LONGEST_NAME and asset.isprintable() and asset.strip()):
+        raise CalibrationRecordError(
+            f"the name of the asset must be 1 to {LONGEST_NAME} printable characters, and {asset!r} came."
+        )
+    return asset
+
+
 def measured_quantities(modal: ModalMeasurement) -> dict[str, tuple[float, float]]:
     """Return name of a quantity of interest -> measured value and its standard deviation, SI."""
     return {
@@ -88,6 +103,8 @@ class CalibrationResult:
         The same at the prior's samples.
     pairs : LoadDisplacementData
         What the load test measured.
+    total_mass : WeighedMass
+        Weighed mass of two servos and the pitot tube.
     modal : ModalMeasurement
         What the ring-down test measured.
     steps : tuple of CalibrationStep
@@ -112,17 +129,14 @@ class CalibrationResult:
     quantity_samples: Float
     prior_quantity_samples: Float
     pairs: LoadDisplacementData
+    total_mass: WeighedMass
     modal: ModalMeasurement
     steps: tuple[CalibrationStep, ...]
     seed: int
     provenance: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        if not (0 < len(self.asset) <= LONGEST_NAME and self.asset.isprintable() and self.asset.strip()):
-            raise CalibrationRecordError(
-                f"the name of the asset must be 1 to {LONGEST_NAME} printable characters, and "
-                f"{self.asset!r} came."
-            )
+        check_name(self.asset)
         if self.procedure not in ("joint", "paper"):
             raise CalibrationRecordError(
                 f"the procedure of a calibration is joint or paper, and {self.procedure!r} came."

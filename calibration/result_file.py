@@ -23,7 +23,7 @@ from reporting.files import atomic_write_bytes
 from .errors import CalibrationError, CalibrationRecordError
 from .experiments import LoadDisplacementData
 from .geometry import LENGTH_NAMES, GeometryCalibration, MeasuredLength
-from .joint import ModalMeasurement
+from .joint import ModalMeasurement, WeighedMass
 from .result import QUANTITIES, STATE, CalibrationResult, Quantity
 from .steps import CalibrationStep
 
@@ -195,7 +195,7 @@ def _geometry(geometry: GeometryCalibration) -> xr.Dataset:
 
 def _measured(result: CalibrationResult) -> xr.Dataset:
     pairs, modal = result.pairs, result.modal
-    table = {
+    table: dict[str, tuple[Any, Any, dict[str, str]]] = {
         "load": _variable("pair", pairs.load, "N", "tip load"),
         "displacement": _variable("pair", pairs.displacement, "m", "tip displacement"),
         "run": _variable("pair", pairs.run.astype(np.int64), "1", "loading run, from 0"),
@@ -206,6 +206,17 @@ def _measured(result: CalibrationResult) -> xr.Dataset:
             "pair", np.full(pairs.count, pairs.displacement_standard_deviation), "m", "of a reading"
         ),
     }
+    mass = result.total_mass
+    table["total_mass"] = (
+        (),
+        mass.mass,
+        {"units": "kg", "long_name": "two servos and the pitot tube, weighed"},
+    )
+    table["total_mass_standard_deviation"] = (
+        (),
+        mass.standard_deviation,
+        {"units": "kg", "long_name": "of the weighing"},
+    )
     for name, unit in (("frequency", "Hz"), ("damping_ratio", "1")):
         title = name.replace("_", " ")
         table[name] = _variable("mode", getattr(modal, name), unit, f"{title} of a flapwise bending mode")
@@ -240,6 +251,9 @@ def _result(groups: Mapping[str, xr.Dataset], root: Mapping[str, Any]) -> Calibr
             load_standard_deviation=float(measured["load_standard_deviation"].values[0]),
             displacement_standard_deviation=float(measured["displacement_standard_deviation"].values[0]),
             source=str(root["load_test_source"]),
+        ),
+        total_mass=WeighedMass(
+            float(measured["total_mass"]), float(measured["total_mass_standard_deviation"])
         ),
         modal=ModalMeasurement(
             frequency=_pair(measured["frequency"]),

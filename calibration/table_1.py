@@ -49,14 +49,14 @@ class Shown:
 
 
 SHOWN = {
-    "semi_span": Shown("semi-span", 1e3, "mm", 3),
-    "root_chord": Shown("root chord", 1e3, "mm", 3),
-    "tip_chord": Shown("tip chord", 1e3, "mm", 3),
-    "young_modulus_factor": Shown("Young's modulus factor e", 1.0, "", 4),
-    "servo_mass": Shown("mass of each servo", 1e3, "g", 1),
-    "pitot_mass": Shown("mass of the pitot tube", 1e3, "g", 1),
-    "damping_alpha": Shown("Rayleigh alpha", 1.0, "1/s", 4),
-    "damping_beta": Shown("Rayleigh beta", 1e3, "ms", 4),
+    "semi_span": Shown("semi-span", 1e3, "mm", 2),
+    "root_chord": Shown("root chord", 1e3, "mm", 2),
+    "tip_chord": Shown("tip chord", 1e3, "mm", 2),
+    "young_modulus_factor": Shown("Young's factor e", 1.0, "", 4),
+    "servo_mass": Shown("servo mass", 1e3, "g", 1),
+    "pitot_mass": Shown("pitot mass", 1e3, "g", 1),
+    "damping_alpha": Shown("alpha", 1.0, "1/s", 4),
+    "damping_beta": Shown("beta", 1e3, "ms", 4),
     "tip_stiffness": Shown("tip stiffness", 1e-3, "N/mm", 4),
     "frequency_1": Shown("f1", 1.0, "Hz", 3),
     "frequency_2": Shown("f2", 1.0, "Hz", 2),

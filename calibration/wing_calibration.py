@@ -28,7 +28,14 @@ from .joint import (
 )
 from .lab_folder import LabData
 from .posterior import child_seed
-from .result import QUANTITIES, STATE, CalibrationResult, Procedure, measured_quantities
+from .result import (
+    QUANTITIES,
+    STATE,
+    CalibrationResult,
+    Procedure,
+    check_name,
+    measured_quantities,
+)
 from .static_calibration import StaticCalibration
 from .steps import (
     CalibrationStep,
@@ -123,7 +130,9 @@ def calibrate_wing(
         If the tailored wing cannot be built.
     """
     progress = progress or SilentProgress()
-    tailored = tailored_design(design or load_design(), lab.lengths)
+    drawn = design or load_design()
+    name = check_name(drawn.name if asset is None else asset)
+    tailored = tailored_design(drawn, lab.lengths)
     model = (model_of or (lambda wing: reduced_model(wing, progress=progress)))(tailored)
     with progress.stage("Step 2: Young's modulus factor"):
         curve = stiffness_curve_of(model, name="tip stiffness of the tailored model")
@@ -133,9 +142,13 @@ def calibrate_wing(
     with progress.stage("Step 3: masses and damping, the paper's procedure"):
         factors = static.exact.samples(child_seed(seed, _PAPER_PURPOSE), PAPER_SAMPLE_COUNT, stratified=True)
         targets = DynamicTargets(modal.frequency, modal.damping_ratio)
-        paper = calibrate_dynamics(model, factors, targets, source="tailored model")
+        paper = calibrate_dynamics(
+            model, factors, targets, total_mass=lab.total_mass.mass, source="tailored model"
+        )
     with progress.stage("Step 3: masses and damping, joint posterior"):
-        joint = joint_posterior(model, lab.pairs, modal, seed=seed, count=SAMPLE_COUNT)
+        joint = joint_posterior(
+            model, lab.pairs, modal, total_mass=lab.total_mass, seed=seed, count=SAMPLE_COUNT
+        )
     paper_samples = np.column_stack([paper.young_modulus_factor, paper.samples])
     paper_quantities = quantities_of(model, paper_samples)
     prior_quantities = quantities_of(model, joint.prior_samples)
@@ -151,7 +164,7 @@ def calibrate_wing(
     }
     other: Procedure = "paper" if procedure == "joint" else "joint"
     result = CalibrationResult(
-        asset=asset if asset is not None else tailored.name,
+        asset=name,
         design=tailored,
         geometry=lab.lengths,
         procedure=procedure,
@@ -160,12 +173,13 @@ def calibrate_wing(
         quantity_samples=quantities,
         prior_quantity_samples=prior_quantities,
         pairs=lab.pairs,
+        total_mass=lab.total_mass,
         modal=modal,
         steps=(_geometry_step(lab.lengths), _static_step(static), thirds[procedure], thirds[other]),
         seed=seed,
         provenance=collect_provenance(
             seed,
-            input_hashes={**lab.input_hashes, "design": (design or load_design()).hash},
+            input_hashes={**lab.input_hashes, "design": drawn.hash},
             packages=("calibration", "fe"),
             distributions=("uav-twin", "numpy", "scipy", "scikit-fem", "pymor"),
         ).as_dict(),

@@ -78,8 +78,7 @@ def render_page(calibration: WingCalibration, drawings: Mapping[str, bytes]) -> 
         drawings["modes"],
         "Mode shapes of the upper skin at the posterior mean, healthy; the colour is the length of the "
         "displacement, from none (dark) to the largest (light); grey is the wing at rest. The leading "
-        "edge is at "
-        "the back. modes.vtu has them for ParaView, wing.vtu the wing in a 3g turn.",
+        "edge is at the back. modes.vtu has them for ParaView, wing.vtu the wing in a 3g turn.",
         title="Mode shapes",
     )
     _add_origin(page, calibration)
@@ -91,8 +90,8 @@ def _add_result(page: Page, calibration: WingCalibration, drawings: Mapping[str,
     page.add_highlights(
         [
             (
-                printed(entry.name, result.mean(entry.name), result.standard_deviation(entry.name)),
-                ", ".join(filter(None, (SHOWN[entry.name].title, SHOWN[entry.name].unit))),
+                f"{printed(entry.name, result.mean(entry.name))} {SHOWN[entry.name].unit}".strip(),
+                f"{SHOWN[entry.name].title}, ± {printed(entry.name, result.standard_deviation(entry.name))}",
             )
             for entry in STATE
         ]
@@ -109,29 +108,27 @@ def _add_result(page: Page, calibration: WingCalibration, drawings: Mapping[str,
                 Column("figure"),
                 Column("prior", numeric=True),
                 Column("this wing", numeric=True),
-                Column("by the paper's procedure", numeric=True),
+                Column("paper's procedure", numeric=True),
                 Column("in the paper", numeric=True),
-                Column("this wing less paper", numeric=True),
-                Column("procedure less paper", numeric=True),
+                Column("difference, wing", numeric=True),
+                Column("difference, procedure", numeric=True),
             ),
             [_table_row(row) for row in table_1(calibration)],
         ),
-        f"Mean ± standard deviation. This wing: {TITLES[result.procedure]}, {len(result.samples)} "
-        "samples, as in "
-        "calibration.nc. By the paper's procedure: e by its particle filter on its stiffness line, then "
-        "masses by eq. (19) and damping by eq. (25) on the tailored model for each sample of e; its standard "
-        "deviations hold the uncertainty of e alone. In the paper: planform and e are printed in its "
-        "Table 1; "
+        f"Mean ± standard deviation. This wing: {TITLES[result.procedure]}, {len(result.samples)} samples, "
+        "as in calibration.nc. Paper's procedure: e by its particle filter on its stiffness line, then masses "
+        "by eq. (19) and damping by eq. (25) on the tailored model for each sample of e; its standard "
+        "deviations hold the uncertainty of e alone. In the paper: planform and e are printed in its Table 1; "
         "masses are the means of the authors' published samples of step 3, alpha and beta follow from their "
-        "frequencies by eq. (25). The paper's figures belong to its own wing.",
+        "frequencies by eq. (25). Differences: this wing, and the paper's procedure, less the paper's own "
+        "figure, which belongs to its own wing.",
         title="Table 1 of the paper, with this calibration beside it",
     )
     page.add_figure(
         drawings["quantities"],
-        "Tip stiffness, frequencies and damping ratios of the two flapwise bending modes before and "
-        "after the "
-        "calibration, and what was measured with its 95 % interval. The vertical scale of each panel is "
-        "free.",
+        "Tip stiffness, frequencies and damping ratios of the two flapwise bending modes before and after "
+        "the calibration, and what was measured with its 95 % interval. The vertical scale of each panel "
+        "is free.",
         title="Quantities of interest",
     )
 
@@ -139,7 +136,7 @@ def _add_result(page: Page, calibration: WingCalibration, drawings: Mapping[str,
 def _table_row(row: TableRow) -> tuple[str, ...]:
     shown = SHOWN[row.name]
     return (
-        f"{shown.title}, {shown.unit}" if shown.unit else shown.title,
+        (f"{shown.title}, {shown.unit}" if shown.unit else shown.title).replace(" ", "\u00a0"),
         printed(row.name, *row.prior),
         printed(row.name, *row.found),
         printed(row.name, *row.paper_way),
@@ -209,8 +206,7 @@ def _add_planform(page: Page, calibration: WingCalibration) -> None:
             ],
         ),
         "The design is tailored to the posterior means, rounded to 0.1 mm, and meshed anew; what it "
-        "places by "
-        "fractions moves with the planform, what it places by distances stays.",
+        "places by fractions moves with the planform, what it places by distances stays.",
         title="Planform",
     )
     _add_reward(page, calibration.result.step(1))
@@ -220,10 +216,9 @@ def _add_load_test(page: Page, calibration: WingCalibration, drawings: Mapping[s
     static, published = calibration.static, calibration.static_published
     page.add_figure(
         drawings["load_test"],
-        "(a) Measured pairs with 95 % intervals; 95 % bands of f = k(e) x before (grey) and after (blue) the "
-        "calibration. (b) Prior, the kernel likelihood of each pair, and the posterior by quadrature and "
-        "by the "
-        "particle filter. (c) The tip stiffness, before and after. After Fig. 5 of the paper.",
+        "(a) Measured pairs with 95 % intervals; 95 % bands of f = k(e) x before (grey) and after (blue) "
+        "the calibration. (b) Prior, the kernel likelihood of each pair, and the posterior by quadrature "
+        "and by the particle filter. (c) The tip stiffness, before and after. After Fig. 5 of the paper.",
         title="Load test, posterior of e and of the tip stiffness",
     )
     rows = []
@@ -258,8 +253,7 @@ def _add_load_test(page: Page, calibration: WingCalibration, drawings: Mapping[s
     page.add_figure(
         drawings["residuals"],
         "(a) Displacement less load over calibrated stiffness, with 95 % intervals of the readings; the "
-        "broken "
-        "lines are the means of the runs. (b) Mean and 95 % interval of e under other assumptions.",
+        "broken lines are the means of the runs. (b) Mean and 95 % interval of e under other assumptions.",
         title="Residuals of the load test",
     )
     _add_reward(page, calibration.result.step(2))
@@ -269,11 +263,9 @@ def _add_ring_down(page: Page, calibration: WingCalibration, drawings: Mapping[s
     if "ring_down" in drawings:
         page.add_figure(
             drawings["ring_down"],
-            "(a) The first trial with the fitted sum of two damped cosines and its envelopes. (b) "
-            "Spectra of all "
-            "trials. (c), (d) Frequency and damping of the first mode in windows of 0.8 s over its "
-            "amplitude; a "
-            "linear wing would show one value.",
+            "(a) The first trial with the fitted sum of two damped cosines and its envelopes. (b) Spectra "
+            "of all trials. (c), (d) Frequency and damping of the first mode in windows of 0.8 s over its "
+            "amplitude; a linear wing would show one value.",
             title="Ring-down records, fits and spectra",
         )
     else:
@@ -283,16 +275,14 @@ def _add_ring_down(page: Page, calibration: WingCalibration, drawings: Mapping[s
     page.add_figure(
         drawings["masses"],
         "One point for each sample of e: the masses that meet the measured frequencies best under the "
-        "weighed "
-        "total, eqs. (19) and (20), and the Rayleigh coefficients of eq. (25)"
+        "weighed total, eqs. (19) and (20), and the Rayleigh coefficients of eq. (25)"
         + ("; grey squares are the authors' published samples." if calibration.lab.authors else "."),
         title="Masses and damping by the paper's procedure",
     )
     page.add_figure(
         drawings["posterior"],
         "Samples of the joint posterior (blue) and of the paper's procedure (green, its histograms on a "
-        "scale of "
-        "their own); upper right: correlations of the joint posterior. Numbers over 0.3 are blue.",
+        "scale of their own); upper right: correlations of the joint posterior. Numbers over 0.3 are blue.",
         title="Joint posterior",
     )
     for step in calibration.result.steps[2:]:
