@@ -116,12 +116,12 @@ def _add_result(page: Page, calibration: WingCalibration, drawings: Mapping[str,
             [_table_row(row) for row in table_1(calibration)],
         ),
         f"Mean ± standard deviation. This wing: {TITLES[result.procedure]}, {len(result.samples)} samples, "
-        "as in calibration.nc. Paper's procedure: e by its particle filter on its stiffness line, then masses "
-        "by eq. (19) and damping by eq. (25) on the tailored model for each sample of e; its standard "
-        "deviations hold the uncertainty of e alone. In the paper: planform and e are printed in its Table 1; "
-        "masses are the means of the authors' published samples of step 3, alpha and beta follow from their "
-        "frequencies by eq. (25). Differences: this wing, and the paper's procedure, less the paper's own "
-        "figure, which belongs to its own wing.",
+        "as in calibration.nc. Paper's procedure: e by its particle filter on its stiffness line, then "
+        "masses by eq. (19) and damping by eq. (25) on the tailored model for each sample of e; its standard "
+        "deviations hold the uncertainty of e alone. In the paper: planform and e are printed in its "
+        "Table 1; masses are the means of the authors' published samples of step 3, alpha and beta follow "
+        "from their frequencies by eq. (25). Differences: this wing, and the paper's procedure, less the "
+        "paper's own figure, which belongs to its own wing.",
         title="Table 1 of the paper, with this calibration beside it",
     )
     page.add_figure(

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from calibration.result import QUANTITIES, STATE
 from reporting import figures as style
 from twin_master.report.data import RunRecord
 from twin_master.report.text import number
@@ -89,9 +90,9 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
         wing=str(kept.get("asset") or ""),
         figures=tuple(
             figure
-            for group in ("state", "quantities")
-            for entry in _table(kept, group).values()
-            if (figure := _figure(entry)) is not None
+            for group, columns in (("state", STATE), ("quantities", QUANTITIES))
+            for column in columns
+            if (figure := _figure(_table(kept, group).get(column.name))) is not None
         ),
     )
 

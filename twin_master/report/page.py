@@ -176,8 +176,8 @@ def render_page(record: RunRecord, figures: Mapping[str, ReportFigure], drawings
             page.add_section(title)
         for figure in present:
             page.add_figure(drawings[figure.name], figure.caption, title=figure.title)
-        if "calibration" in names:
-            _add_calibrated_wing(page, calibration_view(record))
+            if figure.name == "calibration":
+                _add_calibrated_wing(page, calibration_view(record))
     page.add_section("The run")
     _add_run(page, record)
     return page.render()
