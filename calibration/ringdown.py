@@ -30,7 +30,10 @@ SEARCH_BAND = (2.0, 80.0)
 
 _PADDING = 64  # zero padding of the spectrum: bins of 1/64 of the record's own resolution
 _PROMINENCE = 3.5  # of a spectral peak, over the median amplitude of the noise
-_SMALLEST_PEAK = 0.02  # of the highest amplitude; smaller ripples come from the end of the record
+# Smallest peak, of the highest amplitude: smaller ripples come from the end of a record that still rings
+# there, and from the skirts of the first mode where it has died away.
+_SMALLEST_PEAK = (0.003, 0.02)
+_END_SHARE = 0.05  # of a record, in which its end is judged
 _STARTING_RATIOS = (0.01, 0.03, 0.08)
 _STEADY_SHARE = 0.7  # rms of the last third over the first; above it nothing decays
 
@@ -172,14 +175,22 @@ def _noise_floor(record: RingDownRecord, band: tuple[float, float]) -> float:
     return float(np.median(amplitude[(frequency >= band[0]) & (frequency <= band[1])]))
 
 
+def _smallest_peak(record: RingDownRecord) -> float:
+    """Return the share of the highest amplitude from which a peak counts."""
+    signal = detrend(record.signal)
+    end = signal[-max(int(_END_SHARE * record.count), 8) :]
+    left = math.sqrt(2.0 * float(np.mean(end**2))) / float(np.abs(signal).max())
+    return min(max(left, _SMALLEST_PEAK[0]), _SMALLEST_PEAK[1])
+
+
 def spectral_peaks(record: RingDownRecord, band: tuple[float, float] = SEARCH_BAND) -> tuple[float, float]:
     """Return the two most prominent peaks of the spectrum, by ascending frequency [Hz].
 
     Raises
     ------
     RingDownError
-        If the record is sampled too slowly, or fewer than two peaks rise by 2 % of the highest amplitude
-        and by 3.5 times the median noise.
+        If the record is sampled too slowly, or fewer than two peaks rise by 3.5 times the median noise
+        and by 2 % of the highest amplitude (less, down to 0.3 %, if the record has died away at its end).
     """
     if 0.5 * record.sampling_rate < 4.0 * band[0]:
         raise RingDownError(
@@ -187,7 +198,8 @@ def spectral_peaks(record: RingDownRecord, band: tuple[float, float] = SEARCH_BA
             f"{0.5 * record.sampling_rate:.3g} Hz; is the time in s?"
         )
     frequency, amplitude = spectrum(record, band)
-    needed = max(_PROMINENCE * _noise_floor(record, band), _SMALLEST_PEAK * float(amplitude.max()))
+    smallest = _smallest_peak(record) * float(amplitude.max())
+    needed = max(_PROMINENCE * _noise_floor(record, band), smallest)
     places, found = find_peaks(amplitude, prominence=needed)
     if places.size < 2:
         seen = "none" if places.size == 0 else f"one, at {frequency[places[0]]:.3g} Hz"

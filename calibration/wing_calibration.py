@@ -26,7 +26,7 @@ from .joint import (
     modal_measurement,
     published_modal_measurement,
 )
-from .lab_folder import LabData
+from .lab_data import LabData
 from .posterior import child_seed
 from .result import (
     QUANTITIES,

@@ -204,6 +204,10 @@ class ModalIntegrator:
         self._modal_output = np.vstack((self.modes.strain, self.modes.tip_displacement))
         # what the modes that are not kept contribute, at once, per unit load
         self._correction = self._static_output - self._modal_output @ self._modal_static
+        participation = self.modes.tip_participation  # also how far each mode moves the load point
+        self._load_point_correction = (
+            model.static_load[1] @ self._static_coordinates - participation @ self._modal_static
+        )
         self._cached: tuple[float, Propagator] | None = None
 
     def static_response(self, load_factor: float, tip_force: float = 0.0) -> TransientResponse:
@@ -333,6 +337,22 @@ class ModalIntegrator:
         return TransientResponse(
             output[:-1], float(output[-1]), float(self.modes.tip_displacement @ state.velocity)
         )
+
+    def load_point_displacement(self, state: TransientState) -> float:
+        """Return the displacement of the point where the tip force acts, 5 cm from the tip.
+
+        Parameters
+        ----------
+        state : TransientState
+            The state.
+
+        Returns
+        -------
+        float
+            Displacement, upwards positive [m].
+        """
+        kept = self.modes.tip_participation @ state.displacement
+        return float(kept + self._load_point_correction @ state.load)
 
     def energy(self, state: TransientState) -> float:
         """Return the mechanical energy of the kept modes about the equilibrium under the state's load [J].

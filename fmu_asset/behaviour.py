@@ -139,6 +139,19 @@ class WingBehaviour:
             self._equilibrium(self._parameters, self._inputs)
         return self._bound or 0.0
 
+    def load_point_displacement(self) -> float:
+        """Return the displacement of the point where the tip force acts [m]."""
+        if self._parameters is None:
+            raise RuntimeError("the wing was not initialised")
+        if self._integrator is not None and self._transient is not None:
+            return self._integrator.load_point_displacement(self._transient)
+        load_factor, z1, z2, tip_force = self._inputs
+        model = self._physics.model
+        static = model.static_response(
+            self._parameters.young_modulus_factor, (z1, z2), load_factor, tip_force
+        )
+        return float(model.static_load[1] @ static.coordinates)
+
     def modal_data(self) -> tuple[list[float], list[float]]:
         """Return natural frequencies [Hz] and damping ratios [1] under the last inputs."""
         parameters = self._parameters

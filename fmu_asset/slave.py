@@ -104,7 +104,8 @@ class WingSlave:
         self._tip = self._reference["tip_displacement"]
         self._bound = self._reference["strain_error_bound"]
         self._status = self._reference["status"]
-        self._modal = self._status + 1
+        self._load_point = self._reference["load_point_displacement"]
+        self._modal = self._load_point + 1
         self._reading = _reading((), 0)
         self._phase = INSTANTIATED
         self._time = 0.0
@@ -242,7 +243,7 @@ class WingSlave:
             self._values[vr] = float(value)
 
     def get_real(self, vrs: Sequence[int]) -> list[float]:
-        """Return values; the error bound and the modal outputs are computed when they are asked for."""
+        """Return values; error bound, load point and modal outputs are computed when they are asked for."""
         try:
             if vrs != self._reading.references:
                 self._reading = _reading(vrs, len(self._values))
@@ -268,6 +269,8 @@ class WingSlave:
         if self._stale_bound and self._bound in vrs:
             self._values[self._bound] = self._behaviour.strain_error_bound()
             self._stale_bound = False
+        if highest >= self._load_point and self._load_point in vrs:
+            self._values[self._load_point] = self._behaviour.load_point_displacement()
         if self._stale_modal and highest >= self._modal:
             frequency, damping_ratio = self._behaviour.modal_data()
             self._values[self._modal :] = [*frequency, *damping_ratio]

@@ -244,6 +244,11 @@ def variable_table(
         unit="1", display="microstrain",
     )  # fmt: skip
     add("status", "output", "What became of the last call", enumeration="Status")
+    add(
+        "load_point_displacement", "output",
+        "Displacement of the point near the tip where tip_force acts, positive upwards",
+        unit="m", display="mm",
+    )  # fmt: skip
     for mode in range(1, mode_count + 1):
         add(f"frequency[{mode}]", "output", f"Natural frequency of mode {mode}", unit="Hz")
     for mode in range(1, mode_count + 1):

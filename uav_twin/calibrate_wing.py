@@ -63,7 +63,7 @@ def calibrate_wing(
         return
     if measured and data is None:
         raise typer.BadParameter("--measured needs --data with ring-down records.")
-    from calibration.lab_folder import published_data, read_lab_folder
+    from calibration.lab_data import published_data, read_lab_folder
     from calibration.wing_calibration import calibrate_wing as calibrate
     from calibration.wing_files import check_folder, write_calibration_folder
     from fe.design import load_design

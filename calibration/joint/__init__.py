@@ -1,7 +1,7 @@
 """The joint Bayesian posterior of the digital state: load test, weighed masses and ring-down together."""
 
 from .inference import joint_posterior
-from .modal_measurement import ModalMeasurement, modal_measurement, published_modal_measurement
+from .measurement import ModalMeasurement, modal_measurement, published_modal_measurement
 from .prior import JointPrior, ModelError, WeighedMass
 from .result import NAMES, JointDiagnostics, JointPosterior
 

@@ -33,7 +33,7 @@ from ..experiments import LoadDisplacementData
 from ..posterior import GaussianPrior
 from ..stiffness_curve import StiffnessCurve
 from .frequency_table import FrequencyTable
-from .modal_measurement import ModalMeasurement
+from .measurement import ModalMeasurement
 from .prior import JointPrior, ModelError, WeighedMass
 
 FloatArray = NDArray[np.float64]

@@ -16,7 +16,7 @@ from ..posterior import child_seed
 from ..stiffness_curve import StiffnessCurve, stiffness_curve_of
 from .density import JointDensity, masses_of
 from .frequency_table import FrequencyTable, tabulate_frequencies
-from .modal_measurement import ModalMeasurement
+from .measurement import ModalMeasurement
 from .prior import JointPrior, ModelError, WeighedMass
 from .result import JointDiagnostics, JointPosterior
 from .sampler import (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fe.state import DigitalState, Geometry
 
 from ..errors import PosteriorError
-from .modal_measurement import ModalMeasurement
+from .measurement import ModalMeasurement
 from .prior import NAMES, JointPrior, ModelError, WeighedMass
 
 __all__ = ["NAMES", "JointDiagnostics", "JointPosterior"]

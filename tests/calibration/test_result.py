@@ -40,9 +40,9 @@ def test_what_it_gives(make_calibration: MakeCalibration) -> None:
         result.samples[0, 0] = 0.0
 
 
-@given(st.integers(1, 60), st.integers(0, 5))
+@given(count=st.integers(1, 60), seed=st.integers(0, 5))
 def test_stratified_draws_take_one_sample_from_each_stratum(
-    count: int, seed: int, make_calibration: MakeCalibration
+    make_calibration: MakeCalibration, count: int, seed: int
 ) -> None:
     """As many draws as samples are all samples, shuffled; fewer are one of each group of neighbours."""
     result = make_calibration(count=60)

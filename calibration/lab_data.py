@@ -19,6 +19,7 @@ from .experiments import (
 )
 from .geometry import GEOMETRY_FILE, GeometryCalibration, published_lengths, read_lengths
 from .joint import WeighedMass
+from .laboratory import WEIGHED_MASS_FILE, read_weighed_mass
 from .ringdown_extremes import refine_by_extremes
 from .ringdown_records import STEP_FOLDER, find_records, read_records
 from .ringdown_trials import RingDownTrials, fit_trials
@@ -115,7 +116,7 @@ def read_lab_folder(path: Path, targets: Targets | None = None) -> LabData:
             "or one laid out like it."
         )
     published = published_data()
-    lengths, pairs = published.lengths, published.pairs
+    lengths, pairs, mass = published.lengths, published.pairs, published.total_mass
     hashes = dict(published.input_hashes)
     origins = {origin.step: origin for origin in published.origins}
     if 1 in steps:
@@ -126,6 +127,10 @@ def read_lab_folder(path: Path, targets: Targets | None = None) -> LabData:
         pairs = read_measurements(path)
         hashes["load_test"] = pairs.sha256
         origins[2] = Origin(2, True, f"{MEASUREMENTS_FILE.as_posix()} read, {pairs.count} pairs")
+    weighed = _weighed(path)
+    if weighed is not None:
+        mass = weighed
+        hashes["weighed_mass"] = hash_record([*mass])
     trials = None
     if targets == "measured" and not records:
         raise ExperimentFileError(
@@ -136,12 +141,14 @@ def read_lab_folder(path: Path, targets: Targets | None = None) -> LabData:
         hashes |= {f"ring_down_{number}": hash_file(file) for number, file in enumerate(records, start=1)}
         names = records[0].name if len(records) == 1 else f"{records[0].name} to {records[-1].name}"
         origins[3] = Origin(3, True, f"{names} read")
+        if weighed is not None:
+            origins[3] = origins[3]._replace(text=f"{origins[3].text}; {WEIGHED_MASS_FILE.as_posix()} read")
     elif records:
         origins[3] = Origin(3, False, "records left aside as asked; " + _PUBLISHED[3])
     return LabData(
         lengths=lengths,
         pairs=pairs,
-        total_mass=published.total_mass,
+        total_mass=mass,
         trials=trials,
         authors=_authors(path),
         origins=tuple(origins[step] for step in (1, 2, 3)),
@@ -167,6 +174,13 @@ def _fitted(path: Path) -> RingDownTrials:
     trials = fit_trials(records)
     # Of a record read off a plot the extremes are averages of the signal; the middle of the ink is none.
     return refine_by_extremes(trials) if all(record.lowest is not None for record in records) else trials
+
+
+def _weighed(path: Path) -> WeighedMass | None:
+    for above in _FOLDERS_OF_STEPS:
+        if (path / above / WEIGHED_MASS_FILE).is_file():
+            return read_weighed_mass(path / above)
+    return None
 
 
 def _authors(path: Path) -> DynamicCalibration | None:

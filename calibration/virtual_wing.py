@@ -1,0 +1,310 @@
+"""A wing that never was on the test bench: experiments of which the truth is known.
+
+`TestBench` is what every experiment needs of a wing; `VirtualWing` is a reduced model with a digital state as
+its truth, `twin_master.virtual_experiments` has the FMU behind the same interface. The functions
+`measure_...` do the experiments of the paper on a bench, with reading errors and a seed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fe.damping import rayleigh_damping_ratio
+from fe.reduced import ReducedModel
+from fe.state import DigitalState, Geometry
+
+from .errors import ExperimentDataError
+from .experiments import (
+    DISPLACEMENT_STANDARD_DEVIATION,
+    HALF_WIDTH_95,
+    LOAD_STANDARD_DEVIATION,
+    LoadDisplacementData,
+    published_measurements,
+)
+from .geometry import READING_UNCERTAINTY, GeometryCalibration, MeasuredLength, published_lengths
+from .joint.prior import WeighedMass
+from .posterior import Seed, child_seed
+from .ringdown_records import RingDownRecord
+
+FloatArray = NDArray[np.float64]
+
+SENSITIVITY = 50.0
+"""Volts per unit strain: a quarter bridge of gauge factor 2 at 5 V, amplified 20 times [V]."""
+
+RECORDED_GAUGE = 22
+"""The gauge whose strain is recorded: a released tip moves mode 2 by a quarter of mode 1 there, the higher
+modes hardly; nearer to the root mode 2 is lost behind mode 1."""
+
+_PURPOSES = {"load": 31, "ring_down": 32, "geometry": 33, "weighing": 34}
+
+
+class RingDownSignal(NamedTuple):
+    """What a recorder saw: instants (N,) from the release on [s] and signal (N,) [V]."""
+
+    time: FloatArray
+    signal: FloatArray
+
+
+class TestBench(Protocol):
+    """A wing, real or not, that can be loaded and let go. It reads without error."""
+
+    def tip_displacement(self, load: float) -> float:
+        """Return the displacement [m] of the load point, 5 cm from the tip, under a load there [N]."""
+
+    def ring_down(
+        self, initial_tip_displacement: float, duration: float, sampling_rate: float
+    ) -> RingDownSignal:
+        """Hold the tip aside [m], let it go, and record for `duration` [s] at `sampling_rate` [Hz]."""
+
+
+def sampling_times(duration: float, sampling_rate: float) -> FloatArray:
+    """Return the instants of a record [s], from 0 to `duration`.
+
+    Raises
+    ------
+    ExperimentDataError
+        If duration or rate is not positive and finite, or no two samples fit.
+    """
+    if not (0.0 < duration < math.inf and 0.0 < sampling_rate < math.inf and duration * sampling_rate >= 1.0):
+        raise ExperimentDataError(
+            "a record needs a positive duration and sampling rate, but "
+            f"{duration:g} s at {sampling_rate:g} Hz were asked for."
+        )
+    return np.arange(int(duration * sampling_rate + 1e-9) + 1) / sampling_rate
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualWing:
+    """A reduced model with a known digital state, in the manner of `TestBench`.
+
+    Attributes
+    ----------
+    model : ReducedModel
+        The wing.
+    truth : DigitalState
+        Its true state; the geometry is that of the model.
+    frequency_error : (float, float)
+        Relative differences delta between this wing's two flapwise frequencies and its model's [1]: what
+        the model leaves out. Mode shapes and damping ratios stay the model's.
+    gauge : int
+        Whose strain is recorded, from 0.
+    sensitivity : float
+        Of the strain signal [V].
+
+    Raises
+    ------
+    ExperimentDataError
+        If the gauge is not there or a frequency error is not above -1.
+    fe.errors.OutsideModelError
+        If the truth lies outside the model.
+    """
+
+    model: ReducedModel
+    truth: DigitalState
+    frequency_error: tuple[float, float] = (0.0, 0.0)
+    gauge: int = RECORDED_GAUGE
+    sensitivity: float = SENSITIVITY
+    _modal: _FreeVibration = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.gauge < self.model.gauge_count:
+            raise ExperimentDataError(
+                f"the wing has the gauges 0 to {self.model.gauge_count - 1}, but {self.gauge} was asked for."
+            )
+        if not all(math.isfinite(error) and error > -1.0 for error in self.frequency_error):
+            raise ExperimentDataError(
+                "a relative frequency error must be finite and above -1, but "
+                f"{' and '.join(f'{error:g}' for error in self.frequency_error)} were given."
+            )
+        object.__setattr__(self, "_modal", _free_vibration(self))
+
+    def tip_displacement(self, load: float) -> float:
+        """Return the displacement [m] of the load point under a load there [N]."""
+        return load / self.model.tip_stiffness(self.truth.young_modulus_factor, self.truth.stiffness_loss)
+
+    def ring_down(
+        self, initial_tip_displacement: float, duration: float, sampling_rate: float
+    ) -> RingDownSignal:
+        """Return the strain signal after the tip is let go: each mode's free decay, exactly."""
+        time = sampling_times(duration, sampling_rate)
+        modal = self._modal
+        signal = np.zeros_like(time)
+        for omega, zeta, amplitude in zip(*modal, strict=True):
+            signal += amplitude * _free_decay(float(omega), float(zeta), time)
+        return RingDownSignal(time, self.sensitivity * initial_tip_displacement * signal)
+
+
+class _FreeVibration(NamedTuple):
+    """Angular frequency [rad/s], damping ratio, and strain at the release per tip displacement [1/m]."""
+
+    omega: FloatArray
+    zeta: FloatArray
+    amplitude: FloatArray
+
+
+def _free_vibration(wing: VirtualWing) -> _FreeVibration:
+    truth, model = wing.truth, wing.model
+    factor, loss = truth.young_modulus_factor, truth.stiffness_loss
+    modes = model.modes(factor, loss, truth.servo_mass, truth.pitot_mass)
+    static = model.static_response(factor, loss, 0.0, 1.0)
+    omega = 2.0 * math.pi * modes.frequency
+    displacement = modes.tip_participation / omega**2 / static.tip_displacement
+    frequency = modes.frequency.copy()
+    for mode, error in zip(modes.flapwise, wing.frequency_error, strict=True):
+        frequency[mode] *= 1.0 + error
+    zeta = rayleigh_damping_ratio(truth.damping_alpha, truth.damping_beta, modes.frequency)
+    return _FreeVibration(2.0 * math.pi * frequency, zeta, modes.strain[wing.gauge] * displacement)
+
+
+def _free_decay(omega: float, zeta: float, time: FloatArray) -> FloatArray:
+    """Return q(t) of q'' + 2 zeta omega q' + omega^2 q = 0 with q(0) = 1, q'(0) = 0."""
+    root = np.sqrt(complex(zeta**2 - 1.0))
+    if abs(root) < 1e-8:
+        return np.asarray((1.0 + omega * time) * np.exp(-omega * time))
+    slow, fast = omega * (-zeta + root), omega * (-zeta - root)
+    decay = (slow * np.exp(fast * time) - fast * np.exp(slow * time)) / (slow - fast)
+    return np.asarray(decay.real)
+
+
+# ---------------------------------------------------------------------- the experiments
+
+
+def measure_load_test(
+    bench: TestBench,
+    seed: Seed,
+    *,
+    load: Sequence[float] | None = None,
+    run: Sequence[int] | None = None,
+    load_standard_deviation: float = LOAD_STANDARD_DEVIATION,
+    displacement_standard_deviation: float = DISPLACEMENT_STANDARD_DEVIATION,
+) -> LoadDisplacementData:
+    """Hang weights near the tip and read the displacement.
+
+    The true load is the nominal one; load and displacement are then both read with Gaussian errors.
+
+    Parameters
+    ----------
+    bench : TestBench
+        The wing.
+    seed : int or SeedSequence
+        Of the reading errors.
+    load, run : sequences, optional
+        Nominal loads [N] and the run of each; the paper's two runs of 250 to 1000 g by default.
+    load_standard_deviation, displacement_standard_deviation : float
+        Of the readings [N], [m]; the paper's by default.
+    """
+    published = published_measurements()
+    nominal = np.asarray(published.load if load is None else load, dtype=np.float64)
+    runs = published.run if run is None and load is None else run
+    generator = np.random.default_rng(child_seed(seed, _PURPOSES["load"]))
+    displacement = np.array([bench.tip_displacement(float(value)) for value in nominal])
+    return LoadDisplacementData(
+        load=nominal + generator.normal(0.0, load_standard_deviation, nominal.size),
+        displacement=displacement + generator.normal(0.0, displacement_standard_deviation, nominal.size),
+        run=np.zeros(nominal.size, dtype=np.int64) if runs is None else np.asarray(runs),
+        load_standard_deviation=load_standard_deviation,
+        displacement_standard_deviation=displacement_standard_deviation,
+        source="virtual load test",
+    )
+
+
+def measure_ring_down(
+    bench: TestBench,
+    seed: Seed,
+    *,
+    trials: int = 5,
+    initial_tip_displacement: float = 0.03,
+    duration: float = 6.4,
+    sampling_rate: float = 2000.0,
+    noise: float = 1e-4,
+    quantisation: float | None = None,
+) -> tuple[RingDownRecord, ...]:
+    """Let the tip go several times and record the strain.
+
+    Parameters
+    ----------
+    bench : TestBench
+        The wing.
+    seed : int or SeedSequence
+        Of noise and releases.
+    trials : int
+        Number of records.
+    initial_tip_displacement : float
+        How far the tip is held aside [m]; a hand holds it to 5 % (standard deviation).
+    duration, sampling_rate : float
+        Of a record [s], [Hz]; the published ones last 6.5 s at 100 kHz.
+    noise : float
+        Standard deviation of a sample [V]; about 1 % of the first mode by default.
+    quantisation : float, optional
+        Step of the recorder [V]; none by default.
+
+    Raises
+    ------
+    ExperimentDataError
+        If there is no trial, noise or step is negative or not finite, or the records would be too short.
+    """
+    if trials < 1 or not (math.isfinite(noise) and noise >= 0.0):
+        raise ExperimentDataError(
+            "ring-down tests need at least one trial and noise that is finite and not negative, but "
+            f"{trials} trials with {noise:g} V were asked for."
+        )
+    if quantisation is not None and not (math.isfinite(quantisation) and quantisation > 0.0):
+        raise ExperimentDataError(f"the recorder's step must be positive, but {quantisation:g} V was given.")
+    generator = np.random.default_rng(child_seed(seed, _PURPOSES["ring_down"]))
+    records = []
+    for trial in range(1, trials + 1):
+        held = initial_tip_displacement * (1.0 + 0.05 * float(generator.standard_normal()))
+        time, signal = bench.ring_down(held, duration, sampling_rate)
+        signal = signal + generator.normal(0.0, noise, signal.size)
+        if quantisation is not None:
+            signal = quantisation * np.round(signal / quantisation)
+        records.append(RingDownRecord(time, signal, source=f"virtual ring-down {trial}"))
+    return tuple(records)
+
+
+def measure_lengths(
+    geometry: Geometry, seed: Seed, *, reading_uncertainty: float = READING_UNCERTAINTY
+) -> GeometryCalibration:
+    """Measure semi-span and chords of a wing that was built to the published drawing.
+
+    Parameters
+    ----------
+    geometry : Geometry
+        True lengths [m].
+    seed : int or SeedSequence
+        Of the reading errors.
+    reading_uncertainty : float
+        Half-width of the 95 % interval of a reading [m].
+    """
+    generator = np.random.default_rng(child_seed(seed, _PURPOSES["geometry"]))
+    measured = {}
+    for drawn in published_lengths().lengths:
+        error = float(generator.normal(0.0, reading_uncertainty / HALF_WIDTH_95))
+        length = getattr(geometry, drawn.name) + error
+        measured[drawn.name] = MeasuredLength(
+            drawn.name, drawn.designed, length, reading_uncertainty=reading_uncertainty
+        )
+    return GeometryCalibration(source="virtual lengths", **measured)
+
+
+def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) -> WeighedMass:
+    """Weigh two servos and the pitot tube together.
+
+    Parameters
+    ----------
+    truth : DigitalState
+        True masses.
+    seed : int or SeedSequence
+        Of the reading error.
+    standard_deviation : float
+        Of the weighing [kg].
+    """
+    generator = np.random.default_rng(child_seed(seed, _PURPOSES["weighing"]))
+    error = float(generator.normal(0.0, standard_deviation))
+    return WeighedMass(2.0 * truth.servo_mass + truth.pitot_mass + error, standard_deviation)
