@@ -16,6 +16,9 @@ from .wing_calibration import WingCalibration
 NOTICEABLE = 2.0
 """Standard deviations from which a difference is pointed out."""
 
+NOTICEABLE_FREQUENCY = 0.02
+"""Relative difference from which that of a frequency is pointed out, whatever its standard deviation."""
+
 AUTHORS_SECOND_FREQUENCY = 28.613
 """Mean of the authors' model's second flapwise frequency after their calibration [Hz] (step 3)."""
 
@@ -43,8 +46,9 @@ class Miss(NamedTuple):
 
     @property
     def noticeable(self) -> bool:
-        """Whether the difference is more than chance."""
-        return abs(self.score) > NOTICEABLE
+        """Whether the difference is more than chance, or that of a frequency more than two percent."""
+        far = self.name.startswith("frequency") and abs(self.relative) > NOTICEABLE_FREQUENCY
+        return abs(self.score) > NOTICEABLE or far
 
 
 def misses(calibration: WingCalibration) -> tuple[Miss, ...]:

@@ -149,10 +149,13 @@ def printed(name: str, mean: float, deviation: float | None = None) -> str:
 def signed(name: str, difference: float) -> str:
     """Return a difference as printed, with its sign."""
     shown = SHOWN[name]
-    text = f"{difference * shown.scale:+.{shown.digits}f}"
-    if not text.strip("+-0."):
-        text = f"{0.0:.{shown.digits}f}"
-    return text.replace("-", "−")
+    return signed_number(difference * shown.scale, shown.digits)
+
+
+def signed_number(value: float, digits: int) -> str:
+    """Return a number with its sign, or zero without one."""
+    text = f"{value:+.{digits}f}"
+    return text.replace("-", "−") if text.strip("+-0.") else f"{0.0:.{digits}f}"
 
 
 def write_table_1(rows: tuple[TableRow, ...], path: Path) -> Path:
@@ -167,13 +170,14 @@ def write_table_1(rows: tuple[TableRow, ...], path: Path) -> Path:
     text.write(
         "figure,prior_mean,prior_standard_deviation,mean,standard_deviation,"
         "paper_procedure_mean,paper_procedure_standard_deviation,paper_mean,paper_standard_deviation,"
-        "difference,source_of_the_papers\n"
+        "difference,paper_procedure_difference,source_of_the_papers\n"
     )
     for row in rows:
         deviation = "" if row.paper.standard_deviation is None else f"{row.paper.standard_deviation:.10g}"
         figures = [*row.prior, *row.found, *row.paper_way, row.paper.mean]
         text.write(
             f"{row.name},{','.join(f'{value:.10g}' for value in figures)},{deviation},{row.difference:.10g},"
+            f"{row.paper_way_difference:.10g},"
             f'"{row.paper.source}"\n'
         )
     return atomic_write_text(path, text.getvalue())

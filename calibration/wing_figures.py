@@ -166,7 +166,7 @@ def _draw_quantity(axes: Axes, result: CalibrationResult, name: str, measured: t
     prior, posterior = result.draws_of(name, prior=True) * scale, result.draws_of(name) * scale
     value, half = measured[0] * scale, HALF_WIDTH_95 * measured[1] * scale
     spread = max(float(posterior.std()), 1e-6 * abs(float(posterior.mean())))
-    low = min(float(posterior.mean()) - 4.5 * spread, value - 1.6 * half)
+    low = max(min(float(posterior.mean()) - 4.5 * spread, value - 1.6 * half), 0.0)
     high = max(float(posterior.mean()) + 4.5 * spread, value + 1.6 * half)
     grid = np.linspace(low, high, 301)
     axes.axvspan(

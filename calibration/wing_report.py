@@ -16,7 +16,7 @@ from .figures import calibration_figure, residual_figure
 from .report import SOURCE
 from .result import STATE
 from .steps import CalibrationStep
-from .table_1 import SHOWN, TableRow, printed, signed, table_1
+from .table_1 import SHOWN, TableRow, printed, signed, signed_number, table_1
 from .tailoring import tailored_geometry
 from .wing_calibration import WingCalibration
 from .wing_figures import corner_figure, modes_figure, quantities_figure
@@ -110,8 +110,7 @@ def _add_result(page: Page, calibration: WingCalibration, drawings: Mapping[str,
                 Column("this wing", numeric=True),
                 Column("paper's procedure", numeric=True),
                 Column("in the paper", numeric=True),
-                Column("difference, wing", numeric=True),
-                Column("difference, procedure", numeric=True),
+                Column("difference", numeric=True),
             ),
             [_table_row(row) for row in table_1(calibration)],
         ),
@@ -120,8 +119,8 @@ def _add_result(page: Page, calibration: WingCalibration, drawings: Mapping[str,
         "masses by eq. (19) and damping by eq. (25) on the tailored model for each sample of e; its standard "
         "deviations hold the uncertainty of e alone. In the paper: planform and e are printed in its "
         "Table 1; masses are the means of the authors' published samples of step 3, alpha and beta follow "
-        "from their frequencies by eq. (25). Differences: this wing, and the paper's procedure, less the "
-        "paper's own figure, which belongs to its own wing.",
+        "from their frequencies by eq. (25). Difference: this wing less the paper's, which belongs to its own "
+        "wing. table_1.csv has all figures in SI.",
         title="Table 1 of the paper, with this calibration beside it",
     )
     page.add_figure(
@@ -142,7 +141,6 @@ def _table_row(row: TableRow) -> tuple[str, ...]:
         printed(row.name, *row.paper_way),
         printed(row.name, row.paper.mean, row.paper.standard_deviation),
         signed(row.name, row.difference),
-        signed(row.name, row.paper_way_difference),
     )
 
 
@@ -168,8 +166,8 @@ def _add_disagreements(page: Page, calibration: WingCalibration) -> None:
                     SHOWN[miss.name].unit,
                     printed(miss.name, *miss.measured),
                     printed(miss.name, *miss.model),
-                    f"{100.0 * miss.relative:+.2f}".replace("-", "−"),
-                    f"{miss.score:+.1f}".replace("-", "−"),
+                    signed_number(100.0 * miss.relative, 2),
+                    signed_number(miss.score, 1),
                 )
                 for miss in misses(calibration)
             ],
@@ -191,16 +189,16 @@ def _add_planform(page: Page, calibration: WingCalibration) -> None:
                 Column("measured", "mm", numeric=True),
                 Column("posterior", "mm", numeric=True),
                 Column("modelled", "mm", numeric=True),
-                Column("measured from design, in standard deviations", numeric=True),
+                Column("from design, in standard deviations", numeric=True),
             ),
             [
                 (
-                    SHOWN[length.name].title,
+                    SHOWN[length.name].title.replace(" ", "\u00a0"),
                     printed(length.name, length.prior.mean, length.prior.standard_deviation),
                     printed(length.name, length.measured),
                     printed(length.name, length.posterior.mean, length.posterior.standard_deviation),
                     f"{getattr(kept, length.name) * 1e3:.1f}",
-                    f"{length.score:+.2f}".replace("-", "−"),
+                    signed_number(length.score, 2),
                 )
                 for length in lengths
             ],

@@ -94,7 +94,7 @@ def _show(calibration: WingCalibration) -> None:
     from rich.table import Table
 
     from calibration.disagreements import disagreements, misses
-    from calibration.table_1 import SHOWN, printed, signed, table_1
+    from calibration.table_1 import SHOWN, printed, signed, signed_number, table_1
 
     result = calibration.result
     console = Console(highlight=False, markup=False)
@@ -120,7 +120,7 @@ def _show(calibration: WingCalibration) -> None:
             shown.title,
             printed(miss.name, *miss.measured),
             printed(miss.name, *miss.model),
-            f"{100.0 * miss.relative:+.1f} %".replace("-", "−"),
+            f"{signed_number(100.0 * miss.relative, 1)} %",
             shown.unit,
         )
     console.print(table)
