@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -211,14 +211,14 @@ class CalibrationResult:
 
     def mean_state(self) -> DigitalState:
         """Return the digital state at the posterior mean, healthy."""
-        return self._state(self.samples.mean(axis=0))
+        return self._state([self.mean(entry.name) for entry in STATE])
 
     def states(self) -> tuple[DigitalState, ...]:
         """Return one digital state for each sample, healthy and of the tailored planform."""
-        return tuple(self._state(row) for row in self.samples)
+        return tuple(self._state(row) for row in self.samples.tolist())
 
-    def _state(self, row: Float) -> DigitalState:
-        factor, servo, pitot, alpha, beta = row.tolist()
+    def _state(self, row: Sequence[float]) -> DigitalState:
+        factor, servo, pitot, alpha, beta = row
         return DigitalState(self.design.geometry, factor, servo, pitot, alpha, beta)
 
     def step(self, number: int) -> CalibrationStep:

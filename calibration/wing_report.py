@@ -119,8 +119,8 @@ def _add_result(page: Page, calibration: WingCalibration, drawings: Mapping[str,
         "masses by eq. (19) and damping by eq. (25) on the tailored model for each sample of e; its standard "
         "deviations hold the uncertainty of e alone. In the paper: planform and e are printed in its "
         "Table 1; masses are the means of the authors' published samples of step 3, alpha and beta follow "
-        "from their frequencies by eq. (25). Difference: this wing less the paper's, which belongs to its own "
-        "wing. table_1.csv has all figures in SI.",
+        "from their frequencies by eq. (25). Difference: this wing less the paper's, which belongs to its "
+        "own wing. table_1.csv has all figures in SI.",
         title="Table 1 of the paper, with this calibration beside it",
     )
     page.add_figure(
