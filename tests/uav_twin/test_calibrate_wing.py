@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import re
 import shutil
 import sys
 from collections.abc import Callable
@@ -23,6 +24,7 @@ from calibration.laboratory import write_lab_folder
 from calibration.result import STATE, CalibrationResult
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down
 from fe.cache import reduced_model
+from fe.design import SHIPPED_DESIGN, load_design
 from fe.reduced import ReducedModel
 from fe.state import DigitalState
 from fmu_asset.session import FmiAsset
@@ -254,7 +256,10 @@ def test_the_truth_of_the_scenario_stays_and_is_told(
         file, out = made.out / "calibration.nc", tmp_path / name
         assert call(monkeypatch, "run", "level_turns", "--calibration", file, "--out", out) == 0
         error = capsys.readouterr().err.replace("\n", " ")
-        assert "true young_modulus_factor is 1.0073, but the calibration says" in error
+        off = abs(1.0073 - made.result.mean("young_modulus_factor"))
+        far = off > 3.0 * made.result.standard_deviation("young_modulus_factor")
+        assert ("true young_modulus_factor is 1.0073, but the calibration says" in error) == far
+        assert far or name == "stiff"  # at least the soft wing is another one
         with xr.open_datatree(out / "run.nc", engine="h5netcdf") as tree:
             true[name] = tree["truth"]["strain"].values[0].copy()
     np.testing.assert_array_equal(true["soft"], true["stiff"])
@@ -320,7 +325,55 @@ def test_records_may_be_left_aside(
     )
     out = capsys.readouterr().out
     assert "Step 3: records left aside as asked; published" in out
-    assert "f1               5.649" in out
+    assert re.search(r"f1 +5\.649\s", out)
+
+
+def measured_planform(folder: Path, semi_span: float) -> Path:
+    """A laboratory folder with nothing but lengths, semi-span in mm."""
+    file = folder / "lab" / "step1" / "geometry_data.csv"
+    file.parent.mkdir(parents=True)
+    rows = f"length,1828.8,{semi_span}\nchord_{{root}},435.61,433\nchord_{{tip}},261.112,260\n"
+    file.write_text("parameter,designed,manufactured\n" + rows, encoding="utf-8")
+    return folder / "lab"
+
+
+def test_the_model_follows_the_measured_planform(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The tailored wing is shorter and stiffer than the one on the drawing (a coarse mesh, for speed)."""
+    text = SHIPPED_DESIGN.read_text(encoding="utf-8")
+    coarse = tmp_path / "coarse.toml"
+    coarse.write_text(text.replace("refinement = 1.0", "refinement = 0.25"), encoding="utf-8")
+    out = tmp_path / "out"
+    lab = measured_planform(tmp_path, 1818.0)
+    arguments = ["--data", lab, "--design", coarse, "--out", out, "--asset", "short wing"]
+    assert call(monkeypatch, "calibrate", *arguments) == 0
+    capsys.readouterr()
+    result = CalibrationResult.load(out / "calibration.nc")
+    assert result.design.planform.semi_span == 1.8181  # prior and measurement together, to 0.1 mm
+    assert result.mean_state().geometry.semi_span == 1.8181
+    model = reduced_model(result.design)
+    assert model.design_hash == result.design_hash
+    (stiffness,) = result.step(2).quantities
+    assert stiffness.prior_mean == pytest.approx(model.tip_stiffness(1.0), rel=1e-3)
+    # against the wing as drawn, by the beam's k ~ 1 / L^3
+    shipped = reduced_model(load_design(coarse))
+    expected = shipped.tip_stiffness(1.0) * (1.828 / 1.8181) ** 3
+    assert model.tip_stiffness(1.0) == pytest.approx(expected, rel=5e-3)
+
+
+def test_a_design_that_the_measured_planform_spoils_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = SHIPPED_DESIGN.read_text(encoding="utf-8")
+    design = tmp_path / "design.toml"
+    design.write_text(text.replace("span_end = 1.59938", "span_end = 1.825"), encoding="utf-8")
+    lab = measured_planform(tmp_path, 1815.0)
+    arguments = ["--data", lab, "--design", design, "--out", tmp_path / "out"]
+    assert call(monkeypatch, "calibrate", *arguments) == 1
+    error = capsys.readouterr().err
+    assert "defects[1] ends 1.825 m from the root, off the wing of 1.8151 m" in error
+    assert not (tmp_path / "out").exists()
 
 
 # ---------------------------------------------------------------------------- what is refused
