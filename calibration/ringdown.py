@@ -34,6 +34,7 @@ _PROMINENCE = 3.5  # of a spectral peak, over the median amplitude of the noise
 # there, and from the skirts of the first mode where it has died away.
 _SMALLEST_PEAK = (0.003, 0.02)
 _END_SHARE = 0.05  # of a record, in which its end is judged
+_SEARCH_DECAY = 3.0  # 1/s, put upon a record in which the first search finds too little
 _STARTING_RATIOS = (0.01, 0.03, 0.08)
 _STEADY_SHARE = 0.7  # rms of the last third over the first; above it nothing decays
 
@@ -190,26 +191,41 @@ def spectral_peaks(record: RingDownRecord, band: tuple[float, float] = SEARCH_BA
     ------
     RingDownError
         If the record is sampled too slowly, or fewer than two peaks rise by 3.5 times the median noise
-        and by 2 % of the highest amplitude (less, down to 0.3 %, if the record has died away at its end).
+        and by 2 % of the highest amplitude (less, down to 0.3 %, if the record has died away at its end),
+        in the record itself or in its beginning.
     """
     if 0.5 * record.sampling_rate < 4.0 * band[0]:
         raise RingDownError(
             f"{record.source}: a sampling rate of {record.sampling_rate:.3g} Hz shows nothing above "
             f"{0.5 * record.sampling_rate:.3g} Hz; is the time in s?"
         )
-    frequency, amplitude = spectrum(record, band)
-    smallest = _smallest_peak(record) * float(amplitude.max())
-    needed = max(_PROMINENCE * _noise_floor(record, band), smallest)
-    places, found = find_peaks(amplitude, prominence=needed)
-    if places.size < 2:
-        seen = "none" if places.size == 0 else f"one, at {frequency[places[0]]:.3g} Hz"
+    found = _peaks(record, band, 0.0)
+    if len(found) < 2:
+        found = _peaks(record, band, _SEARCH_DECAY)
+    if len(found) < 2:
+        seen = "none" if not found else f"one, at {found[0]:.3g} Hz"
+        top = min(band[1], 0.5 * record.sampling_rate)
         raise RingDownError(
-            f"{record.source}: two spectral peaks are needed between {frequency[0]:.3g} and "
-            f"{frequency[-1]:.3g} Hz, but there is {seen}; check the record, its sampling and the release."
+            f"{record.source}: two spectral peaks are needed between {band[0]:.3g} and "
+            f"{top:.3g} Hz, but there is {seen}; check the record, its sampling and the release."
         )
-    highest = np.argsort(found["prominences"])[-2:]
-    first, second = sorted(float(frequency[places[place]]) for place in highest)
+    first, second = sorted(found[:2])
     return first, second
+
+
+def _peaks(record: RingDownRecord, band: tuple[float, float], decay: float) -> list[float]:
+    """Return the peaks that count [Hz], the most prominent first, of a record times exp(-decay t).
+
+    A second mode that is gone after a tenth of the record drowns in the noise of the rest and in the skirts
+    of the first; the decay [1/s] takes both away and moves no frequency.
+    """
+    weight = np.exp(-decay * (record.time - record.time[0]))
+    floor = _noise_floor(record, band) * math.sqrt(float(np.mean(weight**2)))
+    faded = RingDownRecord(record.time, weight * detrend(record.signal), source=record.source)
+    frequency, amplitude = spectrum(faded if decay else record, band)
+    needed = max(_PROMINENCE * floor, _smallest_peak(faded) * float(amplitude.max()))
+    places, found = find_peaks(amplitude, prominence=needed)
+    return [float(frequency[places[place]]) for place in np.argsort(found["prominences"])[::-1]]
 
 
 def fit_ring_down(

@@ -1,5 +1,6 @@
 """The joint Bayesian posterior of the digital state: load test, weighed masses and ring-down together."""
 
+from .frequency_table import WingTables, tabulate_wing
 from .inference import joint_posterior
 from .measurement import ModalMeasurement, modal_measurement, published_modal_measurement
 from .prior import JointPrior, ModelError, WeighedMass
@@ -13,7 +14,9 @@ __all__ = [
     "ModalMeasurement",
     "ModelError",
     "WeighedMass",
+    "WingTables",
     "joint_posterior",
     "modal_measurement",
     "published_modal_measurement",
+    "tabulate_wing",
 ]

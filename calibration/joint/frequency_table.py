@@ -12,11 +12,12 @@ from scipy.stats import qmc
 from fe.reduced import ReducedModel
 
 from ..errors import OutsideValidityError, PosteriorError
+from ..stiffness_curve import StiffnessCurve, stiffness_curve_of
 
 TOLERANCE = 1e-5
 """Largest relative error of a tabulated frequency that is accepted; 0.1 % of f1 is 1 g of servo mass."""
 
-_DEGREES = ((4, 6, 6), (6, 8, 8), (8, 11, 11))
+_DEGREES = ((5, 7, 7), (8, 11, 11))
 _CHECKS = 128
 _NAMES = ("young_modulus_factor", "servo_mass", "pitot_mass")
 
@@ -69,8 +70,30 @@ class FrequencyTable:
         shape = self.coefficient.shape
         first, second, third = (chebvander(scaled[:, axis], shape[axis] - 1) for axis in range(3))
         inner = (first @ self.coefficient.reshape(shape[0], -1)).reshape(-1, *shape[1:])
-        logarithm = np.einsum("nj,nk,njkl->nl", second, third, inner, optimize=True)
+        inner = np.einsum("nj,njkl->nkl", second, inner)
+        logarithm = np.einsum("nk,nkl->nl", third, inner)
         return np.asarray(np.exp(logarithm))
+
+
+@dataclass(frozen=True, eq=False)
+class WingTables:
+    """A reduced model as the posterior needs it: tables that many posteriors can share.
+
+    Attributes
+    ----------
+    frequency : FrequencyTable
+        f1 and f2.
+    stiffness : StiffnessCurve
+        k(e) of the tip.
+    """
+
+    frequency: FrequencyTable
+    stiffness: StiffnessCurve
+
+
+def tabulate_wing(model: ReducedModel) -> WingTables:
+    """Tabulate a healthy model; see `tabulate_frequencies` and `stiffness_curve_of`."""
+    return WingTables(tabulate_frequencies(model), stiffness_curve_of(model))
 
 
 def tabulate_frequencies(model: ReducedModel, tolerance: float = TOLERANCE) -> FrequencyTable:

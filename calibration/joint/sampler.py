@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from scipy.special import gammaln
 
 FloatArray = NDArray[np.float64]
@@ -19,6 +18,10 @@ LogDensity = Callable[[FloatArray], FloatArray]
 DEGREES_OF_FREEDOM = 6.0
 """Of the Student-t proposals: tails heavier than those of the posterior, which are cut-off Gaussians."""
 
+_NEWTON_STEPS = 50
+_DIFFERENCE = 1e-2  # step of the central differences, in rough standard deviations
+_TEMPERED_SHARE = 0.1
+_MOST_ROUNDS = 60
 _INFLATION = 1.15  # of the proposal's covariance over the posterior's
 
 
@@ -52,7 +55,7 @@ class StudentT(NamedTuple):
 
 
 def laplace(log_density: LogDensity, start: FloatArray, scale: FloatArray) -> Laplace:
-    """Find the mode and the Gaussian that fits there.
+    """Find the mode by Newton's method, and the Gaussian that fits there.
 
     Parameters
     ----------
@@ -64,49 +67,87 @@ def laplace(log_density: LogDensity, start: FloatArray, scale: FloatArray) -> La
         Rough standard deviations: units of the search, and where the covariance is cut off if the mode lies
         at the end of the region.
     """
-
-    def negative(unknown: FloatArray) -> float:
-        value = -float(log_density((start + scale * unknown)[None, :])[0])
-        return value if math.isfinite(value) else 1e300
-
-    size = start.size
-    found = np.zeros(size)
-    for _ in range(2):  # a second simplex around the first result: one alone may stop early
-        options = {"xatol": 1e-7, "fatol": 1e-10, "maxiter": 4000, "maxfev": 4000}
-        found = minimize(negative, found, method="Nelder-Mead", options=options).x
-    mode = start + scale * found
-    step = 1e-2
-    offsets = step * np.eye(size)
-    pairs = [(i, j) for i in range(size) for j in range(size)]
-    corners = np.array(
-        [
-            [found + a * offsets[i] + b * offsets[j] for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
-            for i, j in pairs
-        ]
-    ).reshape(-1, size)
-    values = log_density(start + scale * corners).reshape(len(pairs), 4)
-    curvature = ((values @ np.array([1.0, -1.0, -1.0, 1.0])) / (4.0 * step**2)).reshape(size, size)
+    here = start
+    value = float(log_density(here[None, :])[0])
+    for _ in range(_NEWTON_STEPS):
+        slope, curvature = _derivatives(log_density, here, scale)
+        if not np.all(np.isfinite(curvature)):
+            return Laplace(here, np.diag(scale**2), False)  # at the end of the region
+        eigenvalue, direction = np.linalg.eigh(-curvature)
+        # Uphill also where the density is not yet concave, and not farther than three units.
+        step = direction @ ((direction.T @ slope) / np.maximum(np.abs(eigenvalue), 1e-3))
+        step *= min(1.0, 3.0 / max(float(np.linalg.norm(step)), 1e-300))
+        trials = here + scale * step * 0.5 ** np.arange(12.0)[:, None]
+        values = log_density(trials)
+        best = int(np.argmax(values))
+        if not values[best] > value:
+            break
+        gained, here, value = float(values[best]) - value, trials[best], float(values[best])
+        if gained < 1e-9:
+            break
+    curvature = _derivatives(log_density, here, scale)[1]
     if np.all(np.isfinite(curvature)) and np.all(np.linalg.eigvalsh(-curvature) > 0.0):
-        return Laplace(mode, np.linalg.inv(-curvature) * np.outer(scale, scale), True)
-    return Laplace(mode, np.diag(scale**2), False)
+        return Laplace(here, np.linalg.inv(-curvature) * np.outer(scale, scale), True)
+    return Laplace(here, np.diag(scale**2), False)
+
+
+def _derivatives(
+    log_density: LogDensity, centre: FloatArray, scale: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return first (D,) and second (D, D) central differences in units of `scale`."""
+    size = centre.size
+    unit = _DIFFERENCE * np.eye(size)
+    signs = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
+    shifts = [a * unit[i] + b * unit[j] for i in range(size) for j in range(size) for a, b in signs]
+    values = log_density(centre + scale * np.array([*unit, *-unit, *shifts]))
+    if not np.all(np.isfinite(values)):
+        return np.full(size, np.nan), np.full((size, size), np.nan)
+    slope = (values[:size] - values[size : 2 * size]) / (2.0 * _DIFFERENCE)
+    corner = values[2 * size :].reshape(size, size, 4)
+    return slope, (corner @ np.array([1.0, -1.0, -1.0, 1.0])) / (4.0 * _DIFFERENCE**2)
 
 
 def adapted_proposal(
     log_density: LogDensity, start: Laplace, generator: np.random.Generator, *, rounds: int, count: int
 ) -> StudentT:
-    """Return a proposal whose centre and scale follow the density, by rounds of weighted draws."""
+    """Return a proposal whose centre and scale follow the density, by rounds of weighted draws.
+
+    Where the draws of a round say too little of the density (its mode may lie at the end of the region, where
+    Laplace's approximation is none), their weights are tempered, w^g with g < 1, so that a tenth of them
+    counts; the next round then begins closer.
+    """
     centre, covariance = start.mode, start.covariance
-    for _ in range(rounds):
+    least = _TEMPERED_SHARE * count
+    good = 0
+    for _ in range(_MOST_ROUNDS):
         proposal = StudentT(centre, _INFLATION * covariance)
         points, log_proposal = proposal.draw(generator, count)
-        weight, _ = normalised(log_density(points) - log_proposal)
-        if effective_sample_size(weight) < 10.0 * centre.size:
-            covariance = 4.0 * covariance  # the proposal is too narrow to be improved from: look around
+        log_weight = log_density(points) - log_proposal
+        if np.count_nonzero(np.isfinite(log_weight)) <= least:
+            covariance = 0.25 * covariance  # most draws lie outside the region
             continue
+        power = _tempering(log_weight, least)
+        weight, _ = normalised(power * log_weight)
         centre = weight @ points
         deviation = points - centre
         covariance = (deviation * weight[:, None]).T @ deviation
+        good += power == 1.0
+        if good == rounds:
+            break
     return StudentT(centre, _INFLATION * covariance)
+
+
+def _tempering(log_weight: FloatArray, least: float) -> float:
+    """Return the greatest power g up to 1 at which weights w^g have an effective sample size of `least`."""
+    low, high = 0.0, 1.0
+    if effective_sample_size(normalised(log_weight)[0]) >= least:
+        return 1.0
+    finite = log_weight[np.isfinite(log_weight)]
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        enough = effective_sample_size(normalised(middle * finite)[0]) >= least
+        low, high = (middle, high) if enough else (low, middle)
+    return low
 
 
 def normalised(log_weight: FloatArray) -> tuple[FloatArray, float]:

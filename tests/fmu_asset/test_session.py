@@ -297,3 +297,15 @@ def test_describe_lists_variables_with_their_roles(fmu: Path, binding: Binding) 
     assert roles["strain[7]"] == "observation.strain"
     assert roles["mass.pitot"] == "parameter.pitot_mass"
     assert record["state_method"] == "serialised"
+
+
+@pytest.mark.parametrize("response", [1.0, 2.0], ids=["quasi-static", "transient"])
+def test_the_load_point_moves_by_its_compliance(
+    fmu: Path, binding: Binding, model: ReducedModel, response: float
+) -> None:
+    monitor = {"load_point": {"variable": "load_point_displacement", "unit": "mm"}}
+    changed = bind(binding, binding={"name": "wing", "step_size": 60.0}, monitor=monitor)
+    with FmiAsset(fmu, changed, isolated=False, parameters={"response": response}) as asset:
+        asset.step({"load_factor": 0.0}, {"z1": 0.2}, {"tip_force": 10.0})
+        seen = asset.step().extra["load_point"]
+    assert seen == pytest.approx(1e3 * 10.0 / model.tip_stiffness(1.0, (0.2, 0.0)), rel=1e-9)

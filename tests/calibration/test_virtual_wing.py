@@ -1,0 +1,194 @@
+"""The virtual wing: its physics against the integrator, its experiments, its laboratory folder."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration import virtual_wing
+from calibration.errors import ExperimentDataError, ExperimentFileError
+from calibration.experiments import published_measurements, read_measurements
+from calibration.geometry import published_lengths, read_lengths
+from calibration.joint import WeighedMass
+from calibration.laboratory import WEIGHED_MASS_FILE, read_weighed_mass, write_lab_folder
+from calibration.ringdown import Frequencies
+from calibration.ringdown_records import read_records
+from calibration.ringdown_trials import fit_trials
+from calibration.virtual_wing import (
+    RECORDED_GAUGE,
+    SENSITIVITY,
+    RingDownSignal,
+    VirtualWing,
+    measure_lengths,
+    measure_load_test,
+    measure_ring_down,
+    weigh,
+)
+from fe.errors import OutsideModelError
+from fe.reduced import ReducedModel
+from fe.state import DigitalState, Geometry
+from fe.transient import ModalIntegrator
+
+TRUTH = DigitalState(young_modulus_factor=1.0073, damping_alpha=1.03, damping_beta=7.66e-4)
+
+
+class Beam:
+    """A test bench of closed formulas: k = 680 N/m, two modes."""
+
+    def tip_displacement(self, load: float) -> float:
+        return load / 680.0
+
+    def ring_down(self, initial_tip_displacement: float, duration: float, rate: float) -> RingDownSignal:
+        time = virtual_wing.sampling_times(duration, rate)
+        signal = np.zeros_like(time)
+        for frequency, ratio, share in ((5.65, 0.028, 0.8), (29.0, 0.05, 0.5)):
+            omega = 2.0 * math.pi * frequency
+            damped = omega * math.sqrt(1.0 - ratio**2)
+            signal += share * np.exp(-ratio * omega * time) * np.cos(damped * time)
+        return RingDownSignal(time, 0.4 * initial_tip_displacement * signal)
+
+
+@pytest.fixture(scope="module")
+def wing() -> ReducedModel:
+    from fe.cache import reduced_model
+
+    return reduced_model()
+
+
+@pytest.mark.slow
+def test_the_release_is_the_integrators(wing: ReducedModel) -> None:
+    bench = VirtualWing(wing, TRUTH)
+    time, signal = bench.ring_down(0.03, 0.4, 1000.0)
+    integrator = ModalIntegrator(
+        wing,
+        young_modulus_factor=TRUTH.young_modulus_factor,
+        stiffness_loss=(0.0, 0.0),
+        servo_mass=TRUTH.servo_mass,
+        pitot_mass=TRUTH.pitot_mass,
+        damping_alpha=TRUTH.damping_alpha,
+        damping_beta=TRUTH.damping_beta,
+    )
+    state = integrator.released(0.03)
+    strain = [integrator.response(state).strain[RECORDED_GAUGE]]
+    for _ in time[1:]:
+        state = integrator.advance(state, 1e-3, (0.0, 0.0), (0.0, 0.0))
+        strain.append(integrator.response(state).strain[RECORDED_GAUGE])
+    np.testing.assert_allclose(signal, SENSITIVITY * np.array(strain), atol=1e-12)
+    held = wing.static_response(1.0073, (0.0, 0.0), 0.0, 1.0)
+    holding_force = 0.03 / held.tip_displacement
+    # What six modes leave out of the static strain is small.
+    assert signal[0] == pytest.approx(SENSITIVITY * holding_force * held.strain[RECORDED_GAUGE], rel=0.02)
+
+
+@pytest.mark.slow
+def test_overdamped_and_critical_modes(wing: ReducedModel) -> None:
+    for beta in (0.03, 1.0 / (math.pi * wing.modes(1.0, (0.0, 0.0), 0.169, 0.134).frequency[3])):
+        state = DigitalState(damping_alpha=0.0, damping_beta=beta)
+        _, signal = VirtualWing(wing, state).ring_down(0.03, 1.0, 500.0)
+        assert np.all(np.isfinite(signal))
+        assert abs(signal[-1]) < abs(signal[0])
+
+
+@pytest.mark.slow
+def test_records_give_back_the_truth(wing: ReducedModel) -> None:
+    bench = VirtualWing(wing, TRUTH, frequency_error=(-0.01, 0.045))
+    first, second = wing.modes(1.0073, (0.0, 0.0), 0.169, 0.134).flapwise
+    frequency = wing.modes(1.0073, (0.0, 0.0), 0.169, 0.134).frequency
+    records = measure_ring_down(bench, 3, sampling_rate=250.0)
+    trials = fit_trials(records, Frequencies.FITTED)
+    assert trials.frequency(0).mean == pytest.approx(0.99 * frequency[first], rel=2e-4)
+    assert trials.frequency(1).mean == pytest.approx(1.045 * frequency[second], rel=5e-3)
+    assert trials.damping_ratio(0).mean == pytest.approx(0.0281, rel=5e-3)
+    assert trials.damping_ratio(1).mean == pytest.approx(0.0716, rel=0.04)
+    stiffness = wing.tip_stiffness(1.0073)
+    assert bench.tip_displacement(9.81) == pytest.approx(9.81 / stiffness, rel=1e-12)
+    with pytest.raises(ExperimentDataError, match="gauges 0 to 23, but 24"):
+        VirtualWing(wing, TRUTH, gauge=24)
+    with pytest.raises(ExperimentDataError, match="frequency error"):
+        VirtualWing(wing, TRUTH, frequency_error=(-1.0, 0.0))
+    with pytest.raises(OutsideModelError, match="servo_mass"):
+        VirtualWing(wing, DigitalState(servo_mass=0.9))
+
+
+def test_reading_errors_are_as_stated() -> None:
+    count = 4000
+    data = measure_load_test(Beam(), 1, load=[5.0] * count)
+    assert np.mean(data.load) == pytest.approx(5.0, abs=3e-3)
+    assert np.std(data.load) == pytest.approx(data.load_standard_deviation, rel=0.05)
+    assert np.mean(data.displacement) == pytest.approx(5.0 / 680.0, abs=2e-5)
+    assert np.std(data.displacement) == pytest.approx(data.displacement_standard_deviation, rel=0.05)
+    assert abs(np.corrcoef(data.load, data.displacement)[0, 1]) < 0.05
+    assert data.run_indices == (0,)
+    published = published_measurements()
+    usual = measure_load_test(Beam(), 1)
+    np.testing.assert_array_equal(usual.run, published.run)
+    np.testing.assert_allclose(usual.load, published.load, atol=0.3)
+
+
+def test_experiments_repeat_with_the_seed() -> None:
+    one, two, other = (measure_ring_down(Beam(), seed, trials=2, duration=2.0) for seed in (4, 4, 5))
+    assert one[1].signal.tobytes() == two[1].signal.tobytes()
+    assert one[1].signal.tobytes() != other[1].signal.tobytes()
+    assert one[0].signal.tobytes() != one[1].signal.tobytes()
+    assert measure_load_test(Beam(), 4).sha256 == measure_load_test(Beam(), 4).sha256
+    weighed = [weigh(TRUTH, seed).mass for seed in range(400)]
+    assert np.mean(weighed) == pytest.approx(2.0 * TRUTH.servo_mass + TRUTH.pitot_mass, abs=2e-4)
+    assert np.std(weighed) == pytest.approx(1e-3, rel=0.15)
+    lengths = [measure_lengths(Geometry(), seed).semi_span.measured for seed in range(400)]
+    assert np.mean(lengths) == pytest.approx(1.828, abs=2e-5)
+    assert np.std(lengths) == pytest.approx(0.2e-3 / 1.96, rel=0.15)
+
+
+def test_quantisation_and_bad_settings() -> None:
+    record = measure_ring_down(Beam(), 1, trials=1, quantisation=5e-5)[0]
+    np.testing.assert_allclose(record.signal / 5e-5, np.round(record.signal / 5e-5), atol=1e-9)
+    with pytest.raises(ExperimentDataError, match="at least one trial"):
+        measure_ring_down(Beam(), 1, trials=0)
+    with pytest.raises(ExperimentDataError, match="step must be positive"):
+        measure_ring_down(Beam(), 1, quantisation=0.0)
+    with pytest.raises(ExperimentDataError, match="positive duration and sampling rate"):
+        measure_ring_down(Beam(), 1, sampling_rate=math.nan)
+    with pytest.raises(ExperimentDataError, match="samples; at least 64"):
+        measure_ring_down(Beam(), 1, duration=0.01)
+
+
+@pytest.mark.parametrize("rate", [500.0, 100_000.0])
+def test_the_laboratory_folder_is_read_back(tmp_path: Path, rate: float) -> None:
+    load_test = measure_load_test(Beam(), 2)
+    records = measure_ring_down(Beam(), 2, trials=2, duration=1.0, sampling_rate=rate)
+    lengths = measure_lengths(Geometry(), 2)
+    files = write_lab_folder(
+        tmp_path, lengths=lengths, load_test=load_test, records=records, total_mass=WeighedMass(0.4711, 2e-3)
+    )
+    assert all(file.is_file() for file in files)
+    seen = read_measurements(tmp_path)
+    np.testing.assert_allclose(seen.load, load_test.load, rtol=1e-9)
+    np.testing.assert_allclose(seen.displacement, load_test.displacement, rtol=1e-9)
+    np.testing.assert_array_equal(seen.run, load_test.run)
+    for written, read in zip(records, read_records(tmp_path), strict=True):
+        np.testing.assert_allclose(read.time, written.time, atol=1e-6)
+        np.testing.assert_allclose(read.signal, written.signal, rtol=1e-8, atol=1e-12)
+        assert read.sampling_rate == pytest.approx(rate, rel=1e-6)
+    measured = read_lengths(tmp_path)
+    assert measured.root_chord.measured == pytest.approx(lengths.root_chord.measured, rel=1e-9)
+    assert measured.root_chord.designed == published_lengths().root_chord.designed
+    assert read_weighed_mass(tmp_path) == pytest.approx((0.4711, 2e-3))
+
+
+def test_the_weighed_mass_file(tmp_path: Path) -> None:
+    assert read_weighed_mass(tmp_path) == WeighedMass()
+    file = tmp_path / WEIGHED_MASS_FILE
+    file.parent.mkdir()
+    for text, error, words in (
+        ("mass\n472\n", ExperimentFileError, "one row in grams"),
+        ("mass,standard_deviation\n", ExperimentFileError, "one row in grams"),
+        ("mass,standard_deviation\n0.472,0.001\n", ExperimentDataError, "looks like kg"),
+        ("mass,standard_deviation\n472,-1\n", ExperimentDataError, "standard_deviation is '-1'"),
+        ("mass,standard_deviation\n472,\n", ExperimentDataError, "standard_deviation is ''"),
+    ):
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(error, match=words):
+            read_weighed_mass(tmp_path)

@@ -1,0 +1,98 @@
+"""`uav-twin calibrate simulate` on the command line: folders that the other commands read."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from calibration.experiments import read_measurements
+from calibration.geometry import read_lengths
+from calibration.laboratory import read_weighed_mass
+from calibration.ringdown import Frequencies
+from calibration.ringdown_records import read_records
+from calibration.ringdown_trials import fit_trials
+from uav_twin import cli
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """Run the command line in this process and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["uav-twin", *map(str, arguments)])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    code = caught.value.code
+    return 0 if code is None else int(code)
+
+
+def simulate(monkeypatch: pytest.MonkeyPatch, out: Path, *arguments: object) -> int:
+    return call(
+        monkeypatch, "calibrate", "simulate", "--out", out, "--sampling-rate", 250, "--seed", 3, *arguments
+    )
+
+
+def test_a_folder_with_its_truth(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    out = tmp_path / "lab"
+    given = ("--e", 0.99, "--servo-mass", 0.18, "--pitot-mass", 0.11, "--alpha", 0.9, "--beta", 5e-4)
+    assert simulate(monkeypatch, out, *given) == 0
+    truth = json.loads((out / "truth.json").read_text(encoding="utf-8"))
+    assert truth["young_modulus_factor"] == 0.99
+    assert (truth["servo_mass"], truth["pitot_mass"]) == (0.18, 0.11)
+    assert (truth["damping_alpha"], truth["damping_beta"], truth["seed"]) == (0.9, 5e-4, 3)
+    assert read_measurements(out).count == 8
+    assert read_lengths(out).semi_span.measured == pytest.approx(1.828, abs=5e-4)
+    assert read_weighed_mass(out).mass == pytest.approx(0.47, abs=4e-3)
+    records = read_records(out)
+    assert len(records) == 5
+    trials = fit_trials(records, Frequencies.FITTED)
+    from fe.cache import reduced_model
+
+    modes = reduced_model().modes(0.99, (0.0, 0.0), 0.18, 0.11)
+    first, second = modes.flapwise
+    assert trials.frequency(0).mean == pytest.approx(modes.frequency[first], rel=1e-3)
+    assert trials.frequency(1).mean == pytest.approx(modes.frequency[second], rel=5e-3)
+    # the same again, bit for bit
+    assert simulate(monkeypatch, tmp_path / "again", *given) == 0
+    for file in sorted(path for path in out.rglob("*") if path.is_file()):
+        assert file.read_bytes() == (tmp_path / "again" / file.relative_to(out)).read_bytes()
+    # the readers of the command line take it
+    assert call(monkeypatch, "calibrate", "static", "--data", out) == 0
+    assert call(monkeypatch, "calibrate", "geometry", "--data", out) == 0
+    assert call(monkeypatch, "calibrate", "ringdown", "--data", out, "--fitted") == 0
+
+
+def test_the_fmu_gives_the_same_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    fmu = tmp_path / "wing.fmu"
+    assert call(monkeypatch, "fmu", "build", "--out", fmu) == 0
+    assert simulate(monkeypatch, tmp_path / "model") == 0
+    assert simulate(monkeypatch, tmp_path / "flown", "--fmu", fmu) == 0
+    ours, theirs = read_measurements(tmp_path / "model"), read_measurements(tmp_path / "flown")
+    assert theirs.displacement == pytest.approx(ours.displacement, rel=1e-8)
+    for expected, seen in zip(
+        read_records(tmp_path / "model"), read_records(tmp_path / "flown"), strict=True
+    ):
+        assert seen.signal == pytest.approx(expected.signal, abs=1e-9)
+    truth = json.loads((tmp_path / "flown" / "truth.json").read_text(encoding="utf-8"))
+    assert truth["bench"] == "wing.fmu"
+
+
+def test_refusals(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "lab"
+    assert simulate(monkeypatch, out, "--servo-mass", 2) != 0
+    assert "servo_mass must lie between" in " ".join(capsys.readouterr().err.split())
+    assert not out.exists()
+    assert simulate(monkeypatch, out, "--fmu", tmp_path / "none.fmu", "--frequency-error", 0.01, 0.0) != 0
+    assert "--frequency-error needs the reduced model" in " ".join(capsys.readouterr().err.split())
+    assert simulate(monkeypatch, out, "--fmu", tmp_path / "none.fmu") != 0
+    assert not out.exists()
+    out.mkdir()
+    (out / "mine.txt").write_text("mine", encoding="utf-8")
+    assert simulate(monkeypatch, out) != 0
+    assert "is not an empty folder" in " ".join(capsys.readouterr().err.split())
+    assert [path.name for path in out.iterdir()] == ["mine.txt"]
