@@ -141,10 +141,10 @@ def read_lab_folder(path: Path, targets: Targets | None = None) -> LabData:
         hashes |= {f"ring_down_{number}": hash_file(file) for number, file in enumerate(records, start=1)}
         names = records[0].name if len(records) == 1 else f"{records[0].name} to {records[-1].name}"
         origins[3] = Origin(3, True, f"{names} read")
-        if weighed is not None:
-            origins[3] = origins[3]._replace(text=f"{origins[3].text}; {WEIGHED_MASS_FILE.as_posix()} read")
     elif records:
         origins[3] = Origin(3, False, "records left aside as asked; " + _PUBLISHED[3])
+    if weighed is not None:
+        origins[3] = origins[3]._replace(text=f"{origins[3].text}; {WEIGHED_MASS_FILE.as_posix()} read")
     return LabData(
         lengths=lengths,
         pairs=pairs,
