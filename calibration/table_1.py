@@ -52,7 +52,7 @@ SHOWN = {
     "semi_span": Shown("semi-span", 1e3, "mm", 2),
     "root_chord": Shown("root chord", 1e3, "mm", 2),
     "tip_chord": Shown("tip chord", 1e3, "mm", 2),
-    "young_modulus_factor": Shown("Young's factor e", 1.0, "", 4),
+    "young_modulus_factor": Shown("modulus factor e", 1.0, "", 4),
     "servo_mass": Shown("servo mass", 1e3, "g", 1),
     "pitot_mass": Shown("pitot mass", 1e3, "g", 1),
     "damping_alpha": Shown("alpha", 1.0, "1/s", 4),

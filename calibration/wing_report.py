@@ -121,7 +121,7 @@ def _add_result(page: Page, calibration: WingCalibration, drawings: Mapping[str,
         "Table 1; masses are the means of the authors' published samples of step 3, alpha and beta follow "
         "from their frequencies by eq. (25). Difference: this wing less the paper's, which belongs to its "
         "own wing. table_1.csv has all figures in SI.",
-        title="Table 1 of the paper, with this calibration beside it",
+        title="This calibration beside Table 1 of the paper",
     )
     page.add_figure(
         drawings["quantities"],
