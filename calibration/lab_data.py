@@ -20,6 +20,7 @@ from .experiments import (
 from .geometry import GEOMETRY_FILE, GeometryCalibration, published_lengths, read_lengths
 from .joint import WeighedMass
 from .laboratory import WEIGHED_MASS_FILE, read_weighed_mass
+from .ringdown import Frequencies
 from .ringdown_extremes import refine_by_extremes
 from .ringdown_records import STEP_FOLDER, find_records, read_records
 from .ringdown_trials import RingDownTrials, fit_trials
@@ -83,7 +84,9 @@ def published_data() -> LabData:
     )
 
 
-def read_lab_folder(path: Path, targets: Targets | None = None) -> LabData:
+def read_lab_folder(
+    path: Path, targets: Targets | None = None, frequencies: Frequencies = Frequencies.PEAKS
+) -> LabData:
     """Read a lab folder in the authors' layout; a step that is not there is taken as published.
 
     Parameters
@@ -93,6 +96,8 @@ def read_lab_folder(path: Path, targets: Targets | None = None) -> LabData:
         authors' repository). Ring-down records may also lie in the folder itself.
     targets : {"measured", "published"}, optional
         Whether step 3 aims at the ring-down records; by default where there are any.
+    frequencies : Frequencies
+        How the frequencies of a record are found: from its spectrum as the authors do, or fitted.
 
     Raises
     ------
@@ -137,7 +142,7 @@ def read_lab_folder(path: Path, targets: Targets | None = None) -> LabData:
             f"{path} holds no ring-down record, and --measured asks for them; give --published instead."
         )
     if records and targets != "published":
-        trials = _fitted(path)
+        trials = _fitted(path, frequencies)
         hashes |= {f"ring_down_{number}": hash_file(file) for number, file in enumerate(records, start=1)}
         names = records[0].name if len(records) == 1 else f"{records[0].name} to {records[-1].name}"
         origins[3] = Origin(3, True, f"{names} read")
@@ -169,9 +174,9 @@ def _step_folder(path: Path, step: int) -> Path | None:
     )
 
 
-def _fitted(path: Path) -> RingDownTrials:
+def _fitted(path: Path, frequencies: Frequencies) -> RingDownTrials:
     records = read_records(path)
-    trials = fit_trials(records)
+    trials = fit_trials(records, frequencies)
     # Of a record read off a plot the extremes are averages of the signal; the middle of the ink is none.
     return refine_by_extremes(trials) if all(record.lowest is not None for record in records) else trials
 

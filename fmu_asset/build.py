@@ -57,6 +57,7 @@ class UavWing_0_content_0_(WingSlave, Fmi2Slave):
 '''
 
 _ENTRY = '''"""Joins the slave, the reduced model and pythonfmu's base class."""
+import ctypes
 import json
 
 from .behaviour import Physics, WingBehaviour
@@ -70,13 +71,12 @@ from .variables import variable_table
 
 __all__ = ["Fmi2Slave", "WingSlave", "keep_alive"]
 
-_kept = []
 _contents = []
 
 
 def keep_alive(thing):
-    """Hold one more reference for ever."""
-    _kept.append(thing)
+    """Hold one more reference for ever, also while the interpreter shuts down and clears this module."""
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(thing))
 
 
 def load_contents(resources):

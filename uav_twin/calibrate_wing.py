@@ -49,6 +49,10 @@ def calibrate_wing(
             show_default="measured where there are records",
         ),
     ] = None,
+    fitted: Annotated[
+        bool,
+        typer.Option("--fitted", help="Fit the frequencies of the records too; spectral peaks by default."),
+    ] = False,
 ) -> None:
     """Tailor the model to one wing: planform, stiffness, masses and damping, in this order.
 
@@ -56,14 +60,20 @@ def calibrate_wing(
     """
     given = (data, out, asset, design, measured)
     if context.invoked_subcommand is not None:
-        if any(value is not None for value in given) or seed != 0 or procedure is not ProcedureName.joint:
+        if (
+            any(value is not None for value in given)
+            or seed
+            or fitted
+            or procedure is not ProcedureName.joint
+        ):
             raise typer.BadParameter(
                 f"options go behind the command: calibrate {context.invoked_subcommand} ..."
             )
         return
     if measured and data is None:
         raise typer.BadParameter("--measured needs --data with ring-down records.")
-    from calibration.lab_data import published_data, read_lab_folder
+    from calibration.lab_data import Targets, published_data, read_lab_folder
+    from calibration.ringdown import Frequencies
     from calibration.wing_calibration import calibrate_wing as calibrate
     from calibration.wing_files import check_folder, write_calibration_folder
     from fe.design import load_design
@@ -73,8 +83,9 @@ def calibrate_wing(
     name = drawn.name if asset is None else asset
     if out is not None:
         check_folder(out, name)
-    targets = None if measured is None else "measured" if measured else "published"
-    lab = published_data() if data is None else read_lab_folder(data, targets)  # type: ignore[arg-type]
+    targets: Targets | None = None if measured is None else "measured" if measured else "published"
+    frequencies = Frequencies.FITTED if fitted else Frequencies.PEAKS
+    lab = published_data() if data is None else read_lab_folder(data, targets, frequencies)
     for origin in lab.origins:
         typer.echo(f"Step {origin.step}: {origin.text}.")
     progress = RichProgress()

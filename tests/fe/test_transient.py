@@ -124,6 +124,17 @@ def test_rest_is_the_static_response_and_stays(integrator: ModalIntegrator, mode
     np.testing.assert_allclose(same.strain, static.strain, rtol=1e-9)
 
 
+def test_the_load_point_rests_where_its_compliance_puts_it(
+    integrator: ModalIntegrator, model: ReducedModel
+) -> None:
+    rest = integrator.load_point_displacement(integrator.at_rest(0.0, 7.0))
+    stiffness = model.tip_stiffness(1.0)
+    assert rest == pytest.approx(7.0 / stiffness, rel=1e-10)
+    # 5 cm inboard of the tip, it moves less than the tip and in time with it
+    released = integrator.released(0.03)
+    assert 0.9 * 0.03 < integrator.load_point_displacement(released) < 0.03
+
+
 def test_slow_load_is_followed_quasi_statically(integrator: ModalIntegrator, model: ReducedModel) -> None:
     state = integrator.advance(integrator.at_rest(2.0), 500.0, (2.0, 0.0), (3.0, 0.0))
     static = model.static_response(1.0, (0.0, 0.0), 3.0)
