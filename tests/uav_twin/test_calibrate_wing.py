@@ -89,9 +89,8 @@ def wings(wing: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> dict[
             total_mass=WeighedMass(2.0 * truth.servo_mass + truth.pitot_mass, 1e-3),
         )
         with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as said:
-            code = call(
-                patch, "calibrate", "--data", folder / "lab", "--out", folder / "out", "--asset", name
-            )
+            places = ["--data", folder / "lab", "--out", folder / "out"]
+            code = call(patch, "calibrate", *places, "--asset", name, "--fitted")
         assert code == 0
         result = CalibrationResult.load(folder / "out" / "calibration.nc")
         made[name] = Tailored(truth, folder / "lab", folder / "out", result, said.getvalue())
@@ -151,7 +150,7 @@ def test_a_calibration_repeats_to_the_byte_and_another_wing_is_not_overwritten(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     made = wings["soft"]
-    arguments = ["calibrate", "--data", made.lab, "--asset", "soft"]
+    arguments = ["calibrate", "--data", made.lab, "--asset", "soft", "--fitted"]
     assert call(monkeypatch, *arguments, "--out", tmp_path) == 0
     for name in ("calibration.nc", "report.html", "table_1.csv", "figures/posterior.svg"):
         assert (tmp_path / name).read_bytes() == (made.out / name).read_bytes(), name
