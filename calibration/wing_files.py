@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from fe.cache import wing_fields
@@ -64,8 +65,8 @@ def write_calibration_folder(
 ) -> CalibrationFiles:
     """Write page, figures, table, the wing for ParaView, and last `calibration.nc`.
 
-    Everything is drawn before anything is written; each file is whole or not there, and an older file of the
-    same name is replaced.
+    Everything is written beside the folder first and moved into place when it is complete: a full disk leaves
+    the folder as it was. An older file of the same name is replaced.
 
     Raises
     ------
@@ -80,34 +81,45 @@ def write_calibration_folder(
         pictures = {name: to_png(figure) for name, figure in figures.items()}
         page = render_page(calibration, drawings)
         content = result_bytes(calibration.result)
-    for name in figures:
-        atomic_write_bytes(folder / "figures" / f"{name}.svg", drawings[name])
-        atomic_write_bytes(folder / "figures" / f"{name}.png", pictures[name])
-    write_table_1(table_1(calibration), paths.table)
-    _write_fields(calibration, fields, folder)
-    atomic_write_text(paths.report, page)
-    atomic_write_bytes(paths.calibration, content)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as scratch:
+            fresh = Path(scratch)
+            for name in figures:
+                atomic_write_bytes(fresh / "figures" / f"{name}.svg", drawings[name])
+                atomic_write_bytes(fresh / "figures" / f"{name}.png", pictures[name])
+            write_table_1(table_1(calibration), fresh / paths.table.name)
+            _write_fields(calibration, fields, fresh)
+            atomic_write_text(fresh / paths.report.name, page)
+            atomic_write_bytes(fresh / paths.calibration.name, content)
+            _move(fresh, folder, last=paths.calibration.name)
+    except OSError as error:
+        raise write_error(error, folder) from error
     return paths
+
+
+def _move(fresh: Path, folder: Path, last: str) -> None:
+    """Move all files into the folder, the calibration itself at the end."""
+    files = sorted(path.relative_to(fresh) for path in fresh.rglob("*") if path.is_file())
+    for name in sorted(files, key=lambda name: (name.name == last, name)):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (fresh / name).replace(folder / name)
 
 
 def _write_fields(calibration: WingCalibration, fields: WingFields, folder: Path) -> None:
     state = calibration.result.mean_state()
-    wing, modes = folder / "wing.vtu", folder / "modes.vtu"
-    try:
-        write_wing_vtu(
-            wing,
-            fields,
-            young_modulus_factor=state.young_modulus_factor,
-            stiffness_loss=state.stiffness_loss,
-            load_factor=LOAD_FACTOR,
-        )
-        write_modes_vtu(
-            modes,
-            fields,
-            young_modulus_factor=state.young_modulus_factor,
-            stiffness_loss=state.stiffness_loss,
-            servo_mass=state.servo_mass,
-            pitot_mass=state.pitot_mass,
-        )
-    except OSError as error:
-        raise write_error(error, Path(error.filename or wing)) from error
+    write_wing_vtu(
+        folder / "wing.vtu",
+        fields,
+        young_modulus_factor=state.young_modulus_factor,
+        stiffness_loss=state.stiffness_loss,
+        load_factor=LOAD_FACTOR,
+    )
+    write_modes_vtu(
+        folder / "modes.vtu",
+        fields,
+        young_modulus_factor=state.young_modulus_factor,
+        stiffness_loss=state.stiffness_loss,
+        servo_mass=state.servo_mass,
+        pitot_mass=state.pitot_mass,
+    )

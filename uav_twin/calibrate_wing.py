@@ -90,11 +90,11 @@ def calibrate_wing(
         typer.echo(f"Step {origin.step}: {origin.text}.")
     progress = RichProgress()
     calibration = calibrate(lab, drawn, asset=name, procedure=procedure.value, seed=seed, progress=progress)
-    paths = None if out is None else write_calibration_folder(calibration, out, progress)
     _show(calibration)
-    if paths is None:
+    if out is None:
         typer.echo("Nothing was written: give --out DIR for calibration.nc and the report.")
         return
+    paths = write_calibration_folder(calibration, out, progress)
     typer.echo(f"Calibration: {paths.calibration}")
     typer.echo(f"Report: {paths.report}")
 

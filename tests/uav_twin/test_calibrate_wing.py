@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import json
+import os
 import re
 import shutil
 import sys
@@ -313,6 +315,29 @@ def test_missing_steps_are_told_and_taken_as_published(
     assert lines[2].startswith("Step 3: published frequencies and damping ratios")
     assert lines[3] == "UAV wing, paper, 100 samples"
     assert "Nothing was written" in lines[-1]
+
+
+def test_a_full_disk_leaves_nothing(
+    wings: dict[str, Tailored],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lab = tmp_path / "lab"
+    shutil.copytree(wings["stiff"].lab / "step2", lab / "step2")
+    replace, count = Path.replace, 0
+
+    def full(self: Path, target: Path) -> Path:
+        nonlocal count
+        count += 1
+        if count > 10:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", full)
+    assert call(monkeypatch, "calibrate", "--data", lab, "--out", tmp_path / "out") == 1
+    assert "No space is left on the disk" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["lab"]
 
 
 def test_records_may_be_left_aside(
