@@ -334,7 +334,11 @@ def _field_writer(
     """Return what writes the field under the last estimate and the last control."""
     flight, scenario = result.flight, knowledge.scenario
     estimate = knowledge.model.states.mean(flight.filtered[-1]).tolist()
-    state = dict(zip(scenario.state_names, estimate, strict=True))
+    # A belief that is sure of the last level may round to a little beyond it, where no model holds.
+    state = {
+        factor.name: min(max(value, factor.levels[0]), factor.levels[-1])
+        for factor, value in zip(scenario.state, estimate, strict=True)
+    }
     control = scenario.control[int(flight.control_index[-1])].values
     return lambda path: source.write_field(path, state, control)
 
