@@ -199,16 +199,26 @@ def _draw_residuals(axes: Axes, result: StaticCalibration) -> None:
     panel_label(axes, "a", "Residuals of the two runs" if len(quality.runs) == 2 else "Residuals")
 
 
+def _short_name(assumption: str) -> str:
+    for beginning, short in (
+        ("prior flat", "flat in load"),
+        ("density", "ratio"),
+        ("a zero", "zero offsets"),
+    ):
+        if assumption.startswith(beginning):
+            return short
+    return assumption
+
+
 def _draw_alternatives(axes: Axes, result: StaticCalibration) -> None:
-    short = ("flat in load", "ratio", "zero offsets")
     rows = [
         ("paper", PAPER_MEAN, PAPER_STANDARD_DEVIATION, REFERENCE),
         ("particle filter", result.particle.mean, result.particle.standard_deviation, PRESENT),
         ("exact", result.exact.mean, result.exact.standard_deviation, PAST),
     ]
     rows += [
-        (f"exact, {name}", alternative.mean, alternative.standard_deviation, PAST)
-        for name, alternative in zip(short, result.alternatives, strict=True)
+        (f"exact, {_short_name(alternative.name)}", alternative.mean, alternative.standard_deviation, PAST)
+        for alternative in result.alternatives
     ]
     for row, (_, mean, deviation, colour) in enumerate(rows):
         axes.errorbar(

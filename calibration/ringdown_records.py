@@ -124,19 +124,33 @@ def read_records(path: Path) -> tuple[RingDownRecord, ...]:
     ExperimentDataError
         If a record holds values that none can have; see `RingDownRecord`.
     """
+    files = find_records(path)
+    if not files:
+        raise ExperimentFileError(
+            f"{path} holds no ring-down record; {FILE_PATTERNS[0]} or {FILE_PATTERNS[-1]} is needed, there "
+            f"or in its folder {STEP_FOLDER}."
+        )
+    return tuple(_read_record(file) for file in files)
+
+
+def find_records(path: Path) -> tuple[Path, ...]:
+    """Return the files that `read_records` reads, best kind first; none if there are none.
+
+    Raises
+    ------
+    ExperimentFileError
+        If the path does not exist.
+    """
     path = Path(path)
     if path.is_file():
-        return (_read_record(path),)
+        return (path,)
     if not path.exists():
         raise ExperimentFileError(f"{path} does not exist; give a folder of ring-down records or one file.")
     for pattern in FILE_PATTERNS:
         for folder in (*(path / above / STEP_FOLDER for above in _FOLDERS_OF_STEPS), path):
             if files := sorted(folder.glob(pattern)):
-                return tuple(_read_record(file) for file in files)
-    raise ExperimentFileError(
-        f"{path} holds no ring-down record; {FILE_PATTERNS[0]} or {FILE_PATTERNS[-1]} is needed, there or in "
-        f"its folder {STEP_FOLDER}."
-    )
+                return tuple(files)
+    return ()
 
 
 def _read_record(file: Path) -> RingDownRecord:

@@ -79,7 +79,7 @@ class StaticCalibration:
     pair_likelihood : (n_pairs, N) array
         Exact likelihood of each pair on `particle.likelihood_grid`, scaled to integrate to one there.
     alternatives : tuple of Alternative
-        The exact posterior under other assumptions.
+        The exact posterior under other assumptions; those that leave the range of the curve are missing.
     quality : FitQuality
         Residuals at the exact posterior mean.
     reward : CalibrationReward

@@ -11,7 +11,8 @@ import numpy as np
 
 from reporting.provenance import collect_provenance
 
-from .errors_in_variables import exact_posterior, pair_log_likelihoods, residual_variance
+from .errors import OutsideValidityError
+from .errors_in_variables import Measure, exact_posterior, pair_log_likelihoods, residual_variance
 from .experiments import HALF_WIDTH_95, LoadDisplacementData, published_measurements
 from .particle_filter import DEFAULT_PARTICLE_COUNT, particle_filter
 from .posterior import GaussianPrior, ScalarPosterior
@@ -110,28 +111,27 @@ def _push_forward(posterior: ScalarPosterior, curve: StiffnessCurve) -> ScalarPo
 def _alternatives(
     curve: StiffnessCurve, data: LoadDisplacementData, prior: GaussianPrior
 ) -> tuple[Alternative, ...]:
-    load = exact_posterior(data, curve=curve, prior=prior, measure="load")
-    ratio = exact_posterior(data, curve=curve, prior=prior, measure="ratio")
-    offset = exact_posterior(
-        data,
-        curve=curve,
-        prior=prior,
-        zero_offset_standard_deviation=data.displacement_standard_deviation,
-    )
+    """Return the posterior under other assumptions, but for those that lead out of the curve's range."""
     half_width = HALF_WIDTH_95 * data.displacement_standard_deviation * 1e3
-    return (
-        Alternative("prior flat in the true load", load.mean, load.standard_deviation),
-        Alternative(
-            "density of the ratio (the particle filter with unlimited samples)",
-            ratio.mean,
-            ratio.standard_deviation,
-        ),
-        Alternative(
+    assumptions: tuple[tuple[str, Measure, float], ...] = (
+        ("prior flat in the true load", "load", 0.0),
+        ("density of the ratio (the particle filter with unlimited samples)", "ratio", 0.0),
+        (
             f"a zero offset of ±{half_width:.2g} mm shared by each run",
-            offset.mean,
-            offset.standard_deviation,
+            "displacement",
+            data.displacement_standard_deviation,
         ),
     )
+    found = []
+    for name, measure, offset in assumptions:
+        try:
+            posterior = exact_posterior(
+                data, curve=curve, prior=prior, measure=measure, zero_offset_standard_deviation=offset
+            )
+        except OutsideValidityError:
+            continue
+        found.append(Alternative(name, posterior.mean, posterior.standard_deviation))
+    return tuple(found)
 
 
 def _reward(

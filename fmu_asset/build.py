@@ -140,6 +140,8 @@ def build_fmu(
     *,
     state: DigitalState | None = None,
     kind: FmuKind = "python",
+    note: str = "",
+    resources: Mapping[str, bytes] | None = None,
     replace: bool = False,
 ) -> FmuInfo:
     """Pack a reduced model as an FMU; equal input gives equal bytes.
@@ -154,6 +156,11 @@ def build_fmu(
         Start values of parameters and health; the digital state's defaults if absent.
     kind : {"python", "compiled", "source"}
         What evaluates the model: Python in the host, C compiled now, or C to be compiled elsewhere.
+    note : str
+        Added to the description, such as what the wing was calibrated with; XML text without control
+        characters.
+    resources : mapping of str to bytes, optional
+        Further files of the archive's folder `resources`, by name.
     replace : bool
         Whether an existing file may be replaced.
 
@@ -165,15 +172,16 @@ def build_fmu(
     Raises
     ------
     FmuBuildError
-        If the file exists, the suffix is wrong, a start value lies outside the model's validity box, the
-        wrong pythonfmu is installed, or there is no C compiler for a compiled one.
+        If the file exists, the suffix is wrong, a start value lies outside the model's validity box, a
+        resource would take the place of another file, the wrong pythonfmu is installed, or there is no C
+        compiler for a compiled one.
     """
     target = Path(path)
     if target.suffix != ".fmu":
         raise FmuBuildError(f"An FMU must have the suffix .fmu, but {target} was given.")
     if target.exists() and not replace:
         raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
-    content, content_hash = fmu_bytes(model, state, kind)
+    content, content_hash = fmu_bytes(model, state, kind, note=note, resources=resources)
     atomic_write_bytes(target, content)
     return _info(model, target, content, content_hash)
 
@@ -190,7 +198,12 @@ def _info(model: ReducedModel, path: Path, content: bytes, content_hash: str) ->
 
 
 def fmu_bytes(
-    model: ReducedModel, state: DigitalState | None = None, kind: FmuKind = "python"
+    model: ReducedModel,
+    state: DigitalState | None = None,
+    kind: FmuKind = "python",
+    *,
+    note: str = "",
+    resources: Mapping[str, bytes] | None = None,
 ) -> tuple[bytes, str]:
     """Return the archive and its content hash; see `build_fmu`."""
     start = start_values(state or DigitalState())
@@ -199,8 +212,9 @@ def fmu_bytes(
         gauge_count=model.gauge_count, mode_count=mode_count, validity=model.validity, start=start
     )
     _check_start(table)
+    description = f"{DESCRIPTION} {note}".strip()
     if kind == "python":
-        template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start})
+        template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start}, description)
     else:
         template = compiled_members(
             model,
@@ -208,8 +222,12 @@ def fmu_bytes(
             identifier=f"uav_wing_{_PLACEHOLDER}",
             guid=_PLACEHOLDER,
             content_tag=_PLACEHOLDER,
-            description=DESCRIPTION,
+            description=description,
         )
+    for name, content in (resources or {}).items():
+        if f"resources/{name}" in template or "/" in name or not name:
+            raise FmuBuildError(f"A resource of an FMU cannot have the name {name!r}; choose another one.")
+        template[f"resources/{name}"] = content
     content_hash = _hash(template)
     members = {
         _named(name, content_hash): _filled(name, data, content_hash) for name, data in template.items()
@@ -277,7 +295,9 @@ def _check_start(table: Iterable[FmuVariable]) -> None:
             )
 
 
-def _members(model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str, object]) -> dict[str, bytes]:
+def _members(
+    model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str, object], description: str
+) -> dict[str, bytes]:
     """Return the files of the archive, with the placeholder wherever the content hash will stand."""
     try:
         installed = version("pythonfmu")
@@ -297,7 +317,7 @@ def _members(model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str,
             identifier=module,
             guid=_PLACEHOLDER,
             table=table,
-            description=DESCRIPTION,
+            description=description,
             version=version("uav-twin"),
             generation_tool=f"uav-twin with PythonFMU {installed}",
         ),
@@ -307,7 +327,7 @@ def _members(model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str,
         f"binaries/win64/{module}.dll": (
             wrapper / "resources/binaries/win64/pythonfmu-export.dll"
         ).read_bytes(),
-        "documentation/index.html": documentation_page(table, DESCRIPTION),
+        "documentation/index.html": documentation_page(table, description),
         "documentation/licenses/pythonfmu.txt": _licence("pythonfmu"),
         "resources/reduced_model.npz": model,
         "resources/start.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode(),

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+
+if TYPE_CHECKING:
+    from calibration.result import CalibrationResult
 
 LEVELS = (0, 20, 40, 60, 80)
 
@@ -45,6 +50,47 @@ def library_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("library") / "UAVconfig.json"
     path.write_text(json.dumps(synthetic_library()), encoding="utf-8")
     return path
+
+
+def synthetic_calibration(
+    count: int = 40, seed: int = 1, asset: str = "Wing 7 (é)", young_modulus_factor: float = 1.01
+) -> CalibrationResult:
+    """A calibration drawn from Gaussians, for a design 2 mm longer than the shipped one."""
+    from calibration.experiments import published_measurements
+    from calibration.geometry import published_lengths
+    from calibration.joint import WeighedMass, published_modal_measurement
+    from calibration.result import CalibrationResult
+    from calibration.steps import CalibrationStep, StepReward, Update
+    from fe.design import load_design
+
+    generator = np.random.default_rng(seed)
+    mean = np.array([young_modulus_factor, 0.17, 0.132, 1.05, 7.6e-4])
+    spread = np.array([0.01, 0.004, 0.008, 0.1, 1e-4])
+    quantity = np.array([682.0, 5.65, 28.6, 0.028, 0.07])
+    update = Update("tip_stiffness", "tip stiffness", "N/m", 677.0, 15.0, 682.0, 6.0, 682.1, 6.5)
+    step = CalibrationStep(3, "Ring-down", "joint", "drawn", (), (update,), StepReward(-2.0, -0.7, 0.7, None))
+    return CalibrationResult(
+        asset=asset,
+        design=load_design().changed(planform={"semi_span": 1.83}),
+        geometry=published_lengths(),
+        procedure="joint",
+        samples=mean + spread * generator.normal(size=(count, 5)),
+        prior_samples=mean + 3.0 * spread * generator.normal(size=(count + 3, 5)),
+        quantity_samples=quantity * (1.0 + 0.01 * generator.normal(size=(count, 5))),
+        prior_quantity_samples=quantity * (1.0 + 0.05 * generator.normal(size=(count + 3, 5))),
+        pairs=published_measurements(),
+        total_mass=WeighedMass(0.47, 2e-3),
+        modal=published_modal_measurement(),
+        steps=(step,),
+        seed=5,
+        provenance={"versions": {"numpy": "2"}, "input_hashes": {}},
+    )
+
+
+@pytest.fixture(scope="session")
+def make_calibration() -> Callable[..., CalibrationResult]:
+    """What makes a calibration without a wing."""
+    return synthetic_calibration
 
 
 REFERENCE = Path(__file__).parents[1].parent / "shared" / "reference"

@@ -29,6 +29,7 @@ Float = NDArray[np.float64]
 ASSET_FOLDER = "asset"
 """Folder inside the run folder that holds copies of what is flown, so that a run can be resumed anywhere."""
 BINDING_COPY = f"{ASSET_FOLDER}/binding.toml"
+CALIBRATION_COPY = f"{ASSET_FOLDER}/calibration.nc"
 DESIGN_COPY = f"{ASSET_FOLDER}/design.toml"
 FMU_COPY = f"{ASSET_FOLDER}/asset.fmu"
 LIBRARY_COPY = f"{ASSET_FOLDER}/{LIBRARY_NAME}"

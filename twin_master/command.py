@@ -42,6 +42,10 @@ def run(
             "scenario that flies a library, its file."
         ),
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="Fly with this calibration of the wing, a calibration.nc of `uav-twin calibrate`."),
+    ] = None,
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Run the FMU in this process instead of a worker.")
     ] = False,
@@ -53,7 +57,7 @@ def run(
     from twin_master.scenario_file import load_scenario
     from twin_master.workflow import new_run, resume_run
 
-    overrides = Overrides(seed, fmu, binding, strain_library, in_process)
+    overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration)
     progress = SilentProgress() if quiet else RichProgress()
     if resume is not None:
         if out is not None or replace or overrides != Overrides():

@@ -8,13 +8,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.result import CalibrationResult
 from fe.cache import reduced_model, wing_fields
-from fe.design import load_design
+from fe.design import WingDesign, load_design
 from fe.fields import write_wing_vtu
 from fe.reduced import ReducedModel
 from reporting.files import atomic_write_bytes, write_error
 from reporting.progress import Progress
+from reporting.provenance import hash_file
 from twin_master.asset_source import (
+    CALIBRATION_COPY,
     DESIGN_COPY,
     Origin,
     check_wing_scenario,
@@ -31,20 +34,22 @@ Float = NDArray[np.float64]
 
 
 class DesignSource:
-    """The reduced model of a design file.
+    """The reduced model of a design file, or of the design inside a calibration file.
 
     Parameters
     ----------
     scenario : Scenario
         What is flown.
-    design : Path
-        Wing design.
+    design : Path or None
+        Wing design; that of the calibration if absent.
+    calibration : Path or None
+        Calibration file of the wing.
     """
 
-    def __init__(self, scenario: Scenario, design: Path) -> None:
+    def __init__(self, scenario: Scenario, design: Path | None, calibration: Path | None = None) -> None:
         self._scenario = scenario
-        self._design = design
-        self._copy: Path | None = None
+        self._given = {DESIGN_COPY: design, CALIBRATION_COPY: calibration}
+        self._design: WingDesign | None = None
         self._wing: ReducedModel | None = None
         self._mean = 1.0
         self._name = ""
@@ -68,37 +73,50 @@ class DesignSource:
         ------
         MissionInputError, InvalidDesignError
             The design cannot be read, or is wrong.
+        CalibrationRecordError
+            The calibration file is damaged or of another kind, or has no samples of the parameter.
         MissingObservationModelError
             The scenario's states, controls, parameter or sensors are not those of the design's model.
         """
         self.files()
-        check_wing_scenario(self._scenario, len(load_design(self._design).gauges.positions))
+        calibration = read_calibration(self._given[CALIBRATION_COPY], self._scenario)
+        design = read_design(self._given[DESIGN_COPY], calibration, tailored=self._given[DESIGN_COPY] is None)
+        if design is None:
+            raise MissionInputError("there is neither a wing design nor a calibration file.")
+        check_wing_scenario(self._scenario, len(design.gauges.positions))
 
     def files(self) -> dict[str, bytes]:
-        """Return the design as it is given.
+        """Return design and calibration as they are given.
 
         Raises
         ------
         MissionInputError
             It cannot be read.
         """
-        return {DESIGN_COPY: read_content(self._design)}
+        return {name: read_content(path) for name, path in self._given.items() if path is not None}
 
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
-        """Copy the design into the run folder and reduce it; return its hash.
+        """Copy what is given into the run folder and reduce the design; return the hashes.
 
         Raises
         ------
         MissionInputError, InvalidDesignError
             The design cannot be read, or is wrong.
         """
-        self._copy = folder / DESIGN_COPY
-        if not self._copy.exists():
-            atomic_write_bytes(self._copy, read_content(self._design))
-        design = load_design(self._copy)
-        self._name = design.name
-        self._wing = reduced_model(design, progress=progress)
-        return {"design": self._wing.design_hash}
+        copies = {name: folder / name for name, path in self._given.items() if path is not None}
+        for name, copy in copies.items():
+            if not copy.exists():
+                atomic_write_bytes(copy, self.files()[name])
+        hashes = {}
+        if CALIBRATION_COPY in copies:
+            hashes["calibration"] = hash_file(copies[CALIBRATION_COPY])
+        calibration = read_calibration(copies.get(CALIBRATION_COPY), self._scenario)
+        self._design = read_design(copies.get(DESIGN_COPY), calibration, tailored=DESIGN_COPY not in copies)
+        if self._design is None:
+            raise MissionInputError("there is neither a wing design nor a calibration file.")
+        self._name = self._design.name
+        self._wing = reduced_model(self._design, progress=progress)
+        return {**hashes, "design": self._wing.design_hash}
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of e."""
@@ -116,15 +134,39 @@ class DesignSource:
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write displacement and strain of the wing as VTU, at the mean of the calibration."""
-        if self._copy is None:
+        if self._design is None:
             return False
-        return write_design_field(path, self._scenario, self._copy, self._mean, state, control)
+        return write_design_field(path, self._scenario, self._design, self._mean, state, control)
+
+
+def read_calibration(path: Path | None, scenario: Scenario) -> CalibrationResult | None:
+    """Return the calibration file, if there is one, with samples of the scenario's parameter.
+
+    Raises
+    ------
+    CalibrationRecordError
+        It is damaged or of another kind, or has no samples of the parameter.
+    """
+    if path is None:
+        return None
+    calibration = CalibrationResult.load(path)
+    calibration.draws_of(scenario.calibration.parameter)
+    return calibration
+
+
+def read_design(
+    path: Path | None, calibration: CalibrationResult | None, *, tailored: bool
+) -> WingDesign | None:
+    """Return the design of a calibration, if it is to be tailored, or else that of a file."""
+    if tailored and calibration is not None:
+        return calibration.design
+    return None if path is None else load_design(path)
 
 
 def write_design_field(
     path: Path,
     scenario: Scenario,
-    design: Path,
+    design: WingDesign,
     young_modulus_factor: float,
     state: Mapping[str, float],
     control: Mapping[str, float],
@@ -138,7 +180,7 @@ def write_design_field(
     """
     if {*state} != {"z1", "z2"} or {*control} != {"load_factor"}:
         return False
-    fields = wing_fields(load_design(design))
+    fields = wing_fields(design)
     try:
         write_wing_vtu(
             path,

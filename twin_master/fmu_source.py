@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.result import CalibrationResult
 from fe.cache import reduced_model
-from fe.design import load_design
+from fe.design import WingDesign
 from fe.reduced import ReducedModel
 from fmu_asset.binding import Binding, load_binding
 from fmu_asset.build import build_fmu
@@ -19,6 +20,7 @@ from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.asset_source import (
     BINDING_COPY,
+    CALIBRATION_COPY,
     DESIGN_COPY,
     FMU_COPY,
     Origin,
@@ -26,7 +28,8 @@ from twin_master.asset_source import (
     wing_observation_table,
 )
 from twin_master.assets import Asset, AssetReading
-from twin_master.design_source import read_content, write_design_field
+from twin_master.calibrated_asset import pack_calibrated_wing
+from twin_master.design_source import read_calibration, read_content, read_design, write_design_field
 from twin_master.errors import MissionInputError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws, draw_parameter
@@ -93,13 +96,34 @@ class FmuSource:
         Wing design: the twin's model, and what is packed where no FMU is given.
     fmu : Path or None
         The FMU to fly.
+    calibration : Path or None
+        Calibration file of the wing.
+    tailored : bool
+        Whether the design is that of the calibration file.
     """
 
-    def __init__(self, scenario: Scenario, binding: Path, design: Path | None, fmu: Path | None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        binding: Path,
+        design: Path | None,
+        fmu: Path | None,
+        *,
+        calibration: Path | None = None,
+        tailored: bool = False,
+    ) -> None:
         self._scenario = scenario
         self._binding = binding
-        self._given = {BINDING_COPY: binding, DESIGN_COPY: design, FMU_COPY: fmu}
+        self._tailored = tailored
+        self._given = {
+            BINDING_COPY: binding,
+            DESIGN_COPY: design,
+            FMU_COPY: fmu,
+            CALIBRATION_COPY: calibration,
+        }
         self._folder: Path | None = None
+        self._design: WingDesign | None = None
+        self._calibration: CalibrationResult | None = None
         self._wing: ReducedModel | None = None
         self._design_name = ""
 
@@ -109,9 +133,9 @@ class FmuSource:
 
         An FMU that is given may hold any model, also that of the design: whether they differ is not known.
         """
-        design = self._given[DESIGN_COPY]
         model = f"reduced model of the design {self._design_name}".rstrip()
-        if design is None or self._scenario.asset.observation_model == "asset":
+        has_design = self._tailored or self._given[DESIGN_COPY] is not None
+        if not has_design or self._scenario.asset.observation_model == "asset":
             return Origin("FMU", "FMU")
         return Origin("FMU" if self._given[FMU_COPY] else f"FMU of the {model}", model)
 
@@ -126,7 +150,7 @@ class FmuSource:
         return self._folder / name
 
     def check(self) -> None:
-        """Read binding, design and FMU where they are, without copying or starting anything.
+        """Read binding, design, calibration and FMU where they are, without copying or starting anything.
 
         Raises
         ------
@@ -134,21 +158,23 @@ class FmuSource:
             A file cannot be read, or the binding observes another number of values than the scenario.
         InvalidDesignError, FmuError
             A design, binding or FMU is wrong, or the binding does not fit the FMU.
+        CalibrationRecordError
+            The calibration file is damaged or of another kind, or has no samples of the parameter.
         """
+        calibration = read_calibration(self._given[CALIBRATION_COPY], self._scenario)
         self.files()
-        design, fmu = self._given[DESIGN_COPY], self._given[FMU_COPY]
+        design = read_design(self._given[DESIGN_COPY], calibration, tailored=self._tailored)
+        fmu = self._given[FMU_COPY]
         binding = load_binding(self._binding)
         self._observed(binding)
         self._check_names(binding)
-        if design is not None:
-            gauges = len(load_design(design).gauges.positions)
-            if self._scenario.asset.observation_model != "asset":
-                check_wing_scenario(self._scenario, gauges)
+        if design is not None and self._scenario.asset.observation_model != "asset":
+            check_wing_scenario(self._scenario, len(design.gauges.positions))
         if fmu is not None:
             FmiAsset(fmu, binding, parameters=self._scenario.asset.parameters)
 
     def files(self) -> dict[str, bytes]:
-        """Return binding, design and FMU as they are given.
+        """Return binding, design, calibration and FMU as they are given.
 
         Raises
         ------
@@ -188,16 +214,27 @@ class FmuSource:
                 atomic_write_bytes(self._path(name), read_content(path))
         self._observed(load_binding(self._path(BINDING_COPY)))
         hashes = {"binding": hash_file(self._path(BINDING_COPY))}
-        if self._given[DESIGN_COPY] is not None:
-            design = load_design(self._path(DESIGN_COPY))
-            self._design_name = design.name
-            self._wing = reduced_model(design, progress=progress)
+        if self._given[CALIBRATION_COPY] is not None:
+            self._calibration = read_calibration(self._path(CALIBRATION_COPY), self._scenario)
+            hashes["calibration"] = hash_file(self._path(CALIBRATION_COPY))
+        copy = None if self._given[DESIGN_COPY] is None else self._path(DESIGN_COPY)
+        self._design = read_design(copy, self._calibration, tailored=self._tailored)
+        if self._design is not None:
+            self._design_name = self._design.name
+            self._wing = reduced_model(self._design, progress=progress)
             hashes["design"] = self._wing.design_hash
             if self._given[FMU_COPY] is None:
                 with progress.stage("Packing the FMU"):
-                    build_fmu(self._wing, self._path(FMU_COPY), replace=True)
+                    self._pack(self._wing)
         hashes["fmu"] = hash_file(self._path(FMU_COPY))
         return hashes
+
+    def _pack(self, wing: ReducedModel) -> None:
+        """Pack the FMU to fly; where the scenario names no parameter, the start value is flown."""
+        if self._tailored and self._calibration is not None:
+            pack_calibrated_wing(wing, self._calibration, self._path(FMU_COPY), replace=True)
+        else:
+            build_fmu(wing, self._path(FMU_COPY), replace=True)
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the calibrated parameter."""
@@ -267,7 +304,8 @@ class FmuSource:
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write displacement and strain of the wing as VTU, with the parameters of the scenario."""
-        if self._wing is None:
+        if self._design is None:
             return False
-        e = self._scenario.asset.parameters.get("young_modulus_factor", 1.0)
-        return write_design_field(path, self._scenario, self._path(DESIGN_COPY), e, state, control)
+        start = 1.0 if self._calibration is None else self._calibration.mean("young_modulus_factor")
+        e = self._scenario.asset.parameters.get("young_modulus_factor", start)
+        return write_design_field(path, self._scenario, self._design, e, state, control)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from calibration.result import CalibrationResult
 from calibration.stiffness import PUBLISHED_LINE, calibrate_static, stiffness_curve_of
 from calibration.stiffness_curve import StiffnessCurve, TipStiffnessModel
+from twin_master.calibrated_asset import run_record
 from twin_master.errors import MissingObservationModelError
 from twin_master.scenario import Calibration
 from twin_master.seeds import generator, seed_sequence
@@ -50,6 +53,8 @@ def draw_parameter(
 ) -> ParameterDraws:
     """Return draws of the calibrated parameter: Kapteyn et al. 2021, calibration step 2.
 
+    From the file of a whole calibration they are drawn from its samples, one from each of as many strata.
+
     Parameters
     ----------
     calibration : Calibration
@@ -64,8 +69,10 @@ def draw_parameter(
     MissingObservationModelError
         The scenario asks for the stiffness curve of a design and there is none.
     CalibrationError
-        The measurements do not fit the model.
+        The measurements do not fit the model, or the calibration file cannot be read.
     """
+    if calibration.source == "file":
+        return _draws_of_file(calibration, seed)
     if calibration.source == "fixed":
         assert calibration.mean is not None  # the schema asks for it
         return ParameterDraws(
@@ -106,4 +113,17 @@ def draw_parameter(
         standard_deviation=posterior.standard_deviation,
         source=f"static test of the wing, {calibration.method.replace('_', ' ')}, {curve.name}",
         record=found.to_dict(),
+    )
+
+
+def _draws_of_file(calibration: Calibration, seed: int) -> ParameterDraws:
+    name = calibration.parameter
+    found = CalibrationResult.load(Path(calibration.file or ""))
+    return ParameterDraws(
+        name=name,
+        values=found.stratified_draws(name, calibration.draws, seed_sequence(seed, "calibration")),
+        mean=found.mean(name),
+        standard_deviation=found.standard_deviation(name),
+        source=f"calibration of {found.asset}, {found.procedure}, {len(found.samples)} samples",
+        record=run_record(found, name),
     )

@@ -10,6 +10,7 @@ from reporting.provenance import hash_file
 from scenarios import binding_files
 from twin_master.asset_source import (
     BINDING_COPY,
+    CALIBRATION_COPY,
     DESIGN_COPY,
     FMU_COPY,
     LIBRARY_COPY,
@@ -25,6 +26,8 @@ from twin_master.strain_library import FILE_NAME, load_strain_library
 SHIPPED_DESIGN_NAME = "uav_wing"
 REPOSITORY = "https://github.com/michaelkapteyn/UAV-Digital-Twin"
 """Where the authors of Kapteyn et al. 2021 published their strain library."""
+CALIBRATED_DESIGN_NAME = "calibration"
+"""The tailored design inside the calibration file: with a file it takes the place of the scenario's."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,8 @@ class Overrides:
         file of that library.
     in_process : bool
         Fly the FMU in this process instead of a worker.
+    calibration : Path or None
+        The calibration file of the wing, instead of what the scenario says of its calibration.
     """
 
     seed: int | None = None
@@ -49,6 +54,7 @@ class Overrides:
     binding: Path | None = None
     strain_library: Path | None = None
     in_process: bool = False
+    calibration: Path | None = None
 
 
 def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
@@ -65,9 +71,27 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
     """
     table = loaded.scenario.to_dict()
     asset, folder = table["asset"], loaded.path.resolve().parent
+    calibration = table["calibration"]
     if overrides.strain_library and (overrides.fmu or overrides.binding):
         raise MissionInputError("--strain-library flies no FMU: give either it or --fmu and --binding.")
-    if asset["design"] and asset["design"] != SHIPPED_DESIGN_NAME:
+    if overrides.calibration:
+        calibration |= {"source": "file", "file": str(overrides.calibration.resolve())}
+    elif calibration["file"]:
+        calibration["file"] = str(folder / calibration["file"])
+    flies_library = overrides.strain_library or asset["kind"] == "strain_library"
+    believes_design = asset["kind"] == "strain_library" and asset["design"]
+    if calibration["file"] and flies_library and not believes_design:
+        raise MissionInputError(
+            "a strain library brings its own samples of its parameter: fly it without a calibration file."
+        )
+    if calibration["file"] and asset["design"]:
+        asset["design"] = CALIBRATED_DESIGN_NAME
+    elif asset["design"] == CALIBRATED_DESIGN_NAME:
+        raise MissionInputError(
+            "`asset.design` asks for the design of a calibration, and there is no calibration file: give "
+            '--calibration, or `source = "file"` in the table `calibration`.'
+        )
+    elif asset["design"] and asset["design"] != SHIPPED_DESIGN_NAME:
         asset["design"] = str(folder / asset["design"])
     if asset["file"]:
         asset["file"] = str(folder / asset["file"])
@@ -97,25 +121,35 @@ def portable_scenario(scenario: Scenario) -> Scenario:
     """Return a resolved scenario that names the copies in the run folder, so that it holds on any machine."""
     library = scenario.asset.kind == "strain_library"
     copies = {"file": LIBRARY_COPY if library else FMU_COPY, "design": DESIGN_COPY, "binding": BINDING_COPY}
-    return _with_asset(scenario, {key: copies[key] for key in _given_paths(scenario)})
+    portable = _with_asset(scenario, {key: copies[key] for key in _given_paths(scenario)})
+    return _with_calibration_file(portable, CALIBRATION_COPY)
 
 
 def located_scenario(scenario: Scenario, folder: Path) -> Scenario:
     """Return a portable scenario with the paths of the copies in a run folder."""
     paths = _given_paths(scenario)
-    return _with_asset(scenario, {key: str(folder / PurePosixPath(path)) for key, path in paths.items()})
+    located = _with_asset(scenario, {key: str(folder / PurePosixPath(path)) for key, path in paths.items()})
+    return _with_calibration_file(located, str(folder / PurePosixPath(CALIBRATION_COPY)))
 
 
 def _given_paths(scenario: Scenario) -> dict[str, str]:
     """Return the files that the asset names, without what is shipped."""
     asset = scenario.asset
     given = {"file": asset.file, "design": asset.design, "binding": asset.binding}
-    shipped = {SHIPPED_DESIGN_NAME, *binding_files()}
+    shipped = {SHIPPED_DESIGN_NAME, CALIBRATED_DESIGN_NAME, *binding_files()}
     return {key: path for key, path in given.items() if path and (key == "file" or path not in shipped)}
 
 
 def _with_asset(scenario: Scenario, changes: dict[str, Any]) -> Scenario:
     return scenario.model_copy(update={"asset": scenario.asset.model_copy(update=changes)})
+
+
+def _with_calibration_file(scenario: Scenario, path: str) -> Scenario:
+    """Return the scenario with its calibration file, if it has one, at another place."""
+    if scenario.calibration.file is None:
+        return scenario
+    calibration = scenario.calibration.model_copy(update={"file": path})
+    return scenario.model_copy(update={"calibration": calibration})
 
 
 def asset_source(scenario: Scenario) -> AssetSource:
@@ -137,13 +171,25 @@ def asset_source(scenario: Scenario) -> AssetSource:
     from twin_master.design_source import DesignSource
     from twin_master.fmu_source import FmuSource
 
+    calibration = scenario.calibration.file
+    tailored = asset.design == CALIBRATED_DESIGN_NAME
     design = SHIPPED_DESIGN if asset.design == SHIPPED_DESIGN_NAME else asset.design
     if asset.kind == "strain_library":
         check_load_factors(scenario)
-        return MismatchedSource(library, DesignSource(scenario, Path(design or "")))
+        believed = DesignSource(
+            scenario,
+            Path(design) if design and not tailored else None,
+            Path(calibration) if calibration else None,
+        )
+        return MismatchedSource(library, believed)
     binding = binding_files().get(asset.binding or "", Path(asset.binding or ""))
     return FmuSource(
-        scenario, binding, Path(design) if design else None, Path(asset.file) if asset.file else None
+        scenario,
+        binding,
+        Path(design) if design and not tailored else None,
+        Path(asset.file) if asset.file else None,
+        calibration=Path(calibration) if calibration else None,
+        tailored=tailored,
     )
 
 

@@ -197,7 +197,9 @@ class Calibration(Section):
     """The uncertain parameter of the model and where its distribution comes from."""
 
     parameter: Name
-    source: Literal["static_test", "normal", "fixed"]
+    source: Literal["static_test", "normal", "fixed", "file"]
+    file: str | None = None
+    """The calibration of a wing (`calibration.nc`), for the source `file`."""
     method: Literal["particle_filter", "exact"] = "exact"
     curve: Literal["published", "design"] = "published"
     draws: Count = 100
@@ -206,7 +208,13 @@ class Calibration(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.source != "static_test" and self.mean is None:
+        if (self.source == "file") != bool(self.file):
+            raise ValueError(
+                "calibration source `file` needs `file`, the path of a calibration.nc"
+                if self.source == "file"
+                else f"`file` belongs to the calibration source `file`, and the source is `{self.source}`"
+            )
+        if self.source in ("normal", "fixed") and self.mean is None:
             raise ValueError(f"calibration source `{self.source}` needs `mean`")
         if self.source == "normal" and self.standard_deviation is None:
             raise ValueError("calibration source `normal` needs `standard_deviation`")

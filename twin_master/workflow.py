@@ -198,6 +198,7 @@ def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Pro
             progress.stage("Calibrating and planning"),
         ):
             knowledge = prepare_knowledge(scenario, source, scenario.mission.seed)
+            _tell_of_another_truth(knowledge, progress)
             if knowledge.draws.record is not None:
                 text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
                 atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
@@ -214,6 +215,21 @@ def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Pro
         return RunOutcome(folder, report, figures, timing, source.origin)
     finally:
         os.close(lock)
+
+
+def _tell_of_another_truth(knowledge: Knowledge, progress: Progress) -> None:
+    """Say so where the true wing of the scenario is not the one that the calibration file describes."""
+    draws, scenario = knowledge.draws, knowledge.scenario
+    truth = scenario.asset.parameters.get(draws.name)
+    if scenario.calibration.source != "file" or truth is None:
+        return
+    off = abs(truth - draws.mean)
+    if off > 3.0 * draws.standard_deviation:
+        progress.note(
+            f"The scenario's true {draws.name} is {truth:.5g}, but the calibration says {draws.mean:.5g} "
+            f"± {draws.standard_deviation:.2g}: the twin flies with the model of another wing. To fly the "
+            "calibrated wing, leave it out of `parameters` in the scenario's table `asset`."
+        )
 
 
 @contextmanager
@@ -335,7 +351,11 @@ def _field_writer(
     """Return what writes the field under the last estimate and the last control."""
     flight, scenario = result.flight, knowledge.scenario
     estimate = knowledge.model.states.mean(flight.filtered[-1]).tolist()
-    state = dict(zip(scenario.state_names, estimate, strict=True))
+    # A belief that is sure of the last level may round to a little beyond it, where no model holds.
+    state = {
+        factor.name: min(max(value, factor.levels[0]), factor.levels[-1])
+        for factor, value in zip(scenario.state, estimate, strict=True)
+    }
     control = scenario.control[int(flight.control_index[-1])].values
     return lambda path: source.write_field(path, state, control)
 

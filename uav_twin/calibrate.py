@@ -8,13 +8,10 @@ from typing import Annotated
 import typer
 
 from uav_twin import calibrate_simulate, calibrate_steps
+from uav_twin.calibrate_wing import calibrate_wing
 
-calibrate_app = typer.Typer(no_args_is_help=True, help="Tailor the model to the real wing.")
-
-
-@calibrate_app.callback()
-def _calibrate() -> None:
-    """Tailor the model to the real wing."""
+calibrate_app = typer.Typer(no_args_is_help=False)
+calibrate_app.callback(invoke_without_command=True)(calibrate_wing)
 
 
 @calibrate_app.command("static")

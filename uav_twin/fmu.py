@@ -18,9 +18,13 @@ def build(
         Literal["python", "compiled", "source"],
         typer.Option(help="Run by Python, compiled C, or C sources to be compiled elsewhere."),
     ] = "python",
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="Tailor it to a wing: the calibration.nc of `uav-twin calibrate`."),
+    ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
-    """Pack the wing as an FMI 2.0 co-simulation FMU; equal designs give equal bytes."""
+    """Pack the wing as an FMI 2.0 co-simulation FMU; equal designs and calibrations give equal bytes."""
     from fe.cache import reduced_model
     from fe.design import load_design
     from fmu_asset.build import build_fmu
@@ -28,12 +32,23 @@ def build(
     from fmu_asset.errors import FmuBuildError
     from reporting.progress import RichProgress
 
+    if calibration is not None and design is not None:
+        raise typer.BadParameter("the calibration holds its design: give either it or --design.")
     if out.exists() and not replace:
         raise FmuBuildError(f"{out} exists: choose another --out or give --replace.")
     if kind == "compiled":
         find_compiler()  # before the wing is modelled, which can take a minute
-    model = reduced_model(load_design(design), progress=RichProgress())
-    info = build_fmu(model, out, kind=kind, replace=replace)
+    if calibration is None:
+        model = reduced_model(load_design(design), progress=RichProgress())
+        info = build_fmu(model, out, kind=kind, replace=replace)
+    else:
+        from calibration.result import CalibrationResult
+        from twin_master.calibrated_asset import pack_calibrated_wing
+
+        wing = CalibrationResult.load(calibration)
+        model = reduced_model(wing.design, progress=RichProgress())
+        info = pack_calibrated_wing(model, wing, out, kind=kind, replace=replace)
+        typer.echo(f"Calibrated for {wing.asset}.")
     typer.echo(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
 
 

@@ -10,10 +10,12 @@ import pytest
 
 from calibration.errors import CalibrationRecordError, ExperimentFileError
 from calibration.experiments import published_measurements
+from calibration.figures import residual_figure
 from calibration.quality import assess_fit
 from calibration.report import write_report
 from calibration.static_calibration import StaticCalibration
 from calibration.stiffness import PUBLISHED_LINE, calibrate_static, stiffness_curve_of
+from calibration.stiffness_curve import LinearStiffnessCurve
 from calibration.summary import summary_rows
 from calibration.workflow import read_calibration, run_static, write_calibration
 
@@ -72,6 +74,21 @@ def test_a_perfect_fit_has_no_remarks():
     assert quality.remarks == ()
     assert quality.chi_square == pytest.approx(0.0, abs=1e-20)
     assert [run.line_stiffness for run in quality.runs] == pytest.approx([680.0, 680.0])
+
+
+def test_an_alternative_that_leaves_the_model_is_left_out():
+    """Only the assumption of a shared offset is wide enough to reach the end of this curve."""
+    line = LinearStiffnessCurve(
+        gradient=PUBLISHED_LINE.gradient,
+        intercept=PUBLISHED_LINE.intercept,
+        name="short",
+        lower=0.9,
+        upper=1.06,
+    )
+    found = calibrate_static(line, particle_count=20_000)
+    assert [alternative.name.split()[0] for alternative in found.alternatives] == ["prior", "density"]
+    assert len(residual_figure(found).axes) == 2
+    assert len(calibrate_static(particle_count=20_000).alternatives) == 3
 
 
 def test_alternatives_stay_near(result):

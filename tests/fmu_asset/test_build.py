@@ -57,6 +57,30 @@ def test_other_content_gives_another_guid_and_other_names(
     assert not shared
 
 
+def test_a_note_and_a_further_file(model: ReducedModel, fmu: Path, tmp_path: Path) -> None:
+    note, content = 'Calibrated for "Wing <7> & é".', b'{"asset": "Wing <7>"}\n'
+    made = [
+        build_fmu(model, tmp_path / name, note=note, resources={"calibration.json": content}).path
+        for name in ("one.fmu", "two.fmu")
+    ]
+    assert made[0].read_bytes() == made[1].read_bytes()
+    assert validate_fmu(str(made[0])) == []
+    assert check_fmu(made[0]).passed
+    described = read_model_description(str(made[0]))
+    assert described.description.endswith(note)
+    assert described.guid != read_model_description(str(fmu)).guid
+    with zipfile.ZipFile(made[0]) as archive:
+        assert archive.read("resources/calibration.json") == content
+        page = archive.read("documentation/index.html").decode()
+    assert "Wing &lt;7&gt; &amp; é" in page
+    declared, actual = recorded_content_hash(made[0])
+    assert declared == actual
+    for name in ("start.json", "a/b.json", ""):
+        with pytest.raises(FmuBuildError, match="cannot have the name"):
+            build_fmu(model, tmp_path / "three.fmu", resources={name: content})
+    assert not (tmp_path / "three.fmu").exists()
+
+
 def test_fmpy_finds_nothing_to_complain_of(fmu: Path) -> None:
     assert validate_fmu(str(fmu)) == []
     done = subprocess.run([BIN / "fmpy", "validate", fmu], capture_output=True, text=True, check=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from calibration.result import CalibrationResult
 from fe.cache import reduced_model
 from fe.reduced import ReducedModel
+from reporting.progress import SilentProgress
 from scenarios import scenario_files
 from twin_master import workflow
 from twin_master.asset_source import ReducedModelSource, StrainLibrarySource
@@ -95,6 +98,26 @@ def test_without_the_library_one_sentence_says_where_to_get_it(
 
 def resolved(library: Path, path: Path | str = "model_mismatch") -> Scenario:
     return resolve_scenario(load_scenario(path), Overrides(strain_library=library))
+
+
+def test_the_twin_may_believe_a_calibrated_wing(
+    library_file: Path, tmp_path: Path, make_calibration: Callable[..., CalibrationResult]
+) -> None:
+    file = make_calibration().save(tmp_path / "wing.nc")
+    overrides = Overrides(strain_library=library_file, calibration=file)
+    scenario = resolve_scenario(load_scenario("model_mismatch"), overrides)
+    source = asset_source(scenario)
+    source.check()
+    assert source.origin.differ
+    assert sorted(source.files()) == ["asset/UAVconfig.json", "asset/calibration.nc"]
+    (tmp_path / "run" / "asset").mkdir(parents=True)
+    hashes = source.prepare(tmp_path / "run", SilentProgress())
+    assert {"strain_library", "calibration", "design"} <= {*hashes}
+    assert hashes["design"] == CalibrationResult.load(file).design_hash
+    found = source.draws(3)
+    assert found.mean == CalibrationResult.load(file).mean("young_modulus_factor")
+    with pytest.raises(MissionInputError, match="brings its own samples"):
+        resolve_scenario(load_scenario("level_turns"), overrides)
 
 
 def test_the_option_names_the_file_and_keeps_the_model(library_file: Path, tmp_path: Path) -> None:

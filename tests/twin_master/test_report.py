@@ -5,6 +5,7 @@ import importlib.util
 import json
 import os
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +16,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.testing import assert_allclose, assert_array_equal
 
+from calibration.result import CalibrationResult
 from reporting.errors import DiskFullError
 from reporting.figures import to_svg
+from twin_master.calibrated_asset import run_record
 from twin_master.errors import RunFolderError
 from twin_master.report import belief as report_belief
 from twin_master.report import calibration as report_calibration
@@ -35,6 +38,7 @@ from twin_master.report.text import (
     turn_ranges,
 )
 from twin_master.report.view import choose_sensors, default_now
+from twin_master.run_folder import to_json
 
 # The tests are no package, so the generator beside this file is loaded by its path.
 _specification = importlib.util.spec_from_file_location(
@@ -336,6 +340,42 @@ def test_calibration_shows_draws_posterior_and_measurements(
         assert report_calibration.calibration_view(replace(record, calibration=broken)) is not None
     fixed = replace(record, parameter_draws=np.ones(5))
     assert report_calibration.calibration_figure(report_calibration.calibration_view(fixed)).axes
+
+
+def test_a_calibration_file_shows_its_wing(
+    record: report_data.RunRecord, make_calibration: Callable[..., CalibrationResult]
+) -> None:
+    wing = make_calibration(young_modulus_factor=1.05)
+    kept = json.loads(to_json(run_record(wing, "young_modulus_factor")))
+    draws = wing.draws_of("young_modulus_factor")
+    asset = {"design": "calibration", "file": None, "parameters": {}}
+    flown = replace(
+        record,
+        parameter_name="young_modulus_factor",
+        parameter_draws=draws,
+        calibration=kept,
+        config={**record.config, "scenario": {**record.scenario, "asset": asset}},
+    )
+    view = report_calibration.calibration_view(flown)
+    assert view is not None
+    assert view.true_value == wing.mean("young_modulus_factor")  # the FMU starts at the mean
+    assert [figure.unit for figure in view.figures][:6] == ["1", "kg", "kg", "1/s", "s", "N/m"]
+    servo = view.figures[1]
+    assert (servo.mean, servo.standard_deviation) == pytest.approx(
+        (wing.mean("servo_mass"), wing.standard_deviation("servo_mass"))
+    )
+    figures = {figure.name: figure for figure in report.report_figures(flown, 0)}
+    page = report.render_page(
+        flown, figures, {name: to_svg(figure.figure) for name, figure in figures.items()}
+    )
+    assert "The calibrated wing: Wing 7 (é)" in page
+    assert "the model of another wing" not in page
+    asset = asset | {"parameters": {"young_modulus_factor": 1.0}}
+    other = replace(flown, config={"scenario": {**flown.scenario, "asset": asset}})
+    away = report_calibration.calibration_view(other)
+    assert away is not None
+    assert report_calibration.departure(away) == pytest.approx(abs(1.0 - draws.mean()) / draws.std())
+    assert "the model of another wing" in report.render_page(other, {}, {})
 
 
 def test_network_has_the_dependences_of_the_factors() -> None:

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from twin_master.errors import (
 from twin_master.resolution import Overrides, resolve_scenario
 from twin_master.run_folder import lock_run_folder
 from twin_master.scenario_file import load_scenario
+from twin_master.twin import build_graphical_model
 from twin_master.workflow import new_run, resume_run
 
 ROOT = Path(__file__).parents[2]
@@ -92,6 +94,23 @@ def test_run_folder(tmp_path: Path, library_file: Path) -> None:
     assert row == "36" + 24 * ","
     assert "seconds" not in (folder / "summary.json").read_text(encoding="utf-8")
     assert json.loads((folder / "timing.json").read_text(encoding="utf-8"))["turns"] == 50
+
+
+def test_the_field_of_a_belief_that_rounds_beyond_the_last_level() -> None:
+    """A mean of 0.8000000000000003 lies outside every model that ends at 0.8."""
+    scenario = load_scenario("level_turns").scenario
+    model = build_graphical_model(scenario)
+    last = model.states.coordinates[:, 0] == 0.8
+    generator = np.random.default_rng(1)
+    beliefs = (np.where(last, generator.random(len(last)), 0.0) for _ in range(1000))
+    belief = next(b for b in (b / b.sum() for b in beliefs) if model.states.mean(b)[0] > 0.8)
+    seen: dict[str, float] = {}
+    source = SimpleNamespace(write_field=lambda path, state, control: seen.update(state))
+    flight = SimpleNamespace(filtered=belief[np.newaxis], control_index=np.array([0]))
+    knowledge = SimpleNamespace(scenario=scenario, model=model)
+    workflow._field_writer(knowledge, source, SimpleNamespace(flight=flight))(Path("wing.vtu"))  # type: ignore[arg-type]
+    assert seen["z1"] == 0.8
+    assert 0.0 < seen["z2"] < 0.8
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_mission(

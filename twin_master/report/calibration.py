@@ -4,18 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from calibration.result import QUANTITIES, STATE
 from reporting import figures as style
 from twin_master.report.data import RunRecord
 from twin_master.report.text import number
 
 Float = NDArray[np.floating[Any]]
+
+
+class CalibratedFigure(NamedTuple):
+    """One figure of a calibrated wing: what it is, unit (SI), mean, standard deviation, 95 % interval."""
+
+    title: str
+    unit: str
+    mean: float
+    standard_deviation: float
+    interval: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -36,6 +47,10 @@ class CalibrationView:
         Measurements that it was calibrated with.
     stiffness : (mean, standard deviation) N/m or None
         Posterior of the tip stiffness.
+    wing : str
+        Name of the wing, from its calibration file.
+    figures : tuple of CalibratedFigure
+        All that its calibration file gives of it.
     """
 
     parameter: str
@@ -45,6 +60,8 @@ class CalibrationView:
     posterior: tuple[Float, Float] | None
     pairs: tuple[Float, Float] | None
     stiffness: tuple[float, float] | None
+    wing: str = ""
+    figures: tuple[CalibratedFigure, ...] = ()
 
 
 def calibration_view(record: RunRecord) -> CalibrationView | None:
@@ -54,9 +71,14 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
         return None
     kept = record.calibration
     asset = record.scenario.get("asset")
-    parameters = asset.get("parameters") if isinstance(asset, Mapping) else None
+    asset = asset if isinstance(asset, Mapping) else {}
+    parameters = asset.get("parameters")
     true_value = parameters.get(record.parameter_name) if isinstance(parameters, Mapping) else None
-    exact, data = _table(kept, "exact"), _table(kept, "data")
+    if true_value is None and asset.get("design") == "calibration" and not asset.get("file"):
+        # the FMU packed from the calibration starts at its mean
+        true_value = _table(_table(kept, "state"), record.parameter_name).get("mean")
+    exact = _table(kept, "exact") or _table(kept, "posterior")
+    data = _table(kept, "data")
     return CalibrationView(
         parameter=record.parameter_name,
         draws=draws,
@@ -64,8 +86,39 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
         prior=_moments(_table(kept, "prior")),
         posterior=_arrays(exact, "grid", "density"),
         pairs=_arrays(data, "load_N", "displacement_m"),
-        stiffness=_moments(_table(kept, "tip_stiffness_exact")),
+        stiffness=_moments(_table(kept, "tip_stiffness_exact") or _table(kept, "tip_stiffness")),
+        wing=str(kept.get("asset") or ""),
+        figures=tuple(
+            figure
+            for group, columns in (("state", STATE), ("quantities", QUANTITIES))
+            for column in columns
+            if (figure := _figure(_table(kept, group).get(column.name))) is not None
+        ),
     )
+
+
+def _figure(entry: object) -> CalibratedFigure | None:
+    if not isinstance(entry, Mapping):
+        return None
+    try:
+        low, high = (float(end) for end in entry["interval_95"])
+        return CalibratedFigure(
+            str(entry["title"]),
+            str(entry["unit"]),
+            float(entry["mean"]),
+            float(entry["standard_deviation"]),
+            (low, high),
+        )
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def departure(view: CalibrationView) -> float | None:
+    """Return by how many standard deviations of the draws the true value lies off; None if unknown."""
+    spread = float(view.draws.std())
+    if view.true_value is None or spread <= 0.0:
+        return None
+    return abs(view.true_value - float(view.draws.mean())) / spread
 
 
 def _table(record: Mapping[str, Any], key: str) -> Mapping[str, Any]:

@@ -15,7 +15,13 @@ from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.page import Column, Page, Table
 from twin_master.errors import RunFolderError
 from twin_master.report.belief import belief_figure, policy_figure
-from twin_master.report.calibration import calibration_caption, calibration_figure, calibration_view
+from twin_master.report.calibration import (
+    CalibrationView,
+    calibration_caption,
+    calibration_figure,
+    calibration_view,
+    departure,
+)
 from twin_master.report.check import check_figure, predictive_check
 from twin_master.report.data import RunRecord
 from twin_master.report.mission import mission_figure
@@ -35,6 +41,8 @@ from twin_master.report.view import choose_sensors, default_now, sensor_word
 
 REPORT_NAME = "report.html"
 FIGURE_FOLDER = "figures"
+TRUTH_IS_OFF = 3.0
+"""Standard deviations of the calibration beyond which a true parameter is pointed out."""
 MAIN_FIGURE = "mission_now"
 """The figure that is also written as PNG."""
 
@@ -168,6 +176,8 @@ def render_page(record: RunRecord, figures: Mapping[str, ReportFigure], drawings
             page.add_section(title)
         for figure in present:
             page.add_figure(drawings[figure.name], figure.caption, title=figure.title)
+            if figure.name == "calibration":
+                _add_calibrated_wing(page, calibration_view(record))
     page.add_section("The run")
     _add_run(page, record)
     return page.render()
@@ -232,6 +242,34 @@ def _highlights(record: RunRecord) -> list[tuple[str, str]]:
     return items
 
 
+def _add_calibrated_wing(page: Page, view: CalibrationView | None) -> None:
+    """Add what the calibration file says of the wing, where the run flew with one."""
+    if view is None or not view.figures:
+        return
+    rows = [
+        (
+            figure.title,
+            number(figure.mean),
+            number(figure.standard_deviation),
+            " to ".join(number(end) for end in figure.interval),
+            "" if figure.unit == "1" else figure.unit,
+        )
+        for figure in view.figures
+    ]
+    columns = (
+        Column("figure"),
+        Column("mean", numeric=True),
+        Column("standard deviation", numeric=True),
+        Column("95 % interval", numeric=True),
+        Column("unit"),
+    )
+    page.add_table(
+        Table(columns, rows),
+        "From the samples of the calibration file, of the healthy wing.",
+        title=f"The calibrated wing: {view.wing}",
+    )
+
+
 def _notices(record: RunRecord) -> list[str]:
     """Return what a reader must not miss: another model, lost observations."""
     notices = _loss_notices(record)
@@ -248,11 +286,19 @@ def _notices(record: RunRecord) -> list[str]:
 def _loss_notices(record: RunRecord) -> list[str]:
     if record.observation is None:
         return ["The run holds no observations, so the figures show the twin's beliefs only."]
+    view = calibration_view(record)
+    notices = []
+    if view is not None and (off := departure(view)) is not None and off > TRUTH_IS_OFF:
+        notices.append(
+            f"The asset flown has a {view.parameter.replace('_', ' ')} of {number(view.true_value)}, "
+            f"{off:.1f} standard deviations from what the twin was calibrated with: it flies with the model "
+            "of another wing."
+        )
     lost = np.isnan(record.observation)
     if not lost.any():
-        return []
+        return notices
     word = sensor_word(record).lower()
-    notices = [f"Observations lost ({100.0 * lost.mean():.1f} %): {lost_ranges(record)}."]
+    notices += [f"Observations lost ({100.0 * lost.mean():.1f} %): {lost_ranges(record)}."]
     blind = np.flatnonzero(lost.all(axis=1))
     if len(blind):
         notices.append(

@@ -1,0 +1,527 @@
+"""`uav-twin calibrate` as a whole, and what comes after it: files, FMUs and flights of two wings."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import json
+import os
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from fmpy import read_model_description
+from fmpy.validation import validate_fmu
+
+from calibration.geometry import published_lengths
+from calibration.joint import WeighedMass
+from calibration.laboratory import write_lab_folder
+from calibration.result import STATE, CalibrationResult
+from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down
+from fe.cache import reduced_model
+from fe.design import SHIPPED_DESIGN, load_design
+from fe.reduced import ReducedModel
+from fe.state import DigitalState
+from fmu_asset.session import FmiAsset
+from scenarios import scenario_files
+from twin_master import workflow
+from twin_master.checkpoint import Checkpoint
+from twin_master.errors import NotResumableError
+from twin_master.workflow import resume_run
+from uav_twin import cli
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
+
+TRUTHS = {
+    "soft": DigitalState(
+        young_modulus_factor=0.97, servo_mass=0.160, pitot_mass=0.150, damping_alpha=0.8, damping_beta=6.0e-4
+    ),
+    "stiff": DigitalState(
+        young_modulus_factor=1.04, servo_mass=0.180, pitot_mass=0.110, damping_alpha=1.4, damping_beta=9.0e-4
+    ),
+}
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
+    """Run the command line in this process and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["uav-twin", *map(str, arguments)])
+    monkeypatch.setenv("COLUMNS", "120")
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    code = caught.value.code
+    return 0 if code is None else int(code)
+
+
+@pytest.fixture(scope="module")
+def wing() -> ReducedModel:
+    """The shipped wing, from the cache if an earlier test or run built it."""
+    return reduced_model()
+
+
+@dataclass(frozen=True)
+class Tailored:
+    """One virtual wing: its truth, its laboratory folder and where its calibration was left."""
+
+    truth: DigitalState
+    lab: Path
+    out: Path
+    result: CalibrationResult
+    said: str
+
+
+@pytest.fixture(scope="module")
+def wings(wing: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Tailored]:
+    """Two wings of the published planform, measured with errors and calibrated by the command."""
+    made = {}
+    for number, (name, truth) in enumerate(TRUTHS.items()):
+        folder = tmp_path_factory.mktemp(name)
+        bench = VirtualWing(wing, truth)
+        write_lab_folder(
+            folder / "lab",
+            lengths=published_lengths(),
+            load_test=measure_load_test(bench, number),
+            records=measure_ring_down(bench, number, trials=3, noise=2e-5),
+            total_mass=WeighedMass(2.0 * truth.servo_mass + truth.pitot_mass, 1e-3),
+        )
+        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as said:
+            places = ["--data", folder / "lab", "--out", folder / "out"]
+            code = call(patch, "calibrate", *places, "--asset", name, "--fitted")
+        assert code == 0
+        result = CalibrationResult.load(folder / "out" / "calibration.nc")
+        made[name] = Tailored(truth, folder / "lab", folder / "out", result, said.getvalue())
+    return made
+
+
+def test_the_truth_lies_in_the_posterior(wings: dict[str, Tailored], wing: ReducedModel) -> None:
+    for name, made in wings.items():
+        assert made.result.asset == name
+        assert made.result.design_hash == wing.design_hash  # published lengths: nothing was built anew
+        for entry in STATE:
+            off = made.result.mean(entry.name) - getattr(made.truth, entry.name)
+            assert abs(off) < 4.0 * made.result.standard_deviation(entry.name), (name, entry.name)
+        mass = 2.0 * made.result.samples[:, 1] + made.result.samples[:, 2]
+        weighed = 2.0 * made.truth.servo_mass + made.truth.pitot_mass
+        np.testing.assert_allclose(mass, weighed, atol=6e-3)
+    soft, stiff = wings["soft"].result, wings["stiff"].result
+    assert stiff.mean("young_modulus_factor") - soft.mean("young_modulus_factor") > 0.03
+    assert stiff.mean("tip_stiffness") > soft.mean("tip_stiffness")
+    assert stiff.mean("damping_ratio_2") > soft.mean("damping_ratio_2")
+
+
+def test_what_a_calibration_leaves_and_says(wings: dict[str, Tailored]) -> None:
+    made = wings["soft"]
+    names = {path.relative_to(made.out).as_posix() for path in made.out.rglob("*") if path.is_file()}
+    figures = ("load_test", "masses", "modes", "posterior", "quantities", "residuals", "ring_down")
+    assert names == {
+        "calibration.nc", "report.html", "table_1.csv", "wing.vtu", "modes.vtu",
+        *(f"figures/{name}.{kind}" for name in figures for kind in ("svg", "png")),
+    }  # fmt: skip
+    page = (made.out / "report.html").read_text(encoding="utf-8")
+    assert "Calibration of soft" in page
+    assert "What disagrees with the data" in page
+    assert "http" not in page.replace("http://www.w3.org", "")  # nothing is fetched
+    assert str(made.out) not in page
+    for word in (
+        "Step 1: step1/geometry_data.csv read",
+        "8 pairs",
+        "initialconditiondata_1.DAT to",
+        "Report:",
+    ):
+        assert word in made.said
+    assert [step.number for step in made.result.steps] == [1, 2, 3, 3]
+    for step in made.result.steps:
+        assert step.reward.posterior_error is not None
+        assert 0.0 < step.reward.uncertainty_reduction < 1.0
+    joint, paper = made.result.steps[2:]
+    assert joint.reward.information_gain is not None
+    assert joint.reward.information_gain > 0.0
+    assert paper.reward.information_gain is None
+
+
+def test_a_calibration_repeats_to_the_byte_and_another_wing_is_not_overwritten(
+    wings: dict[str, Tailored],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    made = wings["soft"]
+    arguments = ["calibrate", "--data", made.lab, "--asset", "soft", "--fitted"]
+    assert call(monkeypatch, *arguments, "--out", tmp_path) == 0
+    for name in ("calibration.nc", "report.html", "table_1.csv", "figures/posterior.svg"):
+        assert (tmp_path / name).read_bytes() == (made.out / name).read_bytes(), name
+    before = (tmp_path / "calibration.nc").read_bytes()
+    capsys.readouterr()
+    assert call(monkeypatch, "calibrate", "--out", tmp_path, "--asset", "other") == 1
+    assert "is the calibration of soft, not of other: choose another --out" in capsys.readouterr().err
+    assert (tmp_path / "calibration.nc").read_bytes() == before
+
+
+def test_two_wings_are_two_fmus(
+    wings: dict[str, Tailored], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    strain, tip, guid = {}, {}, {}
+    for name, made in wings.items():
+        fmus = [tmp_path / f"{name}{copy}.fmu" for copy in (1, 2)]
+        for fmu in fmus:
+            arguments = ["fmu", "build", "--calibration", made.out / "calibration.nc", "--out", fmu]
+            assert call(monkeypatch, *arguments) == 0
+        assert fmus[0].read_bytes() == fmus[1].read_bytes()
+        assert validate_fmu(str(fmus[0])) == []
+        assert call(monkeypatch, "fmu", "check", fmus[0]) == 0
+        described = read_model_description(str(fmus[0]))
+        guid[name] = described.guid
+        assert f"Calibrated for the wing '{name}'" in described.description
+        start = {variable.name: variable.start for variable in described.modelVariables}
+        for variable, entry in (
+            ("young_modulus_factor", "young_modulus_factor"),
+            ("mass.servo", "servo_mass"),
+            ("mass.pitot", "pitot_mass"),
+            ("damping.alpha", "damping_alpha"),
+            ("damping.beta", "damping_beta"),
+        ):
+            assert float(start[variable]) == made.result.mean(entry)
+        shutil.unpack_archive(fmus[0], tmp_path / name, "zip")
+        record = json.loads((tmp_path / name / "resources" / "calibration.json").read_text(encoding="utf-8"))
+        assert record["asset"] == name
+        assert record["state"]["servo_mass"]["standard_deviation"] == pytest.approx(
+            made.result.standard_deviation("servo_mass")
+        )
+        with FmiAsset(fmus[0], "scenarios/bindings/uav_wing.toml", isolated=False) as asset:
+            seen = asset.step({"load_factor": 3.0}, {"z1": 0.0, "z2": 0.0})
+        strain[name], tip[name] = seen.values, seen.extra["tip_displacement"]
+    assert guid["soft"] != guid["stiff"]
+    ratio = strain["soft"] / strain["stiff"]
+    assert np.all(ratio > 1.0)
+    assert tip["soft"] > tip["stiff"]
+    calibrated = wings["stiff"].result.mean("young_modulus_factor")
+    assert 1.0 < np.median(ratio) < calibrated / wings["soft"].result.mean("young_modulus_factor") * 1.01
+
+
+@pytest.fixture
+def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("twin_master.workflow._report", lambda folder: folder / "report.html")
+
+
+@pytest.mark.usefixtures("no_report")
+def test_two_wings_are_two_flights(
+    wings: dict[str, Tailored], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a truth of its own in the scenario, each wing is flown as it was calibrated."""
+    text = scenario_files()["level_turns"].read_text(encoding="utf-8")
+    scenario = tmp_path / "mine.toml"
+    text = re.sub(r"(?m)^parameters = .*$", "", text)
+    scenario.write_text(re.sub(r"(?m)^steps = .*$", "steps = 3", text), encoding="utf-8")
+    predicted, true = {}, {}
+    for name, made in wings.items():
+        out = tmp_path / name
+        file = made.out / "calibration.nc"
+        assert call(monkeypatch, "run", scenario, "--calibration", file, "--out", out, "-q") == 0
+        assert (out / "asset" / "calibration.nc").read_bytes() == file.read_bytes()
+        config = json.loads((out / "config.json").read_text(encoding="utf-8"))
+        assert config["inputs"]["design"] == made.result.design_hash
+        assert "calibration" in config["inputs"]
+        assert str(tmp_path) not in json.dumps(config)
+        with xr.open_datatree(out / "run.nc", engine="h5netcdf") as tree:
+            tree.load()
+        draws = tree["calibration"]["draw_value"].values
+        assert set(draws.tolist()) <= set(made.result.draws_of("young_modulus_factor").tolist())
+        predicted[name] = tree["predicted"]["quantity_mean"].values[0, 0]
+        width = tree["filtered"]["quantity_upper"].values[0] - tree["filtered"]["quantity_lower"].values[0]
+        assert np.all(width > 0.0)  # the samples' uncertainty is in the bands
+        true[name] = tree["truth"]["strain"].values[0]
+        figures = json.loads((out / "summary.json").read_text(encoding="utf-8"))["figures"]
+        shown = {figure["key"]: figure["value"] for figure in figures}
+        assert shown["young_modulus_factor_mean"] == pytest.approx(made.result.mean("young_modulus_factor"))
+    assert np.all(predicted["soft"] > predicted["stiff"])
+    assert np.all(true["soft"] > true["stiff"])
+
+
+@pytest.mark.usefixtures("no_report")
+def test_the_truth_of_the_scenario_stays_and_is_told(
+    wings: dict[str, Tailored],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    true = {}
+    for name, made in wings.items():
+        file, out = made.out / "calibration.nc", tmp_path / name
+        assert call(monkeypatch, "run", "level_turns", "--calibration", file, "--out", out) == 0
+        error = capsys.readouterr().err.replace("\n", " ")
+        off = abs(1.0073 - made.result.mean("young_modulus_factor"))
+        far = off > 3.0 * made.result.standard_deviation("young_modulus_factor")
+        assert ("true young_modulus_factor is 1.0073, but the calibration says" in error) == far
+        assert far or name == "stiff"  # at least the soft wing is another one
+        with xr.open_datatree(out / "run.nc", engine="h5netcdf") as tree:
+            true[name] = tree["truth"]["strain"].values[0].copy()
+    np.testing.assert_array_equal(true["soft"], true["stiff"])
+
+
+@pytest.mark.usefixtures("no_report")
+def test_a_run_with_a_calibration_needs_nothing_but_its_folder(
+    wings: dict[str, Tailored], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "elsewhere" / "wing.nc"
+    file.parent.mkdir()
+    shutil.copy(wings["soft"].out / "calibration.nc", file)
+    assert (
+        call(monkeypatch, "run", "level_turns", "--calibration", file, "--out", tmp_path / "whole", "-q") == 0
+    )
+    write = workflow.write_checkpoint
+
+    def dying(folder: Path, checkpoint: Checkpoint) -> None:
+        write(folder, checkpoint)
+        if checkpoint.turns == 7:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(workflow, "write_checkpoint", dying)
+        arguments = ["run", "level_turns", "--calibration", file, "--out", tmp_path / "part", "-q"]
+        assert call(patch, *arguments) == 130
+    shutil.rmtree(file.parent)
+    moved = (tmp_path / "part").rename(tmp_path / "moved")
+    assert call(monkeypatch, "run", "--resume", moved, "-q") == 0
+    for name in ("run.nc", "config.json", "summary.json", "calibration.json", "asset/asset.fmu", "wing.vtu"):
+        assert (moved / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    copy = moved / "asset" / "calibration.nc"
+    copy.write_bytes((wings["stiff"].out / "calibration.nc").read_bytes())
+    with pytest.raises(NotResumableError, match=r"calibration.* changed since the run"):
+        resume_run(moved)
+
+
+# ---------------------------------------------------------------------------- parts of a folder
+
+
+def test_missing_steps_are_told_and_taken_as_published(
+    wings: dict[str, Tailored],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    shutil.copytree(wings["soft"].lab / "step2", tmp_path / "lab" / "step2")
+    assert call(monkeypatch, "calibrate", "--data", tmp_path / "lab", "--procedure", "paper") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "Step 1: not measured; published lengths (Kapteyn et al. 2021, Table 1)."
+    assert lines[1] == "Step 2: step2/load_displacement_measurements.csv read, 8 pairs."
+    assert lines[2].startswith("Step 3: published frequencies and damping ratios")
+    assert lines[3] == "UAV wing, paper, 100 samples"
+    assert "Nothing was written" in lines[-1]
+
+
+def test_a_full_disk_leaves_nothing(
+    wings: dict[str, Tailored],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lab = tmp_path / "lab"
+    shutil.copytree(wings["stiff"].lab / "step2", lab / "step2")
+    replace, count = Path.replace, 0
+
+    def full(self: Path, target: Path) -> Path:
+        nonlocal count
+        count += 1
+        if count > 10:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", full)
+    assert call(monkeypatch, "calibrate", "--data", lab, "--out", tmp_path / "out") == 1
+    assert "No space is left on the disk" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["lab"]
+
+
+def test_records_may_be_left_aside(
+    wings: dict[str, Tailored], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        call(monkeypatch, "calibrate", "--data", wings["stiff"].lab, "--published", "--procedure", "paper")
+        == 0
+    )
+    out = capsys.readouterr().out
+    assert "Step 3: records left aside as asked; published" in out
+    assert re.search(r"f1 +5\.649\s", out)
+
+
+def measured_planform(folder: Path, semi_span: float) -> Path:
+    """A laboratory folder with nothing but lengths, semi-span in mm."""
+    file = folder / "lab" / "step1" / "geometry_data.csv"
+    file.parent.mkdir(parents=True)
+    rows = f"length,1828.8,{semi_span}\nchord_{{root}},435.61,433\nchord_{{tip}},261.112,260\n"
+    file.write_text("parameter,designed,manufactured\n" + rows, encoding="utf-8")
+    return folder / "lab"
+
+
+def test_the_model_follows_the_measured_planform(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The tailored wing is shorter and stiffer than the one on the drawing (a coarse mesh, for speed)."""
+    text = SHIPPED_DESIGN.read_text(encoding="utf-8")
+    coarse = tmp_path / "coarse.toml"
+    coarse.write_text(re.sub(r"(?m)^refinement = .*$", "refinement = 0.25", text), encoding="utf-8")
+    out = tmp_path / "out"
+    lab = measured_planform(tmp_path, 1818.0)
+    arguments = ["--data", lab, "--design", coarse, "--out", out, "--asset", "short wing"]
+    assert call(monkeypatch, "calibrate", *arguments) == 0
+    capsys.readouterr()
+    result = CalibrationResult.load(out / "calibration.nc")
+    assert result.design.planform.semi_span == 1.8181  # prior and measurement together, to 0.1 mm
+    assert result.mean_state().geometry.semi_span == 1.8181
+    model = reduced_model(result.design)
+    assert model.design_hash == result.design_hash
+    (stiffness,) = result.step(2).quantities
+    assert stiffness.prior_mean == pytest.approx(model.tip_stiffness(1.0), rel=1e-3)
+    # against the wing as drawn, by the beam's k ~ 1 / L^3
+    shipped = reduced_model(load_design(coarse))
+    expected = shipped.tip_stiffness(1.0) * (1.828 / 1.8181) ** 3
+    assert model.tip_stiffness(1.0) == pytest.approx(expected, rel=5e-3)
+
+
+def test_a_design_that_the_measured_planform_spoils_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = SHIPPED_DESIGN.read_text(encoding="utf-8")
+    design = tmp_path / "design.toml"
+    last = text.rindex("span_end = ")
+    changed = text[:last] + re.sub(r"^span_end = .*", "span_end = 1.825", text[last:])
+    design.write_text(changed, encoding="utf-8")
+    lab = measured_planform(tmp_path, 1815.0)
+    arguments = ["--data", lab, "--design", design, "--out", tmp_path / "out"]
+    assert call(monkeypatch, "calibrate", *arguments) == 1
+    error = capsys.readouterr().err
+    assert "defects[1] ends 1.825 m from the root, off the wing of 1.8151 m" in error
+    assert not (tmp_path / "out").exists()
+
+
+# ---------------------------------------------------------------------------- what is refused
+
+
+def spoil(kind: str, lab: Path) -> None:
+    """Make a laboratory folder wrong in one way."""
+    lengths = lab / "step1" / "geometry_data.csv"
+    pairs = lab / "step2" / "load_displacement_measurements.csv"
+    record = lab / "step3" / "initialconditiondata_1.DAT"
+    table = np.loadtxt(record)
+    time, signal = table[:, 0], table[:, 1]
+
+    def edit(file: Path, change: Callable[[str], str]) -> None:
+        text = file.read_text(encoding="utf-8")
+        assert change(text) != text
+        file.write_text(change(text), encoding="utf-8")
+
+    def rewrite(values: np.ndarray) -> None:  # type: ignore[type-arg]
+        np.savetxt(record, np.column_stack([time, values, 0.0 * time]), fmt="%.9e")
+
+    if kind == "renamed column":
+        edit(pairs, lambda text: text.replace("load,", "force,"))
+    elif kind == "missing column of lengths":
+        edit(lengths, lambda text: text.replace("manufactured", "built"))
+    elif kind == "load in kgf":
+        rows = [line.split(",") for line in pairs.read_text(encoding="utf-8").splitlines()[1:]]
+        text = "\n".join(f"{float(load) / 9.80665},{displacement}" for load, displacement in rows)
+        pairs.write_text(f"load,displacement\n{text}\n", encoding="utf-8")
+    elif kind == "lengths in m":
+        edit(lengths, lambda text: text.replace("1828.8,1828", "1.8288,1.828"))
+    elif kind == "lost value":
+        edit(pairs, lambda text: text.replace(text.splitlines()[3], "nan,7.3"))
+    elif kind == "empty pairs":
+        pairs.write_text("", encoding="utf-8")
+    elif kind == "empty record":
+        record.write_text("", encoding="utf-8")
+    elif kind == "record that does not decay":
+        rewrite(0.01 * np.cos(2 * np.pi * 5.65 * time) + 0.003 * np.cos(2 * np.pi * 29.9 * time))
+    elif kind == "clipped record":
+        rewrite(np.clip(signal, -0.3 * np.abs(signal).max(), 0.3 * np.abs(signal).max()))
+    elif kind == "one mode":
+        rewrite(0.01 * np.exp(-0.9 * time) * np.cos(2 * np.pi * 5.65 * time))
+    elif kind == "record with a gap":
+        signal[200] = np.nan
+        rewrite(signal)
+    elif kind == "masses that cannot be":
+        (lab / "step3" / "weighed_mass.csv").write_text("mass,standard_deviation\n950,1\n", encoding="utf-8")
+    elif kind == "no step":
+        for step in (1, 2, 3):
+            shutil.rmtree(lab / f"step{step}")
+    elif kind == "renamed file":
+        pairs.rename(pairs.with_name("pairs.csv"))
+    elif kind == "a file":
+        shutil.rmtree(lab)
+        lab.write_text("load,displacement\n", encoding="utf-8")
+
+
+SENTENCES = {
+    "renamed column": "lacks the column load",
+    "missing column of lengths": "lacks the column manufactured",
+    "load in kgf": "looks like kgf: give it in N",
+    "lengths in m": "looks like m: give it in mm",
+    "lost value": "is 'nan', but a positive finite number is needed",
+    "empty pairs": "is empty",
+    "empty record": "is empty",
+    "record that does not decay": "decay",
+    "clipped record": "clipped",
+    "one mode": "two spectral peaks are needed",
+    "record with a gap": "must not hold lost values",
+    "masses that cannot be": "cannot weigh 0.95 kg",
+    "no step": "holds none of the folders step1, step2 and step3",
+    "renamed file": "does not hold step2/load_displacement_measurements.csv",
+    "a file": "is no folder",
+}
+
+
+@pytest.mark.parametrize("kind", sorted(SENTENCES))
+def test_a_wrong_folder_is_one_sentence_and_leaves_nothing(
+    kind: str,
+    wings: dict[str, Tailored],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lab, out = tmp_path / "lab", tmp_path / "out"
+    shutil.copytree(wings["soft"].lab, lab)
+    spoil(kind, lab)
+    assert call(monkeypatch, "calibrate", "--data", lab, "--out", out) == 1
+    error = capsys.readouterr().err
+    last = [line for line in error.splitlines() if line.strip()][-1]
+    assert SENTENCES[kind] in last
+    assert "Traceback" not in error
+    assert not out.exists()
+
+
+def test_other_refusals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "lab" / "step1").mkdir(parents=True)
+    (tmp_path / "a file").write_text("x", encoding="utf-8")
+    for arguments, word, code in (
+        (["--data", tmp_path / "nowhere"], "is not there; give the folder", 1),
+        (["--data", tmp_path / "lab"], "does not hold step1/geometry_data.csv", 1),
+        (["--out", tmp_path / "a file"], "exists and is no folder", 1),
+        (["--asset", "a\nb"], "printable characters", 1),
+        (["--measured"], "--measured needs --data", 2),
+        (["--procedure", "other"], "other", 2),
+        (["--seed", "1", "geometry"], "options go behind the command", 2),
+        (["--data", tmp_path, "static"], "options go behind the command", 2),
+    ):
+        assert call(monkeypatch, "calibrate", *arguments) == code, arguments
+        error = capsys.readouterr().err
+        assert word in " ".join(error.replace("│", " ").split()), error
+        assert "Traceback" not in error
+    assert call(monkeypatch, "fmu", "build", "--calibration", "x.nc", "--design", "y.toml") == 2
+    assert (
+        call(monkeypatch, "fmu", "build", "--calibration", tmp_path / "x.nc", "--out", tmp_path / "x.fmu")
+        == 1
+    )
+    assert (
+        call(monkeypatch, "run", "level_turns", "--calibration", tmp_path / "a file", "--out", tmp_path / "r")
+        == 1
+    )
+    assert "cannot be read as NetCDF" in capsys.readouterr().err
+    assert not (tmp_path / "x.fmu").exists()
+    assert not (tmp_path / "r").exists()

@@ -1,0 +1,139 @@
+"""`uav-twin calibrate`: all three steps in order, from the lab folder to the file of a tailored twin."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from calibration.wing_calibration import WingCalibration
+
+
+class ProcedureName(StrEnum):
+    """Whose samples are kept."""
+
+    joint = "joint"
+    paper = "paper"
+
+
+def calibrate_wing(
+    context: typer.Context,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="Lab folder with step1, step2, step3, or some of them; published figures otherwise."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for calibration.nc, report, table and figures.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all samples.")] = 0,
+    asset: Annotated[
+        str | None, typer.Option(help="Name of this wing.", show_default="that of the design")
+    ] = None,
+    procedure: Annotated[
+        ProcedureName,
+        typer.Option(help="Keep samples of the joint posterior, or of the paper's steps one after another."),
+    ] = ProcedureName.joint,
+    design: Annotated[
+        Path | None, typer.Option(help="The wing as drawn; the shipped design by default.")
+    ] = None,
+    measured: Annotated[
+        bool | None,
+        typer.Option(
+            "--measured/--published",
+            help="Aim step 3 at the ring-down records of --data or at the published figures.",
+            show_default="measured where there are records",
+        ),
+    ] = None,
+    fitted: Annotated[
+        bool,
+        typer.Option("--fitted", help="Fit the frequencies of the records too; spectral peaks by default."),
+    ] = False,
+) -> None:
+    """Tailor the model to one wing: planform, stiffness, masses and damping, in this order.
+
+    With a sub-command, one step alone.
+    """
+    given = (data, out, asset, design, measured)
+    if context.invoked_subcommand is not None:
+        if (
+            any(value is not None for value in given)
+            or seed
+            or fitted
+            or procedure is not ProcedureName.joint
+        ):
+            raise typer.BadParameter(
+                f"options go behind the command: calibrate {context.invoked_subcommand} ..."
+            )
+        return
+    if measured and data is None:
+        raise typer.BadParameter("--measured needs --data with ring-down records.")
+    from calibration.lab_data import Targets, published_data, read_lab_folder
+    from calibration.ringdown import Frequencies
+    from calibration.wing_calibration import calibrate_wing as calibrate
+    from calibration.wing_files import check_folder, write_calibration_folder
+    from fe.design import load_design
+    from reporting.progress import RichProgress
+
+    drawn = load_design(design)
+    name = drawn.name if asset is None else asset
+    if out is not None:
+        check_folder(out, name)
+    targets: Targets | None = None if measured is None else "measured" if measured else "published"
+    frequencies = Frequencies.FITTED if fitted else Frequencies.PEAKS
+    lab = published_data() if data is None else read_lab_folder(data, targets, frequencies)
+    for origin in lab.origins:
+        typer.echo(f"Step {origin.step}: {origin.text}.")
+    progress = RichProgress()
+    calibration = calibrate(lab, drawn, asset=name, procedure=procedure.value, seed=seed, progress=progress)
+    _show(calibration)
+    if out is None:
+        typer.echo("Nothing was written: give --out DIR for calibration.nc and the report.")
+        return
+    paths = write_calibration_folder(calibration, out, progress)
+    typer.echo(f"Calibration: {paths.calibration}")
+    typer.echo(f"Report: {paths.report}")
+
+
+def _show(calibration: WingCalibration) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from calibration.disagreements import disagreements, misses
+    from calibration.table_1 import SHOWN, printed, signed, signed_number, table_1
+
+    result = calibration.result
+    console = Console(highlight=False, markup=False)
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("figure", "this wing", "in the paper", "difference"):
+        table.add_column(heading, no_wrap=True)
+    for row in table_1(calibration):
+        shown = SHOWN[row.name]
+        table.add_row(
+            f"{shown.title}, {shown.unit}" if shown.unit else shown.title,
+            printed(row.name, *row.found),
+            printed(row.name, row.paper.mean, row.paper.standard_deviation),
+            signed(row.name, row.difference),
+        )
+    console.print(f"{result.asset}, {result.procedure}, {len(result.samples)} samples")
+    console.print(table)
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("quantity", "measured", "calibrated model", "off", "unit"):
+        table.add_column(heading, no_wrap=True)
+    for miss in misses(calibration):
+        shown = SHOWN[miss.name]
+        table.add_row(
+            shown.title,
+            printed(miss.name, *miss.measured),
+            printed(miss.name, *miss.model),
+            f"{signed_number(100.0 * miss.relative, 1)} %",
+            shown.unit,
+        )
+    console.print(table)
+    for sentence in disagreements(calibration):
+        console.print(f"- {sentence}", soft_wrap=True)
