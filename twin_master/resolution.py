@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from reporting.provenance import hash_file
@@ -13,15 +13,16 @@ from twin_master.asset_source import (
     DESIGN_COPY,
     FMU_COPY,
     LIBRARY_COPY,
+    SHIPPED_DESIGN_NAME,
+    SSP_COPY,
     AssetSource,
     StrainLibrarySource,
+    component_copies,
 )
 from twin_master.errors import MissionInputError
 from twin_master.scenario import Scenario
 from twin_master.scenario_file import LoadedScenario, parse_scenario
 from twin_master.strain_library import FILE_NAME, load_strain_library
-
-SHIPPED_DESIGN_NAME = "uav_wing"
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,8 @@ class Overrides:
         Fly the library instead of an FMU.
     in_process : bool
         Fly the FMU in this process instead of a worker.
+    ssp : Path or None
+        SSP file to fly in the place of the scenario's asset.
     """
 
     seed: int | None = None
@@ -45,6 +48,7 @@ class Overrides:
     binding: Path | None = None
     strain_library: Path | None = None
     in_process: bool = False
+    ssp: Path | None = None
 
 
 def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
@@ -63,12 +67,22 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
     asset, folder = table["asset"], loaded.path.resolve().parent
     if overrides.strain_library and (overrides.fmu or overrides.binding):
         raise MissionInputError("--strain-library flies no FMU: give either it or --fmu and --binding.")
+    if overrides.ssp and (overrides.strain_library or overrides.fmu):
+        raise MissionInputError("an SSP file is flown as it is: give neither --fmu nor --strain-library.")
+    if overrides.fmu and asset["kind"] == "coupled":
+        raise MissionInputError(
+            "--fmu flies one FMU, and the scenario couples several: change its components."
+        )
     if asset["design"] and asset["design"] != SHIPPED_DESIGN_NAME:
         asset["design"] = str(folder / asset["design"])
     if asset["file"]:
         asset["file"] = str(folder / asset["file"])
     if asset["binding"] and asset["binding"] not in binding_files():
         asset["binding"] = str(folder / asset["binding"])
+    for component, section in zip(asset["component"], loaded.scenario.asset.component, strict=True):
+        component |= {key: str(folder / component[key]) for key in component_copies(section)}
+    if overrides.ssp:
+        asset |= {"kind": "coupled", "file": str(overrides.ssp.resolve()), "component": [], "connection": []}
     if overrides.fmu:
         asset |= {"kind": "fmu", "file": str(overrides.fmu.resolve())}
     if overrides.binding:
@@ -76,6 +90,7 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
     if overrides.strain_library:
         asset |= {"kind": "strain_library", "file": str(_library_file(overrides.strain_library))}
         asset |= {"design": None, "binding": None, "observation_model": None}
+        asset |= {"component": [], "connection": [], "seeds": []}
     if overrides.in_process:
         asset["isolated"] = False
     if overrides.seed is not None:
@@ -89,15 +104,23 @@ def _library_file(path: Path) -> Path:
 
 def portable_scenario(scenario: Scenario) -> Scenario:
     """Return a resolved scenario that names the copies in the run folder, so that it holds on any machine."""
-    library = scenario.asset.kind == "strain_library"
-    copies = {"file": LIBRARY_COPY if library else FMU_COPY, "design": DESIGN_COPY, "binding": BINDING_COPY}
-    return _with_asset(scenario, {key: copies[key] for key in _given_paths(scenario)})
+    file = {"strain_library": LIBRARY_COPY, "coupled": SSP_COPY}.get(scenario.asset.kind, FMU_COPY)
+    copies = {"file": file, "design": DESIGN_COPY, "binding": BINDING_COPY}
+    return _with_asset(
+        scenario,
+        {key: copies[key] for key in _given_paths(scenario)}
+        | {"component": tuple(c.model_copy(update=component_copies(c)) for c in scenario.asset.component)},
+    )
 
 
 def located_scenario(scenario: Scenario, folder: Path) -> Scenario:
     """Return a portable scenario with the paths of the copies in a run folder."""
-    paths = _given_paths(scenario)
-    return _with_asset(scenario, {key: str(folder / PurePosixPath(path)) for key, path in paths.items()})
+    changes: dict[str, Any] = {key: str(folder / path) for key, path in _given_paths(scenario).items()}
+    changes["component"] = tuple(
+        c.model_copy(update={key: str(folder / path) for key, path in component_copies(c).items()})
+        for c in scenario.asset.component
+    )
+    return _with_asset(scenario, changes)
 
 
 def _given_paths(scenario: Scenario) -> dict[str, str]:
@@ -125,10 +148,12 @@ def asset_source(scenario: Scenario) -> AssetSource:
         path = Path(asset.file or "")
         return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)
     from fe.design import SHIPPED_DESIGN
+    from twin_master.coupled_source import CoupledSource
     from twin_master.fmu_source import FmuSource
 
     design = SHIPPED_DESIGN if asset.design == SHIPPED_DESIGN_NAME else asset.design
     binding = binding_files().get(asset.binding or "", Path(asset.binding or ""))
-    return FmuSource(
+    source = CoupledSource if asset.kind == "coupled" else FmuSource
+    return source(
         scenario, binding, Path(design) if design else None, Path(asset.file) if asset.file else None
     )
