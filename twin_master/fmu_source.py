@@ -283,9 +283,14 @@ class FmuSource:
         MissionInputError
             The binding has no such monitor or observation.
         """
-        truth = self._scenario.truth
+        truth, asset = self._scenario.truth, self._scenario.asset
         if truth.kind != "asset":
             return None
+        if asset.design is None or asset.observation_model == "asset":
+            raise MissionInputError(
+                "an asset that carries its own damage cannot be asked what the twin should expect of each "
+                "state: give `asset.design`, a model for the twin."
+            )
         unknown = sorted({*truth.state.values()} - {*binding.monitor})
         if unknown:
             raise MissionInputError(

@@ -17,6 +17,7 @@ marks.
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -88,53 +89,67 @@ class DamageGrowth:
     """The growing damage; see the module."""
 
     def __init__(self) -> None:
-        self._parameters: Mapping[str, float] = {}
         self._loss = [0.0, 0.0]
         self._begin = 0.0
         self._mark = 0
         self._last_load = 0.0
+        self._take({})
+
+    def _take(self, parameters: Mapping[str, float]) -> None:
+        """Keep the parameters in the form in which a step needs them."""
+        self._ceiling = parameters.get("ceiling", 1.0)
+        self._period = parameters.get("period", 1.0)
+        self._reference = parameters.get("reference_load_factor", 1.0)
+        self._exponent = parameters.get("exponent", 0.0)
+        self._level, self._seed = parameters.get("level", 0.0), int(parameters.get("seed", 0))
+        self._rate = [parameters.get(f"rate.{region}", 0.0) for region in REGIONS]
+        self._chance = [parameters.get(f"probability.{region}", 0.0) for region in REGIONS]
+        entries = [
+            [parameters.get(f"script[{entry}].{key}", 0.0) for key in ("first", "last", *REGIONS)]
+            for entry in range(1, SCRIPT_LENGTH + 1)
+        ]
+        self._script = [entry for entry in entries if any(entry[2:])]
 
     def start(self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]) -> list[float]:
         """Begin with the initial losses."""
-        self._parameters = parameters
+        self._take(parameters)
         self._loss = [parameters[f"initial.{region}"] for region in REGIONS]
         self._begin, self._mark, self._last_load = time, 0, inputs[0]
         return self._outputs()
 
     def advance(self, time: float, duration: float, inputs: Sequence[float]) -> list[float]:
         """Let the damage of one step happen."""
-        parameters, load = self._parameters, inputs[0]
-        period, tolerance = parameters["period"], 1e-9 * parameters["period"]
-        while True:
+        load, period = inputs[0], self._period
+        tolerance = 1e-9 * period
+        end = time + duration - tolerance
+        if not (self._script or any(self._chance)):
+            self._mark = max(self._mark, math.ceil((end - self._begin) / period))
+        while self._begin + self._mark * period < end:
             moment = self._begin + self._mark * period
-            if moment >= time + duration - tolerance:
-                break
-            self._pass_mark(moment, self._last_load if moment <= time + tolerance else load)
+            self._pass_mark(moment - self._begin, self._last_load if moment <= time + tolerance else load)
             self._mark += 1
-        for index, region in enumerate(REGIONS):
-            if parameters[f"rate.{region}"]:
-                grown = parameters[f"rate.{region}"] * self._severity(load) * duration
-                self._loss[index] = min(self._loss[index] + grown, parameters["ceiling"])
+        for index, rate in enumerate(self._rate):
+            if rate:
+                grown = self._loss[index] + rate * self._severity(load) * duration
+                self._loss[index] = min(grown, self._ceiling)
         self._last_load = load
         return self._outputs()
 
-    def _pass_mark(self, moment: float, load: float) -> None:
-        parameters, tolerance = self._parameters, 1e-9 * self._parameters["period"]
+    def _pass_mark(self, elapsed: float, load: float) -> None:
+        tolerance = 1e-9 * self._period
         for index, region in enumerate(REGIONS):
             gain = 0.0
-            for entry in range(1, SCRIPT_LENGTH + 1):
-                first, last = parameters[f"script[{entry}].first"], parameters[f"script[{entry}].last"]
-                if first - tolerance <= moment - self._begin <= last + tolerance:
-                    gain += parameters[f"script[{entry}].{region}"]
-            chance = parameters[f"probability.{region}"]
-            if chance and self._mark > 0:
-                uniform = random.Random(f"{int(parameters['seed'])}:{region}:{self._mark}").random()
-                if uniform < chance * self._severity(load):
-                    gain += parameters["level"]
-            self._loss[index] = max(0.0, min(self._loss[index] + gain, parameters["ceiling"]))
+            for entry in self._script:
+                if entry[0] - tolerance <= elapsed <= entry[1] + tolerance:
+                    gain += entry[2 + index]
+            if self._chance[index] and self._mark > 0:
+                uniform = random.Random(f"{self._seed}:{region}:{self._mark}").random()
+                if uniform < self._chance[index] * self._severity(load):
+                    gain += self._level
+            self._loss[index] = max(0.0, min(self._loss[index] + gain, self._ceiling))
 
     def _severity(self, load: float) -> float:
-        return float((abs(load) / self._parameters["reference_load_factor"]) ** self._parameters["exponent"])
+        return float((abs(load) / self._reference) ** self._exponent)
 
     def _outputs(self) -> list[float]:
         return [round(loss, _DECIMALS) for loss in self._loss]
@@ -145,6 +160,6 @@ class DamageGrowth:
 
     def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
         """Take back what `state` returned."""
-        self._parameters = parameters
+        self._take(parameters)
         self._loss = list(state[:2])
         self._begin, self._mark, self._last_load = state[2], int(state[3]), state[4]

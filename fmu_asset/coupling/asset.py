@@ -94,12 +94,12 @@ class CoupledAsset:
         self._wiring = structure if isinstance(structure, Wiring) else Wiring(structure)
         self._binding = binding
         self._jacobi, self._iterations, self._tolerance = algorithm == "jacobi", iterations, tolerance
-        self._roles: Roles = resolve_roles(self._wiring, binding)
         self._step_size = binding.step_size
         self._start_time = binding.binding.start_time
         loops = self._wiring.schedule.loops
         if loops and iterations == 1:
             raise AlgebraicLoopError(loop_sentence(loops))
+        self._roles: Roles = resolve_roles(self._wiring, binding)
         self._phase: Literal["new", "ready", "broken", "closed"] = "new"
         self._index = 0
         self._layout = Layout(self._wiring, binding, self._roles)

@@ -103,9 +103,19 @@ class Wiring:
             self._connect(connection, taken)
         self.feeds: tuple[Feed, ...] = tuple(self._joined)
         links = [Link(feed.source, feed.target) for feed in self.feeds if not feed.delayed]
-        self.schedule: Schedule = schedule(
-            names, links, {name: declared.feedthrough for name, declared in self.declared.items()}
-        )
+        self.schedule: Schedule = schedule(names, links, self._feedthrough())
+
+    def _feedthrough(self) -> dict[str, dict[str, frozenset[str]]]:
+        """Return the direct dependencies that count: those of outputs, and of other variables in use."""
+        used = {connection.source for connection in self.structure.connections}
+        return {
+            name: {
+                output: inputs
+                for output, inputs in declared.feedthrough.items()
+                if declared.variables[output].causality == "output" or Endpoint(name, output) in used
+            }
+            for name, declared in self.declared.items()
+        }
 
     # ------------------------------------------------------------------ ends
 

@@ -11,8 +11,8 @@ from twin_master.twin import build_graphical_model
 
 
 def test_what_is_shipped() -> None:
-    assert set(scenario_files()) == {"level_turns", "growing_damage", "failing_gauges"}
-    assert "uav_wing" in binding_files()
+    assert set(scenario_files()) == {"level_turns", "growing_damage", "failing_gauges", "three_fmus"}
+    assert set(binding_files()) == {"uav_wing", "three_fmus"}
 
 
 @pytest.mark.parametrize("name", sorted(scenario_files()))
