@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -32,8 +33,6 @@ from twin_master.errors import MissionInputError
 from twin_master.fmu_source import FmuSource
 from twin_master.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.scenario_file import LoadedScenario
-
-WING_COMPONENT = "wing"
 
 
 def export_scenario(
@@ -93,7 +92,8 @@ def export_design(design: Path | None, out: Path, *, replace_file: bool, progres
 
 
 def single_system(name: str, fmu: Path, binding: Binding) -> Wiring:
-    """Return a system of one FMU whose connectors are the variables that a binding names."""
+    """Return a system of one FMU, named as its binding, whose connectors are the variables of the binding."""
+    own = re.sub(r"[^A-Za-z0-9_]", "_", binding.name)
     inputs = [scalar.variable for role in INPUT_ROLES for scalar in binding.inputs(role).values()]
     outputs = dict.fromkeys(
         [*binding.observation_variables, *(scalar.variable for scalar in binding.monitor.values())]
@@ -105,10 +105,10 @@ def single_system(name: str, fmu: Path, binding: Binding) -> Wiring:
         *(Connector(variable, "parameter") for variable in parameters),
     ]
     connections = [
-        *(Connection(Endpoint("", v), Endpoint(WING_COMPONENT, v)) for v in (*inputs, *parameters)),
-        *(Connection(Endpoint(WING_COMPONENT, v), Endpoint("", v)) for v in outputs),
+        *(Connection(Endpoint("", v), Endpoint(own, v)) for v in (*inputs, *parameters)),
+        *(Connection(Endpoint(own, v), Endpoint("", v)) for v in outputs),
     ]
-    component = Component(WING_COMPONENT, fmu)
+    component = Component(own, fmu)
     return Wiring(SystemStructure(name, (component,), tuple(connectors), tuple(connections)))
 
 
