@@ -106,7 +106,7 @@ class CoupledAsset:
         self._parameters = {name: float(value) for name, value in (parameters or {}).items()}
         self._parameter_values = self._layout.parameters(self._parameters)
         self._held: list[dict[str, float]] = [dict(constants) for constants in self._layout.constants]
-        self._now: list[list[float]] = [[] for _ in self._layout.names]
+        self._now = [0.0] * self._layout.output_count
         self._before = list(self._now)
         self._assets = self._open(isolated, step_timeout)
         if iterations > 1:
@@ -186,15 +186,17 @@ class CoupledAsset:
         self._held[:] = [dict(constants) for constants in self._layout.constants]
         self._place(control, health, load)
         self._phase = "broken"
-        self._now[:] = [[] for _ in self._assets]
+        known: set[int] = set()
         try:
             for index in self._layout.order:
                 start = dict(self._held[index])
-                for name, tap in self._layout.feeds[index]:
-                    if self._now[tap.component]:
-                        start[name] = tap.of(self._now, self._now)
+                names, pick = self._layout.fed[index]
+                fed = zip(names, pick.places, pick.of(self._now, self._now), strict=True)
+                start.update({name: value for name, place, value in fed if place in known})
                 self._assets[index].reset(self._settings(index), load=start or None)
-                self._now[index] = self._assets[index].observe().values.tolist()
+                span = self._layout.spans[index]
+                self._now[span] = self._assets[index].observe().values.tolist()
+                known.update(range(span.start, span.stop))
         except FmuError as error:
             self.close()
             raise self._named(error, index) from error
@@ -282,17 +284,17 @@ class CoupledAsset:
             except FmuError as error:
                 raise self._named(error, index) from error
         self._held = [dict(held) for held in saved.held]
-        self._now, self._before = [list(v) for v in saved.outputs], [list(v) for v in saved.before]
+        self._now, self._before = list(saved.outputs), list(saved.before)
         self._index = saved.index
         self._phase = "ready"
 
     # ------------------------------------------------------------------ stepping
 
-    def _pass(self, group: Sequence[int], source: list[list[float]]) -> None:
+    def _pass(self, group: Sequence[int], source: list[float]) -> None:
         for index in group:
             held = self._held[index]
-            for name, tap in self._layout.feeds[index]:
-                held[name] = tap.of(source, self._before)
+            names, pick = self._layout.fed[index]
+            held.update(zip(names, pick.of(source, self._before), strict=True))
             asset = self._assets[index]
             try:
                 seen = asset.step(load=held)
@@ -300,13 +302,14 @@ class CoupledAsset:
                     seen = asset.step()
             except FmuError as error:
                 raise self._named(error, index) from error
-            self._now[index] = seen.values.tolist()
+            self._now[self._layout.spans[index]] = seen.values.tolist()
 
     def _iterate(self, group: Sequence[int]) -> None:
         """Repeat the step of a circle of components until what they exchange has settled."""
         states = {index: self._assets[index].save_state() for index in group}
-        fed = {(tap.component, tap.output) for index in group for _, tap in self._layout.feeds[index]}
-        watched = sorted((index, output) for index, output in fed if index in states)
+        spans = [self._layout.spans[index] for index in group]
+        own = {place for span in spans for place in range(span.start, span.stop)}
+        watched = sorted(own & {place for index in group for place in self._layout.fed[index][1].places})
         for iteration in range(self._iterations):
             last = list(self._now)
             if iteration:
@@ -316,19 +319,18 @@ class CoupledAsset:
                     except FmuError as error:
                         raise self._named(error, index) from error
             self._pass(group, last if self._jacobi else self._now)
+            change = {place: abs(self._now[place] - last[place]) for place in watched}
             if iteration and all(
-                abs(self._now[i][k] - last[i][k]) <= self._tolerance * max(1.0, abs(last[i][k]))
-                for i, k in watched
+                size <= self._tolerance * max(1.0, abs(last[place])) for place, size in change.items()
             ):
                 return
-        worst = max(watched, key=lambda end: abs(self._now[end[0]][end[1]] - last[end[0]][end[1]]))
-        name = self._layout.output_name(*worst)
-        change = abs(self._now[worst[0]][worst[1]] - last[worst[0]][worst[1]])
+        worst = max(watched, key=change.__getitem__)
         names = listed(self._layout.names[index] for index in group)
+        last_change = f"{self._layout.output_name(worst)} still changes by {change[worst]:.3g}"
         raise IterationError(
             f"The components {names} did not settle in {self._iterations} iterations of the step from "
-            f"t = {self.time:g} s ({name} still changes by {change:.3g}); allow more iterations or a larger "
-            "tolerance, make the step smaller, or delay one of their connections."
+            f"t = {self.time:g} s ({last_change}); allow more iterations or a larger tolerance, make the "
+            "step smaller, or delay one of their connections."
         )
 
     def _place(
@@ -354,9 +356,9 @@ class CoupledAsset:
 
     def _observation(self) -> Observation:
         now, before = self._now, self._before
-        values = np.array([tap.of(now, before) for tap in self._layout.observed])
-        extra = {name: tap.of(now, before) for name, tap in self._layout.monitored.items()}
-        return Observation(values, self.time, extra)
+        names, monitors = self._layout.monitored
+        extra = dict(zip(names, monitors.of(now, before), strict=True))
+        return Observation(np.array(self._layout.observed.of(now, before)), self.time, extra)
 
     def _opened(self) -> None:
         if self._phase == "broken":

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
 from typing import NamedTuple
 
 from ..binding import Binding, Header, Parameter, Scalar, Vector
@@ -14,31 +15,51 @@ from .wiring import Port, Wiring
 
 
 class Tap(NamedTuple):
-    """An output of a component as it is wanted elsewhere: factor * output + offset.
+    """An output as it is wanted elsewhere: factor * output + offset.
 
     Attributes
     ----------
-    component, output : int
-        Numbers of the component, and of the output among those that are read of it.
-    plain : bool
-        Whether factor and offset are one and zero.
-    factor, offset : float
-        The conversion.
+    place : int
+        Where the output stands among all that are read.
+    conversion : Conversion
+        Factor and offset.
     delayed : bool
         Whether the value of the beginning of the step is wanted.
     """
 
-    component: int
-    output: int
-    plain: bool
-    factor: float
-    offset: float
+    place: int
+    conversion: Conversion
     delayed: bool
 
-    def of(self, now: list[list[float]], before: list[list[float]]) -> float:
-        """Return the value, from the outputs of this moment and of the beginning of the step."""
-        value = (before if self.delayed else now)[self.component][self.output]
-        return value if self.plain else self.factor * value + self.offset
+
+class Pick:
+    """Outputs that are wanted together.
+
+    Parameters
+    ----------
+    taps : sequence of Tap
+        The outputs, in order.
+
+    Attributes
+    ----------
+    places : tuple of int
+        Where they stand.
+    """
+
+    def __init__(self, taps: Sequence[Tap]) -> None:
+        self.places = tuple(tap.place for tap in taps)
+        # With two places or more an item getter gives a tuple, at a fraction of the cost of a loop.
+        self._get = itemgetter(*self.places, 0, 0)
+        self._special = [
+            (position, tap) for position, tap in enumerate(taps) if tap.delayed or tap.conversion != IDENTITY
+        ]
+
+    def of(self, now: Sequence[float], before: Sequence[float]) -> list[float]:
+        """Return the values, from the outputs of this moment and of the beginning of the step."""
+        values = list(self._get(now)[:-2])
+        for position, tap in self._special:
+            values[position] = tap.conversion.to_fmu((before if tap.delayed else now)[tap.place])
+        return values
 
 
 class Layout:
@@ -63,11 +84,13 @@ class Layout:
         The components in the order of evaluation.
     groups : list of (tuple of int, bool)
         The same, cut into groups; whether a group is connected in a circle.
-    feeds : list of list of (str, Tap)
-        For each component, the inputs that others feed.
-    observed : list of Tap
+    spans : list of slice
+        For each component, where its outputs stand among all that are read.
+    fed : list of (tuple of str, Pick)
+        For each component, the inputs that others feed, and their values.
+    observed : Pick
         The observations.
-    monitored : dict of str to Tap
+    monitored : (tuple of str, Pick)
         The monitors.
     entries : dict of str to dict of str to list of (int, str, Conversion)
         For each role, for each name of the binding, the inputs that it sets.
@@ -86,13 +109,24 @@ class Layout:
             (tuple(self._number[name] for name in group), circular)
             for group, circular in zip(wiring.schedule.groups, wiring.schedule.circular, strict=True)
         ]
-        self._read: list[dict[str, int]] = [{} for _ in components]
-        self.feeds: list[list[tuple[str, Tap]]] = [[] for _ in components]
-        for feed in wiring.feeds:
-            tap = self._tap(Port(feed.source, feed.conversion, feed.delayed))
-            self.feeds[self._number[feed.target.component]].append((feed.target.variable, tap))
-        self.observed = [self._tap(port) for port in roles.observations]
-        self.monitored = {name: self._tap(port) for name, port in roles.monitors.items()}
+        ports = [Port(feed.source, feed.conversion, feed.delayed) for feed in wiring.feeds]
+        self._outputs = self._read([*ports, *roles.observations, *roles.monitors.values()])
+        self.spans: list[slice] = []
+        self._place: dict[Endpoint, int] = {}
+        for name, outputs in zip(self.names, self._outputs, strict=True):
+            begin = len(self._place)
+            self._place.update({Endpoint(name, o): begin + i for i, o in enumerate(outputs)})
+            self.spans.append(slice(begin, len(self._place)))
+        self.fed: list[tuple[tuple[str, ...], Pick]] = []
+        for name in self.names:
+            own = [
+                (f.target.variable, p)
+                for f, p in zip(wiring.feeds, ports, strict=True)
+                if f.target.component == name
+            ]
+            self.fed.append((tuple(variable for variable, _ in own), self._pick(p for _, p in own)))
+        self.observed = self._pick(roles.observations)
+        self.monitored = (tuple(roles.monitors), self._pick(roles.monitors.values()))
         self.entries = {
             role: {
                 name: [(self._number[p.end.component], p.end.variable, p.conversion) for p in ports]
@@ -103,19 +137,29 @@ class Layout:
         self.settings: list[dict[str, float]] = []
         self.constants: list[dict[str, float]] = []
         for name in self.names:
-            own = wiring.settings[name]
-            inputs = {key for key in own if wiring.variable(Endpoint(name, key)).causality == "input"}
-            self.settings.append({key: value for key, value in own.items() if key not in inputs})
-            self.constants.append({key: value for key, value in own.items() if key in inputs})
+            given = wiring.settings[name]
+            inputs = {key for key in given if wiring.variable(Endpoint(name, key)).causality == "input"}
+            self.settings.append({key: value for key, value in given.items() if key not in inputs})
+            self.constants.append({key: value for key, value in given.items() if key in inputs})
 
-    def _tap(self, port: Port) -> Tap:
-        index = self._number[port.end.component]
-        output = self._read[index].setdefault(port.end.variable, len(self._read[index]))
-        return Tap(index, output, port.conversion == IDENTITY, *port.conversion, port.delayed)
+    def _read(self, ports: Iterable[Port]) -> list[list[str]]:
+        """Return the outputs that are read of each component; at least one, to see that it is alive."""
+        read: list[dict[str, None]] = [{} for _ in self.names]
+        for port in ports:
+            read[self._number[port.end.component]][port.end.variable] = None
+        return [list(own) or [self._any_output(name)] for name, own in zip(self.names, read, strict=True)]
 
-    def output_name(self, component: int, output: int) -> str:
+    def _pick(self, ports: Iterable[Port]) -> Pick:
+        return Pick([Tap(self._place[port.end], port.conversion, port.delayed) for port in ports])
+
+    @property
+    def output_count(self) -> int:
+        """Number of outputs that are read of all components."""
+        return len(self._place)
+
+    def output_name(self, place: int) -> str:
         """Return the name of an output for people."""
-        return f"{self.names[component]}.{list(self._read[component])[output]}"
+        return str(list(self._place)[place])
 
     def component_binding(self, index: int) -> Binding:
         """Return the binding of one component: its own names and units.
@@ -134,13 +178,12 @@ class Layout:
             entry for table in self.entries.values() for ports in table.values() for entry in ports
         ]
         inputs = [
-            *(variable for variable, _ in self.feeds[index]),
+            *self.fed[index][0],
             *(variable for which, variable, _ in entries if which == index),
             *self.constants[index],
         ]
         ports = [port for ports in self._roles.parameters.values() for port in ports]
         parameters = [*self.settings[index], *(p.end.variable for p in ports if p.end.component == name)]
-        outputs = list(self._read[index]) or [self._any_output(name)]
         header = Header(
             name=name,
             step_size=self._binding.step_size / self.substeps[index],
@@ -150,7 +193,7 @@ class Layout:
             binding=header,
             load={key: Scalar(variable=key, unit=unit(key)) for key in dict.fromkeys(inputs)},
             parameter={key: Parameter(variable=key, unit=unit(key)) for key in dict.fromkeys(parameters)},
-            observation={key: Vector(variables=(key,), unit=unit(key)) for key in outputs},
+            observation={key: Vector(variables=(key,), unit=unit(key)) for key in self._outputs[index]},
         )
 
     def _any_output(self, name: str) -> str:

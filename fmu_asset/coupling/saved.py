@@ -31,8 +31,8 @@ class CoupledState:
         As the caller gave them.
     held : sequence of dict of str to float
         The last inputs of each component.
-    outputs, before : sequence of sequence of float
-        Outputs of each component now, and at the beginning of the last step.
+    outputs, before : sequence of float
+        The outputs that are read, now and at the beginning of the last step.
     components : sequence of bytes
         The states of the components.
     """
@@ -41,8 +41,8 @@ class CoupledState:
     index: int
     parameters: Mapping[str, float]
     held: Sequence[Mapping[str, float]]
-    outputs: Sequence[Sequence[float]]
-    before: Sequence[Sequence[float]]
+    outputs: Sequence[float]
+    before: Sequence[float]
     components: Sequence[bytes]
 
     def to_bytes(self) -> bytes:
@@ -52,8 +52,8 @@ class CoupledState:
             "index": self.index,
             "parameters": dict(self.parameters),
             "held": [dict(held) for held in self.held],
-            "outputs": [list(values) for values in self.outputs],
-            "before": [list(values) for values in self.before],
+            "outputs": list(self.outputs),
+            "before": list(self.before),
             "sizes": [len(state) for state in self.components],
         }
         text = json.dumps(head, sort_keys=True, allow_nan=False).encode()  # doubles survive JSON to the bit
@@ -84,8 +84,8 @@ class CoupledState:
                 index=int(head["index"]),
                 parameters={str(k): float(v) for k, v in head["parameters"].items()},
                 held=[{str(k): float(v) for k, v in held.items()} for held in head["held"]],
-                outputs=[[float(v) for v in values] for values in head["outputs"]],
-                before=[[float(v) for v in values] for values in head["before"]],
+                outputs=[float(value) for value in head["outputs"]],
+                before=[float(value) for value in head["before"]],
                 components=components,
             )
         except (struct.error, ValueError, TypeError, KeyError, AttributeError) as error:
