@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping
@@ -179,11 +178,6 @@ def companion_bytes(
     content_hash = _hash(template)
     members = {_named(key, content_hash): _filled(key, data, content_hash) for key, data in template.items()}
     return _archive(members), content_hash
-
-
-def companion_hash(name: str) -> str:
-    """Return the SHA-256 of a companion with its default setting, as a file."""
-    return hashlib.sha256(companion_bytes(name)[0]).hexdigest()
 
 
 def _members(

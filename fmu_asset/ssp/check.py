@@ -10,7 +10,6 @@ from pathlib import Path
 from ..archive import plain_folder
 from ..binding import Binding, Header, Vector
 from ..coupling.asset import CoupledAsset, loop_sentence
-from ..coupling.declared import READABLE
 from ..coupling.structure import Endpoint
 from ..coupling.wiring import Wiring
 from ..errors import FmuError, SspError
@@ -138,7 +137,7 @@ def _trial(wiring: Wiring) -> list[str]:
         f"{component}.{variable.name}"
         for component, declared in wiring.declared.items()
         for variable in declared.variables.values()
-        if variable.causality in READABLE[:1] and variable.kind != "String"
+        if variable.causality == "output" and variable.kind != "String"
     ]
     observation = {}
     for name in names:

@@ -12,7 +12,10 @@ import numpy as np
 import pytest
 from fmpy.ssp.simulation import simulate_ssp
 from fmpy.ssp.ssd import read_ssd
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from fmu_asset.archive import UnitInfo
 from fmu_asset.binding import Binding, parse_binding
 from fmu_asset.companions.build import build_companion
 from fmu_asset.coupling.asset import CoupledAsset
@@ -180,6 +183,50 @@ def test_what_ssp_has_no_word_for_survives(structure: SystemStructure, tmp_path:
     assert read.connections == changed.connections
     assert [c.substeps for c in read.components] == [4, 1, 1]
     read_ssd(str(path))  # still valid for others
+
+
+numbers = st.floats(-1e6, 1e6).filter(lambda value: value == 0.0 or abs(value) > 1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(st.tuples(numbers, numbers, st.booleans(), st.booleans()), min_size=4, max_size=4),
+    st.integers(1, 9),
+    st.floats(0.0, 1.0),
+    st.integers(0, 2**31 - 1),
+)
+def test_any_connection_and_value_survives(
+    fmus: dict[str, Path],
+    tmp_path_factory: pytest.TempPathFactory,
+    drawn: list[tuple[float, float, bool, bool]],
+    substeps: int,
+    level: float,
+    seed: int,
+) -> None:
+    ends = [("damage.z1", "gauges.strain[1]"), ("damage.z2", "gauges.strain[2]"),
+            ("gauges.reading[7]", "damage.load_factor"), ("damage.z1", "out")]  # fmt: skip
+    connections = tuple(
+        replace(
+            expand_connection(*pair, NAMES)[0],
+            factor=factor, offset=offset, convert_units=convert, delayed=delayed,
+        )
+        for pair, (factor, offset, convert, delayed) in zip(ends, drawn, strict=True)
+    )  # fmt: skip
+    settings_ = {"level": Setting(level, "1"), "seed": Setting(seed)}
+    components = (
+        Component("damage", fmus["damage"], settings_, substeps),
+        Component("gauges", fmus["gauges"]),
+    )
+    before = SystemStructure("drawn", components, (Connector("out", "output", "%"),), connections,
+                             (UnitInfo("%", (0,) * 8, 0.01, 0.0, ()),))  # fmt: skip
+    folder = tmp_path_factory.mktemp("drawn")
+    path = write_ssp(Wiring(before), folder / "x.ssp")
+    after = read_ssp(path, folder / "fmus").structure
+    assert after.connections == before.connections
+    assert after.connectors == before.connectors
+    assert [(c.name, c.settings, c.substeps) for c in after.components] == [
+        (c.name, c.settings, c.substeps) for c in components
+    ]
 
 
 def test_files_are_not_overwritten_unasked(structure: SystemStructure, tmp_path: Path) -> None:
