@@ -23,8 +23,8 @@ from ..session import FmiAsset, Observation
 from .layout import Layout
 from .roles import Roles, resolve_roles
 from .saved import CoupledState, wiring_hash
-from .schedule import Schedule
-from .structure import Endpoint, SystemStructure, listed
+from .schedule import Schedule, loop_sentence
+from .structure import SystemStructure, listed
 from .wiring import Wiring
 
 Algorithm = Literal["gauss_seidel", "jacobi"]
@@ -418,16 +418,3 @@ class CoupledAsset:
             "binding": self._binding.name,
             "step_size": self._step_size,
         }
-
-
-def loop_sentence(loops: Sequence[Sequence[Endpoint]]) -> str:
-    """Return the sentence that reports algebraic loops."""
-    shown = "; ".join(" -> ".join(str(end) for end in loop) for loop in loops[:3])
-    more = f" and {len(loops) - 3} more" if len(loops) > 3 else ""
-    return (
-        f"The connections close "
-        f"{'an algebraic loop' if len(loops) == 1 else f'{len(loops)} algebraic loops'} "
-        f"({shown}{more}): every value in it depends on itself at the same moment; delay one of its "
-        "connections, or "
-        "allow iterations."
-    )

@@ -199,3 +199,16 @@ def shortest_circle(graph: Mapping[Node, Collection[Node]], part: Sequence[Node]
                     seen.add(successor)
                     trails.append((*trail, successor))
     return best
+
+
+def loop_sentence(loops: Sequence[Sequence[Endpoint]]) -> str:
+    """Return the sentence that reports algebraic loops."""
+    shown = "; ".join(" -> ".join(str(end) for end in loop) for loop in loops[:3])
+    more = f" and {len(loops) - 3} more" if len(loops) > 3 else ""
+    return (
+        f"The connections close "
+        f"{'an algebraic loop' if len(loops) == 1 else f'{len(loops)} algebraic loops'} "
+        f"({shown}{more}): every value in it depends on itself at the same moment; delay one of its "
+        "connections, or "
+        "allow iterations."
+    )

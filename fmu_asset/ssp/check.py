@@ -9,7 +9,8 @@ from pathlib import Path
 
 from ..archive import plain_folder
 from ..binding import Binding, Header, Vector
-from ..coupling.asset import CoupledAsset, loop_sentence
+from ..coupling.asset import CoupledAsset
+from ..coupling.schedule import loop_sentence
 from ..coupling.structure import Endpoint
 from ..coupling.wiring import Wiring
 from ..errors import FmuError, SspError
