@@ -1,7 +1,7 @@
 """What the mission can fly: one protocol, and the assets that need no FMU.
 
-An asset is told the control and its true health, and returns the noise-free observation. It is driven by the
-`Plant`; the twin never meets it.
+An asset is told the control and its true health, and returns the noise-free observation; or it carries damage
+and sensors of its own, and tells of them beside. It is driven by the `Plant`; the twin never meets it.
 """
 
 from __future__ import annotations
