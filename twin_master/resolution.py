@@ -148,12 +148,15 @@ def asset_source(scenario: Scenario) -> AssetSource:
         path = Path(asset.file or "")
         return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)
     from fe.design import SHIPPED_DESIGN
-    from twin_master.coupled_source import CoupledSource
     from twin_master.fmu_source import FmuSource
 
     design = SHIPPED_DESIGN if asset.design == SHIPPED_DESIGN_NAME else asset.design
     binding = binding_files().get(asset.binding or "", Path(asset.binding or ""))
-    source = CoupledSource if asset.kind == "coupled" else FmuSource
+    source: type[FmuSource] = FmuSource
+    if asset.kind == "coupled":  # who flies one FMU does not pay for the reading of SSP files
+        from twin_master.coupled_source import CoupledSource
+
+        source = CoupledSource
     return source(
         scenario, binding, Path(design) if design else None, Path(asset.file) if asset.file else None
     )
