@@ -25,7 +25,9 @@ def command(*arguments: str) -> list[str]:
 def contents(folder: Path) -> dict[str, bytes]:
     """Return every file that must not depend on interruptions, by its name."""
     paths = [folder / name for name in COMPARED if (folder / name).is_file()]
-    paths += sorted((folder / "csv").glob("*.csv")) + sorted((folder / "asset").glob("*"))
+    paths += sorted((folder / "csv").glob("*.csv")) + sorted(
+        path for path in (folder / "asset").rglob("*") if path.is_file()
+    )
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 

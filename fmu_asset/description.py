@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from .variables import ENUMERATIONS, UNITS, FmuVariable
+from .variables import ENUMERATIONS, UNITS, EnumerationType, FmuVariable, Unit
 
 LOG_CATEGORIES = {
     "logStatusWarning": "Log messages with fmi2Warning status.",
@@ -31,6 +31,10 @@ def model_description(
     version: str,
     generation_tool: str,
     source_files: Sequence[str] = (),
+    model_name: str = "uav_wing",
+    units: Sequence[Unit] = UNITS,
+    enumerations: Sequence[EnumerationType] = ENUMERATIONS,
+    dependencies: Mapping[str, Sequence[str]] | None = None,
 ) -> bytes:
     """Return modelDescription.xml of an FMI 2.0 co-simulation FMU.
 
@@ -46,6 +50,12 @@ def model_description(
         Attributes of the root element. There is no generation date: equal content gives equal bytes.
     source_files : sequence of str
         C sources in the folder `sources`; an FMU with none needs Python to run.
+    model_name : str
+        Attribute of the root element.
+    units, enumerations
+        Units and enumerations that the table uses.
+    dependencies : mapping of str to sequence of str, optional
+        For each output, the inputs that it depends on directly; an output that is missing depends on all.
 
     Returns
     -------
@@ -55,7 +65,7 @@ def model_description(
     root = Element(
         "fmiModelDescription",
         fmiVersion="2.0",
-        modelName="uav_wing",
+        modelName=model_name,
         guid=guid,
         description=description,
         version=version,
@@ -79,14 +89,14 @@ def model_description(
         listed = SubElement(interface, "SourceFiles")
         for name in source_files:
             SubElement(listed, "File", name=name)
-    units = SubElement(root, "UnitDefinitions")
-    for unit in UNITS:
-        element = SubElement(units, "Unit", name=unit.name)
+    defined = SubElement(root, "UnitDefinitions")
+    for unit in units:
+        element = SubElement(defined, "Unit", name=unit.name)
         SubElement(element, "BaseUnit", {symbol: str(power) for symbol, power in unit.exponents})
         for name, factor in unit.displays:
             SubElement(element, "DisplayUnit", name=name, factor=number(factor))
     types = SubElement(root, "TypeDefinitions")
-    for enumeration in ENUMERATIONS:
+    for enumeration in enumerations:
         simple = SubElement(types, "SimpleType", name=enumeration.name, description=enumeration.description)
         items = SubElement(simple, "Enumeration")
         for name, value, text in enumeration.items:
@@ -99,13 +109,25 @@ def model_description(
     for row in table:
         variables.append(_scalar_variable(row))
     structure = SubElement(root, "ModelStructure")
+    index = {row.name: row.reference + 1 for row in table}
     for name in ("Outputs", "InitialUnknowns"):
         unknowns = SubElement(structure, name)
         for row in table:
             if row.causality == "output":
-                SubElement(unknowns, "Unknown", index=str(row.reference + 1))
+                unknown = SubElement(unknowns, "Unknown", index=str(index[row.name]))
+                if name == "Outputs" and dependencies is not None and row.name in dependencies:
+                    inputs = sorted(index[source] for source in dependencies[row.name])
+                    unknown.set("dependencies", " ".join(map(str, inputs)))
     indent(root)
     return bytes(tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
+
+
+_WRITERS: Mapping[str, Callable[[float], str]] = {
+    "Real": number,
+    "Integer": lambda value: str(int(value)),
+    "Enumeration": lambda value: str(int(value)),
+    "Boolean": lambda value: "true" if value else "false",
+}
 
 
 def _scalar_variable(row: FmuVariable) -> Element:
@@ -119,7 +141,7 @@ def _scalar_variable(row: FmuVariable) -> Element:
     if row.causality != "input":
         attributes["initial"] = "exact" if row.causality == "parameter" else "calculated"
     element = Element("ScalarVariable", attributes)
-    write = number if row.kind == "Real" else lambda value: str(int(value))
+    write = _WRITERS[row.kind]
     inner: dict[str, str] = {}
     if row.enumeration is not None:
         inner["declaredType"] = row.enumeration
@@ -128,10 +150,10 @@ def _scalar_variable(row: FmuVariable) -> Element:
     if row.display_unit is not None:
         inner["displayUnit"] = row.display_unit
     # An enumeration's range is its items.
-    if row.enumeration is None:
+    if row.kind in ("Real", "Integer"):
         for name, value in (("min", row.minimum), ("max", row.maximum)):
             if value is not None:
-                inner[name] = number(value)
+                inner[name] = write(value)
     if row.start is not None:
         inner["start"] = write(row.start)
     SubElement(element, row.kind, inner)
@@ -142,6 +164,8 @@ def documentation_page(
     table: Sequence[FmuVariable],
     description: str,
     *,
+    model_name: str = "uav_wing",
+    enumerations: Sequence[EnumerationType] = ENUMERATIONS,
     host: str = "It runs in a Python host that has NumPy.",
 ) -> bytes:
     """Return documentation/index.html: what the FMU is and its variables, as UTF-8 without any request."""
@@ -156,15 +180,15 @@ def documentation_page(
         rows.append("<tr>" + "".join(f"<td>{escape(_text(cell))}</td>" for cell in cells) + "</tr>")
     statuses = "".join(
         f"<li>{enumeration.name} {value} ({name}): {escape(text)}</li>"
-        for enumeration in ENUMERATIONS
+        for enumeration in enumerations
         for name, value, text in enumeration.items
     )
     body = "\n".join(rows)
     page = f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>uav_wing</title>
+<html lang="en"><head><meta charset="utf-8"><title>{model_name}</title>
 <style>body{{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}}
 td,th{{text-align:left;padding:.2em .8em .2em 0;border-bottom:1px solid #ddd}}</style></head><body>
-<h1>uav_wing</h1><p>{escape(description)}</p>
+<h1>{model_name}</h1><p>{escape(description)}</p>
 <p>FMI 2.0 co-simulation. {escape(host)} A call that is refused logs why, sets
 <code>status</code> and leaves state and outputs as they were; a refused step returns fmi2Discard.</p>
 <table><tr><th>variable</th><th>causality</th><th>unit</th><th>range</th><th>start</th><th>meaning</th></tr>

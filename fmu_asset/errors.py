@@ -41,6 +41,22 @@ class BindingError(FmuError, ValueError):
     """A binding file is wrong, or does not fit the FMU or the call."""
 
 
+class CouplingError(FmuError, ValueError):
+    """FMUs cannot be connected as they were told to: an end is unknown, taken twice, or of another type."""
+
+
+class AlgebraicLoopError(CouplingError):
+    """Connections and direct feedthrough close a loop, and nothing says how it is to be solved."""
+
+
+class IterationError(FmuError, RuntimeError):
+    """The values of a loop of FMUs did not settle within the iterations that were allowed."""
+
+
+class SspError(FmuError, ValueError):
+    """An SSP file is missing, damaged, unsafe, not valid, or uses what cannot be read."""
+
+
 class FmuInputError(FmuError, ValueError):
     """A value was refused before it was sent to the FMU: outside its range, or not finite."""
 

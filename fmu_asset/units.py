@@ -92,8 +92,8 @@ def conversion(
         for name, factor, offset in own.displays:
             if name == unit and factor:  # display = factor * value + offset
                 return Conversion(1.0 / factor, -offset / factor)
-    target = _meaning(variable.unit, definitions)
-    source = _meaning(unit, definitions)
+    target = meaning(variable.unit, definitions)
+    source = meaning(unit, definitions)
     if source is None or target is None or source[0] != target[0]:
         raise BindingError(
             f"{where} is in {unit!r}, but the FMU has {variable.name!r} in {variable.unit!r}, and there is "
@@ -103,7 +103,40 @@ def conversion(
     return Conversion(source[1] / target[1], (source[2] - target[2]) / target[1])
 
 
-def _meaning(unit: str, definitions: Sequence[UnitInfo]) -> tuple[Exponents, float, float] | None:
+def between(
+    source: str | None,
+    source_definitions: Sequence[UnitInfo],
+    target: str | None,
+    target_definitions: Sequence[UnitInfo],
+) -> Conversion | None:
+    """Return the conversion of a value from one unit to another; None if there is none.
+
+    A value without a declared unit is taken in the other's.
+
+    Parameters
+    ----------
+    source, target : str or None
+        The units.
+    source_definitions, target_definitions : sequence of UnitInfo
+        Where each of the two is defined; common units need no definition.
+    """
+    if source is None or target is None:
+        return IDENTITY
+    begin, end = meaning(source, source_definitions), meaning(target, target_definitions)
+    if begin is None or end is None:
+        return IDENTITY if source == target else None
+    if begin == end:
+        return IDENTITY
+    if begin[0] != end[0]:
+        return None
+    return Conversion(begin[1] / end[1], (begin[2] - end[2]) / end[1])
+
+
+def meaning(unit: str, definitions: Sequence[UnitInfo]) -> tuple[Exponents, float, float] | None:
+    """Return what a unit means: SI exponents, factor and offset to SI; None if it is not known.
+
+    Units that are defined come first, then common ones.
+    """
     for definition in definitions:
         if definition.name == unit and definition.exponents is not None and definition.factor:
             return definition.exponents, definition.factor, definition.offset

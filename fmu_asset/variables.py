@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-Kind = Literal["Real", "Enumeration"]
+Kind = Literal["Real", "Integer", "Boolean", "Enumeration"]
 Causality = Literal["input", "parameter", "output"]
 Variability = Literal["continuous", "discrete", "fixed"]
 
@@ -102,7 +102,7 @@ class FmuVariable:
         Name in the structured naming convention.
     reference : int
         FMI value reference; also the index of the row.
-    kind : {"Real", "Enumeration"}
+    kind : {"Real", "Integer", "Boolean", "Enumeration"}
         FMI base type; enumerations are read and set as integers.
     causality, variability : str
         As FMI 2.0 defines them.

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fe.reduced import ReducedModel
+from fmu_asset.companions import COMPANION_NAMES
 from reporting.progress import Progress
 from twin_master.assets import Asset, AssetReading, StatelessAsset
 from twin_master.errors import MissingObservationModelError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws, draw_parameter
-from twin_master.scenario import Scenario
+from twin_master.scenario import ComponentSection, Scenario
 from twin_master.strain_library import FILE_NAME as LIBRARY_NAME
 from twin_master.strain_library import StrainLibrary
 
@@ -33,6 +34,21 @@ CALIBRATION_COPY = f"{ASSET_FOLDER}/calibration.nc"
 DESIGN_COPY = f"{ASSET_FOLDER}/design.toml"
 FMU_COPY = f"{ASSET_FOLDER}/asset.fmu"
 LIBRARY_COPY = f"{ASSET_FOLDER}/{LIBRARY_NAME}"
+SSP_COPY = f"{ASSET_FOLDER}/system.ssp"
+COMPONENT_FOLDER = f"{ASSET_FOLDER}/components"
+SHIPPED_DESIGN_NAME = "uav_wing"
+CALIBRATED_DESIGN_NAME = "calibration"
+"""The tailored design inside the calibration file: with a file it takes the place of the scenario's."""
+
+
+def component_copies(component: ComponentSection) -> dict[str, str]:
+    """Return the files that a component names, without what is shipped: key, and path in the run folder."""
+    copies = {}
+    if component.fmu is not None and component.fmu not in COMPANION_NAMES:
+        copies["fmu"] = f"{COMPONENT_FOLDER}/{component.name}.fmu"
+    if component.design not in (None, SHIPPED_DESIGN_NAME, CALIBRATED_DESIGN_NAME):
+        copies["design"] = f"{COMPONENT_FOLDER}/{component.name}.toml"
+    return copies
 
 
 @dataclass(frozen=True)

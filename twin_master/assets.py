@@ -1,7 +1,7 @@
 """What the mission can fly: one protocol, and the assets that need no FMU.
 
-An asset is told the control and its true health, and returns the noise-free observation. It is driven by the
-`Plant`; the twin never meets it.
+An asset is told the control and its true health, and returns the noise-free observation; or it carries damage
+and sensors of its own, and tells of them beside. It is driven by the `Plant`; the twin never meets it.
 """
 
 from __future__ import annotations
@@ -17,6 +17,22 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class InnerTruth:
+    """What an asset with damage and sensors of its own tells for scoring; never for the twin.
+
+    Attributes
+    ----------
+    state : dict of str to float
+        True value of each state factor, SI.
+    sensed : (G,)
+        What its sensors say, SI; NaN where one is lost.
+    """
+
+    state: Mapping[str, float]
+    sensed: Float
+
+
+@dataclass(frozen=True)
 class AssetReading:
     """What an asset returns for one step.
 
@@ -26,10 +42,13 @@ class AssetReading:
         Noise-free observation in its SI unit.
     monitors : dict of str to float
         Further figures that the asset reports of itself, such as a certified error bound.
+    inner : InnerTruth or None
+        What the asset tells of its own damage and sensors, where it carries them.
     """
 
     values: Float
     monitors: Mapping[str, float] = field(default_factory=dict)
+    inner: InnerTruth | None = None
 
 
 class Asset(Protocol):

@@ -18,7 +18,11 @@ INTERRUPTED = 130
 def run(
     scenario: Annotated[
         str | None,
-        typer.Argument(help="A shipped scenario (see `uav-twin scenarios`) or the path of a TOML file."),
+        typer.Argument(
+            metavar="SCENARIO",
+            help="A shipped scenario (see `uav-twin scenarios`), the path of a TOML file, or of an SSP file "
+            "(with --scenario).",
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="The run folder to make.", show_default="runs/SCENARIO")
@@ -49,6 +53,9 @@ def run(
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Run the FMU in this process instead of a worker.")
     ] = False,
+    with_scenario: Annotated[
+        str | None, typer.Option("--scenario", help="What is flown with the SSP file that SCENARIO names.")
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress and no summary.")] = False,
 ) -> None:
     """Fly a scenario: model, reduce, pack, calibrate, fly, report."""
@@ -57,7 +64,16 @@ def run(
     from twin_master.scenario_file import load_scenario
     from twin_master.workflow import new_run, resume_run
 
-    overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration)
+    ssp = None
+    if scenario is not None and Path(scenario).suffix == ".ssp":
+        if with_scenario is None:
+            raise typer.BadParameter(
+                "an SSP file says what is flown, not how: name a scenario as well.", param_hint="--scenario"
+            )
+        scenario, ssp = with_scenario, Path(scenario)
+    elif with_scenario is not None:
+        raise typer.BadParameter("belongs to an SSP file as SCENARIO.", param_hint="--scenario")
+    overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration, ssp)
     progress = SilentProgress() if quiet else RichProgress()
     if resume is not None:
         if out is not None or replace or overrides != Overrides():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from fe.design import WingDesign
 from fe.reduced import ReducedModel
 from fmu_asset.binding import Binding, load_binding
 from fmu_asset.build import build_fmu
+from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.session import FmiAsset
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
@@ -27,34 +29,67 @@ from twin_master.asset_source import (
     check_wing_scenario,
     wing_observation_table,
 )
-from twin_master.assets import Asset, AssetReading
+from twin_master.assets import Asset, AssetReading, InnerTruth
 from twin_master.calibrated_asset import pack_calibrated_wing
 from twin_master.design_source import read_calibration, read_content, read_design, write_design_field
 from twin_master.errors import MissionInputError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws, draw_parameter
 from twin_master.scenario import Scenario
+from twin_master.seeds import generator
 
 Float = NDArray[np.float64]
+Session = FmiAsset | CoupledAsset
+"""One FMU, or several as one, with the same face."""
+LARGEST_SEED = 2**31 - 1
+"""Of an FMU's integer parameter."""
+
+
+@dataclass(frozen=True)
+class InnerRoles:
+    """Where an asset with damage and sensors of its own tells the truth; see `[truth]` of a scenario.
+
+    Attributes
+    ----------
+    state : dict of str to str
+        Monitor by state factor.
+    observation : slice
+        The noise-free observation among those of the binding.
+    received : slice or None
+        Where the binding observes whether each sensor is received.
+    """
+
+    state: Mapping[str, str]
+    observation: slice
+    received: slice | None
 
 
 class FmuAsset:
-    """An FMU behind its one door, as the mission flies it.
+    """An FMU, or several coupled ones, as the mission flies them.
 
     Parameters
     ----------
-    session : FmiAsset
+    session : FmiAsset or CoupledAsset
         The door, at its start.
     observation : slice
         Where the observed quantity stands among the observations of the binding.
     load : mapping of str to float
         Load inputs, the same in every step.
+    inner : InnerRoles, optional
+        Given where damage and sensors are the asset's own.
     """
 
-    def __init__(self, session: FmiAsset, observation: slice, load: Mapping[str, float]) -> None:
+    def __init__(
+        self,
+        session: Session,
+        observation: slice,
+        load: Mapping[str, float],
+        inner: InnerRoles | None = None,
+    ) -> None:
         self._session = session
         self._observation = observation
         self._load = dict(load)
+        self._inner = inner
         binding = session.binding
         self._units = {
             name: scalar.unit for name, scalar in [*binding.control.items(), *binding.monitor.items()]
@@ -68,7 +103,14 @@ class FmuAsset:
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         """Make one communication step."""
         observation = self._session.step(control, health, self._load)
-        return AssetReading(observation.values[self._observation], observation.extra)
+        sensed = observation.values[self._observation]
+        if self._inner is None:
+            return AssetReading(sensed, observation.extra)
+        state = {name: observation.extra[monitor] for name, monitor in self._inner.state.items()}
+        if self._inner.received is not None:
+            sensed = np.where(observation.values[self._inner.received] == 0.0, np.nan, sensed)
+        free = observation.values[self._inner.observation]
+        return AssetReading(free, observation.extra, InnerTruth(state, sensed))
 
     def save_state(self) -> bytes:
         """Return the state of the FMU."""
@@ -144,6 +186,14 @@ class FmuSource:
         """The reduced model of the design, once prepared."""
         return self._wing
 
+    def binding(self) -> Binding:
+        """Return the binding, once prepared."""
+        return load_binding(self._path(BINDING_COPY))
+
+    def fmu_path(self) -> Path:
+        """Return the FMU, once prepared."""
+        return self._path(FMU_COPY)
+
     def _path(self, name: str) -> Path:
         if self._folder is None:
             raise MissionInputError("the asset was not prepared: call `prepare` first.")
@@ -167,11 +217,12 @@ class FmuSource:
         fmu = self._given[FMU_COPY]
         binding = load_binding(self._binding)
         self._observed(binding)
+        self._inner_roles(binding)
         self._check_names(binding)
         if design is not None and self._scenario.asset.observation_model != "asset":
             check_wing_scenario(self._scenario, len(design.gauges.positions))
         if fmu is not None:
-            FmiAsset(fmu, binding, parameters=self._scenario.asset.parameters)
+            FmiAsset(fmu, binding, parameters=self.parameters())
 
     def files(self) -> dict[str, bytes]:
         """Return binding, design, calibration and FMU as they are given.
@@ -187,9 +238,9 @@ class FmuSource:
         scenario = self._scenario
         for what, names, known in (
             ("control input", scenario.control[0].values, binding.control),
-            ("state", scenario.state_names, binding.health),
+            ("state", () if scenario.truth.kind == "asset" else scenario.state_names, binding.health),
             ("load", scenario.asset.load, binding.load),
-            ("parameter", scenario.asset.parameters, binding.parameter),
+            ("parameter", (*scenario.asset.parameters, *scenario.asset.seeds), binding.parameter),
         ):
             unknown = sorted({*names} - {*known})
             if unknown:
@@ -214,6 +265,16 @@ class FmuSource:
                 atomic_write_bytes(self._path(name), read_content(path))
         self._observed(load_binding(self._path(BINDING_COPY)))
         hashes = {"binding": hash_file(self._path(BINDING_COPY))}
+        hashes |= self._prepare_model(progress)
+        if self._wing is not None and self._given[FMU_COPY] is None:
+            with progress.stage("Packing the FMU"):
+                self._pack(self._wing, self._path(FMU_COPY), tailored=self._tailored)
+        hashes["fmu"] = hash_file(self._path(FMU_COPY))
+        return hashes
+
+    def _prepare_model(self, progress: Progress) -> dict[str, str]:
+        """Read the calibration and reduce the design that the twin believes; return the hashes."""
+        hashes = {}
         if self._given[CALIBRATION_COPY] is not None:
             self._calibration = read_calibration(self._path(CALIBRATION_COPY), self._scenario)
             hashes["calibration"] = hash_file(self._path(CALIBRATION_COPY))
@@ -223,18 +284,14 @@ class FmuSource:
             self._design_name = self._design.name
             self._wing = reduced_model(self._design, progress=progress)
             hashes["design"] = self._wing.design_hash
-            if self._given[FMU_COPY] is None:
-                with progress.stage("Packing the FMU"):
-                    self._pack(self._wing)
-        hashes["fmu"] = hash_file(self._path(FMU_COPY))
         return hashes
 
-    def _pack(self, wing: ReducedModel) -> None:
-        """Pack the FMU to fly; where the scenario names no parameter, the start value is flown."""
-        if self._tailored and self._calibration is not None:
-            pack_calibrated_wing(wing, self._calibration, self._path(FMU_COPY), replace=True)
+    def _pack(self, wing: ReducedModel, target: Path, *, tailored: bool) -> None:
+        """Pack an FMU to fly; where the scenario names no parameter, the start value is flown."""
+        if tailored and self._calibration is not None:
+            pack_calibrated_wing(wing, self._calibration, target, replace=True)
         else:
-            build_fmu(wing, self._path(FMU_COPY), replace=True)
+            build_fmu(wing, target, replace=True)
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the calibrated parameter."""
@@ -254,7 +311,7 @@ class FmuSource:
         with self._session() as session:
             chosen = self._observed(session.binding)
             for row, value in enumerate(draws.values):
-                session.reset({**scenario.asset.parameters, draws.name: float(value)})
+                session.reset({**self.parameters(), draws.name: float(value)})
                 for state, levels in enumerate(states):
                     health = dict(zip(scenario.state_names, levels.tolist(), strict=True))
                     for index, control in enumerate(controls):
@@ -264,7 +321,10 @@ class FmuSource:
 
     def _observed(self, binding: Binding) -> slice:
         """Return where the observed quantity stands among the observations of the binding."""
-        role, expected = self._scenario.observation.role, self._scenario.observation.count
+        return self._slice(binding, self._scenario.observation.role)
+
+    def _slice(self, binding: Binding, role: str) -> slice:
+        expected = self._scenario.observation.count
         chosen = binding.observation_slice(role)
         if chosen.stop - chosen.start != expected:
             raise MissionInputError(
@@ -273,14 +333,48 @@ class FmuSource:
             )
         return chosen
 
-    def _session(self) -> FmiAsset:
+    def _inner_roles(self, binding: Binding) -> InnerRoles | None:
+        """Return where the asset tells of its own damage and sensors; None where the truth is the scenario's.
+
+        Raises
+        ------
+        MissionInputError
+            The binding has no such monitor or observation.
+        """
+        truth, asset = self._scenario.truth, self._scenario.asset
+        if truth.kind != "asset":
+            return None
+        if asset.design is None or asset.observation_model == "asset":
+            raise MissionInputError(
+                "an asset that carries its own damage cannot be asked what the twin should expect of each "
+                "state: give `asset.design`, a model for the twin."
+            )
+        unknown = sorted({*truth.state.values()} - {*binding.monitor})
+        if unknown:
+            raise MissionInputError(
+                f"`truth.state` names the monitor {', '.join(unknown)}, which the binding {binding.name} "
+                f"does not know; it knows {', '.join(binding.monitor) or 'none'}."
+            )
+        return InnerRoles(
+            state=truth.state,
+            observation=self._slice(binding, truth.observation or self._scenario.observation.role),
+            received=None if truth.received is None else self._slice(binding, truth.received),
+        )
+
+    def parameters(self) -> dict[str, float]:
+        """Return the parameters of the scenario, and the numbers drawn for its seeds."""
+        asset = self._scenario.asset
+        drawn = generator(self._scenario.mission.seed, "asset").integers(LARGEST_SEED, size=len(asset.seeds))
+        return asset.parameters | {name: float(value) for name, value in zip(asset.seeds, drawn, strict=True)}
+
+    def _session(self) -> Session:
         asset = self._scenario.asset
         return FmiAsset(
             self._path(FMU_COPY),
             self._path(BINDING_COPY),
             isolated=asset.isolated,
             step_timeout=asset.step_timeout,
-            parameters=asset.parameters,
+            parameters=self.parameters(),
         )
 
     def open(self) -> Asset:
@@ -294,13 +388,13 @@ class FmuSource:
             The FMU observes another number of values than the scenario.
         """
         session = self._session()
-        chosen = self._observed(session.binding)
+        chosen, inner = self._observed(session.binding), self._inner_roles(session.binding)
         try:
             session.reset()
         except BaseException:
             session.close()
             raise
-        return FmuAsset(session, chosen, self._scenario.asset.load)
+        return FmuAsset(session, chosen, self._scenario.asset.load, inner)
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write displacement and strain of the wing as VTU, with the parameters of the scenario."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.assets import Asset
+from twin_master.assets import Asset, AssetReading
 from twin_master.errors import AssetOutputError
 from twin_master.scenario import Scenario
 from twin_master.truth import Truth
@@ -64,11 +64,15 @@ class Plant:
             If the asset returns NaN, an infinity or the wrong number of values.
         """
         step = len(self._states)
-        previous = self._states[-1] if self._states else None
-        state = self._truth.state(step, previous, previous_control_index)
         control = self._scenario.control[control_index]
-        health = dict(zip(self._scenario.state_names, state.tolist(), strict=True))
-        reading = self._asset.step(control.values, health)
+        if self._truth.in_asset:
+            reading = self._asset.step(control.values, {})
+            state = self._told(step, reading)
+        else:
+            previous = self._states[-1] if self._states else None
+            state = self._truth.state(step, previous, previous_control_index)
+            health = dict(zip(self._scenario.state_names, state.tolist(), strict=True))
+            reading = self._asset.step(control.values, health)
         values = np.asarray(reading.values, dtype=np.float64)
         if values.shape != (self._scenario.observation.count,):
             raise AssetOutputError(
@@ -85,7 +89,15 @@ class Plant:
         self._observations.append(values)
         for name, value in reading.monitors.items():
             self._monitors.setdefault(name, []).append(float(value))
-        return self._truth.sense(step, values)
+        return self._truth.sense(step, values) if reading.inner is None else reading.inner.sensed
+
+    def _told(self, step: int, reading: AssetReading) -> Float:
+        """Return the true state that an asset with damage of its own tells."""
+        if reading.inner is None:
+            raise AssetOutputError(
+                f"step {step}: the asset does not tell its damage, which `truth` asks of it"
+            )
+        return np.array([reading.inner.state[name] for name in self._scenario.state_names])
 
     def record(self) -> PlantRecord:
         """Return what happened so far."""

@@ -10,12 +10,16 @@ from reporting.provenance import hash_file
 from scenarios import binding_files
 from twin_master.asset_source import (
     BINDING_COPY,
+    CALIBRATED_DESIGN_NAME,
     CALIBRATION_COPY,
     DESIGN_COPY,
     FMU_COPY,
     LIBRARY_COPY,
+    SHIPPED_DESIGN_NAME,
+    SSP_COPY,
     AssetSource,
     StrainLibrarySource,
+    component_copies,
 )
 from twin_master.errors import MissionInputError
 from twin_master.mismatch import MismatchedSource, check_load_factors
@@ -23,11 +27,8 @@ from twin_master.scenario import Scenario
 from twin_master.scenario_file import LoadedScenario, parse_scenario
 from twin_master.strain_library import FILE_NAME, load_strain_library
 
-SHIPPED_DESIGN_NAME = "uav_wing"
 REPOSITORY = "https://github.com/michaelkapteyn/UAV-Digital-Twin"
 """Where the authors of Kapteyn et al. 2021 published their strain library."""
-CALIBRATED_DESIGN_NAME = "calibration"
-"""The tailored design inside the calibration file: with a file it takes the place of the scenario's."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,8 @@ class Overrides:
         Fly the FMU in this process instead of a worker.
     calibration : Path or None
         The calibration file of the wing, instead of what the scenario says of its calibration.
+    ssp : Path or None
+        SSP file to fly in the place of the scenario's asset.
     """
 
     seed: int | None = None
@@ -55,6 +58,7 @@ class Overrides:
     strain_library: Path | None = None
     in_process: bool = False
     calibration: Path | None = None
+    ssp: Path | None = None
 
 
 def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
@@ -84,7 +88,16 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
         raise MissionInputError(
             "a strain library brings its own samples of its parameter: fly it without a calibration file."
         )
+    if overrides.ssp and (overrides.strain_library or overrides.fmu):
+        raise MissionInputError("an SSP file is flown as it is: give neither --fmu nor --strain-library.")
+    if overrides.fmu and asset["kind"] == "coupled":
+        raise MissionInputError(
+            "--fmu flies one FMU, and the scenario couples several: change its components."
+        )
     if calibration["file"] and asset["design"]:
+        for component in asset["component"]:
+            if component["design"] == asset["design"]:  # the wing that the file describes
+                component["design"] = CALIBRATED_DESIGN_NAME
         asset["design"] = CALIBRATED_DESIGN_NAME
     elif asset["design"] == CALIBRATED_DESIGN_NAME:
         raise MissionInputError(
@@ -97,6 +110,10 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
         asset["file"] = str(folder / asset["file"])
     if asset["binding"] and asset["binding"] not in binding_files():
         asset["binding"] = str(folder / asset["binding"])
+    for component, section in zip(asset["component"], loaded.scenario.asset.component, strict=True):
+        component |= {key: str(folder / component[key]) for key in component_copies(section)}
+    if overrides.ssp:
+        asset |= {"kind": "coupled", "file": str(overrides.ssp.resolve()), "component": [], "connection": []}
     if overrides.fmu:
         asset |= {"kind": "fmu", "file": str(overrides.fmu.resolve())}
     if overrides.binding:
@@ -104,7 +121,7 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
     if overrides.strain_library:
         if asset["kind"] != "strain_library":
             asset |= {"kind": "strain_library", "design": None, "binding": None, "observation_model": None}
-            asset["parameters"] = {}  # those of the FMU
+            asset |= {"parameters": {}, "component": [], "connection": [], "seeds": []}  # those of FMUs
         asset["file"] = str(_library_file(overrides.strain_library))
     if overrides.in_process:
         asset["isolated"] = False
@@ -119,16 +136,25 @@ def _library_file(path: Path) -> Path:
 
 def portable_scenario(scenario: Scenario) -> Scenario:
     """Return a resolved scenario that names the copies in the run folder, so that it holds on any machine."""
-    library = scenario.asset.kind == "strain_library"
-    copies = {"file": LIBRARY_COPY if library else FMU_COPY, "design": DESIGN_COPY, "binding": BINDING_COPY}
-    portable = _with_asset(scenario, {key: copies[key] for key in _given_paths(scenario)})
+    file = {"strain_library": LIBRARY_COPY, "coupled": SSP_COPY}.get(scenario.asset.kind, FMU_COPY)
+    copies = {"file": file, "design": DESIGN_COPY, "binding": BINDING_COPY}
+    portable = _with_asset(
+        scenario,
+        {key: copies[key] for key in _given_paths(scenario)}
+        | {"component": tuple(c.model_copy(update=component_copies(c)) for c in scenario.asset.component)},
+    )
     return _with_calibration_file(portable, CALIBRATION_COPY)
 
 
 def located_scenario(scenario: Scenario, folder: Path) -> Scenario:
     """Return a portable scenario with the paths of the copies in a run folder."""
     paths = _given_paths(scenario)
-    located = _with_asset(scenario, {key: str(folder / PurePosixPath(path)) for key, path in paths.items()})
+    changes: dict[str, Any] = {key: str(folder / PurePosixPath(path)) for key, path in paths.items()}
+    changes["component"] = tuple(
+        c.model_copy(update={key: str(folder / path) for key, path in component_copies(c).items()})
+        for c in scenario.asset.component
+    )
+    located = _with_asset(scenario, changes)
     return _with_calibration_file(located, str(folder / PurePosixPath(CALIBRATION_COPY)))
 
 
@@ -183,7 +209,12 @@ def asset_source(scenario: Scenario) -> AssetSource:
         )
         return MismatchedSource(library, believed)
     binding = binding_files().get(asset.binding or "", Path(asset.binding or ""))
-    return FmuSource(
+    source: type[FmuSource] = FmuSource
+    if asset.kind == "coupled":  # who flies one FMU does not pay for the reading of SSP files
+        from twin_master.coupled_source import CoupledSource
+
+        source = CoupledSource
+    return source(
         scenario,
         binding,
         Path(design) if design and not tailored else None,

@@ -17,7 +17,7 @@ from twin_master.planner import PlannedPolicy
 from twin_master.rewards import REWARD_NAMES, RewardModel
 from twin_master.scenario import Scenario
 from twin_master.sensor_model import GaussianSensorModel
-from twin_master.truth import Truth
+from twin_master.truth import SensorStatus, Truth
 
 Float = NDArray[np.float64]
 
@@ -294,6 +294,9 @@ def _policy(result: MissionResult, labels: _Labels) -> xr.Dataset:
 
 def _truth(result: MissionResult, labels: _Labels) -> xr.Dataset:
     record, role = result.flight.truth, result.scenario.observation.role
+    status = result.truth.status
+    if result.truth.in_asset:
+        status = np.where(np.isnan(result.flight.observed), SensorStatus.LOST, status).astype(status.dtype)
     variables: dict[str, Variable] = {
         "state": (
             ("step", "region"),
@@ -309,7 +312,7 @@ def _truth(result: MissionResult, labels: _Labels) -> xr.Dataset:
         ),
         "sensor_status": (
             ("step", "sensor"),
-            result.truth.status,
+            status,
             "1",
             "what each sensor really does: 0 healthy, 1 lost, 2 drifting",
         ),

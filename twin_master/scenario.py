@@ -142,10 +142,38 @@ class Reference(Section):
     source: str
 
 
-class AssetSection(Section):
-    """What is flown: an FMU (packed from a wing design, or a file), or a strain library."""
+class ComponentSection(Section):
+    """One FMU of a coupled asset: a file, a companion by its name, or packed from a wing design."""
 
-    kind: Literal["fmu", "strain_library"] = "fmu"
+    name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$")]
+    fmu: str | None = None
+    design: str | None = None
+    substeps: Count = 1
+    """Steps that it makes in one step of the system."""
+    parameters: dict[str, Flag | Number | str] = Field(default_factory=dict)
+    """By the FMU's names and in its units; `gain[{1..4}]` stands for four of them."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.fmu is None) == (self.design is None):
+            raise ValueError(f"the component `{self.name}` needs one of `fmu` and `design`")
+        return self
+
+
+class ConnectionSection(Section):
+    """What flows from one FMU of a coupled asset to another, or to and from the asset itself."""
+
+    source: Annotated[str, Field(min_length=1)]
+    target: Annotated[str, Field(min_length=1)]
+    factor: Number = 1.0
+    offset: Number = 0.0
+    delayed: Flag = False
+
+
+class AssetSection(Section):
+    """What is flown: an FMU (packed from a wing design, or a file), several of them, or a strain library."""
+
+    kind: Literal["fmu", "coupled", "strain_library"] = "fmu"
     design: str | None = None
     file: str | None = None
     binding: str | None = None
@@ -156,6 +184,13 @@ class AssetSection(Section):
     observation_model: Literal["design", "asset"] | None = None
     """Where the twin's predicted observations come from: the model of the design (the default where there is
     one), or the asset itself."""
+    seeds: tuple[Name, ...] = ()
+    """Parameters of the binding that are given a number drawn from the seed of the run."""
+    component: tuple[ComponentSection, ...] = ()
+    connection: tuple[ConnectionSection, ...] = ()
+    algorithm: Literal["gauss_seidel", "jacobi"] = "gauss_seidel"
+    iterations: Count = 1
+    tolerance: Positive = 1e-9
 
     @property
     def model_of_the_design(self) -> bool:
@@ -169,6 +204,18 @@ class AssetSection(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if self.kind != "coupled" and (self.component or self.connection):
+            raise ValueError("`component` and `connection` belong to the kind `coupled`")
+        if self.kind == "coupled" and (not self.binding or bool(self.file) == bool(self.component)):
+            raise ValueError("a coupled asset needs `binding` and either `file`, an SSP file, or `component`")
+        if self.kind == "coupled" and self.file and self.connection:
+            raise ValueError("the connections of an SSP file stand in it: leave out `connection`")
+        names = [component.name for component in self.component]
+        if len(set(names)) != len(names):
+            raise ValueError(f"each component needs a name of its own, and the names are {_short(names)}")
+        for name in self.seeds:
+            if name in self.parameters:
+                raise ValueError(f"`{name}` is both in `parameters` and in `seeds`: keep one of them")
         if self.kind == "fmu" and (not self.binding or not (self.design or self.file)):
             raise ValueError("an FMU asset needs `binding` and one of `design` and `file`")
         if self.observation_model == "design" and self.design is None:
@@ -264,12 +311,35 @@ class SensorFault(Section):
 
 
 class Truth(Section):
-    """What really happens, unseen by the twin: damage, sensor noise and faults."""
+    """What really happens, unseen by the twin: damage, sensor noise and faults.
 
-    kind: Literal["scripted", "random_growth"]
+    With the kind `asset`, all of it happens inside the asset, and is read back for scoring only.
+    """
+
+    kind: Literal["scripted", "random_growth", "asset"]
     gains: tuple[Gain, ...] = ()
-    noise: Noise
+    noise: Noise = Noise(standard_deviation=0.0)
     sensor_faults: tuple[SensorFault, ...] = ()
+    state: dict[str, Name] = Field(default_factory=dict)
+    """`asset`: for each state, the monitor of the binding that tells its true value."""
+    observation: Name | None = None
+    """`asset`: the observation of the binding that is free of noise; that of the scenario if absent."""
+    received: Name | None = None
+    """`asset`: the observation of the binding that is 0 where a sensor is lost."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.kind == "asset":
+            if self.gains or self.sensor_faults or self.noise.standard_deviation:
+                raise ValueError(
+                    "the kind `asset` leaves damage, noise and faults to the asset: leave out `truth.gains`, "
+                    "`truth.noise` and `truth.sensor_faults`"
+                )
+        elif self.state or self.observation or self.received:
+            raise ValueError("`state`, `observation` and `received` of `truth` belong to the kind `asset`")
+        elif "noise" not in self.model_fields_set:
+            raise ValueError("`truth.noise` is missing")
+        return self
 
 
 class Scenario(Section):
@@ -306,7 +376,7 @@ class Scenario(Section):
         names += [f"mean_reward_{name}" for name in REWARD_NAMES]
         names += [f"{self.calibration.parameter}_{moment}" for moment in ("mean", "standard_deviation")]
         names += ["log_evidence"]
-        if any(fault.kind == "dropout" for fault in self.truth.sensor_faults):
+        if self.truth.received or any(fault.kind == "dropout" for fault in self.truth.sensor_faults):
             names += ["lost_observations", "blind_steps"]
         if self.asset.another_model:
             names += [*MISFIT_FIGURES]
@@ -347,6 +417,10 @@ class Scenario(Section):
             _known(name, self.figure_names, "reference.figure", "figure of the summary")
             if referred.count(name) > 1:
                 raise ValueError(f"`reference` gives `{name}` more than once: keep one of them")
+        if self.truth.kind == "asset":
+            if self.asset.kind == "strain_library":
+                raise ValueError("`truth.kind` `asset` needs an FMU, and the asset is a strain library")
+            _same(self.truth.state, states, "truth.state", "state")
         if self.truth.kind == "random_growth" and self.truth.gains:
             raise ValueError("`truth.gains` belongs to the kind `scripted`, and the kind is `random_growth`")
         for gain in self.truth.gains:

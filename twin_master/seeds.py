@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-PURPOSES = ("damage", "noise", "calibration")
+PURPOSES = ("damage", "noise", "calibration", "asset")
 """Purposes in the order of their spawn keys; new ones are appended."""
 
 

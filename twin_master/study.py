@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from twin_master.asset_source import AssetSource
 from twin_master.crew import Knowledge, prepare_knowledge
+from twin_master.errors import MissionInputError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.mission import Flight, fly
 from twin_master.scenario import Scenario
@@ -175,7 +176,17 @@ def fly_many(
         Seed of the calibration, which all missions share; the first of the seeds by default.
     watch : callable, optional
         Called with the seed and the flight after each mission.
+
+    Raises
+    ------
+    MissionInputError
+        The asset carries its own damage and noise, which the seeds would not change.
     """
+    if scenario.truth.kind == "asset":
+        raise MissionInputError(
+            "the damage and noise of this asset are its own, so that every seed would fly the same life: fly "
+            "the scenario with --seed instead."
+        )
     chosen = tuple(seeds)
     knowledge = prepare_knowledge(
         scenario, source, chosen[0] if calibration_seed is None else calibration_seed

@@ -12,6 +12,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from twin_master.errors import MissionError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.scenario import Scenario
 from twin_master.seeds import generator
@@ -52,6 +53,9 @@ class Truth:
         Drift added to the raw observation, in its SI unit.
     status : (T, G)
         `SensorStatus` of each sensor.
+    in_asset : bool
+        Whether the asset carries damage, noise and faults; then all of the above is zero, and the asset
+        tells what happened.
     """
 
     def __init__(self, scenario: Scenario, model: GraphicalModel, seed: int) -> None:
@@ -61,7 +65,10 @@ class Truth:
         self.drift: Float = np.zeros((steps, sensors))
         self.status: NDArray[np.int8] = np.zeros((steps, sensors), dtype=np.int8)
         self._apply_faults(scenario)
-        if scenario.truth.kind == "scripted":
+        self.in_asset = scenario.truth.kind == "asset"
+        if self.in_asset:
+            self._state: StateRule = _untold
+        elif scenario.truth.kind == "scripted":
             self._state = _scripted(scenario, model)
         else:
             self._state = _random_growth(model, generator(seed, "damage").random(steps))
@@ -105,6 +112,10 @@ class Truth:
 
 
 StateRule = Callable[[int, "Float | None", "int | None"], Float]
+
+
+def _untold(_step: int, _previous_state: Float | None, _previous_control: int | None) -> Float:
+    raise MissionError("the damage of this asset is its own: it is read from the asset, not given to it.")
 
 
 def _scripted(scenario: Scenario, model: GraphicalModel) -> StateRule:

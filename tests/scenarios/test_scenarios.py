@@ -11,8 +11,9 @@ from twin_master.twin import build_graphical_model
 
 
 def test_what_is_shipped() -> None:
-    assert set(scenario_files()) == {"level_turns", "growing_damage", "failing_gauges", "model_mismatch"}
-    assert "uav_wing" in binding_files()
+    expected = {"level_turns", "growing_damage", "failing_gauges", "model_mismatch", "three_fmus"}
+    assert set(scenario_files()) == expected
+    assert set(binding_files()) == {"uav_wing", "uav_wing_laboratory", "three_fmus"}
 
 
 @pytest.mark.parametrize("name", sorted(scenario_files()))

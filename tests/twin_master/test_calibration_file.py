@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 
 from calibration.errors import CalibrationRecordError
 from calibration.result import CalibrationResult
+from reporting.progress import SilentProgress
 from scenarios import scenario_files
 from twin_master.calibrated_asset import calibrated_wing, description, run_record
 from twin_master.errors import MissionInputError, ScenarioError
@@ -152,3 +154,18 @@ def test_what_is_refused_before_a_folder_is_made(file: Path, tmp_path: Path, lib
     for path, word in ((damaged, "damaged"), (tmp_path / "missing.nc", "not there")):
         with pytest.raises(CalibrationRecordError, match=word):
             asset_source(resolve_scenario(loaded, Overrides(calibration=path))).check()
+
+
+def test_the_wing_among_several_fmus_is_tailored_too(file: Path, tmp_path: Path) -> None:
+    scenario = resolve_scenario(load_scenario("three_fmus"), Overrides(calibration=file))
+    assert [component.design for component in scenario.asset.component] == [None, "calibration", None]
+    source = asset_source(scenario)
+    source.check()
+    (tmp_path / "run").mkdir()
+    hashes = source.prepare(tmp_path / "run", SilentProgress())
+    assert hashes["design"] == CalibrationResult.load(file).design_hash
+    with zipfile.ZipFile(tmp_path / "run" / "asset" / "components" / "wing.fmu") as archive:
+        record = json.loads(archive.read("resources/calibration.json"))
+    assert record["asset"] == "Wing 7 (é)"
+    moved = located_scenario(portable_scenario(scenario), tmp_path / "run")
+    assert moved.asset.component[1].design == "calibration"

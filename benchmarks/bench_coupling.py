@@ -1,0 +1,114 @@
+"""A step of three coupled FMUs (damage growth, wing, gauges) beside the same three stepped one by one."""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.measurement import Measurement, median_seconds
+from fe.cache import reduced_model
+from fmu_asset.binding import Binding, load_binding
+from fmu_asset.build import build_fmu
+from fmu_asset.companions.build import build_companion
+from fmu_asset.coupling.asset import CoupledAsset
+from fmu_asset.coupling.layout import Layout
+from fmu_asset.coupling.roles import resolve_roles
+from fmu_asset.coupling.structure import Component, Connector, Setting, SystemStructure, expand_connection
+from fmu_asset.coupling.wiring import Wiring
+from fmu_asset.session import FmiAsset
+from scenarios import binding_files
+from twin_master.scenario_file import load_scenario
+
+REPEATS, INNER = 300, 5
+
+
+def run() -> list[Measurement]:
+    """Measure a macro step, its overhead over the steps of the FMUs, and what a saved state costs."""
+    binding = load_binding(binding_files()["three_fmus"])
+    with tempfile.TemporaryDirectory() as folder:
+        wiring = three_fmus(Path(folder))
+        coupled, alone, saved, size = _in_process(wiring, binding)
+        with CoupledAsset(wiring, binding) as asset:
+            loads = itertools.cycle((2.0, 3.0))
+            isolated = 1e6 * median_seconds(
+                lambda: asset.step({"load_factor": next(loads)}), repeats=REPEATS, inner=INNER
+            )
+        joining = 1e3 * median_seconds(lambda: Wiring(wiring.structure), repeats=5)
+    beside = "the three stepped one by one"
+    return [
+        Measurement("step of three FMUs in process", coupled, "us", None, beside, alone),
+        Measurement("overhead of the coupling", coupled - alone, "us", 50.0),
+        Measurement("step of three FMUs in three workers", isolated, "us"),
+        Measurement(f"state of three FMUs saved, {size} bytes", saved, "us"),
+        Measurement("three FMUs read, checked and joined", joining, "ms"),
+    ]
+
+
+def three_fmus(folder: Path) -> Wiring:
+    """Return the system of the shipped scenario, its noise included."""
+    asset = load_scenario("three_fmus").scenario.asset
+    fmus = {
+        "damage": build_companion("damage_growth", folder / "damage.fmu").path,
+        "wing": build_fmu(reduced_model(), folder / "wing.fmu").path,
+        "gauges": build_companion("strain_gauges", folder / "gauges.fmu").path,
+    }
+    connections = tuple(
+        connection
+        for entry in asset.connection
+        for connection in expand_connection(entry.source, entry.target, list(fmus))
+    )
+    connectors = dict.fromkeys(
+        [Connector(c.source.variable, "input") for c in connections if not c.source.component]
+        + [Connector(c.target.variable, "output") for c in connections if not c.target.component]
+    )
+    components = tuple(
+        Component(c.name, fmus[c.name], {key: Setting(value) for key, value in c.parameters.items()})
+        for c in asset.component
+    )
+    return Wiring(SystemStructure("three_fmus", components, tuple(connectors), connections))
+
+
+def _in_process(wiring: Wiring, binding: Binding) -> tuple[float, float, float, int]:
+    """Time the coupled step and the three FMUs alone in turn, so that other work meets both alike.
+
+    The FMUs alone have the bindings and inputs that they have in the system, and nothing passes between them.
+    """
+    layout = Layout(wiring, binding, resolve_roles(wiring, binding))
+    loads = itertools.cycle((2.0, 3.0))
+    assets, inputs = [], []
+    with CoupledAsset(wiring, binding, isolated=False) as coupled:
+        try:
+            for index, component in enumerate(wiring.structure.components):
+                own = layout.component_binding(index)
+                asset = FmiAsset(component.fmu, own, isolated=False, parameters=layout.settings[index])
+                asset.reset()
+                assets.append(asset)
+                inputs.append(dict.fromkeys(own.load, 0.0))
+
+            def one_by_one() -> None:
+                load = next(loads)
+                for asset, given in zip(assets, inputs, strict=True):
+                    if "load_factor" in given:
+                        given["load_factor"] = load
+                    asset.step(load=given).values.tolist()
+
+            def together() -> None:
+                coupled.step({"load_factor": next(loads)})
+
+            times: tuple[list[float], list[float]] = ([], [])
+            for _ in range(REPEATS):
+                for function, seen in zip((together, one_by_one), times, strict=True):
+                    begin = time.perf_counter()
+                    for _ in range(INNER):
+                        function()
+                    seen.append((time.perf_counter() - begin) / INNER)
+            saved = median_seconds(coupled.save_state, repeats=REPEATS)
+            medians = [1e6 * float(np.median(seen)) for seen in times]
+            return medians[0], medians[1], 1e6 * saved, len(coupled.save_state())
+        finally:
+            for asset in assets:
+                asset.close()

@@ -1,0 +1,238 @@
+"""Packing the companions of the wing as FMUs, by the machinery that packs it; equal input, equal bytes."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import distribution, version
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from reporting.files import atomic_write_bytes
+
+from ..build import (
+    _PLACEHOLDER,
+    PYTHONFMU_VERSION,
+    _archive,
+    _check_start,
+    _filled,
+    _guid,
+    _hash,
+    _licence,
+    _named,
+    relative_imports,
+)
+from ..description import documentation_page, model_description
+from ..errors import FmuBuildError
+from ..variables import ENUMERATIONS, FmuVariable, Unit
+from . import damage_growth, strain_gauges
+
+_OWN_FILES = ("slave.py", "table.py")
+_STATUS = tuple(enumeration for enumeration in ENUMERATIONS if enumeration.name == "Status")
+_UNITS = (
+    Unit("1", (), (("microstrain", 1e6), ("%", 100.0))),
+    Unit("s", (("s", 1),)),
+    Unit("1/s", (("s", -1),), (("microstrain/s", 1e6),)),
+)
+
+_SCRIPT = '''"""Loaded by the FMI wrapper; everything is in the package beside it."""
+from {module}_runtime.entry import CompanionSlave, Fmi2Slave, keep_alive
+
+# The wrapper runs this file once for each instance and drops one reference to its globals too many.
+keep_alive(globals())
+
+
+class Companion{tag}(CompanionSlave, Fmi2Slave):
+    """The FMU."""
+
+    content_tag = "{tag}"
+'''
+
+_ENTRY = '''"""Joins the slave, the behaviour and pythonfmu's base class."""
+import json
+
+from .companions import {name} as companion
+from .companions.slave import CompanionSlave as _CompanionSlave
+from .companions.slave import Contents
+from .pythonfmu.fmi2slave import Fmi2Slave
+
+__all__ = ["CompanionSlave", "Fmi2Slave", "keep_alive"]
+
+_kept = []
+
+
+def keep_alive(thing):
+    """Hold one more reference for ever."""
+    _kept.append(thing)
+
+
+def load_contents(resources):
+    """Read the setting that was packed."""
+    setting = json.loads((resources / "setting.json").read_text(encoding="utf-8"))
+    return Contents(companion.variable_table(setting), lambda: companion.behaviour(setting))
+
+
+class CompanionSlave(_CompanionSlave):
+    """The slave with its resources."""
+
+    load_contents = staticmethod(load_contents)
+'''
+
+
+@dataclass(frozen=True)
+class Companion:
+    """A kind of FMU that is built here.
+
+    Attributes
+    ----------
+    name : str
+        Also the name of its file in this package.
+    description : str
+        One sentence.
+    variable_table, dependencies : callable
+        Take the setting; return the table, and the direct dependencies of the outputs.
+    """
+
+    name: str
+    description: str
+    variable_table: Callable[[Mapping[str, Any]], tuple[FmuVariable, ...]]
+    dependencies: Callable[[Mapping[str, Any]], dict[str, list[str]]]
+
+
+COMPANIONS = {
+    module.NAME: Companion(module.NAME, module.DESCRIPTION, module.variable_table, module.dependencies)
+    for module in (damage_growth, strain_gauges)
+}
+"""What can be built, by name."""
+
+
+@dataclass(frozen=True)
+class CompanionInfo:
+    """A companion FMU that was built: its file, GUID and content hash."""
+
+    path: Path
+    guid: str
+    content_hash: str
+
+
+def build_companion(
+    name: str,
+    path: str | os.PathLike[str],
+    *,
+    start: Mapping[str, float] | None = None,
+    gauge_count: int | None = None,
+    replace: bool = False,
+) -> CompanionInfo:
+    """Pack a companion as an FMU; equal input gives equal bytes.
+
+    Parameters
+    ----------
+    name : str
+        One of `COMPANIONS`.
+    path : path-like
+        Where to write, with the suffix .fmu.
+    start : mapping of str to float, optional
+        Start values of inputs and parameters that take the place of the defaults.
+    gauge_count : int, optional
+        Number of gauges of `strain_gauges`; 24 by default.
+    replace : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    FmuBuildError
+        If there is no such companion, a start value does not fit, the file exists, the suffix is wrong, or
+        the wrong pythonfmu is installed.
+    """
+    target = Path(path)
+    if target.suffix != ".fmu":
+        raise FmuBuildError(f"An FMU must have the suffix .fmu, but {target} was given.")
+    if target.exists() and not replace:
+        raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
+    content, content_hash = companion_bytes(name, start=start, gauge_count=gauge_count)
+    atomic_write_bytes(target, content)
+    return CompanionInfo(target, _guid(content_hash), content_hash)
+
+
+def companion_bytes(
+    name: str, *, start: Mapping[str, float] | None = None, gauge_count: int | None = None
+) -> tuple[bytes, str]:
+    """Return the archive and its content hash; see `build_companion`."""
+    companion = COMPANIONS.get(name)
+    if companion is None:
+        raise FmuBuildError(f"There is no companion FMU {name!r}; there are {', '.join(COMPANIONS)}.")
+    setting: dict[str, Any] = {"start": {key: float(value) for key, value in (start or {}).items()}}
+    if gauge_count is not None:
+        if gauge_count < 1 or name != strain_gauges.NAME:
+            raise FmuBuildError(f"{name} cannot have {gauge_count} gauges.")
+        setting["gauge_count"] = gauge_count
+    try:
+        table = companion.variable_table(setting)
+    except ValueError as error:
+        raise FmuBuildError(f"The companion FMU {name} cannot be built: {error}.") from error
+    _check_start(table)
+    template = _members(companion, table, setting)
+    content_hash = _hash(template)
+    members = {_named(key, content_hash): _filled(key, data, content_hash) for key, data in template.items()}
+    return _archive(members), content_hash
+
+
+def _members(
+    companion: Companion, table: tuple[FmuVariable, ...], setting: Mapping[str, Any]
+) -> dict[str, bytes]:
+    """Return the files of the archive, with the placeholder wherever the content hash will stand."""
+    installed = version("pythonfmu")
+    if installed != PYTHONFMU_VERSION:
+        raise FmuBuildError(
+            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed} is installed."
+        )
+    # As installed, not as imported: an FMU in this process may have brought a pythonfmu of its own.
+    wrapper = Path(str(distribution("pythonfmu").locate_file("pythonfmu")))
+    own = files("fmu_asset")
+    module = f"{companion.name}_{_PLACEHOLDER}"
+    runtime = f"resources/{module}_runtime"
+    host = "It runs in any Python host; the standard library is enough."
+    members = {
+        "modelDescription.xml": model_description(
+            identifier=module,
+            guid=_PLACEHOLDER,
+            table=table,
+            description=companion.description,
+            version=version("uav-twin"),
+            generation_tool=f"uav-twin with PythonFMU {installed}",
+            model_name=companion.name,
+            units=_UNITS,
+            enumerations=_STATUS,
+            dependencies=companion.dependencies(setting),
+        ),
+        f"binaries/linux64/{module}.so": (
+            wrapper / "resources/binaries/linux64/libpythonfmu-export.so"
+        ).read_bytes(),
+        f"binaries/win64/{module}.dll": (
+            wrapper / "resources/binaries/win64/pythonfmu-export.dll"
+        ).read_bytes(),
+        "documentation/index.html": documentation_page(
+            table, companion.description, model_name=companion.name, enumerations=_STATUS, host=host
+        ),
+        "documentation/licenses/pythonfmu.txt": _licence("pythonfmu"),
+        "resources/setting.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode(),
+        "resources/slavemodule.txt": module.encode(),
+        f"resources/{module}.py": _SCRIPT.format(module=module, tag=_PLACEHOLDER).encode(),
+        f"{runtime}/__init__.py": b'"""An FMU of uav-twin."""\n',
+        f"{runtime}/entry.py": _ENTRY.format(name=companion.name).encode(),
+        f"{runtime}/variables.py": (own / "variables.py").read_bytes(),
+        f"{runtime}/companions/__init__.py": b'"""What the FMU does."""\n',
+        f"{runtime}/pythonfmu/__init__.py": b'"""The base class of pythonfmu."""\n',
+    }
+    members |= {
+        f"{runtime}/companions/{name}": (own / "companions" / name).read_bytes()
+        for name in (*_OWN_FILES, f"{companion.name}.py")
+    }
+    members |= {
+        f"{runtime}/pythonfmu/{name}": (wrapper / name).read_bytes()
+        for name in relative_imports(wrapper, ["fmi2slave.py"])
+    }
+    return members

@@ -1,0 +1,165 @@
+"""Damage that grows: the stiffness losses of two regions, by script, by load and by chance.
+
+This file is copied into the FMU: standard library and relative imports only.
+
+The loss of a region is the sum of three parts, kept below a ceiling:
+
+- a script: at each mark of time between `first` and `last` of an entry, the entry's gain;
+- growth with the load, as in crack growth (Paris and Erdogan 1963), dz/dt = rate (|n| / n_ref)^exponent;
+- chance: at each mark but the first, one level more with probability min(1, p (|n| / n_ref)^exponent), where
+  n is the load factor that was held before the mark.
+
+A mark is a multiple of `period` after the start. What happens at a mark belongs to the step that begins at
+it, so that the damage that a turn does is felt from the next turn on. The numbers of a mark follow from the
+seed, the region and the mark alone: they do not depend on the step size, on the other region or on earlier
+marks.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ..variables import FmuVariable
+from .slave import Behaviour
+from .table import Table
+
+NAME = "damage_growth"
+DESCRIPTION = "Growth of the stiffness losses of two regions: by script, with the load factor, and by chance."
+REGIONS = ("z1", "z2")
+SCRIPT_LENGTH = 8
+LARGEST_SEED = 2**31 - 1
+_DECIMALS = 12
+"""Losses are given rounded to this many digits, so that ten times 2 % and 40 % are 60 %."""
+
+
+def variable_table(setting: Mapping[str, Any]) -> tuple[FmuVariable, ...]:
+    """Return the table of variables; `setting` holds `start`, start values by name."""
+    table = Table(setting.get("start", {}))
+    table.add("load_factor", "input", "Load factor that is held over the step", unit="1", box=(-10.0, 10.0),
+              default=1.0)  # fmt: skip
+    for region in REGIONS:
+        table.add(f"initial.{region}", "parameter", f"Loss of region {region[1]} at the start",
+                  unit="1", display="%", box=(0.0, 1.0))  # fmt: skip
+    table.add("ceiling", "parameter", "Largest loss", unit="1", display="%", box=(0.0, 1.0), default=0.8)
+    table.add(
+        "period", "parameter", "Time from one mark to the next", unit="s", box=(1e-6, None), default=1.0
+    )
+    table.add("reference_load_factor", "parameter", "Load factor n_ref at which rates and probabilities hold",
+              unit="1", box=(1e-3, 10.0), default=3.0)  # fmt: skip
+    table.add("exponent", "parameter", "Exponent of the load factor in rates and probabilities", unit="1",
+              box=(0.0, 20.0))  # fmt: skip
+    for region in REGIONS:
+        table.add(f"rate.{region}", "parameter", f"Growth of region {region[1]} at the reference load factor",
+                  unit="1/s", box=(0.0, None))  # fmt: skip
+    table.add("level", "parameter", "By how much chance worsens a region", unit="1", display="%",
+              box=(0.0, 1.0), default=0.2)  # fmt: skip
+    for region in REGIONS:
+        table.add(f"probability.{region}", "parameter",
+                  f"Probability that region {region[1]} worsens at a mark, at the reference load factor",
+                  unit="1", display="%", box=(0.0, 1.0))  # fmt: skip
+    table.add("seed", "parameter", "Seed of chance", kind="Integer", box=(0, LARGEST_SEED))
+    for entry in range(1, SCRIPT_LENGTH + 1):
+        table.add(f"script[{entry}].first", "parameter", f"First mark of entry {entry}", unit="s")
+        table.add(f"script[{entry}].last", "parameter", f"Last mark of entry {entry}", unit="s")
+        for region in REGIONS:
+            table.add(f"script[{entry}].{region}", "parameter",
+                      f"What region {region[1]} loses at each mark of entry {entry}",
+                      unit="1", display="%", box=(-1.0, 1.0))  # fmt: skip
+    for region in REGIONS:
+        table.add(region, "output", f"Stiffness that region {region[1]} has lost, as a fraction",
+                  unit="1", display="%")  # fmt: skip
+    table.add("status", "output", "What became of the last call", kind="Enumeration", enumeration="Status")
+    return table.rows()
+
+
+def dependencies(setting: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Return the direct dependencies: the losses are states, so there are none."""
+    return {name: [] for name in (*REGIONS, "status")}
+
+
+def behaviour(setting: Mapping[str, Any]) -> Behaviour:
+    """Return a fresh behaviour."""
+    return DamageGrowth()
+
+
+class DamageGrowth:
+    """The growing damage; see the module."""
+
+    def __init__(self) -> None:
+        self._loss = [0.0, 0.0]
+        self._begin = 0.0
+        self._mark = 0
+        self._last_load = 0.0
+        self._take({})
+
+    def _take(self, parameters: Mapping[str, float]) -> None:
+        """Keep the parameters in the form in which a step needs them."""
+        self._ceiling = parameters.get("ceiling", 1.0)
+        self._period = parameters.get("period", 1.0)
+        self._reference = parameters.get("reference_load_factor", 1.0)
+        self._exponent = parameters.get("exponent", 0.0)
+        self._level, self._seed = parameters.get("level", 0.0), int(parameters.get("seed", 0))
+        self._rate = [parameters.get(f"rate.{region}", 0.0) for region in REGIONS]
+        self._chance = [parameters.get(f"probability.{region}", 0.0) for region in REGIONS]
+        entries = [
+            [parameters.get(f"script[{entry}].{key}", 0.0) for key in ("first", "last", *REGIONS)]
+            for entry in range(1, SCRIPT_LENGTH + 1)
+        ]
+        self._script = [entry for entry in entries if any(entry[2:])]
+
+    def start(self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]) -> list[float]:
+        """Begin with the initial losses."""
+        self._take(parameters)
+        self._loss = [parameters[f"initial.{region}"] for region in REGIONS]
+        self._begin, self._mark, self._last_load = time, 0, inputs[0]
+        return self._outputs()
+
+    def advance(self, time: float, duration: float, inputs: Sequence[float]) -> list[float]:
+        """Let the damage of one step happen."""
+        load, period = inputs[0], self._period
+        tolerance = 1e-9 * period
+        end = time + duration - tolerance
+        if not (self._script or any(self._chance)):
+            self._mark = max(self._mark, math.ceil((end - self._begin) / period))
+        while self._begin + self._mark * period < end:
+            moment = self._begin + self._mark * period
+            self._pass_mark(moment - self._begin, self._last_load if moment <= time + tolerance else load)
+            self._mark += 1
+        for index, rate in enumerate(self._rate):
+            if rate:
+                grown = self._loss[index] + rate * self._severity(load) * duration
+                self._loss[index] = min(grown, self._ceiling)
+        self._last_load = load
+        return self._outputs()
+
+    def _pass_mark(self, elapsed: float, load: float) -> None:
+        tolerance = 1e-9 * self._period
+        for index, region in enumerate(REGIONS):
+            gain = 0.0
+            for entry in self._script:
+                if entry[0] - tolerance <= elapsed <= entry[1] + tolerance:
+                    gain += entry[2 + index]
+            if self._chance[index] and self._mark > 0:
+                uniform = random.Random(f"{self._seed}:{region}:{self._mark}").random()
+                if uniform < self._chance[index] * self._severity(load):
+                    gain += self._level
+            self._loss[index] = max(0.0, min(self._loss[index] + gain, self._ceiling))
+
+    def _severity(self, load: float) -> float:
+        return float((abs(load) / self._reference) ** self._exponent)
+
+    def _outputs(self) -> list[float]:
+        return [round(loss, _DECIMALS) for loss in self._loss]
+
+    def state(self) -> list[float]:
+        """Return losses, start time, number of the next mark, last load factor."""
+        return [*self._loss, self._begin, float(self._mark), self._last_load]
+
+    def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
+        """Take back what `state` returned."""
+        self._take(parameters)
+        self._loss = list(state[:2])
+        self._begin, self._mark, self._last_load = state[2], int(state[3]), state[4]

@@ -1,0 +1,167 @@
+"""Strain gauges: true strains in; gain, offset, drift, noise and dropout; readings out.
+
+This file is copied into the FMU: standard library and relative imports only.
+
+At time t, a gauge reads gain * strain + offset + drift_rate * max(0, t - drift_start) + noise. It is lost
+where dropout_start < t <= dropout_end, where blackout.start < t <= blackout.end (all gauges), and by chance
+with `dropout_probability`: then it reads 0 and `received` is false. A step that begins at `dropout_start` is
+therefore the first one that is lost. The random numbers of a reading follow from the seed and the number of
+the reading alone.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ..variables import FmuVariable
+from .slave import Behaviour
+from .table import Table
+
+NAME = "strain_gauges"
+DESCRIPTION = "Strain gauges with gain, offset, drift, Gaussian noise and dropout."
+GAUGE_COUNT = 24
+LARGEST_STRAIN = 0.1
+LARGEST_SEED = 2**31 - 1
+
+
+def gauge_count(setting: Mapping[str, Any]) -> int:
+    """Return the number of gauges of a setting."""
+    return int(setting.get("gauge_count", GAUGE_COUNT))
+
+
+def variable_table(setting: Mapping[str, Any]) -> tuple[FmuVariable, ...]:
+    """Return the table of variables; `setting` holds `gauge_count` and `start`, start values by name."""
+    table = Table(setting.get("start", {}))
+    gauges = range(1, gauge_count(setting) + 1)
+    for gauge in gauges:
+        table.add(f"strain[{gauge}]", "input", f"True strain at gauge {gauge}", unit="1",
+                  display="microstrain", box=(-LARGEST_STRAIN, LARGEST_STRAIN))  # fmt: skip
+    table.add("noise", "parameter", "Standard deviation of the noise of every gauge", unit="1",
+              display="microstrain", box=(0.0, LARGEST_STRAIN))  # fmt: skip
+    table.add("seed", "parameter", "Seed of noise and chance", kind="Integer", box=(0, LARGEST_SEED))
+    table.add("dropout_probability", "parameter", "Probability that a reading of a gauge is lost", unit="1",
+              display="%", box=(0.0, 1.0))  # fmt: skip
+    table.add("blackout.start", "parameter", "All gauges are lost after this time", unit="s")
+    table.add("blackout.end", "parameter", "All gauges are back after this time", unit="s")
+    for gauge in gauges:
+        table.add(
+            f"gain[{gauge}]", "parameter", f"Gain of gauge {gauge}", unit="1", box=(-10.0, 10.0), default=1.0
+        )
+        table.add(f"offset[{gauge}]", "parameter", f"Offset of gauge {gauge}", unit="1",
+                  display="microstrain", box=(-LARGEST_STRAIN, LARGEST_STRAIN))  # fmt: skip
+        table.add(f"drift_rate[{gauge}]", "parameter", f"Drift of gauge {gauge}", unit="1/s",
+                  display="microstrain/s")  # fmt: skip
+        table.add(
+            f"drift_start[{gauge}]", "parameter", f"Time at which gauge {gauge} begins to drift", unit="s"
+        )
+        table.add(f"dropout_start[{gauge}]", "parameter", f"Gauge {gauge} is lost after this time", unit="s")
+        table.add(f"dropout_end[{gauge}]", "parameter", f"Gauge {gauge} is back after this time", unit="s")
+    for gauge in gauges:
+        table.add(f"reading[{gauge}]", "output", f"What gauge {gauge} says; 0 where it is lost", unit="1",
+                  display="microstrain")  # fmt: skip
+    for gauge in gauges:
+        table.add(f"received[{gauge}]", "output", f"Whether gauge {gauge} is received", kind="Boolean")
+    table.add("status", "output", "What became of the last call", kind="Enumeration", enumeration="Status")
+    return table.rows()
+
+
+def dependencies(setting: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Return the direct dependencies: each reading on its strain."""
+    gauges = range(1, gauge_count(setting) + 1)
+    return (
+        {f"reading[{gauge}]": [f"strain[{gauge}]"] for gauge in gauges}
+        | {f"received[{gauge}]": [] for gauge in gauges}
+        | {"status": []}
+    )
+
+
+def behaviour(setting: Mapping[str, Any]) -> Behaviour:
+    """Return a fresh behaviour."""
+    return StrainGauges(gauge_count(setting))
+
+
+class StrainGauges:
+    """The gauges; see the module.
+
+    Parameters
+    ----------
+    count : int
+        Number of gauges.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._samples = 0
+        self._take({})
+
+    def _take(self, parameters: Mapping[str, float]) -> None:
+        """Keep the parameters in the form in which a reading needs them."""
+        gauges = range(1, self._count + 1)
+
+        def each(name: str, default: float) -> list[float]:
+            return [parameters.get(f"{name}[{gauge}]", default) for gauge in gauges]
+
+        self._gain, self._offset = each("gain", 1.0), each("offset", 0.0)
+        self._drift = [
+            (index, rate, parameters[f"drift_start[{index + 1}]"])
+            for index, rate in enumerate(each("drift_rate", 0.0))
+            if rate
+        ]
+        windows = zip(each("dropout_start", 0.0), each("dropout_end", 0.0), strict=True)
+        self._windows = [(index, *window) for index, window in enumerate(windows) if window[1] > window[0]]
+        self._blackout = (parameters.get("blackout.start", 0.0), parameters.get("blackout.end", 0.0))
+        self._noise, self._seed = parameters.get("noise", 0.0), int(parameters.get("seed", 0))
+        self._chance = parameters.get("dropout_probability", 0.0)
+
+    def start(self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]) -> list[float]:
+        """Give the first readings."""
+        self._take(parameters)
+        self._samples = 0
+        return self._read(time, inputs)
+
+    def advance(self, time: float, duration: float, inputs: Sequence[float]) -> list[float]:
+        """Give the readings at the end of the step."""
+        outputs = self._read(time + duration, inputs, self._samples + 1)
+        self._samples += 1
+        return outputs
+
+    def _read(self, time: float, strains: Sequence[float], sample: int = 0) -> list[float]:
+        readings = [
+            gain * strain + offset
+            for gain, strain, offset in zip(self._gain, strains, self._offset, strict=True)
+        ]
+        for index, rate, begin in self._drift:
+            readings[index] += rate * max(0.0, time - begin)
+        received = [1.0] * self._count
+        if self._noise or self._chance:
+            generator = random.Random(f"{self._seed}:{sample}")
+            readings = [value + self._noise * normal(generator) for value in readings]
+            if self._chance:
+                received = [float(generator.random() >= self._chance) for _ in received]
+        for index, begin, end in self._windows:
+            if begin < time <= end:
+                received[index] = 0.0
+        if self._blackout[0] < time <= self._blackout[1]:
+            received = [0.0] * self._count
+        return [v if there else 0.0 for v, there in zip(readings, received, strict=True)] + received
+
+    def state(self) -> list[float]:
+        """Return the number of the last reading."""
+        return [float(self._samples)]
+
+    def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
+        """Take back what `state` returned."""
+        self._take(parameters)
+        self._samples = int(state[0])
+
+
+def normal(generator: random.Random) -> float:
+    """Return a standard normal number, by the formula of Box and Muller (1958).
+
+    The library's own is not promised to stay the same from one version of Python to the next.
+    """
+    radius = math.sqrt(-2.0 * math.log(1.0 - generator.random()))
+    return radius * math.cos(2.0 * math.pi * generator.random())

@@ -1,0 +1,222 @@
+"""A system of FMUs as data: components, connectors of the system, connections; no file is opened here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from ..archive import UnitInfo
+from ..binding import expand
+from ..errors import CouplingError
+
+ConnectorKind = Literal["input", "output", "parameter"]
+SettingValue = float | bool | str
+
+
+@dataclass(frozen=True, order=True)
+class Endpoint:
+    """An end of a connection: a variable of a component, or (`component` empty) a connector of the system."""
+
+    component: str
+    variable: str
+
+    def __str__(self) -> str:
+        return f"{self.component}.{self.variable}" if self.component else self.variable
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The value of a parameter, or the start value of an input; a text names an item of an enumeration.
+
+    Attributes
+    ----------
+    value : float, bool or str
+        The value.
+    unit : str or None
+        Its unit; that of the variable if None.
+    """
+
+    value: SettingValue
+    unit: str | None = None
+
+
+@dataclass(frozen=True)
+class Component:
+    """An FMU in a system.
+
+    Attributes
+    ----------
+    name : str
+        Unique in the system.
+    fmu : Path
+        The file.
+    settings : mapping of str to Setting
+        Parameters and start values by variable name.
+    substeps : int
+        Number of steps that the FMU makes in one step of the system, its inputs held.
+    """
+
+    name: str
+    fmu: Path
+    settings: Mapping[str, Setting] = field(default_factory=dict)
+    substeps: int = 1
+
+
+@dataclass(frozen=True)
+class Connector:
+    """A connector of the system itself; without a unit, it has that of what it is connected to."""
+
+    name: str
+    kind: ConnectorKind
+    unit: str | None = None
+
+
+@dataclass(frozen=True)
+class Connection:
+    """What flows from one end to another: target = factor * source + offset, then converted in unit.
+
+    Attributes
+    ----------
+    source, target : Endpoint
+        An output of a component or an input of the system; an input of a component or an output of the
+        system.
+    factor, offset : float
+        The linear transformation, in the unit of the source.
+    convert_units : bool
+        Whether the value is converted where the units of the ends differ.
+    delayed : bool
+        Whether the value is that of the beginning of the step, whatever the order of the components.
+    """
+
+    source: Endpoint
+    target: Endpoint
+    factor: float = 1.0
+    offset: float = 0.0
+    convert_units: bool = True
+    delayed: bool = False
+
+
+@dataclass(frozen=True)
+class SystemStructure:
+    """A system of FMUs.
+
+    Attributes
+    ----------
+    name : str
+        For people.
+    components : tuple of Component
+        At least one.
+    connectors : tuple of Connector
+        What the system shows to the outside.
+    connections : tuple of Connection
+        Between components, and between them and the connectors.
+    units : tuple of UnitInfo
+        Definitions of the units of connectors and settings; common units need none.
+    """
+
+    name: str
+    components: tuple[Component, ...]
+    connectors: tuple[Connector, ...] = ()
+    connections: tuple[Connection, ...] = ()
+    units: tuple[UnitInfo, ...] = ()
+
+    def component(self, name: str) -> Component:
+        """Return the component of that name.
+
+        Raises
+        ------
+        CouplingError
+            If there is none.
+        """
+        for component in self.components:
+            if component.name == name:
+                return component
+        raise CouplingError(
+            f"The system {self.name} has no component {name!r}; it has "
+            f"{listed(c.name for c in self.components)}."
+        )
+
+    def locate(self, text: str) -> Endpoint:
+        """Return the end that a text names: `component.variable`, or a connector of the system.
+
+        Raises
+        ------
+        CouplingError
+            If the system has neither.
+        """
+        if any(connector.name == text for connector in self.connectors):
+            return Endpoint("", text)
+        names = [c.name for c in self.components if text.startswith(f"{c.name}.")]
+        if names:
+            owner = max(names, key=len)
+            return Endpoint(owner, text[len(owner) + 1 :])
+        raise CouplingError(
+            f"The system {self.name} has no connector {text!r} and no component that {text!r} begins with; "
+            "its "
+            f"connectors are {listed(c.name for c in self.connectors)}, its components "
+            f"{listed(c.name for c in self.components)}."
+        )
+
+
+def listed(names: object) -> str:
+    """Return names as a list for people; a long one is cut."""
+    texts = [str(name) for name in names]  # type: ignore[attr-defined]
+    more = f" and {len(texts) - 12} more" if len(texts) > 12 else ""
+    return (", ".join(texts[:12]) or "none") + more
+
+
+def parse_endpoint(text: str, components: Sequence[str]) -> Endpoint:
+    """Return the end that a scenario file names: `component.variable`; without a dot, a system connector.
+
+    Raises
+    ------
+    CouplingError
+        If what stands before the dot is no component.
+    """
+    owners = [name for name in components if text.startswith(f"{name}.")]
+    if owners:
+        owner = max(owners, key=len)
+        return Endpoint(owner, text[len(owner) + 1 :])
+    if "." in text:
+        raise CouplingError(
+            f"The connection end {text!r} begins with no component; the components are "
+            f"{listed(components)}. A "
+            "connector of the system itself is written without a dot."
+        )
+    return Endpoint("", text)
+
+
+def expand_connection(
+    source: str,
+    target: str,
+    components: Sequence[str],
+    *,
+    factor: float = 1.0,
+    offset: float = 0.0,
+    delayed: bool = False,
+) -> tuple[Connection, ...]:
+    """Return the connections that two patterns stand for, such as `wing.strain[{1..24}]`, pair by pair.
+
+    Raises
+    ------
+    CouplingError
+        If the patterns are of unequal length, or an end begins with no component.
+    """
+    try:
+        sources, targets = expand(source), expand(target)
+    except ValueError as error:
+        raise CouplingError(f"A connection from {source!r} to {target!r} cannot be read: {error}.") from error
+    if len(sources) != len(targets):
+        raise CouplingError(
+            f"The connection from {source!r} to {target!r} joins {len(sources)} ends to {len(targets)}; the "
+            "two "
+            "patterns must stand for equally many."
+        )
+    return tuple(
+        Connection(
+            parse_endpoint(a, components), parse_endpoint(b, components), factor, offset, delayed=delayed
+        )
+        for a, b in zip(sources, targets, strict=True)
+    )

@@ -1,0 +1,317 @@
+"""A system of FMUs checked against the FMUs themselves: every end exists, fits, and has one source."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from ..archive import UnitInfo, VariableInfo
+from ..errors import CouplingError
+from ..units import IDENTITY, Conversion, between
+from .declared import READABLE, DeclaredFmu, read_declared
+from .schedule import Link, Schedule, schedule
+from .structure import Component, Connection, Connector, Endpoint, Setting, SystemStructure, listed
+
+_FITS = {
+    "Real": {"Real"},
+    "Integer": {"Integer", "Real"},
+    "Boolean": {"Boolean"},
+    "Enumeration": {"Enumeration"},
+}
+"""For each type of a source, the types of targets that can take it."""
+
+
+class Feed(NamedTuple):
+    """A connection between two components, its units resolved: target = factor * source + offset."""
+
+    source: Endpoint
+    target: Endpoint
+    conversion: Conversion
+    delayed: bool
+
+
+class Port(NamedTuple):
+    """A variable behind a connector of the system.
+
+    variable = factor * connector + offset for inputs and parameters, and the other way round for outputs.
+    """
+
+    end: Endpoint
+    conversion: Conversion
+    delayed: bool
+
+
+class Wiring:
+    """A system whose connections were checked.
+
+    Parameters
+    ----------
+    structure : SystemStructure
+        The system.
+
+    Attributes
+    ----------
+    structure : SystemStructure
+        As given.
+    declared : dict of str to DeclaredFmu
+        The FMUs by component.
+    feeds : tuple of Feed
+        Connections between components.
+    inward : dict of str to tuple of Port
+        For each input and parameter of the system, where it goes.
+    outward : dict of str to Port
+        For each output of the system, where it comes from.
+    units : dict of str to (str or None)
+        Unit of each connector: its own, or that of what it is connected to.
+    settings : dict of str to (dict of str to float)
+        Parameters and start values of each component, in the FMU's units.
+    schedule : Schedule
+        Order of the components, and algebraic loops.
+
+    Raises
+    ------
+    CouplingError
+        If something does not exist, does not fit, or has two sources.
+    FmuFileError, FmuUnsupportedError
+        If an FMU cannot be used.
+    """
+
+    def __init__(self, structure: SystemStructure) -> None:
+        self.structure = structure
+        names = [component.name for component in structure.components]
+        if not names:
+            raise CouplingError(f"The system {structure.name} has no component; name at least one FMU.")
+        for name in names:
+            if names.count(name) > 1:
+                raise CouplingError(
+                    f"The system {structure.name} has two components named {name!r}; each needs a name of "
+                    "its own."
+                )
+        self.declared: dict[str, DeclaredFmu] = {c.name: read_declared(c.fmu) for c in structure.components}
+        self.settings = {c.name: self._settings(c) for c in structure.components}
+        self._connectors = {connector.name: connector for connector in structure.connectors}
+        self.units: dict[str, str | None] = {c.name: c.unit for c in structure.connectors}
+        self._joined: list[Feed] = []
+        self.inward: dict[str, tuple[Port, ...]] = {
+            c.name: () for c in structure.connectors if c.kind != "output"
+        }
+        self.outward: dict[str, Port] = {}
+        taken: dict[Endpoint, Endpoint] = {}
+        for connection in structure.connections:
+            self._connect(connection, taken)
+        self.feeds: tuple[Feed, ...] = tuple(self._joined)
+        links = [Link(feed.source, feed.target) for feed in self.feeds if not feed.delayed]
+        self.schedule: Schedule = schedule(names, links, self._feedthrough())
+
+    def _feedthrough(self) -> dict[str, dict[str, frozenset[str]]]:
+        """Return the direct dependencies that count: those of outputs, and of other variables in use."""
+        used = {connection.source for connection in self.structure.connections}
+        return {
+            name: {
+                output: inputs
+                for output, inputs in declared.feedthrough.items()
+                if declared.variables[output].causality == "output" or Endpoint(name, output) in used
+            }
+            for name, declared in self.declared.items()
+        }
+
+    # ------------------------------------------------------------------ ends
+
+    def variable(self, end: Endpoint) -> VariableInfo:
+        """Return the FMU variable at an end.
+
+        Raises
+        ------
+        CouplingError
+            If there is no such component or variable.
+        """
+        self.structure.component(end.component)
+        declared = self.declared[end.component]
+        variable = declared.variables.get(end.variable)
+        if variable is None:
+            near = difflib.get_close_matches(end.variable, list(declared.variables), 1, 0.6)
+            hint = f"; did you mean {near[0]!r}?" if near else "."
+            raise CouplingError(
+                f"The component {end.component!r} ({declared.description.path.name}) has no variable "
+                f"{end.variable!r}{hint}"
+            )
+        return variable
+
+    def _connector(self, end: Endpoint, kinds: tuple[str, ...], verb: str) -> Connector:
+        connector = self._connectors.get(end.variable)
+        if connector is None:
+            raise CouplingError(
+                f"The system {self.structure.name} has no connector {end.variable!r}; it has "
+                f"{listed(self._connectors)}."
+            )
+        if connector.kind not in kinds:
+            raise CouplingError(
+                f"The connector {end.variable!r} of the system is of the kind {connector.kind} and cannot "
+                f"be {verb} "
+                "of a connection."
+            )
+        return connector
+
+    def _connect(self, connection: Connection, taken: dict[Endpoint, Endpoint]) -> None:
+        source, target = connection.source, connection.target
+        if target in taken:
+            raise CouplingError(
+                f"{target} has two sources, {taken[target]} and {source}; keep one of the two connections."
+            )
+        taken[target] = source
+        if not (math.isfinite(connection.factor) and math.isfinite(connection.offset)):
+            raise CouplingError(f"The transformation from {source} to {target} must be finite.")
+        if source.component and target.component:
+            self._join(connection)
+        elif target.component:
+            self._enter(connection)
+        elif source.component:
+            self._leave(connection)
+        else:
+            raise CouplingError(
+                f"The connection from {source} to {target} joins two connectors of the system; one end must "
+                "be a "
+                "component."
+            )
+
+    def _join(self, connection: Connection) -> None:
+        source, target = self._readable(connection.source), self._writable(connection.target, ("input",))
+        self._fit(connection, source, target)
+        conversion = self._converted(connection, source.unit, target.unit)
+        self._joined.append(Feed(connection.source, connection.target, conversion, connection.delayed))
+
+    def _enter(self, connection: Connection) -> None:
+        connector = self._connector(connection.source, ("input", "parameter"), "the source")
+        causalities = ("input",) if connector.kind == "input" else ("parameter",)
+        target = self._writable(connection.target, causalities)
+        if connection.delayed:
+            raise CouplingError(f"The connection from the input {connection.source} cannot be delayed.")
+        if self.units[connector.name] is None:
+            self.units[connector.name] = target.unit
+        conversion = self._converted(connection, self.units[connector.name], target.unit)
+        self.inward[connector.name] += (Port(connection.target, conversion, False),)
+
+    def _leave(self, connection: Connection) -> None:
+        connector = self._connector(connection.target, ("output",), "the target")
+        source = self._readable(connection.source)
+        if self.units[connector.name] is None:
+            self.units[connector.name] = source.unit
+        conversion = self._converted(connection, source.unit, self.units[connector.name])
+        self.outward[connector.name] = Port(connection.source, conversion, connection.delayed)
+
+    def _readable(self, end: Endpoint) -> VariableInfo:
+        variable = self.variable(end)
+        if variable.causality not in READABLE or variable.kind == "String":
+            raise CouplingError(
+                f"{end} cannot be the source of a connection: it is declared as {variable.causality} of the "
+                "type "
+                f"{variable.kind}, and a numeric output is needed."
+            )
+        return variable
+
+    def _writable(self, end: Endpoint, causalities: tuple[str, ...]) -> VariableInfo:
+        variable = self.variable(end)
+        if variable.causality not in causalities or variable.kind == "String":
+            raise CouplingError(
+                f"{end} cannot be the target of this connection: it is declared as {variable.causality} of "
+                "the type "
+                f"{variable.kind}, and a numeric {' or '.join(causalities)} is needed."
+            )
+        return variable
+
+    def _fit(self, connection: Connection, source: VariableInfo, target: VariableInfo) -> None:
+        if target.kind not in _FITS[source.kind]:
+            raise CouplingError(
+                f"{connection.source} is of the type {source.kind} and cannot feed {connection.target}, "
+                "which is of "
+                f"the type {target.kind}."
+            )
+        scaled = (connection.factor, connection.offset) != (1.0, 0.0)
+        if scaled and target.kind != "Real":
+            raise CouplingError(
+                f"The connection from {connection.source} to {connection.target} has a linear "
+                "transformation, but "
+                f"{connection.target} is of the type {target.kind}; only real numbers can be scaled."
+            )
+
+    def _converted(self, connection: Connection, source: str | None, target: str | None) -> Conversion:
+        own = Conversion(connection.factor, connection.offset)
+        if not connection.convert_units:
+            return own
+        unit = between(
+            source, self._definitions(connection.source), target, self._definitions(connection.target)
+        )
+        if unit is None:
+            raise CouplingError(
+                f"{connection.source} is in {source!r} and {connection.target} in {target!r}, and there is "
+                "no "
+                "conversion between the two; correct the connection, or suppress the conversion of units."
+            )
+        return composed(own, unit)
+
+    def _definitions(self, end: Endpoint) -> tuple[UnitInfo, ...]:
+        return self.declared[end.component].description.units if end.component else self.structure.units
+
+    # ------------------------------------------------------------------ parameters
+
+    def _settings(self, component: Component) -> dict[str, float]:
+        if component.substeps < 1:
+            raise CouplingError(
+                f"The component {component.name!r} needs at least one step in a step of the system."
+            )
+        return {
+            name: self.number(Endpoint(component.name, name), setting)
+            for name, setting in component.settings.items()
+        }
+
+    def number(self, end: Endpoint, setting: Setting) -> float:
+        """Return a parameter or start value as a number in the FMU's unit.
+
+        Raises
+        ------
+        CouplingError
+            If there is no such parameter or input, or the value is of another type or unit.
+        """
+        variable = self.variable(end)
+        if variable.causality not in ("parameter", "input"):
+            raise CouplingError(f"{end} cannot be set: it is declared as {variable.causality}.")
+        value = setting.value
+        if isinstance(value, str):
+            items: Mapping[str, int] = self.declared[end.component].items.get(end.variable, {})
+            if variable.kind == "Enumeration" and value in items:
+                return float(items[value])
+            raise CouplingError(
+                f"{end} cannot be set to {value!r}: it is of the type {variable.kind}"
+                + (f" with the items {listed(items)}." if items else ", and a number is needed.")
+            )
+        wrong = (
+            (isinstance(value, bool) and variable.kind != "Boolean")
+            or (not isinstance(value, bool) and variable.kind == "Boolean" and value not in (0, 1))
+            or (variable.kind in ("Integer", "Enumeration") and not float(value).is_integer())
+            or variable.kind == "String"
+            or not math.isfinite(value)
+        )
+        if wrong:
+            raise CouplingError(f"{end} cannot be set to {value!r}: it is of the type {variable.kind}.")
+        units = (*self.structure.units, *self.declared[end.component].description.units)
+        conversion = between(
+            setting.unit, units, variable.unit, self.declared[end.component].description.units
+        )
+        if conversion is None:
+            raise CouplingError(
+                f"{end} is given in {setting.unit!r}, but it is in {variable.unit!r}, and there is no "
+                "conversion "
+                "between the two."
+            )
+        return conversion.to_fmu(float(value))
+
+
+def composed(first: Conversion, second: Conversion) -> Conversion:
+    """Return one conversion for two, one after the other."""
+    if first == IDENTITY:
+        return second
+    if second == IDENTITY:
+        return first
+    return Conversion(second.factor * first.factor, second.factor * first.offset + second.offset)

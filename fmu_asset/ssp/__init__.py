@@ -1,0 +1,1 @@
+"""Systems of FMUs as SSP 1.0 files (System Structure and Parameterization): in and out."""

@@ -1,0 +1,153 @@
+"""An SSP file against its own FMUs: joined, and tried for one step."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..archive import plain_folder
+from ..binding import Binding, Header, Vector
+from ..coupling.asset import CoupledAsset
+from ..coupling.schedule import loop_sentence
+from ..coupling.structure import Endpoint
+from ..coupling.wiring import Wiring
+from ..errors import FmuError, SspError
+from ..units import between
+from .reader import SspSystem, read_ssp
+
+_CAUSALITIES = {
+    "input": ("input",),
+    "output": ("output", "local"),
+    "parameter": ("parameter",),
+    "calculatedParameter": ("calculatedParameter",),
+}
+
+
+@dataclass(frozen=True)
+class SspCheck:
+    """What a check of an SSP file found.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    problems : tuple of str
+        One sentence each; empty if nothing was found.
+    components : tuple of (str, str)
+        Name of each component and of its model, in the order in which they are evaluated.
+    connections, parameters : int
+        How many there are.
+    loops : tuple of str
+        Algebraic loops; a system with one is sound, but needs iterations.
+    """
+
+    path: Path
+    problems: tuple[str, ...]
+    components: tuple[tuple[str, str], ...] = ()
+    connections: int = 0
+    parameters: int = 0
+    loops: tuple[str, ...] = ()
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing was found."""
+        return not self.problems
+
+
+def join_ssp(system: SspSystem) -> Wiring:
+    """Join a system that was read, and check that its connectors are those of its FMUs.
+
+    Raises
+    ------
+    SspError
+        If a connector of a component is declared otherwise than its FMU has it.
+    CouplingError, FmuFileError, FmuUnsupportedError
+        If the system does not fit its FMUs.
+    """
+    wiring = Wiring(system.structure)
+    definitions = system.structure.units
+    for end, declared in system.declared.items():
+        variable = wiring.variable(end)
+        if variable.causality not in _CAUSALITIES.get(declared.kind, ()):
+            raise SspError(
+                f"The connector {end} is declared as {declared.kind}, but its FMU has it as "
+                f"{variable.causality}."
+            )
+        if declared.type is not None and declared.type != variable.kind:
+            raise SspError(
+                f"The connector {end} is declared of the type {declared.type}, but its FMU has it as "
+                f"{variable.kind}."
+            )
+        units = wiring.declared[end.component].description.units
+        if between(declared.unit, (*definitions, *units), variable.unit, units) is None:
+            raise SspError(
+                f"The connector {end} is declared in {declared.unit!r}, but its FMU has it in "
+                f"{variable.unit!r}."
+            )
+        if declared.unit is not None and declared.unit != variable.unit:
+            raise SspError(
+                f"The connector {end} is declared in {declared.unit!r} and its FMU has it in "
+                f"{variable.unit!r}; connectors "
+                "of components must have the unit of the FMU."
+            )
+    return wiring
+
+
+def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
+    """Check an SSP file: archive, schemas, connections against the FMUs, and one step of 1 s in workers.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Raises
+    ------
+    SspError
+        If there is no SSP file to check.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise SspError(f"There is no SSP file {file}.")
+    folder = plain_folder()
+    try:
+        wiring = join_ssp(read_ssp(file, folder))
+        plan = wiring.schedule
+        problems = _trial(wiring)
+        return SspCheck(
+            path=file,
+            problems=tuple(problems),
+            components=tuple((name, wiring.declared[name].description.model_name) for name in plan.order),
+            connections=len(wiring.structure.connections),
+            parameters=sum(len(component.settings) for component in wiring.structure.components),
+            loops=(loop_sentence(plan.loops),) if plan.loops else (),
+        )
+    except FmuError as error:
+        return SspCheck(file, (str(error),))
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _trial(wiring: Wiring) -> list[str]:
+    """Make one step with the start values, and read what can be read."""
+    if wiring.schedule.loops:
+        return []
+    names = [
+        f"{component}.{variable.name}"
+        for component, declared in wiring.declared.items()
+        for variable in declared.variables.values()
+        if variable.causality == "output" and variable.kind != "String"
+    ]
+    observation = {}
+    for name in names:
+        end: Endpoint = wiring.structure.locate(name)
+        observation[name] = Vector(variables=(name,), unit=wiring.variable(end).unit or "1")
+    binding = Binding(binding=Header(name="check", step_size=1.0), observation=observation)
+    try:
+        with CoupledAsset(wiring, binding) as asset:
+            asset.step()
+    except FmuError as error:
+        return [str(error)]
+    return []

@@ -1,0 +1,192 @@
+"""The SSP archive: checked before it is used, packed to the same bytes, its XML valid by the schemas."""
+
+from __future__ import annotations
+
+import io
+import os
+import posixpath
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from lxml import etree
+
+from ..archive import LARGEST_EXTRACTED_BYTES, _check_entry
+from ..errors import FmuFileError, SspError
+
+SSD_NAME = "SystemStructure.ssd"
+NAMESPACES = {
+    "ssc": "http://ssp-standard.org/SSP1/SystemStructureCommon",
+    "ssd": "http://ssp-standard.org/SSP1/SystemStructureDescription",
+    "ssv": "http://ssp-standard.org/SSP1/SystemStructureParameterValues",
+    "ssm": "http://ssp-standard.org/SSP1/SystemStructureParameterMapping",
+}
+OWN_NAMESPACE = "urn:uav-twin:coupling"
+"""Of the annotations that say what SSP 1.0 has no word for: delayed connections, several steps in one."""
+OWN_ANNOTATION = "org.uav-twin.coupling"
+
+_SCHEMAS = {
+    "ssd": "SystemStructureDescription.xsd",
+    "ssv": "SystemStructureParameterValues.xsd",
+    "ssm": "SystemStructureParameterMapping.xsd",
+}
+_DATE = (1980, 1, 1, 0, 0, 0)
+
+
+class SspPackage:
+    """An SSP file that was checked: sound, safe, and with a system structure in it.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Raises
+    ------
+    SspError
+        If the file is missing, damaged or unsafe, or holds no system structure.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise SspError(
+                f"There is no SSP file {self.path}; check the path, or write it with `uav-twin ssp export`."
+            )
+        try:
+            with zipfile.ZipFile(self.path) as archive:
+                entries = archive.infolist()
+                for entry in entries:
+                    _check_entry(self.path, entry)
+                if sum(entry.file_size for entry in entries) > LARGEST_EXTRACTED_BYTES:
+                    raise SspError(
+                        f"{self.path} would extract to more than {LARGEST_EXTRACTED_BYTES // 1024**3} GiB."
+                    )
+                broken = archive.testzip()
+                if broken is not None:
+                    raise SspError(
+                        f"{self.path} is damaged: the checksum of {broken} is wrong; fetch it again."
+                    )
+                self.names = {entry.filename for entry in entries if not entry.is_dir()}
+        except FmuFileError as error:
+            raise SspError(error.sentence) from error
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            EOFError,
+            NotImplementedError,
+            RuntimeError,
+            OSError,
+        ) as error:
+            if isinstance(error, SspError):
+                raise
+            raise SspError(
+                f"{self.path} is not a sound SSP archive ({error}); fetch or export it again."
+            ) from error
+        if SSD_NAME not in self.names:
+            raise SspError(f"{self.path} is an archive without {SSD_NAME}, so it is no SSP file.")
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a file in the archive."""
+        try:
+            with zipfile.ZipFile(self.path) as archive:
+                return archive.read(name)
+        except (OSError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+            raise SspError(f"{name} in {self.path} cannot be read ({error}).") from error
+
+    def resolve(self, source: str, what: str) -> str:
+        """Return the name in the archive that a URI of the system structure stands for.
+
+        Raises
+        ------
+        SspError
+            If it leads outside the archive, or there is no such file in it.
+        """
+        parts = urlsplit(source)
+        name = posixpath.normpath(unquote(parts.path))
+        outside = parts.scheme or parts.netloc or parts.query or parts.fragment
+        if outside or not parts.path or name.startswith(("/", "..")) or "\\" in name:
+            raise SspError(
+                f"{what} in {self.path} names the source {source!r}, which lies outside the archive; only "
+                "files "
+                "inside it are used."
+            )
+        if name not in self.names:
+            raise SspError(f"{what} in {self.path} names the source {source!r}, which is not in the archive.")
+        return name
+
+    def parse(self, name: str, kind: str) -> Any:
+        """Return the root element of an XML file of the archive, valid by the schema of its kind.
+
+        Parameters
+        ----------
+        name : str
+            The file.
+        kind : {"ssd", "ssv", "ssm"}
+            What it must be.
+        """
+        root = parse_xml(self.read(name), f"{name} in {self.path}")
+        validate(root, kind, f"{name} in {self.path}")
+        return root
+
+
+def parse_xml(content: bytes, where: str) -> Any:
+    """Return the root of an XML text; neither entities nor anything outside is read.
+
+    Raises
+    ------
+    SspError
+        If it is not well-formed, or declares entities.
+    """
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
+    try:
+        root = etree.fromstring(content, parser)
+    except etree.XMLSyntaxError as error:
+        raise SspError(f"{where} is not well-formed XML ({error}).") from error
+    if root.getroottree().docinfo.doctype:
+        raise SspError(
+            f"{where} has a document type declaration, which SSP files have no need of; it was refused."
+        )
+    return root
+
+
+def validate(root: Any, kind: str, where: str) -> None:
+    """Check an element against the published schema of its kind, as fmpy ships it.
+
+    Raises
+    ------
+    SspError
+        If it is not valid; the sentence gives the first violation.
+    """
+    import fmpy.ssp
+
+    folder = Path(fmpy.ssp.__file__).parent / "schema"
+    schema = etree.XMLSchema(file=str(folder / _SCHEMAS[kind]))
+    if not schema.validate(root):
+        first = schema.error_log[0]
+        text = str(first.message)
+        for uri in NAMESPACES.values():
+            text = text.replace(f"{{{uri}}}", "")
+        raise SspError(
+            f"{where} is not valid by the schema of SSP 1.0 (line {first.line}): {text.rstrip('.')}."
+        )
+
+
+def tag(kind: str, name: str) -> str:
+    """Return a tag with its namespace."""
+    return f"{{{NAMESPACES[kind]}}}{name}"
+
+
+def pack(members: Mapping[str, bytes]) -> bytes:
+    """Return an archive with fixed dates and order; stored, since compression differs between versions."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name in sorted(members, key=lambda name: (name != SSD_NAME, name)):
+            entry = zipfile.ZipInfo(name, date_time=_DATE)
+            entry.create_system = 3
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, members[name])
+    return buffer.getvalue()

@@ -1,0 +1,188 @@
+"""Parameter sets (SSV) and mappings (SSM): read into plain values by target name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from ..archive import UnitInfo
+from ..coupling.structure import Setting, SettingValue
+from ..errors import SspError
+from .package import NAMESPACES, SspPackage, tag, validate
+
+_SET_TYPE = "application/x-ssp-parameter-set"
+_MAPPING_TYPE = "application/x-ssp-parameter-mapping"
+
+
+class Binding(NamedTuple):
+    """A parameter binding of an element: values by target name, and the units that the set defines."""
+
+    values: dict[str, Setting]
+    units: tuple[UnitInfo, ...]
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A mapping entry: target = factor * source + offset."""
+
+    source: str
+    target: str
+    factor: float
+    offset: float
+    convert_units: bool
+
+
+def read_units(element: Any) -> tuple[UnitInfo, ...]:
+    """Return the unit definitions below an element that holds `ssc:Unit`."""
+    found = []
+    for unit in element.findall(tag("ssc", "Unit")):
+        base = unit.find(tag("ssc", "BaseUnit"))
+        exponents = tuple(
+            int(base.get(symbol, "0")) for symbol in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+        )
+        found.append(
+            UnitInfo(
+                unit.get("name"),
+                exponents,
+                float(base.get("factor", "1")),
+                float(base.get("offset", "0")),
+                (),
+            )
+        )
+    return tuple(found)
+
+
+def read_bindings(element: Any, package: SspPackage, where: str) -> list[Binding]:
+    """Return the parameter bindings of a component or system.
+
+    Raises
+    ------
+    SspError
+        If a set or mapping is missing, not valid, or uses what is not supported.
+    """
+    return [
+        _read_binding(item, package, where)
+        for item in element.findall("ssd:ParameterBindings/ssd:ParameterBinding", NAMESPACES)
+    ]
+
+
+def _read_binding(element: Any, package: SspPackage, where: str) -> Binding:
+    what = f"a parameter binding of {where}"
+    if element.get("type", _SET_TYPE) != _SET_TYPE:
+        raise SspError(
+            f"{what} in {package.path} is of the type {element.get('type')!r}; only parameter sets are read."
+        )
+    root = _content(element, "ssd:ParameterValues", "ssv", "ParameterSet", package, what)
+    prefix = element.get("prefix", "")
+    units = root.find(tag("ssv", "Units"))
+    values: dict[str, Setting] = {}
+    for parameter in root.findall("ssv:Parameters/ssv:Parameter", NAMESPACES):
+        name = prefix + parameter.get("name")
+        if name in values:
+            raise SspError(f"{what} in {package.path} gives {name!r} twice; keep one of the two.")
+        values[name] = _value(parameter, f"{what} in {package.path}")
+    mapping = element.find(tag("ssd", "ParameterMapping"))
+    if mapping is not None:
+        if mapping.get("type", _MAPPING_TYPE) != _MAPPING_TYPE:
+            raise SspError(f"{what} in {package.path} has a mapping of the type {mapping.get('type')!r}.")
+        entries = _content(mapping, None, "ssm", "ParameterMapping", package, f"the mapping of {what}")
+        values = _mapped(values, _entries(entries, f"{what} in {package.path}"), f"{what} in {package.path}")
+    return Binding(values, () if units is None else read_units(units))
+
+
+def _content(element: Any, inline: str | None, kind: str, name: str, package: SspPackage, what: str) -> Any:
+    """Return the set or mapping that an element refers to or holds."""
+    source = element.get("source")
+    if source:
+        if element.get("sourceBase", "SSD") != "SSD":
+            raise SspError(
+                f"{what} in {package.path} lies inside a component, which is not supported; move it out."
+            )
+        return package.parse(package.resolve(source, what), kind)
+    holder = element if inline is None else element.find(inline, NAMESPACES)
+    root = None if holder is None else holder.find(tag(kind, name))
+    if root is None:
+        raise SspError(f"{what} in {package.path} has neither a source nor content.")
+    validate(_detached(root), kind, f"{what} in {package.path}")
+    return root
+
+
+def _detached(element: Any) -> Any:
+    """Return a copy that is a document of its own, as a schema wants it."""
+    from lxml import etree
+
+    return etree.fromstring(etree.tostring(element))
+
+
+def _value(parameter: Any, where: str) -> Setting:
+    name = parameter.get("name")
+    for kind in ("Real", "Integer", "Boolean", "Enumeration"):
+        item = parameter.find(tag("ssv", kind))
+        if item is None:
+            continue
+        text = item.get("value")
+        value: SettingValue = text
+        if kind == "Real":
+            value = float(text)
+        elif kind == "Integer":
+            value = int(text)
+        elif kind == "Boolean":
+            value = text.strip() in ("true", "1")
+        return Setting(value, item.get("unit"))
+    raise SspError(
+        f"{where} gives {name!r} as a text or binary value; only numbers, Booleans and enumerations are set."
+    )
+
+
+def _entries(root: Any, where: str) -> list[_Entry]:
+    found = []
+    for entry in root.findall(tag("ssm", "MappingEntry")):
+        factor, offset = read_transformation(entry, f"the mapping of {entry.get('source')!r} of {where}")
+        convert = not flag(entry, "suppressUnitConversion")
+        found.append(_Entry(entry.get("source"), entry.get("target"), factor, offset, convert))
+    return found
+
+
+def flag(element: Any, name: str) -> bool:
+    """Return a Boolean attribute; false where it is absent."""
+    return str(element.get(name, "false")).strip() in ("true", "1")
+
+
+def read_transformation(element: Any, where: str) -> tuple[float, float]:
+    """Return factor and offset of a connection or mapping entry.
+
+    Raises
+    ------
+    SspError
+        If it has a transformation of another kind.
+    """
+    for kind in (
+        "BooleanMappingTransformation",
+        "IntegerMappingTransformation",
+        "EnumerationMappingTransformation",
+    ):
+        if element.find(tag("ssc", kind)) is not None:
+            raise SspError(f"{where} has a {kind}, which is not supported; only linear transformations are.")
+    linear = element.find(tag("ssc", "LinearTransformation"))
+    if linear is None:
+        return 1.0, 0.0
+    return float(linear.get("factor", "1")), float(linear.get("offset", "0"))
+
+
+def _mapped(values: dict[str, Setting], entries: list[_Entry], where: str) -> dict[str, Setting]:
+    """Return the values under the names that a mapping gives them; what it does not name is not used."""
+    found: dict[str, Setting] = {}
+    for entry in entries:
+        if entry.source not in values:
+            raise SspError(f"{where} maps {entry.source!r}, which is not in its parameter set.")
+        if entry.target in found:
+            raise SspError(f"{where} maps two parameters to {entry.target!r}; keep one of the two.")
+        setting = values[entry.source]
+        if (entry.factor, entry.offset) != (1.0, 0.0):
+            if isinstance(setting.value, bool | str):
+                raise SspError(f"{where} scales {entry.source!r}, which is no number.")
+            setting = Setting(entry.factor * setting.value + entry.offset, setting.unit)
+        if not entry.convert_units:
+            setting = Setting(setting.value, None)
+        found[entry.target] = setting
+    return found

@@ -1,0 +1,282 @@
+"""Reading an SSP file: nested systems flattened, parameters and mappings applied, FMUs taken out.
+
+What SSP 1.0 allows and is not read is refused in a sentence: signal dictionaries, components that are systems
+of their own files, model exchange, mappings of Booleans, integers and enumerations, texts and binary values.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from reporting.files import atomic_write_bytes
+
+from ..coupling.structure import (
+    Component,
+    Connector,
+    ConnectorKind,
+    Endpoint,
+    Setting,
+    SystemStructure,
+)
+from .flatten import flat_connections, flat_settings
+from .package import NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage, tag
+from .parameters import flag, read_bindings, read_transformation, read_units
+from .tree import INWARD, DeclaredConnector, Edge, ElementPath, Node, Tree
+
+_FMU_TYPE = "application/x-fmu-sharedlibrary"
+
+
+@dataclass(frozen=True)
+class SspSystem:
+    """What an SSP file holds.
+
+    Attributes
+    ----------
+    structure : SystemStructure
+        The system, flat; a component of a nested system is named `system.component`.
+    declared : dict of Endpoint to DeclaredConnector
+        The connectors of the components, as the file declares them.
+    """
+
+    structure: SystemStructure
+    declared: dict[Endpoint, DeclaredConnector]
+
+
+def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> SspSystem:
+    """Read an SSP file, and write the FMUs in it to a folder.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    folder : path-like
+        Where its FMUs are put; made if it is missing.
+
+    Returns
+    -------
+    SspSystem
+        The system. Whether it fits its FMUs is checked where it is joined; see `coupling.wiring`.
+
+    Raises
+    ------
+    SspError
+        If the file is missing, damaged, unsafe or not valid by the schema, or uses what is not supported.
+    """
+    package = SspPackage(path)
+    root = package.parse(SSD_NAME, "ssd")
+    tree = Tree(package)
+    units = root.find(tag("ssd", "Units"))
+    for unit in () if units is None else read_units(units):
+        tree.units[unit.name] = unit
+    system = root.find(tag("ssd", "System"))
+    _system(tree, system, ())
+    names = _names(tree)
+    fmus = _extract(tree, Path(folder))
+    connections = tuple(flat_connections(tree, names))
+    settings = flat_settings(tree)
+    components = tuple(
+        Component(
+            names[place],
+            fmus[source],
+            {node.connector: value for node, value in settings.items() if node.path == place},
+            substeps,
+        )
+        for place, (source, substeps) in tree.components.items()
+    )
+    connectors = tuple(
+        Connector(node.connector, _kind(tree, node, declared), declared.unit)
+        for node, declared in tree.connectors.items()
+        if node.path == ()
+    )
+    structure = SystemStructure(
+        str(root.get("name")), components, connectors, connections, tuple(tree.units.values())
+    )
+    inner = {
+        Endpoint(names[node.path], node.connector): declared
+        for node, declared in tree.connectors.items()
+        if node.path in names
+    }
+    return SspSystem(structure, inner)
+
+
+def _kind(tree: Tree, node: Node, declared: DeclaredConnector) -> ConnectorKind:
+    if declared.kind == "input":
+        return "input"
+    if declared.kind == "output":
+        return "output"
+    if declared.kind == "parameter":
+        return "parameter"
+    raise tree.error(
+        f"the connector {str(node)!r} of the system is of the kind {declared.kind}, which is not supported."
+    )
+
+
+# ---------------------------------------------------------------------- the tree
+
+
+def _system(tree: Tree, element: Any, path: ElementPath) -> None:
+    name = str(element.get("name"))
+    if element.find(tag("ssd", "SignalDictionaries")) is not None:
+        raise tree.error(
+            f"the system {name!r} has signal dictionaries, which are not supported; connect directly."
+        )
+    _connectors(tree, element, path)
+    children: set[str] = set()
+    elements = element.find(tag("ssd", "Elements"))
+    for child in () if elements is None else elements:
+        if not isinstance(child.tag, str):
+            continue  # a comment
+        own = str(child.get("name"))
+        if own in children:
+            raise tree.error(
+                f"the system {name!r} has two elements named {own!r}; each needs a name of its own."
+            )
+        children.add(own)
+        if child.tag == tag("ssd", "System"):
+            _system(tree, child, (*path, own))
+        elif child.tag == tag("ssd", "Component"):
+            _component(tree, child, (*path, own))
+        else:
+            raise tree.error(
+                f"the system {name!r} refers to the signal dictionary {own!r}, which is not supported; "
+                "connect "
+                "directly."
+            )
+    for connection in element.findall("ssd:Connections/ssd:Connection", NAMESPACES):
+        _connection(tree, connection, path, children)
+    _bind(tree, element, path)  # after the elements in it: bindings of a system go before theirs
+
+
+def _component(tree: Tree, element: Any, path: ElementPath) -> None:
+    where = f"the component {'.'.join(path)!r}"
+    if element.get("type", _FMU_TYPE) != _FMU_TYPE:
+        raise tree.error(f"{where} is of the type {element.get('type')!r}; only FMUs are supported.")
+    if element.get("implementation", "any") == "ModelExchange":
+        raise tree.error(f"{where} asks for model exchange; only co-simulation is supported.")
+    source = tree.package.resolve(str(element.get("source")), where)
+    substeps = _annotation(element).get("substeps", "1")
+    if not (substeps.isascii() and substeps.isdigit() and int(substeps) > 0):
+        raise tree.error(
+            f"{where} has the number of steps {substeps!r}, which must be a positive whole number."
+        )
+    tree.components[path] = (source, int(substeps))
+    _connectors(tree, element, path)
+    _bind(tree, element, path)
+
+
+def _connectors(tree: Tree, element: Any, path: ElementPath) -> None:
+    for connector in element.findall("ssd:Connectors/ssd:Connector", NAMESPACES):
+        node = Node(path, str(connector.get("name")))
+        if node in tree.connectors:
+            raise tree.error(f"the connector {str(node)!r} is there twice.")
+        kind, unit = None, None
+        for name in ("Real", "Integer", "Boolean", "Enumeration", "String", "Binary"):
+            item = connector.find(tag("ssc", name))
+            if item is not None:
+                kind, unit = name, item.get("unit")
+        if kind == "Binary":
+            raise tree.error(f"the connector {str(node)!r} is binary, which is not supported.")
+        tree.connectors[node] = DeclaredConnector(str(connector.get("kind")), kind, unit)
+
+
+def _annotation(element: Any) -> Any:
+    found = element.find(f"ssd:Annotations/ssc:Annotation/{{{OWN_NAMESPACE}}}Coupling", NAMESPACES)
+    return {} if found is None else found.attrib
+
+
+def _connection(tree: Tree, element: Any, path: ElementPath, children: set[str]) -> None:
+    ends = []
+    for side in ("start", "end"):
+        owner = element.get(f"{side}Element")
+        connector = str(element.get(f"{side}Connector"))
+        if owner and owner not in children:
+            raise tree.error(f"a connection names the element {owner!r}, which its system does not have.")
+        node = Node((*path, owner) if owner else path, connector)
+        declared = tree.connectors.get(node)
+        if declared is None:
+            raise tree.error(f"a connection names the connector {str(node)!r}, which is not declared.")
+        # Seen from inside, an input of the system is where values come from.
+        gives = (declared.kind in INWARD) == (not owner)
+        if gives != (side == "start"):
+            raise tree.error(
+                f"a connection {'begins' if side == 'start' else 'ends'} at {str(node)!r}, which is of the "
+                "kind "
+                f"{declared.kind}; connections go from outputs to inputs."
+            )
+        ends.append(node)
+    source, target = ends
+    if target in tree.edges:
+        raise tree.error(
+            f"{str(target)!r} has two sources, {str(tree.edges[target].source)!r} and {str(source)!r}; keep "
+            "one of "
+            "the two connections."
+        )
+    factor, offset = read_transformation(element, f"the connection from {source} to {target}")
+    convert = not flag(element, "suppressUnitConversion")
+    delayed = _annotation(element).get("delayed") == "true"
+    tree.edges[target] = Edge(source, factor, offset, convert, delayed)
+
+
+def _bind(tree: Tree, element: Any, path: ElementPath) -> None:
+    """Take the parameter bindings of an element; they go before those of the elements inside it."""
+    where = f"the element {'.'.join(path) or str(element.get('name'))!r}"
+    own: dict[Node, Setting] = {}
+    for values, units in read_bindings(element, tree.package, where):
+        for unit in units:
+            known = tree.units.setdefault(unit.name, unit)
+            if known != unit:
+                raise tree.error(f"the unit {unit.name!r} is defined in two ways.")
+        for name, setting in values.items():
+            for node in _nodes_of(tree, name, path, where):
+                if node in own:
+                    raise tree.error(f"{where} sets {str(node)!r} twice; keep one of the two.")
+                own[node] = setting
+    tree.settings |= own
+
+
+def _nodes_of(tree: Tree, name: str, path: ElementPath, where: str) -> list[Node]:
+    """Return the variables of components, or connectors of systems, that a parameter name stands for."""
+    if path in tree.components:
+        return [Node(path, name)]
+    if Node(path, name) in tree.connectors:
+        return [Node(path, name)]
+    owners = [
+        place
+        for place in (*tree.components, *{node.path for node in tree.connectors})
+        if len(place) > len(path)
+        and place[: len(path)] == path
+        and name.startswith(".".join(place[len(path) :]) + ".")
+    ]
+    if not owners:
+        raise tree.error(f"{where} sets {name!r}, which begins with no element and is no connector of it.")
+    owner = max(owners, key=lambda place: len(".".join(place)))
+    node = Node(owner, name[len(".".join(owner[len(path) :])) + 1 :])
+    if owner not in tree.components and node not in tree.connectors:
+        raise tree.error(
+            f"{where} sets {name!r}, but {'.'.join(owner)!r} has no connector {node.connector!r}."
+        )
+    return [node]
+
+
+def _names(tree: Tree) -> dict[ElementPath, str]:
+    names = {path: ".".join(path) for path in tree.components}
+    for path, name in names.items():
+        if list(names.values()).count(name) > 1:
+            raise tree.error(f"two components are named {name!r} ({path}); rename one of them.")
+    return names
+
+
+def _extract(tree: Tree, folder: Path) -> dict[str, Path]:
+    """Write each FMU once, under a plain name; return the files by their names in the archive."""
+    files: dict[str, Path] = {}
+    for source, _ in tree.components.values():
+        if source not in files:
+            stem = re.sub(r"[^A-Za-z0-9_\-]", "_", Path(source).stem)
+            target = folder / f"{len(files) + 1}-{stem}.fmu"
+            atomic_write_bytes(target, tree.package.read(source))
+            files[source] = target
+    return files

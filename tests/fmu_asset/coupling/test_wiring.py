@@ -1,0 +1,224 @@
+"""What cannot be joined is said in one sentence; units and types of connections."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fmu_asset.binding import parse_binding
+from fmu_asset.coupling.asset import CoupledAsset
+from fmu_asset.coupling.structure import Component, Connection, Connector, Endpoint, Setting, SystemStructure
+from fmu_asset.coupling.structure import expand_connection as expand
+from fmu_asset.coupling.wiring import Wiring
+from fmu_asset.errors import CouplingError, FmuFileError
+
+from .conftest import watch
+
+
+@pytest.fixture(scope="module")
+def base(companions: dict[str, Path], fmu: Path, spring_mass: Path) -> SystemStructure:
+    return SystemStructure(
+        "base",
+        (
+            Component("damage", companions["damage_growth"]),
+            Component("wing", fmu),
+            Component("gauges", companions["strain_gauges"]),
+            Component("spring", spring_mass),
+        ),
+        (Connector("push", "input"), Connector("seen", "output"), Connector("percent", "output", "%")),
+    )
+
+
+def link(source: str, target: str, **options: object) -> Connection:
+    names = ("damage", "wing", "gauges", "spring")
+    return replace(expand(source, target, names)[0], **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("connections", "words"),
+    [
+        ([("damage.z3", "wing.health.z1")], r"'damage' \(damage_growth.fmu\) has no variable 'z3'\."),
+        ([("damage.z1", "wing.helth.z1")], r"no variable 'helth.z1'; did you mean 'health.z1'"),
+        ([("pull", "wing.load_factor")], "no connector 'pull'; it has push, seen, percent"),
+        ([("seen", "wing.load_factor")], "connector 'seen' of the system is of the kind output"),
+        ([("push", "seen")], "joins two connectors of the system"),
+        (
+            [("wing.load_factor", "damage.load_factor")],
+            "wing.load_factor cannot be the source.*declared as input",
+        ),
+        ([("damage.z1", "wing.strain[1]")], r"wing.strain\[1\] cannot be the target.*declared as output"),
+        ([("push", "wing.young_modulus_factor")], "declared as parameter.*a numeric input is needed"),
+        (
+            [("damage.z1", "wing.health.z1"), ("damage.z2", "wing.health.z1")],
+            "wing.health.z1 has two sources, damage.z1 and damage.z2",
+        ),
+        (
+            [("gauges.received[1]", "wing.load_factor")],
+            "of the type Boolean and cannot feed.*of the type Real",
+        ),
+        (
+            [("wing.tip_displacement", "wing.load_factor")],
+            "is in 'm' and wing.load_factor in '1'.*no conversion",
+        ),
+        ([("damage.status", "spring.misbehaviour")], "of the type Enumeration and cannot feed.*Integer"),
+    ],
+)
+def test_connections_that_do_not_fit(
+    base: SystemStructure, connections: list[tuple[str, str]], words: str
+) -> None:
+    with pytest.raises(CouplingError, match=words) as caught:
+        Wiring(replace(base, connections=tuple(link(*pair) for pair in connections)))
+    assert "\n" not in str(caught.value)
+
+
+def test_ends_and_patterns_that_cannot_be_read() -> None:
+    with pytest.raises(
+        CouplingError, match=r"'wnig\.strain' begins with no component; the components are a, b"
+    ):
+        expand("wnig.strain", "a.x", ["a", "b"])
+    with pytest.raises(CouplingError, match="joins 3 ends to 2"):
+        expand("a.x[{1..3}]", "b.y[{1..2}]", ["a", "b"])
+    with pytest.raises(CouplingError, match="is empty or longer"):
+        expand("a.x[{3..1}]", "b.y[{1..2}]", ["a", "b"])
+
+
+def test_components_that_do_not_fit(base: SystemStructure, tmp_path: Path) -> None:
+    twice = replace(base, components=base.components + base.components[:1])
+    for structure, kind, words in (
+        (replace(base, components=()), CouplingError, "has no component"),
+        (twice, CouplingError, "two components named 'damage'"),
+        (
+            replace(base, components=(Component("a", tmp_path / "none.fmu"),)),
+            FmuFileError,
+            r"There is no FMU .*none\.fmu",
+        ),
+        (
+            replace(base, components=(replace(base.components[0], substeps=0),)),
+            CouplingError,
+            "at least one step",
+        ),
+    ):
+        with pytest.raises(kind, match=words):
+            Wiring(structure)
+
+
+@pytest.mark.parametrize(
+    ("component", "settings", "words"),
+    [
+        ("damage", {"rate.z9": Setting(1.0)}, "no variable 'rate.z9'"),
+        ("damage", {"z1": Setting(1.0)}, "damage.z1 cannot be set: it is declared as output"),
+        ("damage", {"seed": Setting(1.5)}, "damage.seed cannot be set to 1.5: it is of the type Integer"),
+        ("damage", {"seed": Setting(True)}, "cannot be set to True"),
+        ("damage", {"level": Setting(float("nan"))}, "cannot be set to nan"),
+        ("damage", {"period": Setting(1.0, "m")}, "is given in 'm', but it is in 's'"),
+        ("wing", {"response": Setting("quick")}, "with the items quasi_static, transient"),
+        ("wing", {"mass.servo": Setting("heavy")}, "a number is needed"),
+    ],
+)
+def test_settings_that_do_not_fit(
+    base: SystemStructure, component: str, settings: dict[str, Setting], words: str
+) -> None:
+    changed = replace(base.component(component), settings=settings)
+    with pytest.raises(CouplingError, match=words):
+        Wiring(replace(base, components=(changed,)))
+
+
+def test_settings_are_converted(base: SystemStructure) -> None:
+    wing = replace(
+        base.component("wing"),
+        settings={
+            "mass.servo": Setting(150.0, "g"),
+            "response": Setting("transient"),
+            "health.z1": Setting(0.2),
+        },
+    )
+    wiring = Wiring(replace(base, components=(wing,)))
+    assert wiring.settings["wing"] == {"mass.servo": pytest.approx(0.15), "response": 2.0, "health.z1": 0.2}
+
+
+def test_units_of_connections_are_converted(base: SystemStructure) -> None:
+    connections = (
+        link("damage.z1", "percent"),
+        link("damage.z1", "wing.health.z1"),
+        link("wing.tip_displacement", "seen", factor=2.0, offset=0.5),
+    )
+    wiring = Wiring(replace(base, connections=connections))
+    assert wiring.outward["percent"].conversion == (100.0, 0.0)
+    assert wiring.feeds[0].conversion == (1.0, 0.0)
+    assert wiring.outward["seen"].conversion == (2.0, 0.5)
+    assert wiring.units["seen"] == "m"
+    # The transformation is made in the unit of the source, the conversion after it.
+    scaled = Wiring(replace(base, connections=(link("damage.z1", "percent", factor=0.5, offset=0.1),)))
+    assert scaled.outward["percent"].conversion == (50.0, 10.0)
+    plain = Wiring(replace(base, connections=(link("damage.z1", "percent", convert_units=False),)))
+    assert plain.outward["percent"].conversion == (1.0, 0.0)
+
+
+def test_an_input_that_is_only_set_keeps_its_value(base: SystemStructure) -> None:
+    """A start value of an input that nothing feeds holds; without one it is the FMU's own."""
+    wing = replace(base.component("wing"), settings={"health.z1": Setting(0.4)})
+    binding = watch("wing.tip_displacement")
+    binding = binding.model_copy(
+        update={"observation": {"tip": binding.observation["all"].model_copy(update={"unit": "mm"})}}
+    )
+    with CoupledAsset(replace(base, components=(wing,)), binding, isolated=False) as asset:
+        damaged = [asset.observe().values[0], asset.step().values[0]]
+    with CoupledAsset(replace(base, components=(base.component("wing"),)), binding, isolated=False) as asset:
+        sound = asset.step().values[0]
+    assert damaged[0] == damaged[1]
+    assert damaged[1] > 1.05 * sound
+
+
+def test_bindings_that_do_not_fit(base: SystemStructure) -> None:
+    structure = replace(
+        base,
+        connections=(
+            link("push", "wing.load_factor"),
+            link("damage.z1", "wing.health.z1"),
+            link("damage.z1", "percent"),
+        ),
+    )
+    wiring = Wiring(structure)
+
+    def bound(role: str, variable: str, unit: str = "1") -> dict[str, object]:
+        table: dict[str, object] = {
+            "binding": {"name": "b", "step_size": 1.0},
+            "observation": {"x": {"variables": ["damage.z1"], "unit": "1"}},
+        }
+        if role == "observation":
+            table["observation"] = {"x": {"variables": [variable], "unit": unit}}
+        else:
+            table[role] = {"x": {"variable": variable, "unit": unit}}
+        return table
+
+    for role, variable, unit, words in (
+        ("control", "pull", "1", "no connector 'pull' and no component"),
+        ("control", "percent", "1", "control.x names 'percent', which is an output"),
+        ("control", "wing.health.z1", "1", "which is fed by a connection already"),
+        ("control", "wing.strain[1]", "1", "declared as output"),
+        ("control", "push", "m", "control.x is in 'm', but the system has 'push' in '1'"),
+        ("observation", "seen", "1", "no output of the system that something is connected to"),
+        ("observation", "wing.load_factor", "1", "declared as input"),
+        ("observation", "percent", "s", "and there is no conversion"),
+        ("parameter", "push", "1", "parameters are needed|is needed"),
+        ("parameter", "wing.load_factor", "1", "a numeric parameter is needed"),
+        ("monitor", "wing.load", "1", "no variable 'load'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            CoupledAsset(wiring, parse_binding(bound(role, variable, unit)))
+    with pytest.raises(ValueError, match="has no parameter 'q'"):
+        CoupledAsset(wiring, parse_binding(bound("control", "push")), parameters={"q": 1.0})
+    with pytest.raises(ValueError, match="algorithm must be one of gauss_seidel, jacobi"):
+        CoupledAsset(wiring, parse_binding(bound("control", "push")), algorithm="newton")  # type: ignore[arg-type]
+    with (
+        CoupledAsset(wiring, parse_binding(bound("control", "push")), isolated=False) as asset,
+        pytest.raises(ValueError, match="has no control 'pull'; it has x"),
+    ):
+        asset.step({"pull": 1.0})
+
+
+def test_an_end_prints_as_it_is_written() -> None:
+    assert str(Endpoint("wing", "health.z1")) == "wing.health.z1"
+    assert str(Endpoint("", "push")) == "push"

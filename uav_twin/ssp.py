@@ -1,0 +1,77 @@
+"""`uav-twin ssp ...`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+ssp_app = typer.Typer(no_args_is_help=True, help="Write and check systems of FMUs as SSP files.")
+
+
+@ssp_app.command("export")
+def export(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENARIO|DESIGN",
+            help="A shipped scenario, the path of a scenario, `uav_wing`, or the path of a wing design.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="The file to write.", show_default=False)],
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of the run; by default that of the scenario.")
+    ] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
+) -> None:
+    """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs."""
+    from fmu_asset.errors import SspError
+    from reporting.progress import RichProgress
+    from twin_master.scenario_file import load_scenario
+    from twin_master.system_export import export_design, export_scenario
+
+    if out.suffix != ".ssp":
+        raise SspError(f"An SSP file must have the suffix .ssp, but {out} was given.")
+    if out.exists() and not replace:
+        raise SspError(f"{out} exists: choose another --out or give --replace.")
+    progress = RichProgress()
+    if _is_design(what):
+        design = None if what == "uav_wing" else Path(what)
+        path = export_design(design, out, replace_file=replace, progress=progress)
+    else:
+        path = export_scenario(load_scenario(what), out, seed=seed, replace_file=replace, progress=progress)
+    typer.echo(f"{path}: {path.stat().st_size / 1024:.0f} KiB")
+
+
+def _is_design(what: str) -> bool:
+    """Return whether a name or path is that of a wing design: a TOML file without a mission."""
+    import tomllib
+
+    if what == "uav_wing":
+        return True
+    try:
+        return "planform" in tomllib.loads(Path(what).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return False
+
+
+@ssp_app.command("check")
+def check(file: Annotated[Path, typer.Argument(help="An SSP file.", show_default=False)]) -> None:
+    """Check an SSP file: archive, schemas, FMUs, connections, one step; exit code 1 if anything is wrong."""
+    from fmu_asset.ssp.check import check_ssp
+
+    result = check_ssp(file)
+    for problem in result.problems:
+        typer.secho(f"problem: {problem}", fg="red", err=True)
+    for loop in result.loops:
+        typer.echo(f"warning: {loop}")
+    if not result.passed:
+        raise typer.Exit(1)
+    order = ", ".join(f"{name} ({model})" for name, model in result.components)
+    typer.echo(
+        f"{file}: no problem found; {result.connections} connections, {result.parameters} parameters, "
+        "evaluated "
+        f"in the order {order}."
+    )
