@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
@@ -31,12 +31,14 @@ class SavedState:
         Number of steps made.
     step_size, start_time : float
         Of the binding [s].
-    parameters : mapping of str to float
+    parameters : mapping of str to float, or to a sequence for an array
         As the caller gave them.
     start_inputs : bytes
         Inputs during initialisation, as doubles; empty if the FMU's start values held.
     inputs : bytes
         The last inputs, as doubles.
+    outputs : bytes
+        The outputs at that moment, as doubles; the FMU must give them again.
     body : bytes
         The FMU's serialised state, or the inputs of each step.
     """
@@ -46,9 +48,10 @@ class SavedState:
     index: int
     step_size: float
     start_time: float
-    parameters: Mapping[str, float]
+    parameters: Mapping[str, float | Sequence[float]]
     start_inputs: bytes
     inputs: bytes
+    outputs: bytes
     body: bytes
 
     def to_bytes(self) -> bytes:
@@ -59,9 +62,13 @@ class SavedState:
             "index": self.index,
             "step_size": self.step_size,
             "start_time": self.start_time,
-            "parameters": dict(self.parameters),
+            "parameters": {
+                name: value if isinstance(value, float | int) else [*map(float, value)]
+                for name, value in self.parameters.items()
+            },
             "start_inputs": self.start_inputs.hex(),
             "inputs": self.inputs.hex(),
+            "outputs": self.outputs.hex(),
         }
         text = json.dumps(head, sort_keys=True).encode()
         return _HEADER.pack(_MAGIC, len(text)) + text + self.body
@@ -87,9 +94,13 @@ class SavedState:
                 index=int(head["index"]),
                 step_size=float(head["step_size"]),
                 start_time=float(head["start_time"]),
-                parameters={str(name): float(value) for name, value in head["parameters"].items()},
+                parameters={
+                    str(name): [*map(float, value)] if isinstance(value, list) else float(value)
+                    for name, value in head["parameters"].items()
+                },
                 start_inputs=bytes.fromhex(head["start_inputs"]),
                 inputs=bytes.fromhex(head["inputs"]),
+                outputs=bytes.fromhex(head["outputs"]),
                 body=content[begin:],
             )
         except (struct.error, ValueError, TypeError, KeyError, AttributeError) as error:

@@ -7,29 +7,32 @@ import os
 import shutil
 import weakref
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, NoReturn, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from .archive import FmuDescription, describe_fmu, extract_fmu, read_fmu
+from .archive import plain_folder, read_fmu
 from .binding import INPUT_ROLES, Binding, load_binding
+from .declared import FmuDescription, describe_fmu
 from .errors import (
     FmuCallError,
     FmuError,
     FmuInputError,
+    FmuMemoryError,
     FmuOutputError,
     FmuStateError,
     FmuWorkerError,
 )
-from .exchange import Exchange
-from .instance import STATUS_NAMES, FmuInstance, forget_modules
+from .exchange import Exchange, Values
+from .extraction import Extraction
+from .instances import open_instance
+from .instances.base import STATUS_NAMES, FmuInstance, forget_modules
 from .saved_state import SavedState, StateMethod
-from .worker import WorkerInstance
+from .worker.client import Limits, WorkerInstance
 
 _LOG_LENGTH = 200
 
@@ -43,9 +46,9 @@ class Observation:
     values : (n_obs,) ndarray
         The observations of the binding in their order and units.
     time : float
-        Time at the end of the step [s]: start + i * step size.
+        Time at the end of the step [s]: start + i * interval.
     extra : dict of str to float
-        The monitors of the binding.
+        Monitors, recorded variables and outputs of ports.
     """
 
     values: npt.NDArray[np.float64]
@@ -62,13 +65,16 @@ class FmiAsset:
     Parameters
     ----------
     fmu_path : path-like
-        An FMI 2.0 co-simulation FMU.
+        An FMU of FMI 1, 2 or 3, for co-simulation or model exchange.
     binding : Binding or path-like
         The binding, or its file.
     isolated : bool
         Whether the FMU runs in a worker process.
-    step_timeout : float
-        Wall-clock limit of one step [s].
+    step_timeout, load_timeout : float, optional
+        Wall-clock limits of one step, and of loading and initialisation [s]; those of the binding, or 10 and
+        60.
+    memory_limit : float, optional
+        Limit of the worker's resident memory [MiB]; that of the binding, or 4096.
     parameters : mapping of str to float, optional
         Parameters by the binding's names and in its units; they are set at every reset that gives no others.
 
@@ -88,25 +94,25 @@ class FmiAsset:
         binding: Binding | str | os.PathLike[str],
         *,
         isolated: bool = True,
-        step_timeout: float = 10.0,
-        parameters: Mapping[str, float] | None = None,
+        step_timeout: float | None = None,
+        load_timeout: float | None = None,
+        memory_limit: float | None = None,
+        parameters: Values | None = None,
     ) -> None:
-        self._binding = binding if isinstance(binding, Binding) else load_binding(binding)
-        self._description = read_fmu(fmu_path)
+        given = binding if isinstance(binding, Binding) else load_binding(binding)
+        self._description = read_fmu(fmu_path, given.binding.interface)
         self._isolated = isolated
-        if not (math.isfinite(step_timeout) and step_timeout > 0.0):
-            raise FmuInputError(
-                f"step_timeout must be a positive number of seconds, but is {step_timeout!r}."
-            )
-        self._step_timeout = step_timeout
-        self._exchange = Exchange(self._description, self._binding)
+        self._limits = _limits(given, step_timeout, load_timeout, memory_limit)
+        self._exchange = Exchange(self._description, given)
+        self._binding = self._exchange.binding
         self._settings = self._exchange.settings(parameters or {})
-        self._parameters = {name: float(value) for name, value in (parameters or {}).items()}
+        self._parameters = dict(parameters or {})
+        self._extraction: Extraction | None = None
         self._instance: FmuInstance | WorkerInstance | None = None
         self._release: Callable[[], object] = lambda: None
         self._phase: Literal["new", "ready", "broken", "closed"] = "new"
         self._index = 0
-        self._step_size = self._binding.step_size
+        self._step_size, self._interval = self._binding.step_size, self._binding.interval
         self._start_time = self._binding.binding.start_time
         self._recording = self.state_method == "replay"
         self._record: list[bytes] = []
@@ -117,7 +123,7 @@ class FmiAsset:
 
     @property
     def binding(self) -> Binding:
-        """The binding."""
+        """The binding, with arrays that are observed or recorded as their elements."""
         return self._binding
 
     @property
@@ -127,8 +133,8 @@ class FmiAsset:
 
     @property
     def time(self) -> float:
-        """Time of the asset [s]: start + i * step size, never accumulated."""
-        return self._start_time + self._index * self._step_size
+        """Time of the asset [s]: start + i * interval, never accumulated."""
+        return self._start_time + self._index * self._interval
 
     @property
     def step_index(self) -> int:
@@ -138,8 +144,12 @@ class FmiAsset:
     @property
     def state_method(self) -> StateMethod:
         """How `save_state` keeps the state: serialised by the FMU, or by replaying the recorded inputs."""
+        wanted = self._binding.binding.state
+        if wanted != "auto":
+            return wanted
         able = self._description.can_get_and_set_state and self._description.can_serialise_state
-        return "serialised" if able else "replay"
+        # A state in model exchange would have to hold our solver as well.
+        return "serialised" if able and self._description.interface == "co-simulation" else "replay"
 
     @property
     def log(self) -> tuple[tuple[str, str], ...]:
@@ -152,6 +162,17 @@ class FmiAsset:
         """Process number of the worker; None without one."""
         instance = self._instance
         return instance.process_id if isinstance(instance, WorkerInstance) and not instance.lost else None
+
+    @property
+    def worker_memory(self) -> int | None:
+        """Resident memory of the worker [bytes]; None without one."""
+        instance = self._instance
+        return instance.memory if isinstance(instance, WorkerInstance) and not instance.lost else None
+
+    @property
+    def recorded_units(self) -> dict[str, str]:
+        """Units of `Observation.extra` by name."""
+        return dict(self._exchange.recorded_units)
 
     def describe(self) -> dict[str, Any]:
         """Return what the FMU is and how it is bound, as plain records for a listing.
@@ -169,9 +190,13 @@ class FmiAsset:
         }
         for name, vector in self._binding.observation.items():
             roles.update(dict.fromkeys(vector.variables, f"observation.{name}"))
+        for name, port in self._binding.port.items():
+            for quantity, vector in port.quantities.items():
+                roles.update(dict.fromkeys(vector.variables, f"port.{name}.{quantity}"))
         return describe_fmu(self._description, roles) | {
             "binding": self._binding.name,
             "step_size": self._binding.step_size,
+            "decimation": self._binding.binding.decimation,
             "state_method": self.state_method,
         }
 
@@ -194,11 +219,12 @@ class FmiAsset:
 
     def reset(
         self,
-        parameters: Mapping[str, float] | None = None,
+        parameters: Values | None = None,
         *,
-        control: Mapping[str, float] | None = None,
-        health: Mapping[str, float] | None = None,
-        load: Mapping[str, float] | None = None,
+        control: Values | None = None,
+        health: Values | None = None,
+        load: Values | None = None,
+        port: Values | None = None,
     ) -> None:
         """Go back to the start.
 
@@ -206,7 +232,7 @@ class FmiAsset:
         ----------
         parameters : mapping of str to float, optional
             Parameters in the binding's units; those of the constructor if absent. They stay for later resets.
-        control, health, load : mapping of str to float, optional
+        control, health, load, port : mapping of str to float, optional
             Inputs that hold already during initialisation. If none is given, the FMU's start values hold.
 
         Raises
@@ -220,16 +246,17 @@ class FmiAsset:
         """
         if parameters is not None:
             self._settings = self._exchange.settings(parameters)
-            self._parameters = {name: float(value) for name, value in parameters.items()}
+            self._parameters = dict(parameters)
         start = self._exchange.start_values()
-        given = self._exchange.place(start, control, health, load)
+        given = self._exchange.place(start, control, health, load, port)
         self._begin(start, with_inputs=given)
 
     def step(
         self,
-        control: Mapping[str, float] | None = None,
-        health: Mapping[str, float] | None = None,
-        load: Mapping[str, float] | None = None,
+        control: Values | None = None,
+        health: Values | None = None,
+        load: Values | None = None,
+        port: Values | None = None,
     ) -> Observation:
         """Make one communication step.
 
@@ -238,8 +265,8 @@ class FmiAsset:
 
         Parameters
         ----------
-        control, health, load : mapping of str to float
-            Inputs of this step.
+        control, health, load, port : mapping of str to float, or to a sequence for an array
+            Inputs of this step; those of a port are called `<port>.<quantity>`.
 
         Returns
         -------
@@ -262,9 +289,9 @@ class FmiAsset:
         instance = self._opened()
         request = instance.request
         before = bytes(request)
-        begin = self._start_time + self._index * self._step_size
+        begin = self._start_time + self._index * self._interval
         try:
-            self._exchange.place(request, control, health, load)
+            self._exchange.place(request, control, health, load, port)
             request[0] = begin
             request[1] = self._step_size
             instance.step()
@@ -313,11 +340,12 @@ class FmiAsset:
             method=self.state_method,
             fmu=self._description.sha256,
             index=self._index,
-            step_size=self._step_size,
+            step_size=self._interval,
             start_time=self._start_time,
             parameters=self._parameters,
             start_inputs=self._start_inputs,
             inputs=bytes(self._instance.request)[16:],
+            outputs=self._outputs_now(),
             body=body,
         ).to_bytes()
 
@@ -332,7 +360,8 @@ class FmiAsset:
         Raises
         ------
         FmuStateError
-            If it is damaged, or belongs to another FMU or step size.
+            If it is damaged, belongs to another FMU or step size, or the FMU gives other outputs than when it
+            was saved.
         FmuCallError, FmuWorkerError, FmuTimeoutError
             If the FMU fails.
         """
@@ -342,7 +371,7 @@ class FmiAsset:
                 f"The state was saved with another FMU than {self._description.path} (its hash differs); "
                 "use that one."
             )
-        if (saved.step_size, saved.start_time) != (self._step_size, self._start_time):
+        if (saved.step_size, saved.start_time) != (self._interval, self._start_time):
             raise FmuStateError("The state was saved with another step size or start time; use that binding.")
         width = 8 * self._exchange.plan.input_count
         replayed = saved.method == "replay"
@@ -355,12 +384,16 @@ class FmiAsset:
             raise FmuStateError(
                 "The saved state is damaged, or another binding was in use; use that binding."
             )
-        self._settings = self._exchange.settings(saved.parameters)
-        self._parameters = dict(saved.parameters)
-        start = self._exchange.start_values()
-        if saved.start_inputs:
-            start[2:] = np.frombuffer(saved.start_inputs).tolist()
-        self._begin(start, with_inputs=bool(saved.start_inputs))
+        ready = self._phase == "ready" and self._instance is not None and not self._instance.lost
+        same = (dict(saved.parameters), saved.start_inputs) == (self._parameters, self._start_inputs)
+        # An instance that was initialised in the same way takes the state as it is: what an ensemble needs.
+        if replayed or not (ready and same):
+            self._settings = self._exchange.settings(saved.parameters)
+            self._parameters = dict(saved.parameters)
+            start = self._exchange.start_values()
+            if saved.start_inputs:
+                start[2:] = np.frombuffer(saved.start_inputs).tolist()
+            self._begin(start, with_inputs=bool(saved.start_inputs))
         instance = self._instance
         assert instance is not None
         try:
@@ -371,14 +404,82 @@ class FmiAsset:
                 instance.restore(saved.body)
                 self._index = saved.index
                 memoryview(instance.request).cast("B")[16:] = saved.inputs
+            if self._outputs_now() != saved.outputs:
+                raise self._other_outputs(saved.outputs, replayed=replayed)
         except FmuError as error:
             self._phase = "broken"
             self._fail(error, "restoring the state")
 
+    def fork(self) -> FmiAsset:
+        """Return another asset of the same FMU in the same state, with a worker of its own.
+
+        The FMU is not extracted again. Each of the two goes its own way from here.
+
+        Raises
+        ------
+        FmuStateError
+            If the asset is not open.
+        FmuError
+            As `save_state` and `restore_state`.
+        """
+        state = self.save_state()
+        other = self.sibling()
+        try:
+            other.restore_state(state)
+        except BaseException:
+            other.close()
+            raise
+        return other
+
+    def sibling(self, parameters: Values | None = None) -> FmiAsset:
+        """Return a new asset of the same FMU, binding and limits, without extracting the FMU again.
+
+        Parameters
+        ----------
+        parameters : mapping of str to float, optional
+            Parameters in the binding's units; those of this asset if absent.
+
+        Raises
+        ------
+        BindingError, FmuInputError
+            If a parameter is unknown or lies outside its range.
+        """
+        other = FmiAsset.__new__(FmiAsset)
+        other.__dict__.update(self.__dict__)
+        other._instance, other._phase, other._index = None, "new", 0
+        other._release = lambda: None
+        other._record, other._start_inputs = [], b""
+        other._log = deque(maxlen=_LOG_LENGTH)
+        if parameters is not None:
+            other._settings = other._exchange.settings(parameters)
+            other._parameters = dict(parameters)
+        return other
+
+    def renew(self) -> None:
+        """Free the FMU's instance, make another one in the same process, and go back to the start.
+
+        `reset` uses the FMU's own reset; this is what a batch of runs without it costs.
+
+        Raises
+        ------
+        FmuError
+            If the FMU fails.
+        """
+        instance = self._instance
+        if isinstance(instance, WorkerInstance) and not instance.lost:
+            try:
+                instance.renew()
+            except FmuError as error:
+                self._fail(error, "making a new instance")
+            self._begin(self._exchange.start_values(), with_inputs=False, reset=False)
+        else:
+            self.close()
+            self.reset()
+
     def _replay(self, inputs: bytes) -> None:
         instance = self._instance
         assert instance is not None
-        instance.request[0], instance.request[1] = self.time, self._binding.step_size
+        instance.request[0], instance.request[1] = self.time, self._step_size
         memoryview(instance.request).cast("B")[16:] = inputs
         instance.step()
         self._index += 1
@@ -386,11 +487,11 @@ class FmiAsset:
 
     # ------------------------------------------------------------------ inside
 
-    def _begin(self, start: Sequence[float], *, with_inputs: bool) -> None:
+    def _begin(self, start: Sequence[float], *, with_inputs: bool, reset: bool = True) -> None:
         try:
-            instance = self._fresh()
+            instance = self._fresh() if reset or self._instance is None else self._instance
             instance.request[:] = list(start)
-            instance.initialise(self._binding.binding.start_time, self._settings, with_inputs=with_inputs)
+            instance.initialise(self._start_time, self._settings, with_inputs=with_inputs)
         except FmuError as error:
             self.close()
             self._fail(error, "the start")
@@ -398,6 +499,34 @@ class FmiAsset:
         self._record = []
         self._start_inputs = bytes(instance.request)[16:] if with_inputs else b""
         self._phase = "ready"
+
+    def _outputs_now(self) -> bytes:
+        """Return the outputs of this moment as the FMU gives them."""
+        instance = self._instance
+        assert instance is not None
+        instance.read()
+        return bytes(instance.reply)
+
+    def _other_outputs(self, saved: bytes, *, replayed: bool) -> FmuStateError:
+        now = self._reply
+        then = np.frombuffer(saved)
+        if then.shape != now.shape:
+            return FmuStateError(
+                "The state was saved with another binding (its outputs differ); use that one."
+            )
+        which = int(np.flatnonzero(now.view(np.int64) != then.view(np.int64))[0])
+        name = self._exchange.output_name(which)
+        if replayed:
+            cause = "it does not give equal outputs for equal inputs, so that it cannot be resumed"
+        else:
+            cause = (
+                "it declares canGetAndSetFMUstate but does not restore all of its state; write "
+                '`state = "replay"` into the table [binding] of its binding'
+            )
+        return FmuStateError(
+            f"After the state was restored the FMU gives {name} = {now[which]!r} instead of {then[which]!r}: "
+            f"{cause}."
+        )
 
     def _opened(self) -> FmuInstance | WorkerInstance:
         """Return the instance, which is opened by its first use but never started again unasked."""
@@ -419,19 +548,35 @@ class FmiAsset:
                 return self._instance
             except FmuCallError:
                 pass  # an FMU that cannot be reset is instantiated anew
+        shared = self._extraction
+        # After a crash the files of the FMU are not trusted either.
+        crashed = self._instance is not None and self._instance.lost
+        if shared is not None and (crashed or not shared.usable):
+            shared = None
+        if shared is not None:
+            shared.hold()
         self.close()
-        folder = extract_fmu(self._description)
-        plan = replace(self._exchange.plan, folder=str(folder))
+        if shared is None:
+            shared = Extraction(self._description)
+            shared.hold()
         try:
-            instance = (
-                WorkerInstance(plan, step_timeout=self._step_timeout) if self._isolated else FmuInstance(plan)
-            )
+            plan = replace(self._exchange.plan, folder=str(shared.folder))
+            instance: FmuInstance | WorkerInstance
+            if self._isolated:
+                scratch = plain_folder()
+                try:
+                    instance = WorkerInstance(plan, scratch, limits=self._limits)
+                except BaseException:
+                    shutil.rmtree(scratch, ignore_errors=True)
+                    raise
+            else:
+                instance = open_instance(plan)
         except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)
+            shared.release()
             raise
-        self._instance = instance
+        self._instance, self._extraction = instance, shared
         # Also at the end of the interpreter, or when the asset is forgotten without being closed.
-        self._release = weakref.finalize(self, _release, instance, folder)
+        self._release = weakref.finalize(self, _release, instance, shared)
         self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
         return instance
 
@@ -448,7 +593,7 @@ class FmiAsset:
                     [text for _, text in self.log[-5:]],
                 )
         values, extra = self._exchange.read(block)
-        return Observation(values, self._start_time + self._index * self._step_size, extra)
+        return Observation(values, self._start_time + self._index * self._interval, extra)
 
     def _collect_log(self) -> None:
         instance = self._instance
@@ -460,15 +605,32 @@ class FmiAsset:
     def _fail(self, error: FmuError, what: str) -> NoReturn:
         """Raise the error with the FMU's file and the moment, and keep its messages."""
         self._log.extend(("Error", message) for message in error.messages)
-        if isinstance(error, FmuCallError | FmuWorkerError | TimeoutError):
+        if isinstance(error, FmuCallError | FmuWorkerError | FmuStateError | FmuMemoryError | TimeoutError):
             raise type(error)(
                 f"{self._description.path}, {what}: {error.sentence}", error.messages
             ) from error
         raise error
 
 
-def _release(instance: FmuInstance | WorkerInstance, folder: Path) -> None:
+def _release(instance: FmuInstance | WorkerInstance, extraction: Extraction) -> None:
     instance.close()
     if isinstance(instance, FmuInstance):
-        forget_modules(str(folder))
-    shutil.rmtree(folder, ignore_errors=True)
+        forget_modules(str(extraction.folder))
+    extraction.release()
+
+
+def _limits(
+    binding: Binding, step_timeout: float | None, load_timeout: float | None, memory_limit: float | None
+) -> Limits:
+    """Return what the caller says, then what the binding says, then the defaults."""
+    given = {"step_timeout": step_timeout, "load_timeout": load_timeout, "memory_limit": memory_limit}
+    for name, value in given.items():
+        if value is not None and not (math.isfinite(value) and value > 0.0):
+            unit = "MiB" if name == "memory_limit" else "seconds"
+            raise FmuInputError(f"{name} must be a positive number of {unit}, but is {value!r}.")
+    own, default = binding.limits, Limits()
+    return Limits(
+        step_time=step_timeout or own.step_time or default.step_time,
+        load_time=load_timeout or own.load_time or default.load_time,
+        memory=memory_limit or own.memory or default.memory,
+    )

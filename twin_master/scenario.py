@@ -187,7 +187,7 @@ class AssetSection(Section):
     file: str | None = None
     binding: str | None = None
     isolated: Flag = True
-    step_timeout: Positive = 60.0
+    step_timeout: Positive | None = None
     parameters: dict[str, Number] = {}
     load: dict[str, Number] = {}
     observation_model: Literal["design", "asset"] | None = None

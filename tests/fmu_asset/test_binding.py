@@ -61,7 +61,7 @@ def test_observations_keep_their_order(tmp_path: Path) -> None:
         ("step_size = 1.0", "step_size = 0.0", r"binding\.step_size is wrong"),
         ("step_size = 1.0", "step_size = nan", r"binding\.step_size is wrong"),
         ("step_size = 1.0", 'step_size = "1"', r"binding\.step_size is wrong"),
-        ("step_size = 1.0", 'step_size = 1.0\nfmi_version = "3.0"', r"binding\.fmi_version is wrong"),
+        ("step_size = 1.0", 'step_size = 1.0\nfmi_version = "4.0"', r"binding\.fmi_version is wrong"),
         ("[control.n]", "[controll.n]", r"the key 'controll' is unknown"),
         ('variable = "n"\n', "", r"the key 'control\.n\.variable' is missing"),
         ('unit = "mm"', "", r"the key 'observation\.tip\.unit' is missing"),

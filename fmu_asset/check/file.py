@@ -8,11 +8,11 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from .archive import FmuDescription, read_fmu
-from .binding import parse_binding
-from .build import recorded_content_hash
-from .errors import FmuError
-from .session import FmiAsset
+from ..archive import FmuDescription, read_fmu
+from ..binding import parse_binding
+from ..build import recorded_content_hash
+from ..errors import FmuError
+from ..session import FmiAsset
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,3 @@
+"""Checks of an FMU."""
+
+from .file import check_fmu as check_fmu
