@@ -4,35 +4,31 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
-import weakref
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Literal, NoReturn, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from .archive import plain_folder, read_fmu
+from .archive import read_fmu
 from .binding import INPUT_ROLES, Binding, load_binding
 from .declared import FmuDescription, describe_fmu
 from .errors import (
     FmuCallError,
     FmuError,
-    FmuInputError,
     FmuMemoryError,
     FmuOutputError,
     FmuStateError,
     FmuWorkerError,
 )
 from .exchange import Exchange, Values
-from .extraction import Extraction
-from .instances import open_instance
-from .instances.base import STATUS_NAMES, FmuInstance, forget_modules
+from .housing import Housing, Instance, limits_of
+from .instances.base import STATUS_NAMES
 from .saved_state import SavedState, StateMethod
-from .worker.client import Limits, WorkerInstance
+from .worker.client import WorkerInstance
 
 _LOG_LENGTH = 200
 
@@ -101,15 +97,12 @@ class FmiAsset:
     ) -> None:
         given = binding if isinstance(binding, Binding) else load_binding(binding)
         self._description = read_fmu(fmu_path, given.binding.interface)
-        self._isolated = isolated
-        self._limits = _limits(given, step_timeout, load_timeout, memory_limit)
+        limits = limits_of(given, step_timeout, load_timeout, memory_limit)
         self._exchange = Exchange(self._description, given)
+        self._housing = Housing(self._description, self._exchange.plan, limits, isolated=isolated)
         self._binding = self._exchange.binding
         self._settings = self._exchange.settings(parameters or {})
         self._parameters = dict(parameters or {})
-        self._extraction: Extraction | None = None
-        self._instance: FmuInstance | WorkerInstance | None = None
-        self._release: Callable[[], object] = lambda: None
         self._phase: Literal["new", "ready", "broken", "closed"] = "new"
         self._index = 0
         self._step_size, self._interval = self._binding.step_size, self._binding.interval
@@ -160,13 +153,13 @@ class FmiAsset:
     @property
     def worker_process_id(self) -> int | None:
         """Process number of the worker; None without one."""
-        instance = self._instance
+        instance = self._housing.instance
         return instance.process_id if isinstance(instance, WorkerInstance) and not instance.lost else None
 
     @property
     def worker_memory(self) -> int | None:
         """Resident memory of the worker [bytes]; None without one."""
-        instance = self._instance
+        instance = self._housing.instance
         return instance.memory if isinstance(instance, WorkerInstance) and not instance.lost else None
 
     @property
@@ -214,8 +207,8 @@ class FmiAsset:
 
     def close(self) -> None:
         """End the worker and remove its files; the asset can be opened again by `reset`."""
-        self._instance, self._phase = None, "closed"
-        self._release()
+        self._phase = "closed"
+        self._housing.close()
 
     def reset(
         self,
@@ -327,11 +320,11 @@ class FmiAsset:
         FmuCallError
             If the FMU fails to save.
         """
-        if self._phase != "ready" or self._instance is None:
+        if self._phase != "ready" or self._housing.instance is None:
             raise FmuStateError("There is no state to save before the first reset or step.")
         if self.state_method == "serialised":
             try:
-                body = self._instance.save()
+                body = self._housing.instance.save()
             except FmuError as error:
                 self._fail(error, "saving the state")
         else:
@@ -344,7 +337,7 @@ class FmiAsset:
             start_time=self._start_time,
             parameters=self._parameters,
             start_inputs=self._start_inputs,
-            inputs=bytes(self._instance.request)[16:],
+            inputs=bytes(self._housing.instance.request)[16:],
             outputs=self._outputs_now(),
             body=body,
         ).to_bytes()
@@ -384,7 +377,9 @@ class FmiAsset:
             raise FmuStateError(
                 "The saved state is damaged, or another binding was in use; use that binding."
             )
-        ready = self._phase == "ready" and self._instance is not None and not self._instance.lost
+        ready = (
+            self._phase == "ready" and self._housing.instance is not None and not self._housing.instance.lost
+        )
         same = (dict(saved.parameters), saved.start_inputs) == (self._parameters, self._start_inputs)
         # An instance that was initialised in the same way takes the state as it is: what an ensemble needs.
         if replayed or not (ready and same):
@@ -394,7 +389,7 @@ class FmiAsset:
             if saved.start_inputs:
                 start[2:] = np.frombuffer(saved.start_inputs).tolist()
             self._begin(start, with_inputs=bool(saved.start_inputs))
-        instance = self._instance
+        instance = self._housing.instance
         assert instance is not None
         try:
             if replayed:
@@ -446,8 +441,8 @@ class FmiAsset:
         """
         other = FmiAsset.__new__(FmiAsset)
         other.__dict__.update(self.__dict__)
-        other._instance, other._phase, other._index = None, "new", 0
-        other._release = lambda: None
+        other._housing = self._housing.sibling()
+        other._phase, other._index = "new", 0
         other._record, other._start_inputs = [], b""
         other._log = deque(maxlen=_LOG_LENGTH)
         if parameters is not None:
@@ -465,7 +460,7 @@ class FmiAsset:
         FmuError
             If the FMU fails.
         """
-        instance = self._instance
+        instance = self._housing.instance
         if isinstance(instance, WorkerInstance) and not instance.lost:
             try:
                 instance.renew()
@@ -477,7 +472,7 @@ class FmiAsset:
             self.reset()
 
     def _replay(self, inputs: bytes) -> None:
-        instance = self._instance
+        instance = self._housing.instance
         assert instance is not None
         instance.request[0], instance.request[1] = self.time, self._step_size
         memoryview(instance.request).cast("B")[16:] = inputs
@@ -489,7 +484,10 @@ class FmiAsset:
 
     def _begin(self, start: Sequence[float], *, with_inputs: bool, reset: bool = True) -> None:
         try:
-            instance = self._fresh() if reset or self._instance is None else self._instance
+            instance = self._housing.instance
+            if reset or instance is None:
+                instance = self._housing.fresh()
+                self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
             instance.request[:] = list(start)
             instance.initialise(self._start_time, self._settings, with_inputs=with_inputs)
         except FmuError as error:
@@ -502,7 +500,7 @@ class FmiAsset:
 
     def _outputs_now(self) -> bytes:
         """Return the outputs of this moment as the FMU gives them."""
-        instance = self._instance
+        instance = self._housing.instance
         assert instance is not None
         instance.read()
         return bytes(instance.reply)
@@ -523,12 +521,12 @@ class FmiAsset:
                 "it declares canGetAndSetFMUstate but does not restore all of its state; write "
                 '`state = "replay"` into the table [binding] of its binding'
             )
+        was, is_now = float(then[which]), float(now[which])
         return FmuStateError(
-            f"After the state was restored the FMU gives {name} = {now[which]!r} instead of {then[which]!r}: "
-            f"{cause}."
+            f"After the state was restored the FMU gives {name} = {is_now!r} instead of {was!r}: {cause}."
         )
 
-    def _opened(self) -> FmuInstance | WorkerInstance:
+    def _opened(self) -> Instance:
         """Return the instance, which is opened by its first use but never started again unasked."""
         if self._phase == "broken":
             raise FmuStateError("A state could not be restored; reset the asset to go on.")
@@ -536,48 +534,8 @@ class FmiAsset:
             raise FmuStateError("The asset is closed; reset it to start anew.")
         if self._phase == "new":
             self.reset()
-        instance = self._instance
+        instance = self._housing.instance
         assert instance is not None
-        return instance
-
-    def _fresh(self) -> FmuInstance | WorkerInstance:
-        """Return an instance as after its instantiation; never one that a fatal error has touched."""
-        if self._instance is not None and not self._instance.lost:
-            try:
-                self._instance.reset()
-                return self._instance
-            except FmuCallError:
-                pass  # an FMU that cannot be reset is instantiated anew
-        shared = self._extraction
-        # After a crash the files of the FMU are not trusted either.
-        crashed = self._instance is not None and self._instance.lost
-        if shared is not None and (crashed or not shared.usable):
-            shared = None
-        if shared is not None:
-            shared.hold()
-        self.close()
-        if shared is None:
-            shared = Extraction(self._description)
-            shared.hold()
-        try:
-            plan = replace(self._exchange.plan, folder=str(shared.folder))
-            instance: FmuInstance | WorkerInstance
-            if self._isolated:
-                scratch = plain_folder()
-                try:
-                    instance = WorkerInstance(plan, scratch, limits=self._limits)
-                except BaseException:
-                    shutil.rmtree(scratch, ignore_errors=True)
-                    raise
-            else:
-                instance = open_instance(plan)
-        except BaseException:
-            shared.release()
-            raise
-        self._instance, self._extraction = instance, shared
-        # Also at the end of the interpreter, or when the asset is forgotten without being closed.
-        self._release = weakref.finalize(self, _release, instance, shared)
-        self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
         return instance
 
     def _observation(self) -> Observation:
@@ -596,7 +554,7 @@ class FmiAsset:
         return Observation(values, self._start_time + self._index * self._interval, extra)
 
     def _collect_log(self) -> None:
-        instance = self._instance
+        instance = self._housing.instance
         if instance is not None and instance.has_log and not instance.lost:
             for status, text in instance.take_log():
                 name = STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
@@ -610,27 +568,3 @@ class FmiAsset:
                 f"{self._description.path}, {what}: {error.sentence}", error.messages
             ) from error
         raise error
-
-
-def _release(instance: FmuInstance | WorkerInstance, extraction: Extraction) -> None:
-    instance.close()
-    if isinstance(instance, FmuInstance):
-        forget_modules(str(extraction.folder))
-    extraction.release()
-
-
-def _limits(
-    binding: Binding, step_timeout: float | None, load_timeout: float | None, memory_limit: float | None
-) -> Limits:
-    """Return what the caller says, then what the binding says, then the defaults."""
-    given = {"step_timeout": step_timeout, "load_timeout": load_timeout, "memory_limit": memory_limit}
-    for name, value in given.items():
-        if value is not None and not (math.isfinite(value) and value > 0.0):
-            unit = "MiB" if name == "memory_limit" else "seconds"
-            raise FmuInputError(f"{name} must be a positive number of {unit}, but is {value!r}.")
-    own, default = binding.limits, Limits()
-    return Limits(
-        step_time=step_timeout or own.step_time or default.step_time,
-        load_time=load_timeout or own.load_time or default.load_time,
-        memory=memory_limit or own.memory or default.memory,
-    )

@@ -16,6 +16,7 @@ import shutil
 import signal
 import threading
 import time
+from typing import NoReturn
 
 LARGEST_FILE = 2 * 1024**3
 """Bytes that an FMU may write to one file, such as an endless log."""
@@ -57,17 +58,22 @@ class Household:
         self._twin = os.getppid()
         threading.Thread(target=self._watch, args=(incoming,), daemon=True).start()
 
-    def remove(self, *, asked: bool) -> None:
-        """Remove the folders that nobody else will remove.
+    def leave(self, *, asked: bool) -> NoReturn:
+        """Remove the folders that nobody else will remove, and end.
 
         Parameters
         ----------
         asked : bool
-            Whether the twin asked for the end, so that it lives.
+            Whether the twin asked for the end, so that it lives and ends what the FMU has started.
         """
         shutil.rmtree(self._scratch, ignore_errors=True)
         if self.shared and not asked and self._orphaned():
             shutil.rmtree(self.shared, ignore_errors=True)
+        if not asked and os.getpgrp() == os.getpid():
+            with contextlib.suppress(OSError):
+                os.killpg(os.getpid(), signal.SIGKILL)
+        # Without the interpreter's shutdown, which third-party libraries may not survive.
+        os._exit(0)
 
     def _orphaned(self) -> bool:
         """Return whether the twin is dead; its pipes are closed a moment before it is."""
@@ -82,10 +88,7 @@ class Household:
         poll.register(incoming, 0)  # the end of the pipe is reported in any case
         poll.poll()
         time.sleep(_GRACE)  # a worker that is not busy ends by itself
-        self.remove(asked=False)
-        with contextlib.suppress(OSError):
-            os.killpg(os.getpgrp(), signal.SIGKILL)
-        os._exit(1)
+        self.leave(asked=False)
 
 
 def resident_memory(process: int) -> int | None:

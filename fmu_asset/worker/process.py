@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from ..errors import FmuWorkerError
-from .protocol import OWN_FAILURE
+from .protocol import OWN_FAILURE, PIPES_GONE
 
 CLOSE_LIMIT = 2.0
 """Seconds that a worker has to end by itself."""
@@ -71,7 +71,7 @@ class WorkerProcess:
                     env=environment,
                     pass_fds=(their_in, their_out),
                     # A group of its own, so that what the FMU starts ends with it.
-                    start_new_session=True,
+                    process_group=0,
                 )
         except OSError as error:
             os.close(self.outgoing)
@@ -118,6 +118,8 @@ class WorkerProcess:
             name = {item.value: item.name for item in signal.Signals}.get(-code, "a real-time signal")
             meaning = f": {_MEANINGS[name]}" if name in _MEANINGS else ""
             how = f"was ended by signal {-code} ({name}){meaning}"
+        elif code == PIPES_GONE:
+            how = "could not answer: the FMU's code closed files that are not its own"
         elif code == OWN_FAILURE:
             how = "failed outside the FMU"
         else:

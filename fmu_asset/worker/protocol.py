@@ -33,8 +33,8 @@ class Operation(IntEnum):
 
 
 RESULT, FAILURE = 1, 2
-OWN_FAILURE = 70
-"""Exit status of a worker whose own program failed."""
+OWN_FAILURE, PIPES_GONE = 70, 71
+"""Exit statuses of a worker whose own program failed, or whose pipes were closed by the FMU."""
 
 # Waking a process that sleeps on a pipe costs as much as a whole step. Whoever awaits the other side of a
 # step therefore looks again for a moment before it sleeps, if there is a processor for each of the two.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import faulthandler
 import json
 import os
@@ -15,7 +16,7 @@ from ..instances import open_instance
 from ..instances.base import FmuInstance
 from ..instances.plan import Plan
 from .guard import Household, restrict
-from .protocol import FAILURE, HEADER, OWN_FAILURE, RESULT, Operation, look, receive, send
+from .protocol import FAILURE, HEADER, OWN_FAILURE, PIPES_GONE, RESULT, Operation, look, receive, send
 
 _STEP, _OPEN, _RENEW, _CLOSE, _LOG = (
     int(operation)
@@ -86,13 +87,13 @@ def serve(incoming: int, outgoing: int, folder: str) -> None:
             instance.close()
     except BrokenPipeError:
         pass  # the twin is gone
+    except OSError as error:
+        os._exit(PIPES_GONE if error.errno == errno.EBADF else OWN_FAILURE)
     except BaseException:  # noqa: BLE001 - the twin reads the last words in worker.log
         traceback.print_exc()
         sys.stderr.flush()
         os._exit(OWN_FAILURE)
-    household.remove(asked=asked)
-    # Without the interpreter's shutdown, which third-party libraries may not survive.
-    os._exit(0)
+    household.leave(asked=asked)
 
 
 def _answer(
