@@ -346,10 +346,7 @@ class Exchange:
             for name, value in values.items():
                 slot = slots.get(name)
                 if slot is None:
-                    raise BindingError(
-                        f"The binding {self._binding.name} has no {role} {name!r}; "
-                        f"it has {', '.join(slots) or 'none'}."
-                    )
+                    raise self._no_input(role, name)
                 # NaN fails the comparisons; the last one is for an infinity in a range without limit.
                 if (
                     slot.direct
@@ -361,6 +358,18 @@ class Exchange:
                 else:
                     _put(target, slot, value)
         return given
+
+    def input_range(self, role: str, name: str) -> tuple[float, float]:
+        """Return the range of an input in the binding's unit; see `FmiAsset.input_range`."""
+        slot = self._slots.get(role, {}).get(name)
+        if slot is None:
+            raise self._no_input(role, name)
+        low, high = sorted(slot.conversion.from_fmu(end) for end in (slot.low, slot.high))
+        return low, high
+
+    def _no_input(self, role: str, name: str) -> BindingError:
+        known = ", ".join(self._slots.get(role, {})) or "none"
+        return BindingError(f"The binding {self._binding.name} has no {role} {name!r}; it has {known}.")
 
     def read(self, block: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], dict[str, float]]:
         """Return observations and monitors in the binding's units.

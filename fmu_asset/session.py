@@ -167,6 +167,16 @@ class FmiAsset:
         """Units of `Observation.extra` by name."""
         return dict(self._exchange.recorded_units)
 
+    def input_range(self, role: str, name: str) -> tuple[float, float]:
+        """Return the range of an input in the binding's unit: that of the FMU and of the binding together.
+
+        Raises
+        ------
+        BindingError
+            If the binding has no such input.
+        """
+        return self._exchange.input_range(role, name)
+
     def describe(self) -> dict[str, Any]:
         """Return what the FMU is and how it is bound, as plain records for a listing.
 

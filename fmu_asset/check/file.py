@@ -1,125 +1,115 @@
-"""Checks of an FMU beyond what flying it shows: the standard's rules, the house's rules, one trial step."""
+"""What the file itself tells: the standard's rules, its content, its units and ranges."""
 
 from __future__ import annotations
 
-import math
-import os
 import zipfile
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterator
 
-from ..archive import FmuDescription, read_fmu
-from ..binding import parse_binding
 from ..build import recorded_content_hash
-from ..errors import FmuError
-from ..session import FmiAsset
+from ..declared import FLOAT_KINDS, FmuDescription
+from ..unit_symbols import meaning_of
+from ..units import contradictions
+from .result import Finding
 
 
-@dataclass(frozen=True)
-class FmuCheck:
-    """What the checks found.
-
-    Attributes
-    ----------
-    path : Path
-        The FMU.
-    problems : tuple of str
-        One sentence each; empty if nothing was found.
-    warnings : tuple of str
-        What is allowed but makes an FMU harder to use.
-    """
-
-    path: Path
-    problems: tuple[str, ...]
-    warnings: tuple[str, ...]
-
-    @property
-    def passed(self) -> bool:
-        """Whether nothing was found."""
-        return not self.problems
+def check_file(description: FmuDescription) -> Iterator[Finding]:
+    """Yield what the file of an FMU tells without running it."""
+    yield _archive(description)
+    yield from _schema(description)
+    yield from _content(description)
+    yield from _units(description)
+    yield from _ranges(description)
+    if description.needs_tool:
+        yield Finding("authoring tool", "warning", "It needs its authoring tool on this machine to run.")
 
 
-def check_fmu(path: str | os.PathLike[str]) -> FmuCheck:
-    """Check an FMU: archive, `fmpy validate`, GUID against content (ours only), and one step in a worker.
+def _archive(description: FmuDescription) -> Finding:
+    kinds = " and ".join(description.interfaces)
+    count = len(description.variables)
+    return Finding(
+        "archive",
+        "ok",
+        f"FMI {description.fmi_version}, {kinds}, {count} variables, binaries for "
+        f"{', '.join(description.platforms)}.",
+    )
 
-    Parameters
-    ----------
-    path : path-like
-        Any FMI 2.0 co-simulation FMU.
 
-    Returns
-    -------
-    FmuCheck
-        Problems and warnings.
-
-    Raises
-    ------
-    FmuFileError, FmuUnsupportedError
-        If there is no FMU to check.
-    """
+def _schema(description: FmuDescription) -> Iterator[Finding]:
     # It needs a grammar parser and an XML schema; those who only fly an FMU shall not pay for it.
     from fmpy.validation import validate_fmu
 
-    description = read_fmu(path)
-    problems = [" ".join(str(problem).split()) for problem in validate_fmu(str(path))]
-    problems += _content_problems(description)
-    problems += _trial_problems(description)
-    return FmuCheck(description.path, tuple(problems), tuple(_warnings(description)))
+    problems = [" ".join(str(problem).split()) for problem in validate_fmu(str(description.path))]
+    for problem in problems:
+        yield Finding("fmpy validate", "problem", problem)
+    if not problems:
+        yield Finding(
+            "fmpy validate", "ok", "The model description keeps the schema and the standard's rules."
+        )
 
 
-def _content_problems(description: FmuDescription) -> list[str]:
+def _content(description: FmuDescription) -> Iterator[Finding]:
+    """Compare the GUID of a wing FMU of ours with its content."""
     with zipfile.ZipFile(description.path) as archive:
         ours = {"resources/start.json", "resources/reduced_model.npz"} <= set(archive.namelist())
     if not ours:
-        return []
+        return
     try:
         declared, actual = recorded_content_hash(description.path)
     except (KeyError, IndexError, UnicodeDecodeError):
-        return [
-            "Its parts are not those of a wing FMU as it was built: the file was changed after its build."
-        ]
+        yield Finding(
+            "content",
+            "problem",
+            "Its parts are not those of a wing FMU as it was built: the file was changed after its build.",
+        )
+        return
     if declared == actual:
-        return []
-    return [f"The GUID {declared} does not fit the content ({actual}): the file was changed after its build."]
+        yield Finding("content", "ok", "The GUID is the hash of the content.")
+    else:
+        yield Finding(
+            "content",
+            "problem",
+            f"The GUID {declared} does not fit the content ({actual}): the file was changed after its build.",
+        )
 
 
-def _warnings(description: FmuDescription) -> list[str]:
-    found = []
-    bare = [v.name for v in description.variables if v.kind == "Real" and v.unit is None]
+def _units(description: FmuDescription) -> Iterator[Finding]:
+    reals = [v for v in description.variables if v.kind in FLOAT_KINDS and v.causality != "independent"]
+    bare = [v.name for v in reals if v.unit is None]
+    found = [Finding("units", "warning", sentence) for sentence in contradictions(description.units)]
     if bare:
-        found.append(f"{len(bare)} real variables have no unit: {', '.join(bare[:5])}.")
-    unlimited = [
+        found.append(
+            Finding("units", "warning", f"{len(bare)} real variables have no unit: {', '.join(bare[:5])}.")
+        )
+    defined = {unit.name for unit in description.units if unit.exponents is not None}
+    unknown = sorted(
+        {v.unit for v in reals if v.unit and v.unit not in defined and meaning_of(v.unit) is None}
+    )
+    if unknown:
+        found.append(
+            Finding(
+                "units",
+                "warning",
+                f"Nothing can be converted to {', '.join(unknown[:5])}: the FMU does not define it in SI.",
+            )
+        )
+    yield from found or [
+        Finding("units", "ok", "All real variables have units, and these mean what is usual.")
+    ]
+
+
+def _ranges(description: FmuDescription) -> Iterator[Finding]:
+    inputs = [v for v in description.variables if v.kind in FLOAT_KINDS and v.causality == "input"]
+    unlimited = [v.name for v in inputs if v.minimum is None or v.maximum is None]
+    empty = [
         v.name
         for v in description.variables
-        if v.kind == "Real" and v.causality == "input" and (v.minimum is None or v.maximum is None)
+        if v.minimum is not None and v.maximum is not None and v.minimum > v.maximum
     ]
+    if empty:
+        yield Finding("ranges", "problem", f"The range of {', '.join(empty[:5])} is empty.")
     if unlimited:
-        found.append(f"{len(unlimited)} inputs have no range: {', '.join(unlimited[:5])}.")
-    if not (description.can_get_and_set_state and description.can_serialise_state):
-        found.append("Its state cannot be serialised; a mission is resumed by replaying the inputs.")
-    return found
-
-
-def _trial_problems(description: FmuDescription) -> list[str]:
-    """Make one step with the start values and read every numeric output."""
-    outputs = [v.name for v in description.variables if v.causality == "output" and v.kind != "String"]
-    if not outputs:
-        return ["It has no numeric output."]
-    units = {v.name: v.unit or "1" for v in description.variables}
-    binding = parse_binding(
-        {
-            "binding": {"name": "check", "step_size": 1.0},
-            "observation": {
-                str(number): {"variables": [name], "unit": units[name]} for number, name in enumerate(outputs)
-            },
-        }
-    )
-    try:
-        with FmiAsset(description.path, binding) as asset:
-            asset.observe()
-            observation = asset.step()
-            if not math.isclose(observation.time, 1.0):
-                return [f"After one step of 1 s the time is {observation.time:g} s."]
-    except FmuError as error:
-        return [str(error)]
-    return []
+        yield Finding(
+            "ranges", "warning", f"{len(unlimited)} inputs have no range: {', '.join(unlimited[:5])}."
+        )
+    if inputs and not (unlimited or empty):
+        yield Finding("ranges", "ok", "All real inputs have ranges.")

@@ -1,13 +1,17 @@
-/* FMI 2.0 co-simulation that misbehaves in the way that -D says, in the third step unless it does so earlier:
-   otherwise an integrator. */
+/* FMI 2.0 co-simulation that misbehaves in the way that -D says, in the third step unless it does so earlier
+   (and only while the file named by HOSTILE_FLAG exists, if that is set): otherwise an integrator. */
 #include <fcntl.h>
 #include <math.h>
 #include <signal.h>
 #include <stdio.h>
 #include <unistd.h>
 #include "model.h"
-enum { Y, U, HIDDEN };
+enum { Y, U, DAMAGE, FACTOR };
+#ifndef AFTER
+#define AFTER 2 /* steps that go well */
+#endif
 
+void model_start(Model *m) { m->r[FACTOR] = 1.0; }
 static void hang(void) { for (volatile long k = 0;; k++) {} }
 static void *volatile kept; /* so that the compiler does not leave the memory out */
 static void take(size_t size) { kept = memset(malloc(size), 1, size); }
@@ -61,14 +65,19 @@ int model_initialise(Model *m) {
     return OK;
 }
 int model_step(Model *m, double time, double size) {
+#ifdef STATELESS
+    m->r[Y] = m->r[FACTOR] * m->r[U] * (1.0 - m->r[DAMAGE]);
+#else
     m->r[Y] += m->r[U] * size;
+#endif
     hidden += 1.0;
 #if defined STATE_HIDDEN
     m->r[Y] += 0.001 * hidden;
 #elif defined NOT_DETERMINISTIC
     m->r[Y] += 1e-9 * (double)getpid() + 1e-12 * hidden;
 #endif
-    if (m->stepped < 2) return OK;
+    if (m->stepped < AFTER) return OK;
+    if (getenv("HOSTILE_FLAG") && access(getenv("HOSTILE_FLAG"), F_OK) != 0) return OK;
 #if defined SEGFAULT
     crash();
 #elif defined ABORT
