@@ -574,7 +574,9 @@ class FmiAsset:
         """Raise the error with the FMU's file and the moment, and keep its messages."""
         self._log.extend(("Error", message) for message in error.messages)
         if isinstance(error, FmuCallError | FmuWorkerError | FmuStateError | FmuMemoryError | TimeoutError):
+            tool = what == "the start" and self._description.needs_tool
+            hint = " It declares that it needs its authoring tool on this machine." if tool else ""
             raise type(error)(
-                f"{self._description.path}, {what}: {error.sentence}", error.messages
+                f"{self._description.path}, {what}: {error.sentence}{hint}", error.messages
             ) from error
         raise error

@@ -33,6 +33,9 @@ from twin_master.scenario import Scenario
 
 Float = NDArray[np.float64]
 
+_TAKEN = ("state", "sensor_status", "step", "region", "sensor")
+"""What the truth of a run holds already."""
+
 
 class FmuAsset:
     """An FMU behind its one door, as the mission flies it.
@@ -51,20 +54,22 @@ class FmuAsset:
         self._session = session
         self._observation = observation
         self._load = dict(load)
-        binding = session.binding
-        self._units = {
-            name: scalar.unit for name, scalar in [*binding.control.items(), *binding.monitor.items()]
-        }
+        recorded = session.recorded_units
+        taken = {*session.binding.control, *session.binding.observation, *_TAKEN}
+        self._names = {name: _plain_name(name, taken) for name in recorded}
+        self._units = {name: scalar.unit for name, scalar in session.binding.control.items()}
+        self._units |= {self._names[name]: unit for name, unit in recorded.items()}
 
     @property
     def units(self) -> Mapping[str, str]:
-        """Units of control inputs and monitors, as the binding has them."""
+        """Units of control inputs and of what is recorded beside the observations."""
         return self._units
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         """Make one communication step."""
         observation = self._session.step(control, health, self._load)
-        return AssetReading(observation.values[self._observation], observation.extra)
+        extra = {self._names[name]: value for name, value in observation.extra.items()}
+        return AssetReading(observation.values[self._observation], extra)
 
     def save_state(self) -> bytes:
         """Return the state of the FMU."""
@@ -124,14 +129,15 @@ class FmuSource:
         self.files()
         design, fmu = self._given[DESIGN_COPY], self._given[FMU_COPY]
         binding = load_binding(self._binding)
-        self._observed(binding)
         self._check_names(binding)
         if design is not None:
             gauges = len(load_design(design).gauges.positions)
             if self._scenario.asset.observation_model != "asset":
                 check_wing_scenario(self._scenario, gauges)
         if fmu is not None:
-            FmiAsset(fmu, binding, parameters=self._scenario.asset.parameters)
+            # Only with the FMU it is known how many values an array has.
+            binding = FmiAsset(fmu, binding, parameters=self._scenario.asset.parameters).binding
+        self._observed(binding)
 
     def files(self) -> dict[str, bytes]:
         """Return binding, design and FMU as they are given.
@@ -172,7 +178,6 @@ class FmuSource:
         for name, path in self._given.items():
             if path is not None and not self._path(name).exists():
                 atomic_write_bytes(self._path(name), _content(path))
-        self._observed(load_binding(self._path(BINDING_COPY)))
         hashes = {"binding": hash_file(self._path(BINDING_COPY))}
         if self._given[DESIGN_COPY] is not None:
             design = load_design(self._path(DESIGN_COPY))
@@ -268,6 +273,15 @@ class FmuSource:
         except OSError as error:
             raise write_error(error, path) from error
         return True
+
+
+def _plain_name(name: str, taken: set[str]) -> str:
+    """Return a name under which a variable of an FMU can be stored: without `/`, and not taken."""
+    plain = "".join("_" if letter == "/" or not letter.isprintable() else letter for letter in name).strip()
+    while plain in taken or not plain:
+        plain += "_"
+    taken.add(plain)
+    return plain
 
 
 def _content(path: Path) -> bytes:

@@ -19,8 +19,6 @@ def check_file(description: FmuDescription) -> Iterator[Finding]:
     yield from _content(description)
     yield from _units(description)
     yield from _ranges(description)
-    if description.needs_tool:
-        yield Finding("authoring tool", "warning", "It needs its authoring tool on this machine to run.")
 
 
 def _archive(description: FmuDescription) -> Finding:

@@ -26,6 +26,7 @@ _MUCH = 0.5
 _KIBIBYTE = 1024
 # What a long-lived process may grow by without being suspected: allocators keep some memory.
 _SMALL_GROWTH, _LARGE_GROWTH = 1.0, 16.0
+_NOISE = 1024 * _KIBIBYTE
 
 Inputs = dict[str, dict[str, Any]]
 Series = npt.NDArray[np.float64]
@@ -287,6 +288,8 @@ class Flights:
             )
         growth = (end - half) / _KIBIBYTE / max(cycles - cycles // 2, 1)
         text = f"{cycles} made and freed in one process; it grows by {max(growth, 0.0):.2g} KiB with each"
+        if end - half < _NOISE:
+            return Finding("instances", "ok", f"{text}.")
         if growth > _LARGE_GROWTH:
             return Finding("instances", "problem", f"{text}: it leaks.")
         if growth > _SMALL_GROWTH:

@@ -351,3 +351,15 @@ def test_odd_characters_in_paths(parts: dict[str, bytes], described: Binding, tm
     path = packed(folder / "flügel %20 #1.fmu", {**parts, "resources/Größe ß.txt": b"x"})
     with FmiAsset(path, described) as asset:
         assert asset.step().values[0] == 1.0
+
+
+def test_an_fmu_without_its_authoring_tool(foreign_fmu: Any, described: Binding, tmp_path: Path) -> None:
+    fmu = foreign_fmu("hostile2", "NO_INSTANCE")
+    with zipfile.ZipFile(fmu) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    text = entries["modelDescription.xml"]
+    entries["modelDescription.xml"] = text.replace(
+        b"<CoSimulation ", b'<CoSimulation needsExecutionTool="true" '
+    )
+    with pytest.raises(FmuCallError, match=r"could not be instantiated .*needs its authoring tool"):
+        FmiAsset(packed(tmp_path / "tool.fmu", entries), described).reset()

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import xarray as xr
 
 from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
 from twin_master import workflow
@@ -142,3 +143,55 @@ def test_a_run_is_resumed_once_the_cause_is_gone(
     resume_run(tmp_path / "part")
     for name in ("run.nc", "config.json", "summary.json", "csv/observed.csv"):
         assert (tmp_path / "part" / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+ARRAY_BINDING = """
+[binding]
+name = "array"
+step_size = 1.0
+
+[control.u]
+variable = "u[1]"
+unit = "1"
+
+[health.d]
+variable = "u[2]"
+unit = "1"
+
+[parameter.k]
+variable = "gain"
+unit = "1"
+
+[observation.y]
+variables = "y"
+unit = "m"
+
+[record]
+variables = ["calls", "y"]
+"""
+
+
+def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu: Any, tmp_path: Path) -> None:
+    """Its outputs grow with every step, so that only the way through twin, store and names is looked at."""
+    fmu = foreign_fmu.changed("array3", "names", ('name="calls"', 'name="state/calls"'))
+    (tmp_path / "binding.toml").write_text(
+        ARRAY_BINDING.replace('"calls"', '"state/calls"'), encoding="utf-8"
+    )
+    text = (
+        SCENARIO.replace("FMU", str(fmu)).replace("count = 1", "count = 2").replace("steps = 30", "steps = 3")
+    )
+    text = text.replace("standard_deviation = 0.1", "standard_deviation = 10.0")
+    (tmp_path / "scenario.toml").write_text(text, encoding="utf-8")
+    folder = new_run(load_scenario(tmp_path / "scenario.toml"), tmp_path / "run").folder
+    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
+        tree.load()
+    truth = tree["truth"]
+    assert truth["state_calls"].values.tolist() == [1.0, 2.0, 3.0]
+    assert truth["y[1]"].attrs["units"] == "mm"
+    assert truth["y"].attrs["units"] == "m"
+    assert truth["y"].shape == (3, 2)
+    assert truth["y"].values[:, 1].tolist() == pytest.approx((1e-3 * truth["y[2]"].values).tolist())
+    (tmp_path / "scenario.toml").write_text(text.replace("count = 2", "count = 3"), encoding="utf-8")
+    with pytest.raises(Exception, match=r"observes 2 values of `y`, and the scenario expects 3"):
+        new_run(load_scenario(tmp_path / "scenario.toml"), tmp_path / "other")
+    assert not (tmp_path / "other").exists()
