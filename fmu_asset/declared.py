@@ -16,6 +16,7 @@ NUMERIC_KINDS = frozenset(
     {"Real", "Integer", "Enumeration", "Boolean", "Float32", "Float64"}
     | {f"{sign}{bits}" for sign in ("Int", "UInt") for bits in (8, 16, 32, 64)}
 )
+_LARGEST_ARRAY = 10_000_000
 FLOAT_KINDS = frozenset({"Real", "Float32", "Float64"})
 
 
@@ -238,6 +239,9 @@ def _variable(declared: Any) -> VariableInfo:
             getattr(declared_type, attribute, None) if value is None and declared_type is not None else value
         )
 
+    shape = tuple(declared.shape or ())
+    if any(length < 0 for length in shape) or math.prod(shape) > _LARGEST_ARRAY:
+        raise ValueError(f"{declared.name!r} is an array of {' x '.join(map(str, shape))} elements")
     return VariableInfo(
         name=str(declared.name),
         reference=int(declared.valueReference),
@@ -250,7 +254,7 @@ def _variable(declared: Any) -> VariableInfo:
         minimum=None if of("min") is None else float(of("min")),
         maximum=None if of("max") is None else float(of("max")),
         start=None if declared.start is None else str(declared.start),
-        shape=tuple(declared.shape or ()),
+        shape=shape,
         clocked=bool(declared.clocks),
     )
 

@@ -2,36 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from .binding import INPUT_ROLES, Binding, Input
 from .declared import FLOAT_KINDS, FmuDescription, VariableInfo
-from .errors import BindingError, FmuInputError
+from .errors import BindingError
 from .instances.plan import Plan, Settings
 from .layout import Layout, Place, element_names, find, start_values
-from .units import IDENTITY, Conversion, conversion
+from .slots import Slot, in_unit, put, value_range
+from .units import IDENTITY, conversion
 
 Values = Mapping[str, float | Sequence[float]]
 """Values by the binding's names: a number, or as many as the bound array or port has."""
-
-
-class _Slot(NamedTuple):
-    """Where an input goes: positions in the request block, range in the FMU's unit, conversion."""
-
-    position: int
-    positions: Sequence[int]
-    low: float
-    high: float
-    conversion: Conversion
-    label: str
-    whole: bool
-    direct: bool
-    variable: VariableInfo
 
 
 class Exchange:
@@ -144,7 +130,7 @@ class Exchange:
         self._inputs = Layout(
             self._description, [place.variable for found in places.values() for place in found], begin=2
         )
-        self._slots: dict[str, dict[str, _Slot]] = {role: {} for role in (*INPUT_ROLES, "port")}
+        self._slots: dict[str, dict[str, Slot]] = {role: {} for role in (*INPUT_ROLES, "port")}
         taken: dict[int, str] = {}
         items: dict[tuple[str, str], Input] = {
             (role, name): item for role in INPUT_ROLES for name, item in self._table(role).items()
@@ -182,25 +168,26 @@ class Exchange:
         table: Mapping[str, Input] = getattr(self._binding, role)
         return table
 
-    def _slot(self, label: str, item: Input, variable: VariableInfo, positions: Sequence[int]) -> _Slot:
+    def _slot(self, label: str, item: Input, variable: VariableInfo, positions: Sequence[int]) -> Slot:
         scale = conversion(item.unit, variable, self._description.units, where=label)
-        low, high = _range(variable)
-        own = [
-            limit if bound is None else scale.to_fmu(bound)
-            for bound, limit in ((item.minimum, low), (item.maximum, high))
-        ]
-        own.sort()  # a conversion with a negative factor turns a range round
-        if own[0] > high or own[1] < low:
+        low, high = value_range(variable)
+        least, most = (
+            None if bound is None else scale.to_fmu(bound) for bound in (item.minimum, item.maximum)
+        )
+        if scale.factor < 0.0:
+            least, most = most, least
+        own_low, own_high = low if least is None else least, high if most is None else most
+        if own_low > high or own_high < low:
             raise BindingError(
                 f"The range of {label} of the binding {self._binding.name} lies outside that of "
-                f"{variable.name!r}, {low:g} to {high:g}{_in(variable)}; correct minimum or maximum."
+                f"{variable.name!r}, {low:g} to {high:g}{in_unit(variable)}; correct minimum or maximum."
             )
         whole = variable.kind not in FLOAT_KINDS
-        return _Slot(
+        return Slot(
             position=positions[0],
             positions=positions,
-            low=max(low, own[0]),
-            high=min(high, own[1]),
+            low=max(low, own_low),
+            high=min(high, own_high),
             conversion=scale,
             label=label,
             whole=whole,
@@ -310,7 +297,7 @@ class Exchange:
                 kind = self._description.exchange_kind(variable)
                 start = start_values(self._description, variable) if variable.shape else [0.0]
                 set_values[variable.name] = (kind, variable.reference, start)
-            _put(set_values[variable.name][2], slots[name], value)
+            put(set_values[variable.name][2], slots[name], value)
         return list(set_values.values())
 
     def place(
@@ -356,7 +343,7 @@ class Exchange:
                 ):
                     target[slot.position] = value
                 else:
-                    _put(target, slot, value)
+                    put(target, slot, value)
         return given
 
     def input_range(self, role: str, name: str) -> tuple[float, float]:
@@ -407,64 +394,3 @@ class Exchange:
         """Return the names of outputs that are NaN or infinite."""
         count = len(self._output_names)
         return [self._output_names[index] for index in np.flatnonzero(~np.isfinite(block[:count]))]
-
-
-def _checked(slot: _Slot, value: float) -> float:
-    """Return the value in the FMU's unit, refused if it is not finite, not whole or out of range."""
-    try:
-        number = slot.conversion.to_fmu(float(value))
-    except (TypeError, ValueError) as error:
-        raise FmuInputError(f"{slot.label} must be a number, but is {value!r}.") from error
-    if slot.low <= number <= slot.high and not slot.whole and number - number == 0.0:
-        return number
-    if not math.isfinite(number):
-        raise FmuInputError(f"{slot.label} must be finite, but is {value!r}; nothing was sent to the FMU.")
-    if slot.whole and not number.is_integer():
-        raise FmuInputError(
-            f"{slot.label} must be a whole number, but is {value!r}; nothing was sent to the FMU."
-        )
-    # A conversion of units may round a value at the edge of the range to just outside of it.
-    inside = min(max(number, slot.low), slot.high)
-    if abs(inside - number) > 1e-12 * max(abs(inside), 1.0):
-        raise FmuInputError(
-            f"{slot.label} = {value!r} lies outside the range of {slot.variable.name!r}, {slot.low:g} to "
-            f"{slot.high:g}{_in(slot.variable)}; nothing was sent to the FMU."
-        )
-    return inside
-
-
-def _put(target: Any, slot: _Slot, given: float | Sequence[float]) -> None:
-    """Put one value, or as many as the slot takes, where they belong."""
-    if len(slot.positions) == 1:
-        if not isinstance(given, float | int | str) and np.size(given) == 1:
-            given = float(np.ravel(given)[0])
-        target[slot.position] = _checked(slot, given)  # type: ignore[arg-type]
-        return
-    if np.ndim(given) == 0 or len(np.ravel(given)) != len(slot.positions):
-        count = 1 if np.ndim(given) == 0 else len(np.ravel(given))
-        raise FmuInputError(f"{slot.label} takes {len(slot.positions)} values, but {count} came.")
-    values = [_checked(slot, value) for value in np.ravel(given).tolist()]
-    for position, value in zip(slot.positions, values, strict=True):
-        target[position] = value
-
-
-def _range(variable: VariableInfo) -> tuple[float, float]:
-    """Return the declared range, within that of the type: C would wrap what does not fit."""
-    low, high = -math.inf, math.inf
-    if variable.kind == "Boolean":
-        low, high = 0.0, 1.0
-    elif variable.kind in ("Integer", "Enumeration"):
-        low, high = -(2.0**31), 2.0**31 - 1.0
-    elif variable.kind.startswith("Int"):
-        low, high = -(2.0 ** (int(variable.kind[3:]) - 1)), 2.0 ** (int(variable.kind[3:]) - 1) - 1.0
-    elif variable.kind.startswith("UInt"):
-        low, high = 0.0, 2.0 ** int(variable.kind[4:]) - 1.0
-    if variable.minimum is not None:
-        low = max(low, variable.minimum)
-    if variable.maximum is not None:
-        high = min(high, variable.maximum)
-    return low, high
-
-
-def _in(variable: VariableInfo) -> str:
-    return "" if variable.unit in (None, "1") else f" {variable.unit}"

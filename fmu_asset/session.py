@@ -6,12 +6,10 @@ import math
 import os
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Literal, NoReturn, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from .archive import read_fmu
 from .binding import INPUT_ROLES, Binding, load_binding
@@ -27,29 +25,11 @@ from .errors import (
 from .exchange import Exchange, Values
 from .housing import Housing, Instance, limits_of
 from .instances.base import STATUS_NAMES
+from .observation import Observation
 from .saved_state import SavedState, StateMethod
 from .worker.client import WorkerInstance
 
 _LOG_LENGTH = 200
-
-
-@dataclass(frozen=True, slots=True)
-class Observation:
-    """What came out of one communication step.
-
-    Attributes
-    ----------
-    values : (n_obs,) ndarray
-        The observations of the binding in their order and units.
-    time : float
-        Time at the end of the step [s]: start + i * interval.
-    extra : dict of str to float
-        Monitors, recorded variables and outputs of ports.
-    """
-
-    values: npt.NDArray[np.float64]
-    time: float
-    extra: dict[str, float] = field(default_factory=dict)
 
 
 class FmiAsset:
@@ -369,24 +349,16 @@ class FmiAsset:
             If the FMU fails.
         """
         saved = SavedState.from_bytes(content)
-        if saved.fmu != self._description.sha256:
-            raise FmuStateError(
-                f"The state was saved with another FMU than {self._description.path} (its hash differs); "
-                "use that one."
-            )
-        if (saved.step_size, saved.start_time) != (self._interval, self._start_time):
-            raise FmuStateError("The state was saved with another step size or start time; use that binding.")
         width = 8 * self._exchange.plan.input_count
+        saved.refuse_if_foreign(
+            path=self._description.path,
+            fmu=self._description.sha256,
+            interval=self._interval,
+            start_time=self._start_time,
+            method=self.state_method,
+            width=width,
+        )
         replayed = saved.method == "replay"
-        if (
-            saved.method != self.state_method
-            or len(saved.inputs) != width
-            or len(saved.start_inputs) not in (0, width)
-            or (replayed and len(saved.body) != width * saved.index)
-        ):
-            raise FmuStateError(
-                "The saved state is damaged, or another binding was in use; use that binding."
-            )
         ready = (
             self._phase == "ready" and self._housing.instance is not None and not self._housing.instance.lost
         )
@@ -409,8 +381,7 @@ class FmiAsset:
                 instance.restore(saved.body)
                 self._index = saved.index
                 memoryview(instance.request).cast("B")[16:] = saved.inputs
-            if self._outputs_now() != saved.outputs:
-                raise self._other_outputs(saved.outputs, replayed=replayed)
+            saved.refuse_other_outputs(self._outputs_now(), self._exchange.output_name)
         except FmuError as error:
             self._phase = "broken"
             self._fail(error, "restoring the state")
@@ -514,27 +485,6 @@ class FmiAsset:
         assert instance is not None
         instance.read()
         return bytes(instance.reply)
-
-    def _other_outputs(self, saved: bytes, *, replayed: bool) -> FmuStateError:
-        now = self._reply
-        then = np.frombuffer(saved)
-        if then.shape != now.shape:
-            return FmuStateError(
-                "The state was saved with another binding (its outputs differ); use that one."
-            )
-        which = int(np.flatnonzero(now.view(np.int64) != then.view(np.int64))[0])
-        name = self._exchange.output_name(which)
-        if replayed:
-            cause = "it does not give equal outputs for equal inputs, so that it cannot be resumed"
-        else:
-            cause = (
-                "it declares canGetAndSetFMUstate but does not restore all of its state; write "
-                '`state = "replay"` into the table [binding] of its binding'
-            )
-        was, is_now = float(then[which]), float(now[which])
-        return FmuStateError(
-            f"After the state was restored the FMU gives {name} = {is_now!r} instead of {was!r}: {cause}."
-        )
 
     def _opened(self) -> Instance:
         """Return the instance, which is opened by its first use but never started again unasked."""

@@ -53,6 +53,7 @@ class FmuInstance(ABC):
         self.request = (ctypes.c_double * (2 + plan.input_count))()
         self.reply = (ctypes.c_double * max(plan.output_count, 1))()
         self._plan = plan
+        self._substeps = plan.substeps
         self._mailbox = Mailbox(plan.instance_name)
         self._lost = False
         self._phase = "instantiated"
@@ -137,9 +138,9 @@ class FmuInstance(ABC):
         """
         if self._lost:
             raise FmuWorkerError("The instance was lost to a fatal error; reset the asset to go on.")
-        begin, size = self.request[0], self.request[1]
         self._send()
-        if self._plan.substeps == 1:
+        begin, size = self.request[0], self.request[1]
+        if self._substeps == 1:
             self._advance(begin, size)
         else:
             self._advance_many(begin, size)
@@ -232,7 +233,7 @@ class FmuInstance(ABC):
         calls = []
         for group in groups:
             name = f"{verb}{group.kind}"
-            block = Block(self._plan.fmi_version, group, doubles, begin)
+            block = Block(self._plan.fmi_version, self._component, group, doubles, begin)
             calls.append((name, self._function(name), block))
             begin += group.count
         return calls
@@ -247,7 +248,7 @@ class FmuInstance(ABC):
         for name, function, block in calls:
             if sending and not block.direct:
                 block.to_fmu()
-            status = function(self._component, *block.arguments)
+            status = function(*block.arguments)
             if status > WARNING:
                 raise self._call_error(
                     f"fmi{self._plan.fmi_version}{name}",

@@ -36,6 +36,8 @@ class Block:
     ----------
     fmi_version : int
         1, 2 or 3.
+    component : pointer
+        The instance.
     group : Group
         The variables.
     doubles : ctypes array of double
@@ -46,12 +48,12 @@ class Block:
     Attributes
     ----------
     arguments : tuple
-        What the C function takes after the instance.
+        What the C function takes.
     direct : bool
         Whether the FMU reads and writes the block itself, so that nothing is to be converted.
     """
 
-    def __init__(self, fmi_version: int, group: Group, doubles: Any, begin: int) -> None:
+    def __init__(self, fmi_version: int, component: Any, group: Group, doubles: Any, begin: int) -> None:
         kind = _C_TYPES[fmi_version, group.kind]
         self._doubles, self._begin, self._count = doubles, begin, group.count
         self._convert = float if kind is ctypes.c_float else int
@@ -68,7 +70,7 @@ class Block:
             else self._values
         )
         counted = (group.count,) if fmi_version == 3 else ()
-        self.arguments: tuple[Any, ...] = (references, len(group.references), values, *counted)
+        self.arguments: tuple[Any, ...] = (component, references, len(group.references), values, *counted)
 
     def to_fmu(self) -> None:
         """Convert the doubles for the FMU."""

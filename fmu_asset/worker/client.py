@@ -88,9 +88,11 @@ class WorkerInstance:
         # An exception between question and answer, such as an interruption, leaves the two out of step.
         self._busy = False
         self._process = WorkerProcess(scratch)
+        self._out, self._in = self._process.outgoing, self._process.incoming
         self._next_glance = 0.0
+        self._first_wait = 1000.0 * min(limits.step_time, _GLANCE)
         self._poll = select.poll()
-        self._poll.register(self._process.incoming, select.POLLIN | select.POLLHUP)
+        self._poll.register(self._in, select.POLLIN | select.POLLHUP)
         try:
             self._call(Operation.OPEN, plan.to_json().encode(), "loading and instantiation", limits.load_time)
         except BaseException:
@@ -115,7 +117,7 @@ class WorkerInstance:
         what = "the step"
         self._begin()
         try:
-            send(self._process.outgoing, self._step_header, self._request)
+            send(self._out, self._step_header, self._request)
         except BrokenPipeError:
             raise self._died(what) from None
         look(self._poll)
@@ -181,21 +183,22 @@ class WorkerInstance:
 
     def close(self) -> None:
         """End the worker, kindly at first, and remove its folder."""
-        if self._process.outgoing < 0:
+        if self._out < 0:
             return
         kindly = not (self._lost or self._busy)
         if kindly:
             with contextlib.suppress(BrokenPipeError):
-                send(self._process.outgoing, HEADER.pack(Operation.CLOSE, 0, 0))
+                send(self._out, HEADER.pack(Operation.CLOSE, 0, 0))
         self._lost = True
         self._process.close_pipes()
+        self._out = self._in = -1
         self._process.end(CLOSE_LIMIT if kindly else 0.0)
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _call(self, operation: Operation, content: bytes, what: str, limit: float) -> bytes:
         self._begin()
         try:
-            send(self._process.outgoing, HEADER.pack(operation, 0, len(content)), content)
+            send(self._out, HEADER.pack(operation, 0, len(content)), content)
         except BrokenPipeError:
             raise self._died(what) from None
         kind, length = self._await(what, limit)
@@ -214,7 +217,7 @@ class WorkerInstance:
 
     def _await(self, what: str, limit: float) -> tuple[int, int]:
         # The first wait covers the usual step; a longer one is a chance to look at the worker's memory.
-        if not self._poll.poll(1000.0 * min(limit, _GLANCE)):
+        if not self._poll.poll(self._first_wait):
             self._await_long(what, limit)
         self._fill(self._header_view, what)
         kind, logged, length = HEADER.unpack(self._header)
@@ -224,7 +227,7 @@ class WorkerInstance:
         return kind, length
 
     def _await_long(self, what: str, limit: float) -> None:
-        deadline = time.monotonic() + limit - _GLANCE
+        deadline = time.monotonic() + limit - self._first_wait / 1000.0
         while True:
             self._check_memory(what)
             left = deadline - time.monotonic()
@@ -253,7 +256,7 @@ class WorkerInstance:
             )
 
     def _fill(self, target: memoryview, what: str) -> None:
-        if not receive(self._process.incoming, target):
+        if not receive(self._in, target):
             raise self._died(what)
 
     def _fail(self, length: int, what: str) -> None:

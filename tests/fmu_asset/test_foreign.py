@@ -11,7 +11,14 @@ import pytest
 
 from fmu_asset.archive import read_fmu
 from fmu_asset.binding import Binding, parse_binding
-from fmu_asset.errors import BindingError, FmuCallError, FmuInputError, FmuUnsupportedError
+from fmu_asset.errors import (
+    BindingError,
+    FmuCallError,
+    FmuFileError,
+    FmuInputError,
+    FmuUnsupportedError,
+    FmuWorkerError,
+)
 from fmu_asset.session import FmiAsset
 
 BOTH = pytest.mark.parametrize("isolated", [True, False], ids=["worker", "in process"])
@@ -360,3 +367,36 @@ def test_ports_are_sent_and_read(foreign_fmu: Any) -> None:
 def test_ports_that_are_none(port: dict[str, Any], sentence: str) -> None:
     with pytest.raises(BindingError, match=sentence):
         binding(1.0, observation={"y": {"variables": "y", "unit": "1"}}, port={"root": port})
+
+
+def test_both_interfaces_in_one_fmu(foreign_fmu: Any) -> None:
+    """Co-simulation is taken unless the binding says otherwise; a model without states is solved as well."""
+    both = foreign_fmu.changed(
+        "fixed2", "both", ("<CoSimulation", '<ModelExchange modelIdentifier="fixed2"/><CoSimulation')
+    )
+    roles = {
+        "control": {"u": {"variable": "u", "unit": "1"}},
+        "observation": {"y": {"variables": "y", "unit": "1"}},
+    }
+    for interface, expected in ((None, 0.03), ("co-simulation", 0.03), ("model-exchange", 0.0)):
+        header = {} if interface is None else {"interface": interface}
+        with FmiAsset(both, binding(0.01, header=header, **roles)) as asset:
+            assert asset.description.interface == (interface or "co-simulation")
+            assert asset.step({"u": 3.0}).values[0] == pytest.approx(expected)
+
+
+def test_an_array_beyond_reason_is_refused(foreign_fmu: Any) -> None:
+    huge = foreign_fmu.changed(
+        "array3", "huge", ('<Dimension start="2"/>', '<Dimension start="2000000000"/>')
+    )
+    with pytest.raises(FmuFileError, match=r"cannot be read \('y' is an array of 2000000000 elements\)"):
+        read_fmu(huge)
+
+
+def test_events_that_pile_up_are_one_sentence(foreign_fmu: Any) -> None:
+    with FmiAsset(foreign_fmu("ball2"), binding(1.0, **BALL)) as asset:
+        asset.step(), asset.step()
+        with pytest.raises(FmuCallError, match=r"10000 events in the step from t = 2 s .* pile up"):
+            asset.step()
+        with pytest.raises(FmuWorkerError, match="reset the asset"):
+            asset.step()
