@@ -315,6 +315,9 @@ class FmiAsset:
         if self.state_method == "serialised":
             try:
                 body = self._housing.instance.save()
+            except FmuCallError as error:
+                hint = 'If it cannot save its state, write `state = "replay"` into [binding] of its binding.'
+                self._fail(FmuCallError(f"{error.sentence} {hint}", error.messages), "saving the state")
             except FmuError as error:
                 self._fail(error, "saving the state")
         else:
@@ -507,7 +510,8 @@ class FmiAsset:
                 more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
                 raise FmuOutputError(
                     f"The FMU {self._description.path} gave values that are not finite at "
-                    f"t = {self.time:g} s: {', '.join(bad[:5])}{more}.",
+                    f"t = {self.time:g} s: {', '.join(bad[:5])}{more}. Its inputs or its step size are "
+                    "probably beyond what it can compute; reset the asset or restore a state to go on.",
                     [text for _, text in self.log[-5:]],
                 )
         values, extra = self._exchange.read(block)

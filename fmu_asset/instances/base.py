@@ -272,14 +272,16 @@ class FmuInstance(ABC):
         name = STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
         if status == PENDING:
             self._lost = True
-            after = "asynchronous steps are not supported"
+            after = "asynchronous steps are not supported; export it to step synchronously"
         elif not 0 <= status < FATAL:
             self._lost = True
-            after = "the instance is lost"
+            after = "the instance is lost; reset the asset or restore a state"
         elif status == DISCARD:
-            after = "the FMU did not accept it"
+            after = "the FMU did not accept it and stays where it was; other inputs or a smaller step may do"
         else:
-            after = "its values are no longer to be trusted"
+            # What the standard still allows then is not worth the trouble: another instance is made.
+            self._lost = True
+            after = "its values are no longer to be trusted; reset the asset or restore a state"
         return FmuCallError(f"{function} returned {name} in {what}: {after}.", self._texts())
 
     def _texts(self) -> list[str]:
@@ -288,7 +290,8 @@ class FmuInstance(ABC):
 
 def _why_not_instantiated(error: Exception) -> str:
     text = " ".join(str(error).split())
-    if "shared library" in text:
+    text = text.rpartition(".so: ")[2]  # without our folder
+    if "shared library" in str(error):
         return (
             f"The FMU's binary cannot be loaded on this machine ({text.removesuffix('.')}); it was built for "
             "another processor or system, or it needs a library that is not installed."

@@ -17,11 +17,14 @@ from ..errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
 from ..instances.plan import Plan, Settings
 from .guard import resident_memory
 from .process import CLOSE_LIMIT, WorkerProcess
-from .protocol import FAILURE, HEADER, LARGEST_MESSAGE, RESULT, Operation, look, receive, send
+from .protocol import FAILURE, HEADER, LARGEST_MESSAGE, QUICK, RESULT, Operation, look, receive, send
 
 _MEBIBYTE = 1024**2
 _GLANCE = 0.05
 """Seconds between two looks at the memory of a worker that is at work."""
+_OPENING, _INITIALISING, _RESETTING = "loading and instantiation", "initialisation", "reset"
+_RENEWING = "freeing the instance and making another"
+_LOADING = (_OPENING, _INITIALISING, _RESETTING, _RENEWING)
 _ERRORS: Mapping[str, type[FmuError]] = {
     kind.__name__: kind
     for kind in vars(errors).values()
@@ -94,7 +97,7 @@ class WorkerInstance:
         self._poll = select.poll()
         self._poll.register(self._in, select.POLLIN | select.POLLHUP)
         try:
-            self._call(Operation.OPEN, plan.to_json().encode(), "loading and instantiation", limits.load_time)
+            self._call(Operation.OPEN, plan.to_json().encode(), _OPENING, limits.load_time)
         except BaseException:
             self.close()
             raise
@@ -108,9 +111,7 @@ class WorkerInstance:
             "parameters": parameters,
             "inputs": bytes(self._request[16:]).hex() if with_inputs else "",
         }
-        self._call(
-            Operation.INITIALISE, json.dumps(setting).encode(), "initialisation", self._limits.load_time
-        )
+        self._call(Operation.INITIALISE, json.dumps(setting).encode(), _INITIALISING, self._limits.load_time)
 
     def step(self) -> None:
         """Make the step that the request block describes."""
@@ -147,7 +148,7 @@ class WorkerInstance:
 
     def reset(self) -> None:
         """Bring the instance back to the moment after its instantiation."""
-        self._call(Operation.RESET, b"", "reset", self._limits.load_time)
+        self._call(Operation.RESET, b"", _RESETTING, self._limits.load_time)
 
     def take_log(self) -> list[tuple[int, str]]:
         """Return and forget the messages that the FMU has logged: status and text."""
@@ -159,7 +160,7 @@ class WorkerInstance:
 
     def renew(self) -> None:
         """Free the instance and make a new one in the same process."""
-        self._call(Operation.RENEW, b"", "freeing the instance and making another", self._limits.load_time)
+        self._call(Operation.RENEW, b"", _RENEWING, self._limits.load_time)
 
     @property
     def has_log(self) -> bool:
@@ -201,6 +202,8 @@ class WorkerInstance:
             send(self._out, HEADER.pack(operation, 0, len(content)), content)
         except BrokenPipeError:
             raise self._died(what) from None
+        if operation in QUICK:
+            look(self._poll)
         kind, length = self._await(what, limit)
         if kind == FAILURE:
             self._fail(length, what)
@@ -237,10 +240,10 @@ class WorkerInstance:
                 return
         self._lost = True
         self._process.kill()
+        name = "load_time" if what in _LOADING else "step_time"
         raise FmuTimeoutError(
-            f"The FMU took longer than {limit:g} s for {what}; its worker was stopped. If it is only "
-            "slow, give "
-            f"a longer {'step' if limit == self._limits.step_time else 'load'}_timeout; otherwise it hangs."
+            f"The FMU took longer than {limit:g} s for {what}; its worker was stopped. If it is only slow, "
+            f"give it more `{name}` in the table [limits] of its binding; otherwise it hangs."
         )
 
     def _check_memory(self, what: str) -> None:
@@ -251,8 +254,8 @@ class WorkerInstance:
             self._process.kill()
             raise FmuMemoryError(
                 f"The FMU took {used / _MEBIBYTE:.0f} MiB of memory during {what}, more than the limit of "
-                f"{self._limits.memory:g} MiB; its worker was stopped. If it needs that much, give a larger "
-                "memory limit; otherwise it leaks."
+                f"{self._limits.memory:g} MiB; its worker was stopped. If it needs that much, "
+                "give it more `memory` in the table [limits] of its binding; otherwise it leaks."
             )
 
     def _fill(self, target: memoryview, what: str) -> None:

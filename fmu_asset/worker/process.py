@@ -125,7 +125,7 @@ class WorkerProcess:
         else:
             how = f"ended with exit status {code}: the FMU's code ended its own process"
         return FmuWorkerError(
-            f"The worker process of the FMU {how}, during {what}. {_REMEDY}", self._last_words()
+            f"During {what} the worker process of the FMU {how}. {_REMEDY}", self._last_words()
         )
 
     def _await_end(self, limit: float) -> bool:

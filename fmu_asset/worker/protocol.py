@@ -32,6 +32,9 @@ class Operation(IntEnum):
     CLOSE = 10
 
 
+QUICK = frozenset({Operation.STEP, Operation.READ, Operation.SAVE, Operation.RESTORE})
+"""What is asked often and answered at once: both sides look again for a moment before they sleep."""
+
 RESULT, FAILURE = 1, 2
 OWN_FAILURE, PIPES_GONE = 70, 71
 """Exit statuses of a worker whose own program failed, or whose pipes were closed by the FMU."""

@@ -16,7 +16,7 @@ from ..instances import open_instance
 from ..instances.base import FmuInstance
 from ..instances.plan import Plan
 from .guard import Household, restrict
-from .protocol import FAILURE, HEADER, OWN_FAILURE, PIPES_GONE, RESULT, Operation, look, receive, send
+from .protocol import FAILURE, HEADER, OWN_FAILURE, PIPES_GONE, QUICK, RESULT, Operation, look, receive, send
 
 _STEP, _OPEN, _RENEW, _CLOSE, _LOG = (
     int(operation)
@@ -81,7 +81,7 @@ def serve(incoming: int, outgoing: int, folder: str) -> None:
                 payload = json.dumps([type(error).__name__, error.sentence, error.messages, lost]).encode()
                 HEADER.pack_into(reply_header, 0, FAILURE, 0, len(payload))
             send(outgoing, reply_header, payload)
-            if operation == _STEP:
+            if operation in QUICK:
                 look(poll)
         if instance is not None:
             instance.close()

@@ -75,7 +75,7 @@ IN_THE_THIRD_STEP = [
     ("DIVIDE", FmuWorkerError, r"signal 8 \(SIGFPE\): the FMU's code divided an integer by zero"),
     ("KILL", FmuWorkerError, r"signal 9 \(SIGKILL\): somebody killed it, or the system ran out of memory"),
     ("EXIT", FmuWorkerError, r"exit status 3: the FMU's code ended its own process"),
-    ("HANG", FmuTimeoutError, r"longer than 0\.5 s for the step.*longer step_timeout; otherwise it hangs"),
+    ("HANG", FmuTimeoutError, r"longer than 0\.5 s for the step.*more `step_time` in .*otherwise it hangs"),
     ("IGNORE_SIGNALS", FmuTimeoutError, r"longer than 0\.5 s for the step"),
     ("LEAK_IN_STEP", FmuMemoryError, r"MiB of memory during the step, more than the limit of 400 MiB.*leaks"),
     ("FILL_DISK", FmuWorkerError, r"SIGXFSZ\): the FMU wrote more than 2 GiB to one file"),
@@ -104,7 +104,7 @@ def test_a_step_that_goes_wrong_is_one_sentence(
         with pytest.raises(kind, match=sentence) as caught:
             asset.step()
         assert str(fmu) in str(caught.value)
-        if what not in ("NOT_A_NUMBER", "FAIL"):
+        if what != "NOT_A_NUMBER":
             with pytest.raises(FmuWorkerError, match="reset the asset"):
                 asset.step()
         # The same instance is never used again; another one goes on from the last state.
@@ -137,10 +137,14 @@ def test_a_slow_leak_is_noticed_between_short_steps(foreign_fmu: Any, described:
 
 
 AT_THE_START = [
-    ("CRASH_AT_LOAD", FmuWorkerError, r"SIGSEGV.*during loading and instantiation"),
-    ("EXIT_AT_LOAD", FmuWorkerError, r"exit status 4.*during loading and instantiation"),
-    ("HANG_AT_LOAD", FmuTimeoutError, r"longer than 2 s for loading and instantiation.*load_timeout"),
-    ("MISSING_LIBRARY_FUNCTION", FmuCallError, r"cannot be loaded on this machine|lacks a function"),
+    ("CRASH_AT_LOAD", FmuWorkerError, r"During loading and instantiation .*SIGSEGV"),
+    ("EXIT_AT_LOAD", FmuWorkerError, r"During loading and instantiation .*exit status 4"),
+    ("HANG_AT_LOAD", FmuTimeoutError, r"longer than 2 s for loading and instantiation.*more `load_time`"),
+    (
+        "MISSING_LIBRARY_FUNCTION",
+        FmuCallError,
+        r"cannot be loaded on this machine \(undefined symbol: function",
+    ),
     ("NO_INSTANCE", FmuCallError, r"(?s)could not be instantiated.*no licence"),
     ("HANG_IN_INITIALISATION", FmuTimeoutError, r"longer than 2 s for initialisation"),
     ("REFUSE_INITIALISATION", FmuCallError, r"(?s)returned Error in initialisation.*table file is missing"),
@@ -182,8 +186,12 @@ def test_an_fmu_that_removes_its_files_is_extracted_again(
 
 
 STATES = [
-    ("STATE_ERROR", FmuCallError, r"(?s)fmi2GetFMUstate returned Error in saving the state.*not implemented"),
-    ("STATE_CRASH", FmuWorkerError, r"SIGSEGV.*during restoring the state"),
+    (
+        "STATE_ERROR",
+        FmuCallError,
+        r"(?s)fmi2GetFMUstate returned Error in saving the state.*`state = \"replay\"`.*not implemented",
+    ),
+    ("STATE_CRASH", FmuWorkerError, r"During restoring the state .*SIGSEGV"),
     (
         "STATE_NOT_RESTORED",
         FmuStateError,
