@@ -82,7 +82,8 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
     except FmuUnsupportedError:
         raise
     except Exception as error:
-        raise FmuFileError(f"The model description of {file} cannot be read ({error}).") from error
+        why = " ".join(str(error).split()).removesuffix(".")
+        raise FmuFileError(f"The model description of {file} cannot be read ({why}).") from error
     if not _IDENTIFIER.fullmatch(description.model_identifier):
         raise FmuFileError(
             f"The model identifier of {file}, {description.model_identifier!r}, is no name of a C "

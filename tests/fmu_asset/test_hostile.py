@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import struct
 import subprocess
@@ -15,9 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from fmu_asset.archive import read_fmu
 from fmu_asset.binding import Binding, parse_binding
+from fmu_asset.draft import draft_binding
 from fmu_asset.errors import (
     FmuCallError,
     FmuError,
@@ -374,3 +378,58 @@ def test_an_fmu_without_its_authoring_tool(foreign_fmu: Any, described: Binding,
     )
     with pytest.raises(FmuCallError, match=r"could not be instantiated .*needs its authoring tool"):
         FmiAsset(packed(tmp_path / "tool.fmu", entries), described).reset()
+
+
+def test_an_fmu_in_python_that_loops(spring_mass: Path, spring_binding: Binding, scratch: Path) -> None:
+    """It holds the interpreter of the worker; neither the limit nor the death of the twin needs that."""
+    with (
+        FmiAsset(spring_mass, spring_binding, step_timeout=0.5) as asset,
+        pytest.raises(FmuTimeoutError, match=r"longer than 0\.5 s for the step"),
+    ):
+        asset.step(load={"misbehaviour": 8})
+    program = (
+        "import json, sys\n"
+        "from fmu_asset.binding import parse_binding\n"
+        "from fmu_asset.session import FmiAsset\n"
+        "asset = FmiAsset(sys.argv[1], parse_binding(json.loads(sys.argv[2])))\n"
+        "asset.step()\n"
+        "print('loops', flush=True)\n"
+        "asset.step(load={'misbehaviour': 8})\n"
+    )
+    described = spring_binding.model_dump_json(exclude_none=True)
+    twin = subprocess.Popen(
+        [sys.executable, "-c", program, spring_mass, described], cwd=ROOT, stdout=subprocess.PIPE
+    )
+    assert twin.stdout is not None
+    assert twin.stdout.readline() == b"loops\n"
+    os.kill(twin.pid, signal.SIGKILL)
+    twin.wait()
+    twin.stdout.close()
+    assert not left_behind(scratch, 30.0)
+
+
+@settings(max_examples=100, deadline=None)
+@given(data=st.data())
+def test_a_description_with_one_odd_attribute(
+    foreign_fmu: Any, tmp_path_factory: Any, data: st.DataObject
+) -> None:
+    """Whatever one attribute says, or if it is missing: a description and a draft, or one sentence."""
+    model = data.draw(st.sampled_from(["lag1", "room2", "array3", "swing3", "ball2"]))
+    with zipfile.ZipFile(foreign_fmu(model)) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    text = entries["modelDescription.xml"].decode()
+    places = list(re.finditer(r'\s[A-Za-z]+="([^"]*)"', text))
+    place = data.draw(st.sampled_from(places))
+    odd = st.sampled_from(["", "-1", "1e999", "nan", "x", "0", "99999999999999999999", "true", "1 2", "<"])
+    if data.draw(st.booleans()):
+        text = text[: place.start()] + text[place.end() :]
+    else:
+        text = text[: place.start(1)] + data.draw(odd).replace("<", "&lt;") + text[place.end(1) :]
+    entries["modelDescription.xml"] = text.encode()
+    path = packed(tmp_path_factory.mktemp("odd") / "odd.fmu", entries)
+    sentence = ""
+    try:
+        draft_binding(read_fmu(path))
+    except FmuError as error:
+        sentence = str(error)
+    assert "\n" not in sentence
