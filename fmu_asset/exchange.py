@@ -20,6 +20,14 @@ Values = Mapping[str, float | Sequence[float]]
 """Values by the binding's names: a number, or as many as the bound array or port has."""
 
 
+def plain_values(values: Values) -> dict[str, float | list[float]]:
+    """Return values as floats and lists of floats, which can be compared and kept as JSON."""
+    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
+    return {
+        name: array.item() if array.ndim == 0 else array.ravel().tolist() for name, array in arrays.items()
+    }
+
+
 class Exchange:
     """What an asset exchanges with its FMU.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -51,7 +51,7 @@ class SavedState:
     index: int
     step_size: float
     start_time: float
-    parameters: Mapping[str, float | Sequence[float]]
+    parameters: Mapping[str, float | list[float]]
     start_inputs: bytes
     inputs: bytes
     outputs: bytes
@@ -65,10 +65,7 @@ class SavedState:
             "index": self.index,
             "step_size": self.step_size,
             "start_time": self.start_time,
-            "parameters": {
-                name: value if isinstance(value, float | int) else [*map(float, value)]
-                for name, value in self.parameters.items()
-            },
+            "parameters": dict(self.parameters),
             "start_inputs": self.start_inputs.hex(),
             "inputs": self.inputs.hex(),
             "outputs": self.outputs.hex(),

@@ -22,7 +22,7 @@ from .errors import (
     FmuStateError,
     FmuWorkerError,
 )
-from .exchange import Exchange, Values
+from .exchange import Exchange, Values, plain_values
 from .housing import Housing, Instance, limits_of
 from .instances.base import STATUS_NAMES
 from .observation import Observation
@@ -82,7 +82,7 @@ class FmiAsset:
         self._housing = Housing(self._description, self._exchange.plan, limits, isolated=isolated)
         self._binding = self._exchange.binding
         self._settings = self._exchange.settings(parameters or {})
-        self._parameters = dict(parameters or {})
+        self._parameters = plain_values(parameters or {})
         self._phase: Literal["new", "ready", "broken", "closed"] = "new"
         self._index = 0
         self._step_size, self._interval = self._binding.step_size, self._binding.interval
@@ -229,7 +229,7 @@ class FmiAsset:
         """
         if parameters is not None:
             self._settings = self._exchange.settings(parameters)
-            self._parameters = dict(parameters)
+            self._parameters = plain_values(parameters)
         start = self._exchange.start_values()
         given = self._exchange.place(start, control, health, load, port)
         self._begin(start, with_inputs=given)
@@ -365,11 +365,11 @@ class FmiAsset:
         ready = (
             self._phase == "ready" and self._housing.instance is not None and not self._housing.instance.lost
         )
-        same = (dict(saved.parameters), saved.start_inputs) == (self._parameters, self._start_inputs)
+        same = (plain_values(saved.parameters), saved.start_inputs) == (self._parameters, self._start_inputs)
         # An instance that was initialised in the same way takes the state as it is: what an ensemble needs.
         if replayed or not (ready and same):
             self._settings = self._exchange.settings(saved.parameters)
-            self._parameters = dict(saved.parameters)
+            self._parameters = plain_values(saved.parameters)
             start = self._exchange.start_values()
             if saved.start_inputs:
                 start[2:] = np.frombuffer(saved.start_inputs).tolist()
@@ -431,7 +431,7 @@ class FmiAsset:
         other._log = deque(maxlen=_LOG_LENGTH)
         if parameters is not None:
             other._settings = other._exchange.settings(parameters)
-            other._parameters = dict(parameters)
+            other._parameters = plain_values(parameters)
         return other
 
     def renew(self) -> None:

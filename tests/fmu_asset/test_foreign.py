@@ -172,12 +172,16 @@ def test_whole_arrays_take_as_many_values(foreign_fmu: Any) -> None:
         "observation": {"y": {"variables": ["y[2]", "y[1]"], "unit": "mm"}},
     }
     matrix = np.arange(6.0).reshape(2, 3) ** 2
-    parameters = {"A": matrix.ravel().tolist()}
+    parameters = {"A": matrix.ravel()}
     with FmiAsset(foreign_fmu("array3"), binding(1.0, **roles), parameters=parameters) as asset:
         seen = asset.step(load={"u": np.array([1.0, -2.0, 3.0])})
         np.testing.assert_allclose(seen.values, (matrix @ [1.0, -2.0, 3.0])[::-1], rtol=1e-12)
+        saved = asset.save_state()
+        asset.step()
+        asset.restore_state(saved)
         other = asset.fork()
-        np.testing.assert_array_equal(other.observe().values, seen.values)
+        for copy in (asset, other):
+            np.testing.assert_array_equal(copy.observe().values, seen.values)
         other.close()
         for wrong, count in ((1.0, 1), ([1.0, 2.0], 2)):
             with pytest.raises(FmuInputError, match=rf"load\.u takes 3 values, but {count} came"):
