@@ -121,10 +121,6 @@ class Port(_Record):
         if self.displacement is None and self.velocity is None:
             raise ValueError("a port needs a displacement or a velocity beside its force")
         for name, vector in self.quantities.items():
-            if len(vector.variables) != len(self.force.variables):
-                raise ValueError(
-                    f"{name} has {len(vector.variables)} variables and force {len(self.force.variables)}"
-                )
             allowed = [same_dimension(vector.unit, unit) for unit in PORT_QUANTITIES[name]]
             if allowed == [False, False]:
                 raise ValueError(
@@ -295,8 +291,19 @@ class Binding(_Record):
             for number, name in enumerate(names, 1):
                 label = key if len(names) == 1 else f"{key}[{number}]"
                 monitor[label] = scalar.model_copy(update={"variable": name})
+        port = {
+            key: item.model_copy(
+                update={
+                    quantity: vector.model_copy(update={"variables": of(vector.variables)})
+                    for quantity, vector in item.quantities.items()
+                }
+            )
+            for key, item in self.port.items()
+        }
         record = self.record.model_copy(update={"variables": of(self.record.variables)})
-        return self.model_copy(update={"observation": observation, "monitor": monitor, "record": record})
+        return self.model_copy(
+            update={"observation": observation, "monitor": monitor, "port": port, "record": record}
+        )
 
 
 def _expanded(given: object) -> object:

@@ -96,6 +96,12 @@ class Exchange:
             own = {}
             for quantity, vector in port.quantities.items():
                 label = f"port.{name}.{quantity}"
+                if len(vector.variables) != len(port.force.variables):
+                    raise BindingError(
+                        f"{label} of the binding {self._binding.name} has {len(vector.variables)} values "
+                        "and the "
+                        f"force {len(port.force.variables)}; give as many."
+                    )
                 causalities = {self._causality(variable) == "input" for variable in vector.variables}
                 if len(causalities) > 1:
                     raise BindingError(

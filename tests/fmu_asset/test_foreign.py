@@ -362,10 +362,6 @@ def test_ports_are_sent_and_read(foreign_fmu: Any) -> None:
             {"force": {"variables": "f", "unit": "N"}, "velocity": {"variables": "v", "unit": "m"}},
             "velocity is in 'm', but must be in m/s or rad/s",
         ),
-        (
-            {"force": {"variables": ["f", "g"], "unit": "N"}, "velocity": {"variables": "v", "unit": "m/s"}},
-            "velocity has 1 variables and force 2",
-        ),
     ],
 )
 def test_ports_that_are_none(port: dict[str, Any], sentence: str) -> None:
@@ -404,3 +400,23 @@ def test_events_that_pile_up_are_one_sentence(foreign_fmu: Any) -> None:
             asset.step()
         with pytest.raises(FmuWorkerError, match="reset the asset"):
             asset.step()
+
+
+def test_a_port_of_several_directions(foreign_fmu: Any) -> None:
+    """Elements of an array go in, a whole array comes out."""
+    port = {
+        "force": {"variables": ["u[1]", "u[3]"], "unit": "kN"},
+        "displacement": {"variables": "y", "unit": "m"},
+    }
+    roles = {"observation": {"y": {"variables": "y[1]", "unit": "mm"}}, "port": {"tip": port}}
+    fmu = foreign_fmu.changed("array3", "forces", ('min="-10" max="10"', 'min="-10" max="10" unit="N"'))
+    with FmiAsset(fmu, binding(1.0, **roles)) as asset:
+        seen = asset.step(port={"tip.force": [0.002, -0.001]})
+        expected = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]) @ [2.0, 0.0, -1.0]
+        found = [seen.extra["tip.displacement[1]"], seen.extra["tip.displacement[2]"]]
+        np.testing.assert_allclose(found, 1e-3 * expected, rtol=1e-12)
+        with pytest.raises(FmuInputError, match=r"port\.tip\.force takes 2 values, but 1 came"):
+            asset.step(port={"tip.force": 1.0})
+    three = {**port, "force": {"variables": "u", "unit": "N"}}
+    with pytest.raises(BindingError, match=r"port\.tip\.displacement .* has 2 values and the force 3"):
+        FmiAsset(fmu, binding(1.0, **{**roles, "port": {"tip": three}}))
