@@ -5,7 +5,6 @@ A binding knows roles, not wings. It is TOML:
 ```toml
 [binding]
 name = "uav_wing"
-fmi_version = "2.0"
 step_size = 1.0            # s
 
 [control.load_factor]      # what a policy chooses
@@ -18,7 +17,9 @@ unit = "1"
 ```
 
 The other roles are `health` (the state of damage), `load` (other inputs), `parameter` (set before the first
-step, optionally with a `value` here) and `monitor` (further scalars to be recorded).
+step, optionally with a `value` here), `monitor` (further scalars to be recorded) and `port` (force,
+displacement and velocity where another FMU can be coupled). `[record]` names variables to be recorded in the
+FMU's own units, and `[limits]` says what the FMU's worker may take.
 """
 
 from __future__ import annotations
@@ -26,21 +27,28 @@ from __future__ import annotations
 import os
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from .errors import BindingError
+from .instances.plan import Interface
+from .unit_symbols import same_dimension
 
 INPUT_ROLES = ("control", "health", "load")
-"""Roles whose variables are sent at every step, in the order in which they are sent."""
+"""Roles whose variables are sent at every step, in the order in which they are sent; ports follow."""
+
+PORT_QUANTITIES = {"force": ("N", "N.m"), "displacement": ("m", "rad"), "velocity": ("m/s", "rad/s")}
+"""What a mechanical port consists of, with its units where it is one of translation or of rotation."""
 
 _RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
 _LARGEST_PATTERN = 100_000
 
 _Text = Annotated[str, Field(min_length=1)]
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 class _Record(BaseModel):
@@ -48,16 +56,33 @@ class _Record(BaseModel):
 
 
 class Scalar(_Record):
-    """One variable: its name in the FMU and the unit in which the caller gives or takes it."""
+    """One variable: its name in the FMU and the unit in which the caller gives or takes it.
+
+    The name is that of a scalar, of one element of an FMI 3 array (`p[3]`, `a[2,1]`; from 1), or of a whole
+    array, which takes as many values.
+    """
 
     variable: _Text
     unit: _Text
 
 
-class Parameter(Scalar):
+class Input(Scalar):
+    """An input with a range of its own, in `unit`, within that of the FMU."""
+
+    minimum: _Number | None = None
+    maximum: _Number | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Input:
+        if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
+            raise ValueError(f"minimum {self.minimum:g} is larger than maximum {self.maximum:g}")
+        return self
+
+
+class Parameter(Input):
     """A parameter; `value`, in `unit`, is set at every reset unless the caller gives another."""
 
-    value: float | None = Field(default=None, allow_inf_nan=False)
+    value: _Number | None = None
 
 
 class Vector(_Record):
@@ -69,13 +94,7 @@ class Vector(_Record):
     @field_validator("variables", mode="before")
     @classmethod
     def _expand(cls, given: object) -> object:
-        if isinstance(given, str):
-            return expand(given)
-        if isinstance(given, list):
-            return tuple(
-                name for item in given for name in (expand(item) if isinstance(item, str) else (item,))
-            )
-        return given
+        return _expanded(given)
 
     @field_validator("variables")
     @classmethod
@@ -85,13 +104,97 @@ class Vector(_Record):
         return names
 
 
+class Port(_Record):
+    """A mechanical port: where another FMU can be coupled.
+
+    Force goes one way and motion the other: an FMU takes the force and gives displacement or velocity, or the
+    other way round. Inputs are given to `FmiAsset.step` as `port={"<name>.force": ...}`, outputs are in
+    `Observation.extra` under the same names.
+    """
+
+    force: Vector
+    displacement: Vector | None = None
+    velocity: Vector | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> Port:
+        if self.displacement is None and self.velocity is None:
+            raise ValueError("a port needs a displacement or a velocity beside its force")
+        for name, vector in self.quantities.items():
+            allowed = [same_dimension(vector.unit, unit) for unit in PORT_QUANTITIES[name]]
+            if allowed == [False, False]:
+                raise ValueError(
+                    f"{name} is in {vector.unit!r}, but must be in {' or '.join(PORT_QUANTITIES[name])}"
+                )
+        return self
+
+    @property
+    def quantities(self) -> dict[str, Vector]:
+        """What the port has, in the order of `PORT_QUANTITIES`."""
+        given = {name: getattr(self, name) for name in PORT_QUANTITIES}
+        return {name: vector for name, vector in given.items() if vector is not None}
+
+
+class Record(_Record):
+    """The table `[record]`: further variables to be recorded, in the FMU's own units."""
+
+    variables: tuple[_Text, ...] = ()
+
+    @field_validator("variables", mode="before")
+    @classmethod
+    def _expand(cls, given: object) -> object:
+        return _expanded(given)
+
+
+class WorkerLimits(_Record):
+    """The table `[limits]`: what the FMU's worker may take; what is not said is the default.
+
+    Attributes
+    ----------
+    step_time, load_time : float or None
+        Wall clock for one step, and for loading and initialisation [s].
+    memory : float or None
+        Resident memory [MiB].
+    """
+
+    step_time: _Positive | None = None
+    load_time: _Positive | None = None
+    memory: _Positive | None = None
+
+
 class Header(_Record):
-    """The table `[binding]`: name, FMI version, step size [s], start time [s], a line for people."""
+    """The table `[binding]`.
+
+    Attributes
+    ----------
+    name : str
+        Name of the binding.
+    step_size : float
+        Communication step of the FMU [s].
+    decimation : int
+        Communication steps between two observations; the inputs are held meanwhile.
+    start_time : float
+        Where the FMU begins [s].
+    fmi_version : {"1.0", "2.0", "3.0"}, optional
+        What the FMU must be; any of them if absent.
+    interface : {"co-simulation", "model-exchange"}, optional
+        How it is run; co-simulation where it offers that.
+    tolerance : float, optional
+        Relative tolerance of the FMU's solver, or of ours in model exchange.
+    state : {"auto", "serialised", "replay"}
+        How `save_state` keeps the state; auto trusts what the FMU declares.
+    description : str
+        A line for people.
+    """
 
     name: _Text
-    fmi_version: Literal["2.0"] = "2.0"
-    step_size: float = Field(gt=0.0, allow_inf_nan=False)
-    start_time: float = Field(default=0.0, allow_inf_nan=False)
+    step_size: _Positive
+    decimation: int = Field(default=1, ge=1, le=10_000_000)
+    start_time: _Number = 0.0
+    fmi_version: Literal["1.0", "2.0", "3.0"] | None = None
+    interface: Interface | None = None
+    tolerance: _Positive | None = None
+    state: Literal["auto", "serialised", "replay"] = "auto"
     description: str = ""
 
 
@@ -102,7 +205,7 @@ class Binding(_Record):
     ----------
     binding : Header
         Name, FMI version, step size.
-    control, health, load : dict of str to Scalar
+    control, health, load : dict of str to Input
         Inputs by role and by the caller's name.
     observation : dict of str to Vector
         What is measured, in order.
@@ -110,15 +213,24 @@ class Binding(_Record):
         Parameters by the caller's name.
     monitor : dict of str to Scalar
         Further scalars to be recorded.
+    port : dict of str to Port
+        Where other FMUs can be coupled.
+    record : Record
+        Further variables to be recorded, in the FMU's units.
+    limits : WorkerLimits
+        What the worker may take.
     """
 
     binding: Header
-    control: dict[str, Scalar] = Field(default_factory=dict)
-    health: dict[str, Scalar] = Field(default_factory=dict)
-    load: dict[str, Scalar] = Field(default_factory=dict)
+    control: dict[str, Input] = Field(default_factory=dict)
+    health: dict[str, Input] = Field(default_factory=dict)
+    load: dict[str, Input] = Field(default_factory=dict)
     observation: dict[str, Vector] = Field(default_factory=dict)
     parameter: dict[str, Parameter] = Field(default_factory=dict)
     monitor: dict[str, Scalar] = Field(default_factory=dict)
+    port: dict[str, Port] = Field(default_factory=dict)
+    record: Record = Field(default_factory=Record)
+    limits: WorkerLimits = Field(default_factory=WorkerLimits)
 
     @property
     def name(self) -> str:
@@ -129,6 +241,16 @@ class Binding(_Record):
     def step_size(self) -> float:
         """Communication step size [s]."""
         return self.binding.step_size
+
+    @property
+    def interval(self) -> float:
+        """Time between two observations [s]."""
+        return self.binding.step_size * self.binding.decimation
+
+    def inputs(self, role: str) -> Mapping[str, Input]:
+        """Return the variables of one of `INPUT_ROLES` by the caller's names."""
+        table: Mapping[str, Input] = {"control": self.control, "health": self.health, "load": self.load}[role]
+        return table
 
     @property
     def observation_variables(self) -> tuple[str, ...]:
@@ -152,12 +274,50 @@ class Binding(_Record):
             f"The binding {self.name} has no observation {name!r}; it has {_listed(self.observation)}."
         )
 
-    def inputs(self, role: str) -> Mapping[str, Scalar]:
-        """Return the variables of one of `INPUT_ROLES` by the caller's names."""
-        table: Mapping[str, Scalar] = {"control": self.control, "health": self.health, "load": self.load}[
-            role
-        ]
-        return table
+    def with_arrays(self, elements: Callable[[str], Sequence[str]]) -> Binding:
+        """Return the binding with every array that is observed or recorded as its elements.
+
+        Parameters
+        ----------
+        elements : callable
+            Names of the elements of a variable; the name itself for a scalar.
+        """
+
+        def of(names: Sequence[str]) -> tuple[str, ...]:
+            return tuple(element for name in names for element in elements(name))
+
+        observation = {
+            key: vector.model_copy(update={"variables": of(vector.variables)})
+            for key, vector in self.observation.items()
+        }
+        monitor = {}
+        for key, scalar in self.monitor.items():
+            names = of([scalar.variable])
+            for number, name in enumerate(names, 1):
+                label = key if len(names) == 1 else f"{key}[{number}]"
+                monitor[label] = scalar.model_copy(update={"variable": name})
+        port = {
+            key: item.model_copy(
+                update={
+                    quantity: vector.model_copy(update={"variables": of(vector.variables)})
+                    for quantity, vector in item.quantities.items()
+                }
+            )
+            for key, item in self.port.items()
+        }
+        record = self.record.model_copy(update={"variables": of(self.record.variables)})
+        return self.model_copy(
+            update={"observation": observation, "monitor": monitor, "port": port, "record": record}
+        )
+
+
+def _expanded(given: object) -> object:
+    """Expand the patterns of a text or of a list of texts."""
+    if isinstance(given, str):
+        return expand(given)
+    if isinstance(given, list):
+        return tuple(name for item in given for name in (expand(item) if isinstance(item, str) else (item,)))
+    return given
 
 
 def expand(pattern: str) -> tuple[str, ...]:

@@ -79,3 +79,7 @@ class FmuWorkerError(FmuError, RuntimeError):
 
 class FmuTimeoutError(FmuError, TimeoutError):
     """An FMI call took longer than the wall-clock limit; the worker was stopped."""
+
+
+class FmuMemoryError(FmuError, RuntimeError):
+    """An FMU took more memory than its limit; the worker was stopped."""

@@ -2,39 +2,30 @@
 
 from __future__ import annotations
 
-import difflib
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from .archive import FmuDescription, VariableInfo
-from .binding import INPUT_ROLES, Binding, Scalar
-from .errors import BindingError, FmuFileError, FmuInputError
-from .instance import Plan, Settings
-from .units import IDENTITY, Conversion, conversion
+from .binding import INPUT_ROLES, Binding, Input
+from .declared import FLOAT_KINDS, FmuDescription, VariableInfo
+from .errors import BindingError
+from .instances.plan import Plan, Settings
+from .layout import Layout, Place, element_names, find, start_values
+from .slots import Slot, in_unit, put, value_range
+from .units import IDENTITY, conversion
 
-_KINDS = {"Real": "Real", "Integer": "Integer", "Enumeration": "Integer", "Boolean": "Boolean"}
-_CAUSALITY = {
-    "input": ("input",),
-    "parameter": ("parameter",),
-    "output": ("output", "local", "calculatedParameter"),
-}
+Values = Mapping[str, float | Sequence[float]]
+"""Values by the binding's names: a number, or as many as the bound array or port has."""
 
 
-class _Slot(NamedTuple):
-    """Where an input goes: position in the request block, range in the FMU's unit, conversion."""
-
-    position: int
-    low: float
-    high: float
-    conversion: Conversion
-    label: str
-    whole: bool
-    direct: bool
-    variable: VariableInfo
+def plain_values(values: Values) -> dict[str, float | list[float]]:
+    """Return values as floats and lists of floats, which can be compared and kept as JSON."""
+    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
+    return {
+        name: array.item() if array.ndim == 0 else array.ravel().tolist() for name, array in arrays.items()
+    }
 
 
 class Exchange:
@@ -49,129 +40,224 @@ class Exchange:
 
     Attributes
     ----------
+    binding : Binding
+        The binding, with arrays that are observed or recorded as their elements.
     plan : Plan
         For the instance; its folder is still empty.
 
     Raises
     ------
     BindingError
-        If a variable is missing, of the wrong causality or type, or in another unit.
+        If a variable is missing, of the wrong causality or type, or in another unit, or the FMU is of another
+        version.
     """
 
     def __init__(self, description: FmuDescription, binding: Binding) -> None:
-        self._description, self._binding = description, binding
-        self._slots: dict[str, dict[str, _Slot]] = {}
-        self.plan = self._make_plan()
-        self._parameter_slots = self._make_slots("parameter")
+        self._description = description
+        wanted = binding.binding.fmi_version
+        if wanted is not None and wanted[0] != description.fmi_version[0]:
+            raise BindingError(
+                f"The binding {binding.name} is for FMI {wanted}, but {description.path} is of FMI "
+                f"{description.fmi_version}; correct `fmi_version`, or leave it out."
+            )
+        self.binding = self._binding = binding.with_arrays(self._elements)
+        self._reads_ports = self._port_directions()
+        self._make_outputs()
+        self._make_inputs()
+        self.plan = Plan(
+            folder="",
+            fmi_version=description.major_version,
+            interface=description.interface,
+            guid=description.guid,
+            model_identifier=description.model_identifier,
+            instance_name=binding.name,
+            inputs=self._inputs.groups,
+            outputs=self._outputs.groups,
+            substeps=binding.binding.decimation,
+            tolerance=binding.binding.tolerance,
+            states=description.states,
+            event_indicators=description.event_indicators,
+            completed_step=description.completed_step,
+        )
 
-    def _make_plan(self) -> Plan:
-        """Resolve all names of the binding and lay out the two blocks."""
-        binding, inputs = self._binding, {}
-        for role in INPUT_ROLES:
-            self._slots[role] = self._make_slots(role)
-            inputs.update({slot.label: slot for slot in self._slots[role].values()})
-        order = {"Real": 0, "Integer": 1, "Boolean": 2}
-        # Stable: within a base type the order is that of the binding.
-        labels = sorted(inputs, key=lambda label: order[_KINDS[inputs[label].variable.kind]])
-        self._ordered = [inputs[label].variable for label in labels]
-        for role, slots in self._slots.items():
-            self._slots[role] = {
-                name: slot._replace(position=2 + labels.index(slot.label)) for name, slot in slots.items()
-            }
-        observed = [
-            (name, self._resolve(name, f"observation.{key}", "output"), vector.unit, f"observation.{key}")
+    # ------------------------------------------------------------------ resolving
+
+    def _elements(self, name: str) -> tuple[str, ...]:
+        variable = self._description.variable(name)
+        return (name,) if variable is None else element_names(variable)
+
+    def _find(self, name: str, label: str, causality: str) -> Place:
+        return find(self._description, name, f"{label} of the binding {self._binding.name}", causality)
+
+    def _port_directions(self) -> dict[str, bool]:
+        """Return for every quantity of a port whether it is read; force and motion go opposite ways."""
+        reads = {}
+        for name, port in self._binding.port.items():
+            own = {}
+            for quantity, vector in port.quantities.items():
+                label = f"port.{name}.{quantity}"
+                if len(vector.variables) != len(port.force.variables):
+                    raise BindingError(
+                        f"{label} of the binding {self._binding.name} has {len(vector.variables)} values "
+                        "and the "
+                        f"force {len(port.force.variables)}; give as many."
+                    )
+                causalities = {self._causality(variable) == "input" for variable in vector.variables}
+                if len(causalities) > 1:
+                    raise BindingError(
+                        f"{label} of the binding {self._binding.name} mixes inputs and outputs of the FMU."
+                    )
+                own[quantity] = not causalities.pop()
+                reads[f"{name}.{quantity}"] = own[quantity]
+            if any(own[quantity] == own["force"] for quantity in own if quantity != "force"):
+                way = "outputs" if own["force"] else "inputs"
+                raise BindingError(
+                    f"In port.{name} of the binding {self._binding.name}, force and motion are both {way} "
+                    "of the "
+                    "FMU; at a port one is given for the other."
+                )
+        return reads
+
+    def _causality(self, name: str) -> str:
+        variable = self._description.variable(name) or self._description.variable(name.rpartition("[")[0])
+        return "" if variable is None else variable.causality
+
+    def _port_vectors(self, *, read: bool) -> list[tuple[str, tuple[str, ...], str]]:
+        """Return name, variables and unit of the ports' quantities that are read, or that are sent."""
+        return [
+            (f"{name}.{quantity}", vector.variables, vector.unit)
+            for name, port in self._binding.port.items()
+            for quantity, vector in port.quantities.items()
+            if self._reads_ports[f"{name}.{quantity}"] == read
+        ]
+
+    def _make_inputs(self) -> None:
+        """Lay out the request block: time, step size, all inputs."""
+        places = {
+            (role, name): [self._find(item.variable, f"{role}.{name}", "input")]
+            for role in INPUT_ROLES
+            for name, item in self._table(role).items()
+        }
+        ports = self._port_vectors(read=False)
+        for name, variables, _ in ports:
+            places["port", name] = [self._find(item, f"port.{name}", "input") for item in variables]
+        self._inputs = Layout(
+            self._description, [place.variable for found in places.values() for place in found], begin=2
+        )
+        self._slots: dict[str, dict[str, Slot]] = {role: {} for role in (*INPUT_ROLES, "port")}
+        taken: dict[int, str] = {}
+        items: dict[tuple[str, str], Input] = {
+            (role, name): item for role in INPUT_ROLES for name, item in self._table(role).items()
+        }
+        items |= {("port", name): Input(variable=variables[0], unit=unit) for name, variables, unit in ports}
+        for (role, name), found in places.items():
+            positions = [position for place in found for position in self._inputs.positions(place)]
+            if len({(place.variable.unit, place.variable.kind) for place in found}) > 1:
+                raise BindingError(
+                    f"The variables of {role}.{name} of the binding {self._binding.name} have different "
+                    "units or "
+                    "types in the FMU; make one port of each."
+                )
+            for position in positions:
+                if position in taken:
+                    raise BindingError(
+                        f"In the binding {self._binding.name}, {role}.{name} and {taken[position]} set "
+                        "the same "
+                        f"value of {found[0].variable.name!r}; keep one."
+                    )
+                taken[position] = f"{role}.{name}"
+            self._slots[role][name] = self._slot(
+                f"{role}.{name}", items[role, name], found[0].variable, positions
+            )
+        # Parameters are set once, each for itself; their positions count from the variable's own values.
+        self._parameter_slots = {}
+        for name, parameter in self._binding.parameter.items():
+            place = self._find(parameter.variable, f"parameter.{name}", "parameter")
+            positions = [place.element] if place.element is not None else [*range(place.size)]
+            self._parameter_slots[name] = self._slot(
+                f"parameter.{name}", parameter, place.variable, positions
+            )
+
+    def _table(self, role: str) -> Mapping[str, Input]:
+        table: Mapping[str, Input] = getattr(self._binding, role)
+        return table
+
+    def _slot(self, label: str, item: Input, variable: VariableInfo, positions: Sequence[int]) -> Slot:
+        scale = conversion(item.unit, variable, self._description.units, where=label)
+        low, high = value_range(variable)
+        least, most = (
+            None if bound is None else scale.to_fmu(bound) for bound in (item.minimum, item.maximum)
+        )
+        if scale.factor < 0.0:
+            least, most = most, least
+        own_low, own_high = low if least is None else least, high if most is None else most
+        if own_low > high or own_high < low:
+            raise BindingError(
+                f"The range of {label} of the binding {self._binding.name} lies outside that of "
+                f"{variable.name!r}, {low:g} to {high:g}{in_unit(variable)}; correct minimum or maximum."
+            )
+        whole = variable.kind not in FLOAT_KINDS
+        return Slot(
+            position=positions[0],
+            positions=positions,
+            low=max(low, own_low),
+            high=min(high, own_high),
+            conversion=scale,
+            label=label,
+            whole=whole,
+            direct=scale == IDENTITY and not whole and len(positions) == 1,
+            variable=variable,
+        )
+
+    def _make_outputs(self) -> None:
+        """Lay out the reply block: observations, monitors, records, outputs of ports."""
+        binding = self._binding
+        wanted = [
+            (name, name, vector.unit, f"observation.{key}")
             for key, vector in binding.observation.items()
             for name in vector.variables
         ]
-        monitored = [
-            (
-                name,
-                self._resolve(scalar.variable, f"monitor.{name}", "output"),
-                scalar.unit,
-                f"monitor.{name}",
-            )
+        self._observation_count = len(wanted)
+        wanted += [
+            (name, scalar.variable, scalar.unit, f"monitor.{name}")
             for name, scalar in binding.monitor.items()
         ]
-        everything = [*observed, *monitored]
-        outputs = sorted(range(len(everything)), key=lambda i: order[_KINDS[everything[i][1].kind]])
-        place = {which: position for position, which in enumerate(outputs)}
-        self._output_names = [everything[which][1].name for which in outputs]
+        wanted += [(name, name, "", "record.variables") for name in binding.record.variables]
+        for label, variables, unit in self._port_vectors(read=True):
+            several = len(variables) > 1
+            wanted += [
+                (f"{label}[{number}]" if several else label, name, unit, f"port.{label}")
+                for number, name in enumerate(variables, 1)
+            ]
+        places = [self._find(name, where, "output") for _, name, _, where in wanted]
+        self._outputs = Layout(self._description, [place.variable for place in places], begin=0)
+        self._output_names = self._outputs.names()
         conversions = [
-            conversion(unit, variable, self._description.units, where=where)
-            for _, variable, unit, where in everything
+            conversion(
+                unit or place.variable.unit or "1", place.variable, self._description.units, where=where
+            )
+            for (_, _, unit, where), place in zip(wanted, places, strict=True)
         ]
-        self._observation_count = len(observed)
-        index = np.array([place[which] for which in range(len(observed))])
-        self._observation_index = None if np.array_equal(index, np.arange(len(observed))) else index
-        own = conversions[: len(observed)]
+        index = np.array([self._outputs.positions(place)[0] for place in places], dtype=np.intp)
+        count = self._observation_count
+        observed = index[:count]
+        self._observation_index = None if np.array_equal(observed, np.arange(count)) else observed
+        own = conversions[:count]
         self._observation_scale = (
             None
             if all(item == IDENTITY for item in own)
             else (np.array([item.factor for item in own]), np.array([item.offset for item in own]))
         )
         self._monitors = [
-            (name, place[which], None if conversions[which] == IDENTITY else conversions[which])
-            for which, (name, *_) in enumerate(monitored, len(observed))
+            (wanted[which][0], int(index[which]), None if scale == IDENTITY else scale)
+            for which, scale in enumerate(conversions[count:], count)
         ]
+        self.recorded_units = {
+            name: unit or place.variable.unit or "1"
+            for (name, _, unit, _), place in zip(wanted[count:], places[count:], strict=True)
+        }
 
-        def references(kind: str, variables: Sequence[VariableInfo]) -> list[int]:
-            return [variable.reference for variable in variables if _KINDS[variable.kind] == kind]
-
-        read = [everything[which][1] for which in outputs]
-        return Plan(
-            folder="",
-            guid=self._description.guid,
-            model_identifier=self._description.model_identifier,
-            instance_name=binding.name,
-            real_inputs=references("Real", self._ordered),
-            integer_inputs=references("Integer", self._ordered),
-            boolean_inputs=references("Boolean", self._ordered),
-            real_outputs=references("Real", read),
-            integer_outputs=references("Integer", read),
-            boolean_outputs=references("Boolean", read),
-        )
-
-    def _make_slots(self, role: str) -> dict[str, _Slot]:
-        slots = {}
-        table: Mapping[str, Scalar] = getattr(self._binding, role)
-        for name, scalar in table.items():
-            label = f"{role}.{name}"
-            causality = "parameter" if role == "parameter" else "input"
-            variable = self._resolve(scalar.variable, label, causality)
-            scale = conversion(scalar.unit, variable, self._description.units, where=label)
-            whole = variable.kind != "Real"
-            slots[name] = _Slot(
-                position=0,
-                low=-math.inf if variable.minimum is None else variable.minimum,
-                high=math.inf if variable.maximum is None else variable.maximum,
-                conversion=scale,
-                label=label,
-                whole=whole,
-                direct=scale == IDENTITY and not whole,
-                variable=variable,
-            )
-        return slots
-
-    def _resolve(self, name: str, label: str, causality: str) -> VariableInfo:
-        variable = self._description.variable(name)
-        if variable is None:
-            near = difflib.get_close_matches(name, [v.name for v in self._description.variables], 1, 0.6)
-            hint = f"; did you mean {near[0]!r}?" if near else "."
-            raise BindingError(
-                f"{label} of the binding {self._binding.name} names {name!r}, which is not a variable of "
-                f"{self._description.path}{hint}"
-            )
-        if variable.causality not in _CAUSALITY[causality]:
-            raise BindingError(
-                f"{label} of the binding {self._binding.name} must be of causality {causality}, but {name!r} "
-                f"is declared as {variable.causality} in {self._description.path}."
-            )
-        if variable.kind not in _KINDS:
-            raise BindingError(
-                f"{label} of the binding {self._binding.name} names {name!r}, which is of type "
-                f"{variable.kind}; only numbers can be bound."
-            )
-        return variable
+    # ------------------------------------------------------------------ sending
 
     def start_values(self) -> list[float]:
         """Return a request block with the FMU's own start values of the inputs.
@@ -181,25 +267,23 @@ class Exchange:
         FmuFileError
             If a start value is no number.
         """
-        try:
-            return [0.0, 0.0, *(_start_value(variable) for variable in self._ordered)]
-        except ValueError as error:
-            raise FmuFileError(
-                f"An input of {self._description.path} has a start value that is no number ({error})."
-            ) from error
+        values = [0.0, 0.0]
+        for variable in self._inputs.variables:
+            values += start_values(self._description, variable)
+        return values
 
-    def settings(self, parameters: Mapping[str, float]) -> Settings:
+    def settings(self, parameters: Values) -> Settings:
         """Return what is set before initialisation: the values of the binding, then the caller's.
 
         Parameters
         ----------
-        parameters : mapping of str to float
+        parameters : mapping of str to float or sequence of float
             By the binding's names and in its units.
 
         Returns
         -------
         Settings
-            Base type, value reference, value in the FMU's unit.
+            Base type, value reference, values in the FMU's unit.
 
         Raises
         ------
@@ -220,17 +304,23 @@ class Exchange:
             for name, parameter in self._binding.parameter.items()
             if parameter.value is not None
         }
-        return [
-            (_KINDS[slots[name].variable.kind], slots[name].variable.reference, _checked(slots[name], value))
-            for name, value in {**fixed, **parameters}.items()
-        ]
+        set_values: dict[str, tuple[str, int, list[float]]] = {}
+        for name, value in {**fixed, **parameters}.items():
+            variable = slots[name].variable
+            if variable.name not in set_values:
+                kind = self._description.exchange_kind(variable)
+                start = start_values(self._description, variable) if variable.shape else [0.0]
+                set_values[variable.name] = (kind, variable.reference, start)
+            put(set_values[variable.name][2], slots[name], value)
+        return list(set_values.values())
 
     def place(
         self,
         target: Any,
-        control: Mapping[str, float] | None,
-        health: Mapping[str, float] | None,
-        load: Mapping[str, float] | None,
+        control: Values | None,
+        health: Values | None,
+        load: Values | None,
+        port: Values | None = None,
     ) -> bool:
         """Put inputs where they belong; return whether there were any.
 
@@ -238,8 +328,8 @@ class Exchange:
         ----------
         target : list of float or ctypes array
             A request block; changed in place.
-        control, health, load : mapping of str to float or None
-            By the binding's names and in its units.
+        control, health, load, port : mapping or None
+            By the binding's names and in its units; a port's are called `<port>.<quantity>`.
 
         Raises
         ------
@@ -249,7 +339,7 @@ class Exchange:
             If a value is not finite or outside its range.
         """
         given = False
-        for role, values in (("control", control), ("health", health), ("load", load)):
+        for role, values in (("control", control), ("health", health), ("load", load), ("port", port)):
             if not values:
                 continue
             given = True
@@ -257,10 +347,7 @@ class Exchange:
             for name, value in values.items():
                 slot = slots.get(name)
                 if slot is None:
-                    raise BindingError(
-                        f"The binding {self._binding.name} has no {role} {name!r}; "
-                        f"it has {', '.join(slots) or 'none'}."
-                    )
+                    raise self._no_input(role, name)
                 # NaN fails the comparisons; the last one is for an infinity in a range without limit.
                 if (
                     slot.direct
@@ -270,8 +357,20 @@ class Exchange:
                 ):
                     target[slot.position] = value
                 else:
-                    target[slot.position] = _checked(slot, value)
+                    put(target, slot, value)
         return given
+
+    def input_range(self, role: str, name: str) -> tuple[float, float]:
+        """Return the range of an input in the binding's unit; see `FmiAsset.input_range`."""
+        slot = self._slots.get(role, {}).get(name)
+        if slot is None:
+            raise self._no_input(role, name)
+        low, high = sorted(slot.conversion.from_fmu(end) for end in (slot.low, slot.high))
+        return low, high
+
+    def _no_input(self, role: str, name: str) -> BindingError:
+        known = ", ".join(self._slots.get(role, {})) or "none"
+        return BindingError(f"The binding {self._binding.name} has no {role} {name!r}; it has {known}.")
 
     def read(self, block: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], dict[str, float]]:
         """Return observations and monitors in the binding's units.
@@ -286,7 +385,7 @@ class Exchange:
         values : (n_obs,) ndarray
             The observations in the order of the binding.
         extra : dict of str to float
-            The monitors.
+            Monitors, records and outputs of ports.
         """
         if self._observation_index is None:
             values = block[: self._observation_count].copy()
@@ -301,37 +400,11 @@ class Exchange:
         }
         return values, extra
 
+    def output_name(self, position: int) -> str:
+        """Return the name of an output by its position in the reply block."""
+        return self._output_names[position]
+
     def not_finite(self, block: npt.NDArray[np.float64]) -> list[str]:
         """Return the names of outputs that are NaN or infinite."""
         count = len(self._output_names)
         return [self._output_names[index] for index in np.flatnonzero(~np.isfinite(block[:count]))]
-
-
-def _checked(slot: _Slot, value: float) -> float:
-    """Return the value in the FMU's unit, refused if it is not finite, not whole or out of range."""
-    try:
-        number = slot.conversion.to_fmu(float(value))
-    except (TypeError, ValueError) as error:
-        raise FmuInputError(f"{slot.label} must be a number, but is {value!r}.") from error
-    if slot.low <= number <= slot.high and not slot.whole and number - number == 0.0:
-        return number
-    if not math.isfinite(number):
-        raise FmuInputError(f"{slot.label} must be finite, but is {value!r}; nothing was sent to the FMU.")
-    if slot.whole and not number.is_integer():
-        raise FmuInputError(
-            f"{slot.label} must be a whole number, but is {value!r}; nothing was sent to the FMU."
-        )
-    # A conversion of units may round a value at the edge of the range to just outside of it.
-    inside = min(max(number, slot.low), slot.high)
-    if abs(inside - number) > 1e-12 * max(abs(inside), 1.0):
-        unit = slot.variable.unit
-        raise FmuInputError(
-            f"{slot.label} = {value!r} lies outside the range of {slot.variable.name!r}, {slot.low:g} to "
-            f"{slot.high:g}{'' if unit in (None, '1') else f' {unit}'}; nothing was sent to the FMU."
-        )
-    return inside
-
-
-def _start_value(variable: VariableInfo) -> float:
-    text = (variable.start or "0").lower()
-    return float({"true": "1", "false": "0"}.get(text, text))

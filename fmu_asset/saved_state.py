@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, Self
+
+import numpy as np
 
 from .errors import FmuStateError
 
@@ -30,13 +33,15 @@ class SavedState:
     index : int
         Number of steps made.
     step_size, start_time : float
-        Of the binding [s].
-    parameters : mapping of str to float
+        Time between observations and start of the binding [s].
+    parameters : mapping of str to float, or to a sequence for an array
         As the caller gave them.
     start_inputs : bytes
         Inputs during initialisation, as doubles; empty if the FMU's start values held.
     inputs : bytes
         The last inputs, as doubles.
+    outputs : bytes
+        The outputs at that moment, as doubles; the FMU must give them again.
     body : bytes
         The FMU's serialised state, or the inputs of each step.
     """
@@ -46,9 +51,10 @@ class SavedState:
     index: int
     step_size: float
     start_time: float
-    parameters: Mapping[str, float]
+    parameters: Mapping[str, float | list[float]]
     start_inputs: bytes
     inputs: bytes
+    outputs: bytes
     body: bytes
 
     def to_bytes(self) -> bytes:
@@ -62,6 +68,7 @@ class SavedState:
             "parameters": dict(self.parameters),
             "start_inputs": self.start_inputs.hex(),
             "inputs": self.inputs.hex(),
+            "outputs": self.outputs.hex(),
         }
         text = json.dumps(head, sort_keys=True).encode()
         return _HEADER.pack(_MAGIC, len(text)) + text + self.body
@@ -87,10 +94,93 @@ class SavedState:
                 index=int(head["index"]),
                 step_size=float(head["step_size"]),
                 start_time=float(head["start_time"]),
-                parameters={str(name): float(value) for name, value in head["parameters"].items()},
+                parameters={
+                    str(name): [*map(float, value)] if isinstance(value, list) else float(value)
+                    for name, value in head["parameters"].items()
+                },
                 start_inputs=bytes.fromhex(head["start_inputs"]),
                 inputs=bytes.fromhex(head["inputs"]),
+                outputs=bytes.fromhex(head["outputs"]),
                 body=content[begin:],
             )
         except (struct.error, ValueError, TypeError, KeyError, AttributeError) as error:
             raise FmuStateError("What was given is not a state of an FMI asset, or it is damaged.") from error
+
+    def refuse_if_foreign(
+        self,
+        *,
+        path: Path,
+        fmu: str,
+        interval: float,
+        start_time: float,
+        method: StateMethod,
+        width: int,
+    ) -> None:
+        """Refuse a state of another FMU or binding.
+
+        Parameters
+        ----------
+        path : Path
+            The FMU file, for the error.
+        fmu : str
+            Its SHA-256.
+        interval, start_time : float
+            Of the binding [s].
+        method : {"serialised", "replay"}
+            How the asset keeps its state.
+        width : int
+            Bytes of the inputs of one step.
+
+        Raises
+        ------
+        FmuStateError
+            If something differs.
+        """
+        if self.fmu != fmu:
+            raise FmuStateError(
+                f"The state was saved with another FMU than {path} (its hash differs); use that one."
+            )
+        if (self.step_size, self.start_time) != (interval, start_time):
+            raise FmuStateError("The state was saved with another step size or start time; use that binding.")
+        if (
+            self.method != method
+            or len(self.inputs) != width
+            or len(self.start_inputs) not in (0, width)
+            or (self.method == "replay" and len(self.body) != width * self.index)
+        ):
+            raise FmuStateError(
+                "The saved state is damaged, or another binding was in use; use that binding."
+            )
+
+    def refuse_other_outputs(self, outputs: bytes, name_of: Callable[[int], str]) -> None:
+        """Refuse a restored FMU that does not give the outputs that it gave when it was saved.
+
+        Parameters
+        ----------
+        outputs : bytes
+            What it gives now, as doubles.
+        name_of : callable
+            Name of an output by its position.
+
+        Raises
+        ------
+        FmuStateError
+            If a bit differs: the FMU declares a capability that it does not have.
+        """
+        if outputs == self.outputs:
+            return
+        if len(outputs) != len(self.outputs):
+            raise FmuStateError("The state was saved with another binding; use that one.")
+        then, now = np.frombuffer(self.outputs), np.frombuffer(outputs)
+        which = int(np.flatnonzero(now.view(np.int64) != then.view(np.int64))[0])
+        if self.method == "replay":
+            cause = "it does not give equal outputs for equal inputs, so that it cannot be resumed"
+        else:
+            cause = (
+                "it declares canGetAndSetFMUstate but does not restore all of its state; write "
+                '`state = "replay"` into the table [binding] of its binding'
+            )
+        raise FmuStateError(
+            f"After the state was restored the FMU gives {name_of(which)} = {float(now[which])!r} instead of "
+            f"{float(then[which])!r}: {cause}."
+        )

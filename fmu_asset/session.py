@@ -4,53 +4,32 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
-import weakref
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Literal, NoReturn, Self
 
 import numpy as np
-import numpy.typing as npt
 
-from .archive import FmuDescription, describe_fmu, extract_fmu, read_fmu
+from .archive import read_fmu
 from .binding import INPUT_ROLES, Binding, load_binding
+from .declared import FmuDescription, describe_fmu
 from .errors import (
     FmuCallError,
     FmuError,
-    FmuInputError,
+    FmuMemoryError,
     FmuOutputError,
     FmuStateError,
     FmuWorkerError,
 )
-from .exchange import Exchange
-from .instance import STATUS_NAMES, FmuInstance, forget_modules
+from .exchange import Exchange, Values, plain_values
+from .housing import Housing, Instance, limits_of
+from .instances.base import STATUS_NAMES
+from .observation import Observation
 from .saved_state import SavedState, StateMethod
-from .worker import WorkerInstance
+from .worker.client import WorkerInstance
 
 _LOG_LENGTH = 200
-
-
-@dataclass(frozen=True, slots=True)
-class Observation:
-    """What came out of one communication step.
-
-    Attributes
-    ----------
-    values : (n_obs,) ndarray
-        The observations of the binding in their order and units.
-    time : float
-        Time at the end of the step [s]: start + i * step size.
-    extra : dict of str to float
-        The monitors of the binding.
-    """
-
-    values: npt.NDArray[np.float64]
-    time: float
-    extra: dict[str, float] = field(default_factory=dict)
 
 
 class FmiAsset:
@@ -62,13 +41,16 @@ class FmiAsset:
     Parameters
     ----------
     fmu_path : path-like
-        An FMI 2.0 co-simulation FMU.
+        An FMU of FMI 1, 2 or 3, for co-simulation or model exchange.
     binding : Binding or path-like
         The binding, or its file.
     isolated : bool
         Whether the FMU runs in a worker process.
-    step_timeout : float
-        Wall-clock limit of one step [s].
+    step_timeout, load_timeout : float, optional
+        Wall-clock limits of one step, and of loading and initialisation [s]; those of the binding, or 10 and
+        60.
+    memory_limit : float, optional
+        Limit of the worker's resident memory [MiB]; that of the binding, or 4096.
     parameters : mapping of str to float, optional
         Parameters by the binding's names and in its units; they are set at every reset that gives no others.
 
@@ -88,25 +70,22 @@ class FmiAsset:
         binding: Binding | str | os.PathLike[str],
         *,
         isolated: bool = True,
-        step_timeout: float = 10.0,
-        parameters: Mapping[str, float] | None = None,
+        step_timeout: float | None = None,
+        load_timeout: float | None = None,
+        memory_limit: float | None = None,
+        parameters: Values | None = None,
     ) -> None:
-        self._binding = binding if isinstance(binding, Binding) else load_binding(binding)
-        self._description = read_fmu(fmu_path)
-        self._isolated = isolated
-        if not (math.isfinite(step_timeout) and step_timeout > 0.0):
-            raise FmuInputError(
-                f"step_timeout must be a positive number of seconds, but is {step_timeout!r}."
-            )
-        self._step_timeout = step_timeout
-        self._exchange = Exchange(self._description, self._binding)
+        given = binding if isinstance(binding, Binding) else load_binding(binding)
+        self._description = read_fmu(fmu_path, given.binding.interface)
+        limits = limits_of(given, step_timeout, load_timeout, memory_limit)
+        self._exchange = Exchange(self._description, given)
+        self._housing = Housing(self._description, self._exchange.plan, limits, isolated=isolated)
+        self._binding = self._exchange.binding
         self._settings = self._exchange.settings(parameters or {})
-        self._parameters = {name: float(value) for name, value in (parameters or {}).items()}
-        self._instance: FmuInstance | WorkerInstance | None = None
-        self._release: Callable[[], object] = lambda: None
+        self._parameters = plain_values(parameters or {})
         self._phase: Literal["new", "ready", "broken", "closed"] = "new"
         self._index = 0
-        self._step_size = self._binding.step_size
+        self._step_size, self._interval = self._binding.step_size, self._binding.interval
         self._start_time = self._binding.binding.start_time
         self._recording = self.state_method == "replay"
         self._record: list[bytes] = []
@@ -117,7 +96,7 @@ class FmiAsset:
 
     @property
     def binding(self) -> Binding:
-        """The binding."""
+        """The binding, with arrays that are observed or recorded as their elements."""
         return self._binding
 
     @property
@@ -127,8 +106,8 @@ class FmiAsset:
 
     @property
     def time(self) -> float:
-        """Time of the asset [s]: start + i * step size, never accumulated."""
-        return self._start_time + self._index * self._step_size
+        """Time of the asset [s]: start + i * interval, never accumulated."""
+        return self._start_time + self._index * self._interval
 
     @property
     def step_index(self) -> int:
@@ -138,8 +117,12 @@ class FmiAsset:
     @property
     def state_method(self) -> StateMethod:
         """How `save_state` keeps the state: serialised by the FMU, or by replaying the recorded inputs."""
+        wanted = self._binding.binding.state
+        if wanted != "auto":
+            return wanted
         able = self._description.can_get_and_set_state and self._description.can_serialise_state
-        return "serialised" if able else "replay"
+        # A state in model exchange would have to hold our solver as well.
+        return "serialised" if able and self._description.interface == "co-simulation" else "replay"
 
     @property
     def log(self) -> tuple[tuple[str, str], ...]:
@@ -150,8 +133,29 @@ class FmiAsset:
     @property
     def worker_process_id(self) -> int | None:
         """Process number of the worker; None without one."""
-        instance = self._instance
+        instance = self._housing.instance
         return instance.process_id if isinstance(instance, WorkerInstance) and not instance.lost else None
+
+    @property
+    def worker_memory(self) -> int | None:
+        """Resident memory of the worker [bytes]; None without one."""
+        instance = self._housing.instance
+        return instance.memory if isinstance(instance, WorkerInstance) and not instance.lost else None
+
+    @property
+    def recorded_units(self) -> dict[str, str]:
+        """Units of `Observation.extra` by name."""
+        return dict(self._exchange.recorded_units)
+
+    def input_range(self, role: str, name: str) -> tuple[float, float]:
+        """Return the range of an input in the binding's unit: that of the FMU and of the binding together.
+
+        Raises
+        ------
+        BindingError
+            If the binding has no such input.
+        """
+        return self._exchange.input_range(role, name)
 
     def describe(self) -> dict[str, Any]:
         """Return what the FMU is and how it is bound, as plain records for a listing.
@@ -169,9 +173,13 @@ class FmiAsset:
         }
         for name, vector in self._binding.observation.items():
             roles.update(dict.fromkeys(vector.variables, f"observation.{name}"))
+        for name, port in self._binding.port.items():
+            for quantity, vector in port.quantities.items():
+                roles.update(dict.fromkeys(vector.variables, f"port.{name}.{quantity}"))
         return describe_fmu(self._description, roles) | {
             "binding": self._binding.name,
             "step_size": self._binding.step_size,
+            "decimation": self._binding.binding.decimation,
             "state_method": self.state_method,
         }
 
@@ -189,16 +197,17 @@ class FmiAsset:
 
     def close(self) -> None:
         """End the worker and remove its files; the asset can be opened again by `reset`."""
-        self._instance, self._phase = None, "closed"
-        self._release()
+        self._phase = "closed"
+        self._housing.close()
 
     def reset(
         self,
-        parameters: Mapping[str, float] | None = None,
+        parameters: Values | None = None,
         *,
-        control: Mapping[str, float] | None = None,
-        health: Mapping[str, float] | None = None,
-        load: Mapping[str, float] | None = None,
+        control: Values | None = None,
+        health: Values | None = None,
+        load: Values | None = None,
+        port: Values | None = None,
     ) -> None:
         """Go back to the start.
 
@@ -206,7 +215,7 @@ class FmiAsset:
         ----------
         parameters : mapping of str to float, optional
             Parameters in the binding's units; those of the constructor if absent. They stay for later resets.
-        control, health, load : mapping of str to float, optional
+        control, health, load, port : mapping of str to float, optional
             Inputs that hold already during initialisation. If none is given, the FMU's start values hold.
 
         Raises
@@ -220,16 +229,17 @@ class FmiAsset:
         """
         if parameters is not None:
             self._settings = self._exchange.settings(parameters)
-            self._parameters = {name: float(value) for name, value in parameters.items()}
+            self._parameters = plain_values(parameters)
         start = self._exchange.start_values()
-        given = self._exchange.place(start, control, health, load)
+        given = self._exchange.place(start, control, health, load, port)
         self._begin(start, with_inputs=given)
 
     def step(
         self,
-        control: Mapping[str, float] | None = None,
-        health: Mapping[str, float] | None = None,
-        load: Mapping[str, float] | None = None,
+        control: Values | None = None,
+        health: Values | None = None,
+        load: Values | None = None,
+        port: Values | None = None,
     ) -> Observation:
         """Make one communication step.
 
@@ -238,8 +248,8 @@ class FmiAsset:
 
         Parameters
         ----------
-        control, health, load : mapping of str to float
-            Inputs of this step.
+        control, health, load, port : mapping of str to float, or to a sequence for an array
+            Inputs of this step; those of a port are called `<port>.<quantity>`.
 
         Returns
         -------
@@ -262,9 +272,9 @@ class FmiAsset:
         instance = self._opened()
         request = instance.request
         before = bytes(request)
-        begin = self._start_time + self._index * self._step_size
+        begin = self._start_time + self._index * self._interval
         try:
-            self._exchange.place(request, control, health, load)
+            self._exchange.place(request, control, health, load, port)
             request[0] = begin
             request[1] = self._step_size
             instance.step()
@@ -300,11 +310,14 @@ class FmiAsset:
         FmuCallError
             If the FMU fails to save.
         """
-        if self._phase != "ready" or self._instance is None:
+        if self._phase != "ready" or self._housing.instance is None:
             raise FmuStateError("There is no state to save before the first reset or step.")
         if self.state_method == "serialised":
             try:
-                body = self._instance.save()
+                body = self._housing.instance.save()
+            except FmuCallError as error:
+                hint = 'If it cannot save its state, write `state = "replay"` into [binding] of its binding.'
+                self._fail(FmuCallError(f"{error.sentence} {hint}", error.messages), "saving the state")
             except FmuError as error:
                 self._fail(error, "saving the state")
         else:
@@ -313,11 +326,12 @@ class FmiAsset:
             method=self.state_method,
             fmu=self._description.sha256,
             index=self._index,
-            step_size=self._step_size,
+            step_size=self._interval,
             start_time=self._start_time,
             parameters=self._parameters,
             start_inputs=self._start_inputs,
-            inputs=bytes(self._instance.request)[16:],
+            inputs=bytes(self._housing.instance.request)[16:],
+            outputs=self._outputs_now(),
             body=body,
         ).to_bytes()
 
@@ -332,36 +346,35 @@ class FmiAsset:
         Raises
         ------
         FmuStateError
-            If it is damaged, or belongs to another FMU or step size.
+            If it is damaged, belongs to another FMU or step size, or the FMU gives other outputs than when it
+            was saved.
         FmuCallError, FmuWorkerError, FmuTimeoutError
             If the FMU fails.
         """
         saved = SavedState.from_bytes(content)
-        if saved.fmu != self._description.sha256:
-            raise FmuStateError(
-                f"The state was saved with another FMU than {self._description.path} (its hash differs); "
-                "use that one."
-            )
-        if (saved.step_size, saved.start_time) != (self._step_size, self._start_time):
-            raise FmuStateError("The state was saved with another step size or start time; use that binding.")
         width = 8 * self._exchange.plan.input_count
+        saved.refuse_if_foreign(
+            path=self._description.path,
+            fmu=self._description.sha256,
+            interval=self._interval,
+            start_time=self._start_time,
+            method=self.state_method,
+            width=width,
+        )
         replayed = saved.method == "replay"
-        if (
-            saved.method != self.state_method
-            or len(saved.inputs) != width
-            or len(saved.start_inputs) not in (0, width)
-            or (replayed and len(saved.body) != width * saved.index)
-        ):
-            raise FmuStateError(
-                "The saved state is damaged, or another binding was in use; use that binding."
-            )
-        self._settings = self._exchange.settings(saved.parameters)
-        self._parameters = dict(saved.parameters)
-        start = self._exchange.start_values()
-        if saved.start_inputs:
-            start[2:] = np.frombuffer(saved.start_inputs).tolist()
-        self._begin(start, with_inputs=bool(saved.start_inputs))
-        instance = self._instance
+        ready = (
+            self._phase == "ready" and self._housing.instance is not None and not self._housing.instance.lost
+        )
+        same = (plain_values(saved.parameters), saved.start_inputs) == (self._parameters, self._start_inputs)
+        # An instance that was initialised in the same way takes the state as it is: what an ensemble needs.
+        if replayed or not (ready and same):
+            self._settings = self._exchange.settings(saved.parameters)
+            self._parameters = plain_values(saved.parameters)
+            start = self._exchange.start_values()
+            if saved.start_inputs:
+                start[2:] = np.frombuffer(saved.start_inputs).tolist()
+            self._begin(start, with_inputs=bool(saved.start_inputs))
+        instance = self._housing.instance
         assert instance is not None
         try:
             if replayed:
@@ -371,14 +384,81 @@ class FmiAsset:
                 instance.restore(saved.body)
                 self._index = saved.index
                 memoryview(instance.request).cast("B")[16:] = saved.inputs
+            saved.refuse_other_outputs(self._outputs_now(), self._exchange.output_name)
         except FmuError as error:
             self._phase = "broken"
             self._fail(error, "restoring the state")
 
+    def fork(self) -> FmiAsset:
+        """Return another asset of the same FMU in the same state, with a worker of its own.
+
+        The FMU is not extracted again. Each of the two goes its own way from here.
+
+        Raises
+        ------
+        FmuStateError
+            If the asset is not open.
+        FmuError
+            As `save_state` and `restore_state`.
+        """
+        state = self.save_state()
+        other = self.sibling()
+        try:
+            other.restore_state(state)
+        except BaseException:
+            other.close()
+            raise
+        return other
+
+    def sibling(self, parameters: Values | None = None) -> FmiAsset:
+        """Return a new asset of the same FMU, binding and limits, without extracting the FMU again.
+
+        Parameters
+        ----------
+        parameters : mapping of str to float, optional
+            Parameters in the binding's units; those of this asset if absent.
+
+        Raises
+        ------
+        BindingError, FmuInputError
+            If a parameter is unknown or lies outside its range.
+        """
+        other = FmiAsset.__new__(FmiAsset)
+        other.__dict__.update(self.__dict__)
+        other._housing = self._housing.sibling()
+        other._phase, other._index = "new", 0
+        other._record, other._start_inputs = [], b""
+        other._log = deque(maxlen=_LOG_LENGTH)
+        if parameters is not None:
+            other._settings = other._exchange.settings(parameters)
+            other._parameters = plain_values(parameters)
+        return other
+
+    def renew(self) -> None:
+        """Free the FMU's instance, make another one in the same process, and go back to the start.
+
+        `reset` uses the FMU's own reset; this is what a batch of runs without it costs.
+
+        Raises
+        ------
+        FmuError
+            If the FMU fails.
+        """
+        instance = self._housing.instance
+        if isinstance(instance, WorkerInstance) and not instance.lost:
+            try:
+                instance.renew()
+            except FmuError as error:
+                self._fail(error, "making a new instance")
+            self._begin(self._exchange.start_values(), with_inputs=False, reset=False)
+        else:
+            self.close()
+            self.reset()
+
     def _replay(self, inputs: bytes) -> None:
-        instance = self._instance
+        instance = self._housing.instance
         assert instance is not None
-        instance.request[0], instance.request[1] = self.time, self._binding.step_size
+        instance.request[0], instance.request[1] = self.time, self._step_size
         memoryview(instance.request).cast("B")[16:] = inputs
         instance.step()
         self._index += 1
@@ -386,11 +466,14 @@ class FmiAsset:
 
     # ------------------------------------------------------------------ inside
 
-    def _begin(self, start: Sequence[float], *, with_inputs: bool) -> None:
+    def _begin(self, start: Sequence[float], *, with_inputs: bool, reset: bool = True) -> None:
         try:
-            instance = self._fresh()
+            instance = self._housing.instance
+            if reset or instance is None:
+                instance = self._housing.fresh()
+                self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
             instance.request[:] = list(start)
-            instance.initialise(self._binding.binding.start_time, self._settings, with_inputs=with_inputs)
+            instance.initialise(self._start_time, self._settings, with_inputs=with_inputs)
         except FmuError as error:
             self.close()
             self._fail(error, "the start")
@@ -399,7 +482,14 @@ class FmiAsset:
         self._start_inputs = bytes(instance.request)[16:] if with_inputs else b""
         self._phase = "ready"
 
-    def _opened(self) -> FmuInstance | WorkerInstance:
+    def _outputs_now(self) -> bytes:
+        """Return the outputs of this moment as the FMU gives them."""
+        instance = self._housing.instance
+        assert instance is not None
+        instance.read()
+        return bytes(instance.reply)
+
+    def _opened(self) -> Instance:
         """Return the instance, which is opened by its first use but never started again unasked."""
         if self._phase == "broken":
             raise FmuStateError("A state could not be restored; reset the asset to go on.")
@@ -407,32 +497,8 @@ class FmiAsset:
             raise FmuStateError("The asset is closed; reset it to start anew.")
         if self._phase == "new":
             self.reset()
-        instance = self._instance
+        instance = self._housing.instance
         assert instance is not None
-        return instance
-
-    def _fresh(self) -> FmuInstance | WorkerInstance:
-        """Return an instance as after its instantiation; never one that a fatal error has touched."""
-        if self._instance is not None and not self._instance.lost:
-            try:
-                self._instance.reset()
-                return self._instance
-            except FmuCallError:
-                pass  # an FMU that cannot be reset is instantiated anew
-        self.close()
-        folder = extract_fmu(self._description)
-        plan = replace(self._exchange.plan, folder=str(folder))
-        try:
-            instance = (
-                WorkerInstance(plan, step_timeout=self._step_timeout) if self._isolated else FmuInstance(plan)
-            )
-        except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
-        self._instance = instance
-        # Also at the end of the interpreter, or when the asset is forgotten without being closed.
-        self._release = weakref.finalize(self, _release, instance, folder)
-        self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
         return instance
 
     def _observation(self) -> Observation:
@@ -444,14 +510,15 @@ class FmiAsset:
                 more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
                 raise FmuOutputError(
                     f"The FMU {self._description.path} gave values that are not finite at "
-                    f"t = {self.time:g} s: {', '.join(bad[:5])}{more}.",
+                    f"t = {self.time:g} s: {', '.join(bad[:5])}{more}. Its inputs or its step size are "
+                    "probably beyond what it can compute; reset the asset or restore a state to go on.",
                     [text for _, text in self.log[-5:]],
                 )
         values, extra = self._exchange.read(block)
-        return Observation(values, self._start_time + self._index * self._step_size, extra)
+        return Observation(values, self._start_time + self._index * self._interval, extra)
 
     def _collect_log(self) -> None:
-        instance = self._instance
+        instance = self._housing.instance
         if instance is not None and instance.has_log and not instance.lost:
             for status, text in instance.take_log():
                 name = STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
@@ -460,15 +527,10 @@ class FmiAsset:
     def _fail(self, error: FmuError, what: str) -> NoReturn:
         """Raise the error with the FMU's file and the moment, and keep its messages."""
         self._log.extend(("Error", message) for message in error.messages)
-        if isinstance(error, FmuCallError | FmuWorkerError | TimeoutError):
+        if isinstance(error, FmuCallError | FmuWorkerError | FmuStateError | FmuMemoryError | TimeoutError):
+            tool = what == "the start" and self._description.needs_tool
+            hint = " It declares that it needs its authoring tool on this machine." if tool else ""
             raise type(error)(
-                f"{self._description.path}, {what}: {error.sentence}", error.messages
+                f"{self._description.path}, {what}: {error.sentence}{hint}", error.messages
             ) from error
         raise error
-
-
-def _release(instance: FmuInstance | WorkerInstance, folder: Path) -> None:
-    instance.close()
-    if isinstance(instance, FmuInstance):
-        forget_modules(str(folder))
-    shutil.rmtree(folder, ignore_errors=True)

@@ -2,40 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from .archive import UnitInfo, VariableInfo
+from .declared import UnitInfo, VariableInfo
 from .errors import BindingError
-
-Exponents = tuple[int, ...]
-_ONE: Exponents = (0, 0, 0, 0, 0, 0, 0, 0)
-# kg, m, s, A, K, mol, cd, rad
-_COMMON: dict[str, tuple[Exponents, float]] = {
-    "1": (_ONE, 1.0),
-    "%": (_ONE, 1e-2),
-    "percent": (_ONE, 1e-2),
-    "microstrain": (_ONE, 1e-6),
-    "m": ((0, 1, 0, 0, 0, 0, 0, 0), 1.0),
-    "mm": ((0, 1, 0, 0, 0, 0, 0, 0), 1e-3),
-    "m/s": ((0, 1, -1, 0, 0, 0, 0, 0), 1.0),
-    "m/s2": ((0, 1, -2, 0, 0, 0, 0, 0), 1.0),
-    "kg": ((1, 0, 0, 0, 0, 0, 0, 0), 1.0),
-    "g": ((1, 0, 0, 0, 0, 0, 0, 0), 1e-3),
-    "s": ((0, 0, 1, 0, 0, 0, 0, 0), 1.0),
-    "ms": ((0, 0, 1, 0, 0, 0, 0, 0), 1e-3),
-    "1/s": ((0, 0, -1, 0, 0, 0, 0, 0), 1.0),
-    "Hz": ((0, 0, -1, 0, 0, 0, 0, 0), 1.0),
-    "N": ((1, 1, -2, 0, 0, 0, 0, 0), 1.0),
-    "kN": ((1, 1, -2, 0, 0, 0, 0, 0), 1e3),
-    "N/m": ((1, 0, -2, 0, 0, 0, 0, 0), 1.0),
-    "Pa": ((1, -1, -2, 0, 0, 0, 0, 0), 1.0),
-    "MPa": ((1, -1, -2, 0, 0, 0, 0, 0), 1e6),
-    "K": ((0, 0, 0, 0, 1, 0, 0, 0), 1.0),
-    "rad": ((0, 0, 0, 0, 0, 0, 0, 1), 1.0),
-    "V": ((1, 2, -3, -1, 0, 0, 0, 0), 1.0),
-    "A": ((0, 0, 0, 1, 0, 0, 0, 0), 1.0),
-}
+from .unit_symbols import Meaning, meaning_of
 
 
 class Conversion(NamedTuple):
@@ -103,6 +76,28 @@ def conversion(
     return Conversion(source[1] / target[1], (source[2] - target[2]) / target[1])
 
 
+def contradictions(definitions: Sequence[UnitInfo]) -> list[str]:
+    """Return a sentence for every unit that an FMU defines otherwise than everybody else does."""
+    found = []
+    for definition in definitions:
+        common = meaning_of(definition.name)
+        if common is None or definition.exponents is None:
+            continue
+        # Radians are a dimension in FMI, but not in SI; "1/s" and "rad/s" are mixed up everywhere.
+        if definition.exponents[:-1] != common.exponents[:-1]:
+            found.append(f"The unit {definition.name!r} is defined with another dimension than usual.")
+        elif not (
+            math.isclose(definition.factor, common.factor, rel_tol=1e-6)
+            and math.isclose(definition.offset, common.offset, rel_tol=1e-6, abs_tol=1e-9)
+        ):
+            found.append(
+                f"The unit {definition.name!r} is defined with the factor {definition.factor:g} and the "
+                "offset "
+                f"{definition.offset:g}; usual are {common.factor:g} and {common.offset:g}."
+            )
+    return found
+
+
 def between(
     source: str | None,
     source_definitions: Sequence[UnitInfo],
@@ -127,20 +122,14 @@ def between(
         return IDENTITY if source == target else None
     if begin == end:
         return IDENTITY
-    if begin[0] != end[0]:
+    if begin.exponents != end.exponents:
         return None
-    return Conversion(begin[1] / end[1], (begin[2] - end[2]) / end[1])
+    return Conversion(begin.factor / end.factor, (begin.offset - end.offset) / end.factor)
 
 
-def meaning(unit: str, definitions: Sequence[UnitInfo]) -> tuple[Exponents, float, float] | None:
-    """Return what a unit means: SI exponents, factor and offset to SI; None if it is not known.
-
-    Units that are defined come first, then common ones.
-    """
+def meaning(unit: str, definitions: Sequence[UnitInfo]) -> Meaning | None:
+    """Return what a unit means in SI; None if it is not known. Units that are defined come first."""
     for definition in definitions:
         if definition.name == unit and definition.exponents is not None and definition.factor:
-            return definition.exponents, definition.factor, definition.offset
-    if unit in _COMMON:
-        exponents, factor = _COMMON[unit]
-        return exponents, factor, 0.0
-    return None
+            return Meaning(definition.exponents, definition.factor, definition.offset)
+    return meaning_of(unit)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -103,3 +104,15 @@ def published_library() -> Path:
     if not path.is_file():
         pytest.skip(f"the published strain library is not at {path}")
     return path
+
+
+@pytest.fixture(scope="session")
+def foreign_fmu(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Build FMUs of other conventions and misbehaviours from C: `foreign_fmu("ball2")` is a path."""
+    path = Path(__file__).parent / "fmu_asset" / "foreign" / "workshop.py"
+    specification = importlib.util.spec_from_file_location("foreign_workshop", path)
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module.Workshop(tmp_path_factory.mktemp("foreign"))

@@ -64,6 +64,10 @@ class InnerRoles:
     received: slice | None
 
 
+_TAKEN = ("state", "sensor_status", "step", "region", "sensor")
+"""What the truth of a run holds already."""
+
+
 class FmuAsset:
     """An FMU, or several coupled ones, as the mission flies them.
 
@@ -90,27 +94,29 @@ class FmuAsset:
         self._observation = observation
         self._load = dict(load)
         self._inner = inner
-        binding = session.binding
-        self._units = {
-            name: scalar.unit for name, scalar in [*binding.control.items(), *binding.monitor.items()]
-        }
+        recorded = session.recorded_units
+        taken = {*session.binding.control, *session.binding.observation, *_TAKEN}
+        self._names = {name: _plain_name(name, taken) for name in recorded}
+        self._units = {name: scalar.unit for name, scalar in session.binding.control.items()}
+        self._units |= {self._names[name]: unit for name, unit in recorded.items()}
 
     @property
     def units(self) -> Mapping[str, str]:
-        """Units of control inputs and monitors, as the binding has them."""
+        """Units of control inputs and of what is recorded beside the observations."""
         return self._units
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         """Make one communication step."""
         observation = self._session.step(control, health, self._load)
         sensed = observation.values[self._observation]
+        extra = {self._names[name]: value for name, value in observation.extra.items()}
         if self._inner is None:
-            return AssetReading(sensed, observation.extra)
+            return AssetReading(sensed, extra)
         state = {name: observation.extra[monitor] for name, monitor in self._inner.state.items()}
         if self._inner.received is not None:
             sensed = np.where(observation.values[self._inner.received] == 0.0, np.nan, sensed)
         free = observation.values[self._inner.observation]
-        return AssetReading(free, observation.extra, InnerTruth(state, sensed))
+        return AssetReading(free, extra, InnerTruth(state, sensed))
 
     def save_state(self) -> bytes:
         """Return the state of the FMU."""
@@ -216,13 +222,14 @@ class FmuSource:
         design = read_design(self._given[DESIGN_COPY], calibration, tailored=self._tailored)
         fmu = self._given[FMU_COPY]
         binding = load_binding(self._binding)
-        self._observed(binding)
-        self._inner_roles(binding)
         self._check_names(binding)
         if design is not None and self._scenario.asset.observation_model != "asset":
             check_wing_scenario(self._scenario, len(design.gauges.positions))
         if fmu is not None:
-            FmiAsset(fmu, binding, parameters=self.parameters())
+            # Only with the FMU it is known how many values an array has.
+            binding = FmiAsset(fmu, binding, parameters=self.parameters()).binding
+        self._observed(binding)
+        self._inner_roles(binding)
 
     def files(self) -> dict[str, bytes]:
         """Return binding, design, calibration and FMU as they are given.
@@ -263,7 +270,6 @@ class FmuSource:
         for name, path in self._given.items():
             if path is not None and not self._path(name).exists():
                 atomic_write_bytes(self._path(name), read_content(path))
-        self._observed(load_binding(self._path(BINDING_COPY)))
         hashes = {"binding": hash_file(self._path(BINDING_COPY))}
         hashes |= self._prepare_model(progress)
         if self._wing is not None and self._given[FMU_COPY] is None:
@@ -403,3 +409,12 @@ class FmuSource:
         start = 1.0 if self._calibration is None else self._calibration.mean("young_modulus_factor")
         e = self._scenario.asset.parameters.get("young_modulus_factor", start)
         return write_design_field(path, self._scenario, self._design, e, state, control)
+
+
+def _plain_name(name: str, taken: set[str]) -> str:
+    """Return a name under which a variable of an FMU can be stored: without `/`, and not taken."""
+    plain = "".join("_" if letter == "/" or not letter.isprintable() else letter for letter in name).strip()
+    while plain in taken or not plain:
+        plain += "_"
+    taken.add(plain)
+    return plain

@@ -178,7 +178,7 @@ class AssetSection(Section):
     file: str | None = None
     binding: str | None = None
     isolated: Flag = True
-    step_timeout: Positive = 60.0
+    step_timeout: Positive | None = None
     parameters: dict[str, Number] = Field(default_factory=dict)
     load: dict[str, Number] = Field(default_factory=dict)
     observation_model: Literal["design", "asset"] | None = None

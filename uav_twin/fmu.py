@@ -7,7 +7,10 @@ from typing import Annotated, Literal
 
 import typer
 
-fmu_app = typer.Typer(no_args_is_help=True, help="Build, describe and check FMUs.")
+from uav_twin.fmu_bind import bind
+from uav_twin.fmu_check import check
+
+fmu_app = typer.Typer(no_args_is_help=True, help="Build, describe, bind and check FMUs.")
 
 
 @fmu_app.command("build")
@@ -84,16 +87,5 @@ def info(
         console.print(table)
 
 
-@fmu_app.command("check")
-def check(file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)]) -> None:
-    """Check an FMU; exit code 1 if anything is wrong with it."""
-    from fmu_asset.check import check_fmu
-
-    result = check_fmu(file)
-    for problem in result.problems:
-        typer.secho(f"problem: {problem}", fg="red", err=True)
-    for warning in result.warnings:
-        typer.echo(f"warning: {warning}")
-    if not result.passed:
-        raise typer.Exit(1)
-    typer.echo(f"{file}: no problem found.")
+fmu_app.command("bind")(bind)
+fmu_app.command("check")(check)

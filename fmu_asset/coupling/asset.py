@@ -19,7 +19,8 @@ from ..errors import (
     FmuStateError,
     IterationError,
 )
-from ..session import FmiAsset, Observation
+from ..observation import Observation
+from ..session import FmiAsset
 from .layout import Layout
 from .roles import Roles, resolve_roles
 from .saved import CoupledState, wiring_hash
@@ -55,8 +56,8 @@ class CoupledAsset:
         and its magnitude.
     isolated : bool
         Whether each FMU runs in a worker process of its own.
-    step_timeout : float
-        Wall-clock limit of one step of one FMU [s].
+    step_timeout : float, optional
+        Wall-clock limit of one step of one FMU [s], instead of the binding's.
     parameters : mapping of str to float, optional
         Parameters by the binding's names and in its units.
 
@@ -81,7 +82,7 @@ class CoupledAsset:
         iterations: int = 1,
         tolerance: float = 1e-9,
         isolated: bool = True,
-        step_timeout: float = 10.0,
+        step_timeout: float | None = None,
         parameters: Mapping[str, float] | None = None,
     ) -> None:
         if algorithm not in ALGORITHMS:
@@ -100,6 +101,14 @@ class CoupledAsset:
         if loops and iterations == 1:
             raise AlgebraicLoopError(loop_sentence(loops))
         self._roles: Roles = resolve_roles(self._wiring, binding)
+        self._ranges = {
+            (role, name): (
+                -math.inf if item.minimum is None else item.minimum,
+                math.inf if item.maximum is None else item.maximum,
+            )
+            for role in INPUT_ROLES
+            for name, item in binding.inputs(role).items()
+        }
         self._phase: Literal["new", "ready", "broken", "closed"] = "new"
         self._index = 0
         self._layout = Layout(self._wiring, binding, self._roles)
@@ -119,6 +128,11 @@ class CoupledAsset:
     def binding(self) -> Binding:
         """The binding."""
         return self._binding
+
+    @property
+    def recorded_units(self) -> dict[str, str]:
+        """Units of `Observation.extra` by name."""
+        return {name: scalar.unit for name, scalar in self._binding.monitor.items()}
 
     @property
     def wiring(self) -> Wiring:
@@ -351,6 +365,12 @@ class CoupledAsset:
                     )
                 if not isinstance(value, int | float):
                     raise FmuInputError(f"{role}.{name} must be a number, but is {value!r}.")
+                low, high = self._ranges[role, name]
+                if value < low or value > high:
+                    raise FmuInputError(
+                        f"{role}.{name} = {value:g} lies outside {low:g} to {high:g}, its range in the "
+                        f"binding {self._binding.name}."
+                    )
                 for index, variable, conversion in entries:
                     self._held[index][variable] = float(conversion.to_fmu(value))
 
@@ -375,7 +395,7 @@ class CoupledAsset:
     def _named(self, error: FmuError, index: int) -> FmuError:
         return type(error)(f"component {self._layout.names[index]}: {error.sentence}", error.messages)
 
-    def _open(self, isolated: bool, step_timeout: float) -> list[FmiAsset]:
+    def _open(self, isolated: bool, step_timeout: float | None) -> list[FmiAsset]:
         assets = []
         for index, component in enumerate(self._wiring.structure.components):
             try:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from operator import itemgetter
 from typing import NamedTuple
 
-from ..binding import Binding, Header, Parameter, Scalar, Vector
+from ..binding import Binding, Header, Input, Parameter, Vector
 from ..errors import BindingError, CouplingError
 from ..units import IDENTITY, Conversion
 from .roles import Roles
@@ -191,7 +191,8 @@ class Layout:
         )
         return Binding(
             binding=header,
-            load={key: Scalar(variable=key, unit=unit(key)) for key in dict.fromkeys(inputs)},
+            limits=self._binding.limits,
+            load={key: Input(variable=key, unit=unit(key)) for key in dict.fromkeys(inputs)},
             parameter={key: Parameter(variable=key, unit=unit(key)) for key in dict.fromkeys(parameters)},
             observation={key: Vector(variables=(key,), unit=unit(key)) for key in self._outputs[index]},
         )

@@ -46,6 +46,16 @@ def resolve_roles(wiring: Wiring, binding: Binding) -> Roles:
     CouplingError
         If a component does not exist.
     """
+    for what, given in (
+        ("a decimation", binding.binding.decimation != 1),
+        ("ports", bool(binding.port)),
+        ("a table `record`", bool(binding.record.variables)),
+    ):
+        if given:
+            raise BindingError(
+                f"The binding {binding.name} of several FMUs has {what}, which only a binding of one FMU can "
+                "have; leave it out."
+            )
     return Roles(
         inputs={
             role: {

@@ -9,7 +9,7 @@ import time
 
 from pythonfmu import Boolean, Fmi2Causality, Fmi2Slave, Fmi2Variability, Integer, Real
 
-FINE, NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD, WANDER, TALK = range(8)
+FINE, NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD, WANDER, TALK, LOOP = range(9)
 
 
 class SpringMass(Fmi2Slave):
@@ -43,6 +43,9 @@ class SpringMass(Fmi2Slave):
             self.position = math.nan
         elif self.misbehaviour == SLEEP:
             time.sleep(60.0)
+        elif self.misbehaviour == LOOP:
+            while True:
+                pass
         elif self.misbehaviour == DIE:
             os.abort()
         elif self.misbehaviour == RAISE:

@@ -75,16 +75,21 @@ def test_numbers_that_are_none(repack: Repack, binding: Binding) -> None:
         FmiAsset(strange, binding).reset()
 
 
-def test_another_version(repack: Repack) -> None:
-    with pytest.raises(FmuUnsupportedError, match=r"FMI 3\.0; FMI 2\.0 co-simulation is needed"):
+def test_another_version(repack: Repack, binding: Binding) -> None:
+    with pytest.raises(FmuUnsupportedError, match=r"FMI 4\.0; FMI 1\.0, 2\.0 or 3\.0 is needed"):
+        read_fmu(repack(in_description(b'fmiVersion="2.0"', b'fmiVersion="4.0"')))
+    # What only pretends to be of another version cannot be read as such.
+    with pytest.raises(FmuFileError, match=r"The model description of .* cannot be read"):
         read_fmu(repack(in_description(b'fmiVersion="2.0"', b'fmiVersion="3.0"')))
-    with pytest.raises(FmuUnsupportedError, match=r"FMI 1\.0"):
-        read_fmu(repack(in_description(b'fmiVersion="2.0"', b'fmiVersion="1.0"')))
 
 
-def test_model_exchange_only(repack: Repack) -> None:
-    with pytest.raises(FmuUnsupportedError, match="model-exchange FMU without co-simulation"):
-        read_fmu(repack(in_description(b"<CoSimulation ", b"<ModelExchange ")))
+def test_no_interface_that_could_be_flown(repack: Repack, fmu: Path) -> None:
+    with pytest.raises(FmuUnsupportedError, match="offers neither co-simulation nor model exchange"):
+        read_fmu(repack(in_description(b"<CoSimulation ", b"<ScheduledExecution ")))
+    with pytest.raises(
+        FmuUnsupportedError, match=r"offers co-simulation only, but .* asks for model-exchange"
+    ):
+        read_fmu(fmu, "model-exchange")
 
 
 def test_another_platform(repack: Repack) -> None:

@@ -9,9 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fmu_asset.archive import UnitInfo, VariableInfo
-from fmu_asset.binding import Binding, expand, load_binding
-from fmu_asset.errors import BindingError
+from fmu_asset.binding import Binding, WorkerLimits, expand, load_binding
+from fmu_asset.errors import BindingError, FmuInputError
+from fmu_asset.housing import limits_of
+from fmu_asset.session import FmiAsset
 from fmu_asset.units import Conversion, conversion
+from fmu_asset.worker.client import Limits
 
 GOOD = """
 [binding]
@@ -61,7 +64,7 @@ def test_observations_keep_their_order(tmp_path: Path) -> None:
         ("step_size = 1.0", "step_size = 0.0", r"binding\.step_size is wrong"),
         ("step_size = 1.0", "step_size = nan", r"binding\.step_size is wrong"),
         ("step_size = 1.0", 'step_size = "1"', r"binding\.step_size is wrong"),
-        ("step_size = 1.0", 'step_size = 1.0\nfmi_version = "3.0"', r"binding\.fmi_version is wrong"),
+        ("step_size = 1.0", 'step_size = 1.0\nfmi_version = "4.0"', r"binding\.fmi_version is wrong"),
         ("[control.n]", "[controll.n]", r"the key 'controll' is unknown"),
         ('variable = "n"\n', "", r"the key 'control\.n\.variable' is missing"),
         ('unit = "mm"', "", r"the key 'observation\.tip\.unit' is missing"),
@@ -69,6 +72,17 @@ def test_observations_keep_their_order(tmp_path: Path) -> None:
         ("{9..11}", "{1..2}{1..2}", r"more than one range"),
         ('variable = "n"', "variable = 3", r"control\.n\.variable is wrong"),
         ("[control.n]", "[control.n", r"not valid TOML"),
+        ("step_size = 1.0", "step_size = 1.0\ndecimation = 0", r"binding\.decimation is wrong"),
+        ("step_size = 1.0", 'step_size = 1.0\nstate = "lost"', r"binding\.state is wrong"),
+        ("step_size = 1.0", 'step_size = 1.0\ninterface = "x"', r"binding\.interface is wrong"),
+        (
+            'variable = "n"',
+            'variable = "n"\nminimum = 2.0\nmaximum = 1.0',
+            r"control\.n is wrong: minimum 2 is larger than maximum 1",
+        ),
+        ("[control.n]", "[limits]\nmemory = 0.0\n[control.n]", r"limits\.memory is wrong"),
+        ("[control.n]", "[limits]\nspeed = 1.0\n[control.n]", r"the key 'limits\.speed' is unknown"),
+        ("[control.n]", "[record]\nvariables = [1]\n[control.n]", r"record\.variables\.0 is wrong"),
         (
             '[control.n]\nvariable = "n"',
             '[load.m]\nvariable="n"\nunit="1"\n[control.n]\nvariable = "n"',
@@ -141,3 +155,28 @@ def test_conversions_are_inverse(factor: float, offset: float, value: float) -> 
     scale = Conversion(factor, offset)
     there_and_back = scale.from_fmu(scale.to_fmu(value))
     assert there_and_back == pytest.approx(value, rel=1e-9, abs=1e-9 * (1.0 + abs(offset) / factor))
+
+
+def test_ranges_of_the_binding_narrow_those_of_the_fmu(fmu: Path, binding: Binding) -> None:
+    load_factor = binding.control["load_factor"]
+    narrow = binding.model_copy(
+        update={"control": {"load_factor": load_factor.model_copy(update={"minimum": 1.0, "maximum": 3.0})}}
+    )
+    asset = FmiAsset(fmu, narrow)
+    assert asset.input_range("control", "load_factor") == (1.0, 3.0)
+    with asset, pytest.raises(FmuInputError, match=r"control\.load_factor = 3\.5 lies outside .* 1 to 3"):
+        asset.step({"load_factor": 3.5})
+    outside = binding.model_copy(
+        update={"control": {"load_factor": load_factor.model_copy(update={"minimum": 40.0})}}
+    )
+    with pytest.raises(BindingError, match=r"The range of control\.load_factor .* lies outside that of"):
+        FmiAsset(fmu, outside)
+
+
+def test_limits_come_from_the_caller_then_from_the_binding(binding: Binding) -> None:
+    bound = binding.model_copy(update={"limits": WorkerLimits(step_time=3.0, memory=500.0)})
+    assert limits_of(bound, None, None, None) == Limits(3.0, Limits().load_time, 500.0)
+    assert limits_of(bound, 1.0, 2.0, None) == Limits(1.0, 2.0, 500.0)
+    for wrong in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(FmuInputError, match="memory_limit must be a positive number of MiB"):
+            limits_of(bound, None, None, wrong)

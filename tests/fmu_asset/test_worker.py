@@ -157,7 +157,7 @@ def test_an_interruption_leaves_no_stale_answer(
     with FmiAsset(spring_mass, spring_binding) as asset:
         asset.step({"push": 1.0})
         with monkeypatch.context() as patch:
-            patch.setattr("fmu_asset.worker.WorkerInstance._await", interrupt)
+            patch.setattr("fmu_asset.worker.client.WorkerInstance._await", interrupt)
             with pytest.raises(KeyboardInterrupt):
                 asset.step({"push": 2.0})
         with pytest.raises(FmuWorkerError, match="interrupted; reset the asset"):
@@ -273,12 +273,15 @@ def test_a_thousand_instances_in_one_process(fmu: Path) -> None:
     program = (
         "import sys, shutil\n"
         "from fmu_asset.archive import extract_fmu, read_fmu\n"
-        "from fmu_asset.instance import FmuInstance, Plan\n"
+        "from fmu_asset.instances import open_instance\n"
+        "from fmu_asset.instances.plan import Group, Plan\n"
         "fmu = read_fmu(sys.argv[1])\n"
         "folder = extract_fmu(fmu)\n"
-        "plan = Plan(str(folder), fmu.guid, fmu.model_identifier, 'wing', [0], [], [], [12], [], [])\n"
+        "inputs, outputs = (Group('Real', (0,), 1),), (Group('Real', (12,), 1),)\n"
+        "names = fmu.guid, fmu.model_identifier, 'wing'\n"
+        "plan = Plan(str(folder), 2, 'co-simulation', *names, inputs, outputs)\n"
         "for _ in range(1100):\n"
-        "    instance = FmuInstance(plan)\n"
+        "    instance = open_instance(plan)\n"
         "    instance.initialise(0.0, [], with_inputs=False)\n"
         "    instance.request[:] = [0.0, 1.0, 2.0]\n"
         "    instance.step()\n"

@@ -1,0 +1,313 @@
+"""What an FMU does when it is flown: the same twice, finite, resumable, at other steps, again and again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from reporting.progress import Progress
+
+from ..binding import INPUT_ROLES, Binding
+from ..declared import FmuDescription
+from ..errors import FmuCallError, FmuError, FmuInputError
+from ..layout import find, start_values
+from ..session import FmiAsset
+from ..units import conversion
+from .result import Finding, Verdict
+
+_STEPS = 6
+_SAME = 1e-9
+_CLOSE = 0.02
+_MUCH = 0.5
+_KIBIBYTE = 1024
+# What a long-lived process may grow by without being suspected: allocators keep some memory.
+_SMALL_GROWTH, _LARGE_GROWTH = 1.0, 16.0
+_NOISE = 1024 * _KIBIBYTE
+
+Inputs = dict[str, dict[str, Any]]
+Series = npt.NDArray[np.float64]
+
+
+class Flights:
+    """Flights of one FMU with one binding, each in a worker of its own.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU.
+    binding : Binding
+        The binding.
+    limits : mapping of str to float
+        `step_timeout`, `load_timeout` and `memory_limit` of `FmiAsset`, where they are given.
+    """
+
+    def __init__(self, description: FmuDescription, binding: Binding, limits: Mapping[str, float]) -> None:
+        self._description, self._binding, self._limits = description, binding, dict(limits)
+        # Whether it fits is found here, before anything is started.
+        self._asset()
+        self._base = self._base_inputs()
+
+    def checks(self, cycles: int, progress: Progress) -> Iterator[Finding]:
+        """Yield all findings; without a first flight the others are skipped.
+
+        Parameters
+        ----------
+        cycles : int
+            How many instances are made one after the other; 0 skips that.
+        progress : Progress
+            Shows the cycles.
+        """
+        others = {
+            "determinism": self._determinism,
+            "state": self._state,
+            "step size": self._step_size,
+            "range edges": self._edges,
+            "reset": self._reset,
+        }
+        try:
+            self._series = self._fly()
+        except FmuError as error:
+            yield Finding("first flight", "problem", _sentence(error))
+            for name in [*others, "instances"]:
+                yield Finding(name, "skipped", "It does not fly.")
+            return
+        step = self._binding.step_size
+        yield Finding(
+            "first flight",
+            "ok",
+            f"{_STEPS} steps of {step:g} s, {self._series.shape[1]} finite outputs.",
+        )
+        for name, check in others.items():
+            with progress.stage(f"Checking {name}"):
+                try:
+                    yield from check()
+                except FmuError as error:
+                    yield Finding(name, "problem", _sentence(error))
+        if cycles:
+            yield self._instances(cycles, progress)
+
+    # ------------------------------------------------------------------ flying
+
+    def _asset(self, **header: Any) -> FmiAsset:
+        changed = self._binding.model_copy(
+            update={"binding": self._binding.binding.model_copy(update=header)} if header else {}
+        )
+        return FmiAsset(
+            self._description.path,
+            changed,
+            step_timeout=self._limits.get("step_timeout"),
+            load_timeout=self._limits.get("load_timeout"),
+            memory_limit=self._limits.get("memory_limit"),
+        )
+
+    def _base_inputs(self) -> Inputs:
+        """Return the start values of the inputs in the binding's units."""
+        base: Inputs = {role: {} for role in INPUT_ROLES}
+        for role in INPUT_ROLES:
+            for name, item in getattr(self._binding, role).items():
+                place = find(self._description, item.variable, f"{role}.{name}", "input")
+                scale = conversion(item.unit, place.variable, self._description.units, where=f"{role}.{name}")
+                values = start_values(self._description, place.variable)
+                chosen = values if place.element is None else [values[place.element]]
+                given = [scale.from_fmu(value) for value in chosen]
+                base[role][name] = given if place.variable.shape and place.element is None else given[0]
+        return base
+
+    def _fly(self, asset: FmiAsset | None = None, steps: int = _STEPS) -> Series:
+        """Return the outputs (steps, n) of a flight at the start values, from the start."""
+        own = asset is None
+        asset = asset or self._asset()
+        try:
+            asset.reset(**self._base)
+            return np.array([_row(asset, self._base) for _ in range(steps)])
+        finally:
+            if own:
+                asset.close()
+
+    # ------------------------------------------------------------------ the checks
+
+    def _determinism(self) -> Iterator[Finding]:
+        again = self._fly()
+        if again.tobytes() == self._series.tobytes():
+            yield Finding("determinism", "ok", "Two flights in two processes are equal to the bit.")
+        else:
+            yield Finding(
+                "determinism",
+                "problem",
+                f"Two flights with the same inputs differ ({_difference(self._series, again)}): runs of "
+                "it are "
+                "not reproducible, and a state cannot be replayed.",
+            )
+
+    def _state(self) -> Iterator[Finding]:
+        with self._asset() as asset:
+            asset.reset(**self._base)
+            for _ in range(2):
+                asset.step(**self._base)
+            saved, method = asset.save_state(), asset.state_method
+            expected = np.array([_row(asset, self._base) for _ in range(_STEPS - 2)])
+        with self._asset() as other:
+            try:
+                other.restore_state(saved)
+                found = np.array([_row(other, self._base) for _ in range(_STEPS - 2)])
+            except FmuError as error:
+                yield Finding("state", "problem", _sentence(error))
+                return
+        if found.tobytes() != expected.tobytes():
+            hint = (
+                "it declares canGetAndSetFMUstate but keeps part of its state elsewhere; write "
+                '`state = "replay"` into the table [binding] of its binding'
+                if method == "serialised"
+                else "its outputs are not a function of its inputs"
+            )
+            yield Finding(
+                "state",
+                "problem",
+                "A flight that goes on from a saved state in a new process differs from the one that was "
+                "not "
+                f"interrupted ({_difference(expected, found)}): {hint}.",
+            )
+        elif method == "serialised":
+            yield Finding(
+                "state", "ok", f"Saved ({len(saved)} bytes), restored in a new process, equal to the bit."
+            )
+        else:
+            yield Finding(
+                "state",
+                "warning",
+                "Its state cannot be serialised; a mission is resumed by replaying the inputs, which is "
+                "equal "
+                "to the bit here.",
+            )
+
+    def _step_size(self) -> Iterator[Finding]:
+        header = self._binding.binding
+        with self._asset(step_size=header.step_size / 2.0, decimation=2 * header.decimation) as asset:
+            try:
+                halved = self._fly(asset)
+            except FmuCallError as error:
+                if self._description.can_vary_step:
+                    yield Finding(
+                        "step size",
+                        "problem",
+                        f"It declares that it takes any step size, but not {header.step_size / 2.0:g} s: "
+                        f"{_sentence(error)}",
+                    )
+                else:
+                    yield Finding(
+                        "step size",
+                        "warning",
+                        f"It takes {header.step_size:g} s only; `decimation` observes every n-th step.",
+                    )
+                return
+        scale = max(float(np.abs(self._series).max(initial=0.0)), 1e-300)
+        error_size = float(np.abs(halved - self._series).max(initial=0.0)) / scale
+        if error_size <= _SAME:
+            yield Finding("step size", "ok", "Half the step size gives the same outputs.")
+        else:
+            verdict: Verdict = "ok" if error_size <= _CLOSE else "warning"
+            advice = "" if verdict == "ok" else "; choose a smaller one"
+            if error_size > _MUCH:
+                advice = "; it counts steps rather than time, or the step is far too large"
+            yield Finding(
+                "step size",
+                verdict,
+                f"Half the step size changes the outputs by {100.0 * error_size:.2g} % of the "
+                f"largest{advice}.",
+            )
+
+    def _edges(self) -> Iterator[Finding]:
+        """Fly one step at the ends of each range."""
+        tried, refused = 0, []
+        with self._asset() as asset:
+            for role in INPUT_ROLES:
+                for name, item in getattr(self._binding, role).items():
+                    for value in self._ends(asset, role, name):
+                        tried += 1
+                        inputs = {kind: dict(values) for kind, values in self._base.items()}
+                        inputs[role][name] = value
+                        try:
+                            asset.reset(**self._base)
+                            asset.step(**inputs)
+                        except FmuError as error:
+                            refused.append(f"{item.variable} = {value:g} {item.unit}: {_sentence(error)}")
+        if refused:
+            yield Finding(
+                "range edges",
+                "warning",
+                f"{len(refused)} of {tried} ends of ranges fail, such as {refused[0]}",
+            )
+        elif tried:
+            yield Finding("range edges", "ok", f"{tried} ends of ranges give finite outputs.")
+        else:
+            yield Finding("range edges", "skipped", "No input has a range.")
+
+    def _ends(self, asset: FmiAsset, role: str, name: str) -> list[float]:
+        low, high = asset.input_range(role, name)
+        if isinstance(self._base[role][name], list):
+            return []
+        return [end for end in (low, high) if math.isfinite(end) and abs(end) < 1e9]
+
+    def _reset(self) -> Iterator[Finding]:
+        with self._asset() as asset:
+            first = self._fly(asset)
+            process = asset.worker_process_id
+            second = self._fly(asset)
+            if asset.worker_process_id != process:
+                yield Finding("reset", "warning", "It cannot be reset; every start takes a new process.")
+            elif first.tobytes() == second.tobytes():
+                yield Finding("reset", "ok", "After a reset it is as new, to the bit.")
+            else:
+                yield Finding(
+                    "reset",
+                    "problem",
+                    f"After a reset it is not as new ({_difference(first, second)}); its reset is of no use.",
+                )
+
+    def _instances(self, cycles: int, progress: Progress) -> Finding:
+        """Make, step and free instances in one process, and look at its memory."""
+        done = 0
+        try:
+            with self._asset() as asset, progress.stage("Making instances", cycles, "instances") as stage:
+                asset.reset(**self._base)
+                half = 0
+                for done in range(cycles):
+                    if done == cycles // 2:
+                        half = asset.worker_memory or 0
+                    asset.renew()
+                    asset.step(**self._base)
+                    stage.advance()
+                end = asset.worker_memory or 0
+        except FmuError as error:
+            return Finding(
+                "instances", "problem", f"Instance {done + 1} of {cycles} in one process: {_sentence(error)}"
+            )
+        growth = (end - half) / _KIBIBYTE / max(cycles - cycles // 2, 1)
+        text = f"{cycles} made and freed in one process; it grows by {max(growth, 0.0):.2g} KiB with each"
+        if end - half < _NOISE:
+            return Finding("instances", "ok", f"{text}.")
+        if growth > _LARGE_GROWTH:
+            return Finding("instances", "problem", f"{text}: it leaks.")
+        if growth > _SMALL_GROWTH:
+            return Finding("instances", "warning", f"{text}: it leaks a little.")
+        return Finding("instances", "ok", f"{text}.")
+
+
+def _row(asset: FmiAsset, inputs: Inputs) -> list[float]:
+    seen = asset.step(**inputs)
+    return [*seen.values.tolist(), *seen.extra.values()]
+
+
+def _difference(one: Series, two: Series) -> str:
+    at = np.flatnonzero(one.ravel() != two.ravel())
+    return f"first {one.flat[at[0]]!r}, then {two.flat[at[0]]!r}".replace("np.float64", "")
+
+
+def _sentence(error: FmuError | FmuInputError) -> str:
+    """Return the error in one line."""
+    more = f" The FMU says: {error.messages[-1]}" if error.messages else ""
+    return " ".join(f"{error.sentence}{more}".split())

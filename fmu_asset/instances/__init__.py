@@ -1,0 +1,25 @@
+"""One instance of an FMU in this process, for each FMI version and interface."""
+
+from __future__ import annotations
+
+from .base import FmuInstance
+from .plan import Plan
+
+
+def open_instance(plan: Plan) -> FmuInstance:
+    """Return a new instance of the plan's FMI version and interface.
+
+    Raises
+    ------
+    FmuCallError
+        If the binary cannot be loaded or the instance cannot be made.
+    """
+    if plan.interface == "model-exchange":
+        # Its solver is a library of its own; those who do not need it shall not load it.
+        from .model_exchange import MODEL_EXCHANGE
+
+        return MODEL_EXCHANGE[plan.fmi_version](plan)
+    from .co_simulation import CoSimulation1, CoSimulation2, CoSimulation3
+
+    kinds: dict[int, type[FmuInstance]] = {1: CoSimulation1, 2: CoSimulation2, 3: CoSimulation3}
+    return kinds[plan.fmi_version](plan)

@@ -1,0 +1,324 @@
+"""One instance of an FMU in this process: one batched set and get per step, whatever the FMI version.
+
+The worker process runs this; `FmiAsset` runs it directly when it is told not to isolate. Values travel in two
+blocks of doubles that are allocated once: `request` is time, step size, then all inputs; `reply` is all
+outputs. Integers and Booleans are doubles in the blocks.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from fmpy.fmi1 import FMICallException
+
+from ..errors import FmuCallError, FmuError, FmuStateError, FmuWorkerError
+from .block import Block
+from .messages import Mailbox
+from .plan import Group, Plan, Settings
+
+STATUS_NAMES = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
+WARNING, DISCARD, ERROR, FATAL, PENDING = 1, 2, 3, 4, 5
+_MESSAGES_IN_ERROR = 10
+
+_Calls = list[tuple[str, Callable[..., int], Block]]
+
+
+class FmuInstance(ABC):
+    """One instance; the subclasses speak the FMI versions.
+
+    Parameters
+    ----------
+    plan : Plan
+        What is exchanged.
+
+    Attributes
+    ----------
+    request, reply : ctypes array of double
+        The blocks; see the module.
+
+    Raises
+    ------
+    FmuCallError
+        If the binary cannot be loaded or the instance cannot be made.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self.request = (ctypes.c_double * (2 + plan.input_count))()
+        self.reply = (ctypes.c_double * max(plan.output_count, 1))()
+        self._plan = plan
+        self._substeps = plan.substeps
+        self._mailbox = Mailbox(plan.instance_name)
+        self._lost = False
+        self._phase = "instantiated"
+        with _guarded_directory():
+            try:
+                self._fmu = self._instantiate(plan, self._mailbox)
+            except Exception as error:
+                messages = self._texts()
+                self._mailbox.close()
+                raise FmuCallError(_why_not_instantiated(error), messages) from error
+        self._component = self._fmu.component
+        self._set = self._blocks("Set", plan.inputs, self.request, 2)
+        self._get = self._blocks("Get", plan.outputs, self.reply, 0)
+
+    # ------------------------------------------------------------------ what an FMI version says
+
+    @abstractmethod
+    def _instantiate(self, plan: Plan, mailbox: Mailbox) -> Any:
+        """Return fmpy's object, instantiated."""
+
+    @abstractmethod
+    def _function(self, name: str) -> Callable[..., int]:
+        """Return a C function such as SetReal, with the types that fmpy has given it."""
+
+    @abstractmethod
+    def _initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+        """Bring the instance to its first communication point."""
+
+    @abstractmethod
+    def _advance(self, begin: float, size: float) -> None:
+        """Make one communication step; the inputs are set."""
+
+    def _send(self) -> None:
+        """Set the inputs of the request block."""
+        self._exchange(self._set, sending=True)
+
+    def _free(self) -> None:
+        """Terminate and free the instance."""
+        if self._phase == "stepping":
+            try:
+                self._fmu.terminate()
+            except FMICallException as error:
+                if error.status == FATAL:
+                    return
+        self._fmu.freeInstance()
+
+    # ------------------------------------------------------------------ what the twin asks
+
+    def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+        """Set parameters, and inputs if wanted, and bring the instance to its first communication point.
+
+        Parameters
+        ----------
+        start_time : float
+            Start time [s].
+        parameters : Settings
+            What is set before initialisation.
+        with_inputs : bool
+            Whether the inputs of the request block are set, instead of the FMU's own start values.
+
+        Raises
+        ------
+        FmuCallError
+            If a call fails, or the FMU logs an error on the way.
+        """
+        errors = self._mailbox.errors
+        with self._calls("initialisation"):
+            self._initialise(start_time, parameters, with_inputs=with_inputs)
+            self._phase = "stepping"
+        if self._mailbox.errors > errors:
+            raise FmuCallError("The FMU refused its initialisation.", self._texts())
+
+    def step(self) -> None:
+        """Make the step that the request block describes; the reply block then holds the outputs.
+
+        Raises
+        ------
+        FmuCallError
+            If a call returns Discard, Error or Fatal.
+        FmuWorkerError
+            If the instance was lost to an earlier fatal error.
+        """
+        if self._lost:
+            raise FmuWorkerError("The instance was lost to a fatal error; reset the asset to go on.")
+        self._send()
+        begin, size = self.request[0], self.request[1]
+        if self._substeps == 1:
+            self._advance(begin, size)
+        else:
+            self._advance_many(begin, size)
+        self._exchange(self._get, sending=False)
+
+    def _advance_many(self, begin: float, size: float) -> None:
+        for number in range(self._plan.substeps):
+            try:
+                self._advance(begin + number * size, size)
+            except FmuError as error:
+                if number == 0:
+                    raise
+                # Between two observations it cannot go back to the last one.
+                self._lost = True
+                raise type(error)(
+                    f"{error.sentence} It was step {number + 1} of the {self._plan.substeps} between two "
+                    "observations: reset the asset or restore a state to go on.",
+                    error.messages,
+                ) from error
+
+    def read(self) -> None:
+        """Read the outputs of this moment into the reply block."""
+        with self._calls("reading the outputs"):
+            self._exchange(self._get, sending=False)
+
+    def save(self) -> bytes:
+        """Return the serialised FMU state."""
+        fmu = self._fmu
+        with self._calls("saving the state"):
+            state = fmu.getFMUState()
+            try:
+                return bytes(fmu.serializeFMUState(state))
+            finally:
+                fmu.freeFMUState(state)
+
+    def restore(self, content: bytes) -> None:
+        """Restore a serialised FMU state.
+
+        Raises
+        ------
+        FmuCallError
+            If a call fails.
+        FmuStateError
+            If the FMU refuses the state in its log.
+        """
+        fmu, errors = self._fmu, self._mailbox.errors
+        with self._calls("restoring the state"):
+            state = fmu.deserializeFMUState(content)
+            try:
+                fmu.setFMUState(state)
+            finally:
+                fmu.freeFMUState(state)
+        if self._mailbox.errors > errors:
+            raise FmuStateError("The FMU refused the state.", self._texts())
+
+    def reset(self) -> None:
+        """Bring the instance back to the moment after its instantiation."""
+        with self._calls("reset"):
+            if self._phase == "stepping":
+                self._fmu.terminate()
+            self._fmu.reset()
+            self._phase = "instantiated"
+
+    def take_log(self) -> list[tuple[int, str]]:
+        """Return and forget the messages that the FMU has logged: status and text."""
+        return self._mailbox.take()
+
+    @property
+    def has_log(self) -> bool:
+        """Whether there are messages."""
+        return self._mailbox.filled
+
+    @property
+    def lost(self) -> bool:
+        """Whether a fatal error has made the instance unusable."""
+        return self._lost
+
+    def close(self) -> None:
+        """Free the instance; one that was lost to a fatal error is left alone, since freeing it can crash."""
+        self._mailbox.close()
+        if self._lost:
+            return
+        self._lost = True
+        with _guarded_directory():
+            self._free()
+
+    # ------------------------------------------------------------------ inside
+
+    def _blocks(self, verb: str, groups: tuple[Group, ...], doubles: Any, begin: int) -> _Calls:
+        calls = []
+        for group in groups:
+            name = f"{verb}{group.kind}"
+            block = Block(self._plan.fmi_version, self._component, group, doubles, begin)
+            calls.append((name, self._function(name), block))
+            begin += group.count
+        return calls
+
+    def _apply(self, parameters: Settings) -> None:
+        for kind, reference, values in parameters:
+            doubles = (ctypes.c_double * len(values))(*values)
+            group = Group(kind, (reference,), len(values))
+            self._exchange(self._blocks("Set", (group,), doubles, 0), sending=True)
+
+    def _exchange(self, calls: _Calls, *, sending: bool) -> None:
+        for name, function, block in calls:
+            if sending and not block.direct:
+                block.to_fmu()
+            status = function(*block.arguments)
+            if status > WARNING:
+                raise self._call_error(
+                    f"fmi{self._plan.fmi_version}{name}",
+                    status,
+                    "setting inputs" if sending else "reading outputs",
+                )
+            if not (sending or block.direct):
+                block.from_fmu()
+
+    @contextmanager
+    def _calls(self, what: str) -> Iterator[None]:
+        if self._lost:
+            raise FmuWorkerError("The instance was lost to a fatal error; reset the asset to go on.")
+        with _guarded_directory():
+            try:
+                yield
+            except FMICallException as error:
+                raise self._call_error(str(error.function), int(error.status), what) from error
+
+    def _call_error(self, function: str, status: int, what: str) -> FmuCallError:
+        name = STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
+        if status == PENDING:
+            self._lost = True
+            after = "asynchronous steps are not supported; export it to step synchronously"
+        elif not 0 <= status < FATAL:
+            self._lost = True
+            after = "the instance is lost; reset the asset or restore a state"
+        elif status == DISCARD:
+            after = "the FMU did not accept it and stays where it was; other inputs or a smaller step may do"
+        else:
+            # What the standard still allows then is not worth the trouble: another instance is made.
+            self._lost = True
+            after = "its values are no longer to be trusted; reset the asset or restore a state"
+        return FmuCallError(f"{function} returned {name} in {what}: {after}.", self._texts())
+
+    def _texts(self) -> list[str]:
+        return [text for _, text in self.take_log()][-_MESSAGES_IN_ERROR:]
+
+
+def _why_not_instantiated(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    text = text.rpartition(".so: ")[2]  # without our folder
+    if "shared library" in str(error):
+        return (
+            f"The FMU's binary cannot be loaded on this machine ({text.removesuffix('.')}); it was built for "
+            "another processor or system, or it needs a library that is not installed."
+        )
+    if "undefined symbol" in text:
+        return f"The FMU's binary lacks a function that its FMI version requires ({text}); export it again."
+    return f"The FMU could not be instantiated ({text.removesuffix('.')})."
+
+
+def forget_modules(folder: str) -> None:
+    """Take what an FMU in Python has imported from its folder out of this process.
+
+    Otherwise the next FMU with a module of the same name, or the caller, would be given that module, and the
+    folder is about to be removed. Instances that still run keep what they have.
+    """
+    inside = folder.rstrip(os.sep) + os.sep
+    sys.path[:] = [entry for entry in sys.path if not (entry + os.sep).startswith(inside)]
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", None) or "").startswith(inside):
+            del sys.modules[name]
+
+
+@contextmanager
+def _guarded_directory() -> Iterator[None]:
+    """Come back to the working directory, wherever the FMU or fmpy goes."""
+    here = Path.cwd()
+    try:
+        yield
+    finally:
+        os.chdir(here)

@@ -1,0 +1,83 @@
+"""A part of a block of doubles that is exchanged with an FMU in one call of one base type."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+from .plan import Group
+
+# Enumerations are integers in FMI 1 and 2 and Int64 in FMI 3; see `archive.exchange_kind`.
+_C_TYPES: dict[tuple[int, str], Any] = {
+    (1, "Real"): ctypes.c_double,
+    (1, "Integer"): ctypes.c_int,
+    (1, "Boolean"): ctypes.c_ubyte,
+    (2, "Real"): ctypes.c_double,
+    (2, "Integer"): ctypes.c_int,
+    (2, "Boolean"): ctypes.c_int,
+    (3, "Float64"): ctypes.c_double,
+    (3, "Float32"): ctypes.c_float,
+    (3, "Int8"): ctypes.c_int8,
+    (3, "UInt8"): ctypes.c_uint8,
+    (3, "Int16"): ctypes.c_int16,
+    (3, "UInt16"): ctypes.c_uint16,
+    (3, "Int32"): ctypes.c_int32,
+    (3, "UInt32"): ctypes.c_uint32,
+    (3, "Int64"): ctypes.c_int64,
+    (3, "UInt64"): ctypes.c_uint64,
+    (3, "Boolean"): ctypes.c_bool,
+}
+
+
+class Block:
+    """Variables of one base type within a block of doubles.
+
+    Parameters
+    ----------
+    fmi_version : int
+        1, 2 or 3.
+    component : pointer
+        The instance.
+    group : Group
+        The variables.
+    doubles : ctypes array of double
+        The block.
+    begin : int
+        Where the group begins in it.
+
+    Attributes
+    ----------
+    arguments : tuple
+        What the C function takes.
+    direct : bool
+        Whether the FMU reads and writes the block itself, so that nothing is to be converted.
+    """
+
+    def __init__(self, fmi_version: int, component: Any, group: Group, doubles: Any, begin: int) -> None:
+        kind = _C_TYPES[fmi_version, group.kind]
+        self._doubles, self._begin, self._count = doubles, begin, group.count
+        self._convert = float if kind is ctypes.c_float else int
+        self.direct = kind is ctypes.c_double
+        if self.direct and group.count:
+            self._values = (kind * group.count).from_buffer(doubles, 8 * begin)
+        else:
+            self._values = (kind * group.count)()
+        references = (ctypes.c_uint * len(group.references))(*group.references)
+        # FMI 1 declares its Booleans as char.
+        values = (
+            (ctypes.c_char * group.count).from_buffer(self._values)
+            if kind is ctypes.c_ubyte
+            else self._values
+        )
+        counted = (group.count,) if fmi_version == 3 else ()
+        self.arguments: tuple[Any, ...] = (component, references, len(group.references), values, *counted)
+
+    def to_fmu(self) -> None:
+        """Convert the doubles for the FMU."""
+        for index in range(self._count):
+            self._values[index] = self._convert(self._doubles[self._begin + index])
+
+    def from_fmu(self) -> None:
+        """Convert what the FMU gave to doubles."""
+        for index in range(self._count):
+            self._doubles[self._begin + index] = float(self._values[index])

@@ -1,0 +1,100 @@
+"""What FMUs log: every message reaches the instance whose name it carries."""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import os
+from collections import deque
+from typing import Any
+
+from fmpy import calloc, free
+from fmpy.fmi1 import (
+    fmi1CallbackAllocateMemoryTYPE,
+    fmi1CallbackFreeMemoryTYPE,
+    fmi1CallbackFunctions,
+    fmi1CallbackLoggerTYPE,
+)
+from fmpy.fmi2 import (
+    fmi2CallbackAllocateMemoryTYPE,
+    fmi2CallbackFreeMemoryTYPE,
+    fmi2CallbackFunctions,
+    fmi2CallbackLoggerTYPE,
+)
+from fmpy.logging import addLoggerProxy
+
+_LONGEST_LOG = 1000
+
+# fmpy's native proxy, which formats the messages of C FMUs, knows one logger in a process.
+_mailboxes: dict[bytes, Mailbox] = {}
+_instance_numbers = itertools.count(1)
+_ERROR, _FATAL = 3, 4
+
+
+def _log(_: object, instance_name: bytes, status: int, category: bytes, message: bytes) -> None:
+    mailbox = _mailboxes.get(instance_name or b"")
+    if mailbox is not None:
+        mailbox.log(None, status, category, message)
+
+
+_LOGGER_1, _LOGGER_2 = fmi1CallbackLoggerTYPE(_log), fmi2CallbackLoggerTYPE(_log)
+
+
+class Mailbox:
+    """The messages of one instance.
+
+    Parameters
+    ----------
+    wish : str
+        Name of the instance; made unique in the process.
+
+    Attributes
+    ----------
+    name : str
+        The unique name.
+    errors : int
+        How many messages were errors so far.
+    """
+
+    def __init__(self, wish: str) -> None:
+        self.name = f"{wish}-{os.getpid()}-{next(_instance_numbers)}"
+        self._messages: deque[tuple[int, str]] = deque(maxlen=_LONGEST_LOG)
+        self.errors = 0
+        _mailboxes[self.name.encode()] = self
+
+    def log(self, _: object, status: int, category: bytes, message: bytes) -> None:
+        """Take a message."""
+        self.errors += status in (_ERROR, _FATAL)
+        self._messages.append((int(status), (message or b"").decode("utf-8", "replace").rstrip()))
+
+    @property
+    def filled(self) -> bool:
+        """Whether there are messages."""
+        return bool(self._messages)
+
+    def take(self) -> list[tuple[int, str]]:
+        """Return and forget the messages: status and text."""
+        messages = list(self._messages)
+        self._messages.clear()
+        return messages
+
+    def close(self) -> None:
+        """Take no more messages."""
+        _mailboxes.pop(self.name.encode(), None)
+
+
+def callbacks(fmi_version: int) -> Any:
+    """Return new callbacks for FMI 1 or 2, whose logger knows all mailboxes."""
+    if fmi_version == 1:
+        given = fmi1CallbackFunctions()
+        given.logger = _LOGGER_1
+        given.allocateMemory = fmi1CallbackAllocateMemoryTYPE(calloc)
+        given.freeMemory = fmi1CallbackFreeMemoryTYPE(free)
+        given.stepFinished = None
+    else:
+        given = fmi2CallbackFunctions()
+        given.logger = _LOGGER_2
+        given.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
+        given.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
+    addLoggerProxy(ctypes.byref(given))
+    return given

@@ -1,0 +1,291 @@
+"""Model exchange of FMI 1.0, 2.0 and 3.0 as if it were co-simulation: fmpy's models and CVODE."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from fmpy.fmi1 import FMICallException, FMU1Model
+from fmpy.fmi2 import FMU2Model
+from fmpy.fmi3 import FMU3Model
+
+from ..errors import FmuCallError
+from .base import FmuInstance
+from .co_simulation import slave_arguments
+from .messages import Mailbox, callbacks
+from .plan import Plan, Settings
+from .solver import Solver
+
+_DEFAULT_TOLERANCE = 1e-6
+_MOST_EVENT_ITERATIONS = 100
+_MOST_EVENTS_IN_A_STEP = 10_000
+
+
+class ModelExchange(FmuInstance):
+    """A model-exchange instance with its solver; inputs are held over a communication step.
+
+    Inputs that differ from the last ones are an event at the communication point, and the solver starts again
+    there; without a change it keeps its step size and order.
+    """
+
+    _solver: Solver | None = None
+    _next_event: float | None = None
+    _sent: bytes | None = None
+    # What fmpy calls these depends on the FMI version.
+    _derivatives = "getDerivatives"
+    _nominals = "getNominalsOfContinuousStates"
+
+    # ------------------------------------------------------------------ what an FMI version says
+
+    @abstractmethod
+    def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+        """Initialise until the first event iteration."""
+
+    @abstractmethod
+    def _update_once(self) -> tuple[bool, bool, float | None]:
+        """Iterate once over an event: whether more is needed, whether to end, next time event."""
+
+    def _enter_event_mode(self) -> None:
+        self._fmu.enterEventMode()
+
+    def _enter_continuous_time_mode(self) -> None:
+        self._fmu.enterContinuousTimeMode()
+
+    def _completed_step(self) -> tuple[bool, bool]:
+        """Return whether the FMU wants an event, and whether it wants to end."""
+        event, end = self._fmu.completedIntegratorStep()
+        return bool(event), bool(end)
+
+    def _functions(self) -> dict[str, Callable[..., Any]]:
+        fmu = self._fmu
+        return {
+            "get_x": fmu.getContinuousStates,
+            "set_x": fmu.setContinuousStates,
+            "get_dx": getattr(fmu, self._derivatives),
+            "get_z": fmu.getEventIndicators,
+            "get_nominals": getattr(fmu, self._nominals),
+            "set_time": fmu.setTime,
+        }
+
+    # ------------------------------------------------------------------ the same for all
+
+    def _initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+        self._close_solver()
+        self._start(start_time, parameters, with_inputs=with_inputs)
+        self._iterate_event(start_time)
+        self._sent = bytes(self.request)[16:] if with_inputs else None
+
+    def _send(self) -> None:
+        """Send inputs that have changed, as an event."""
+        now = bytes(self.request)[16:]
+        if now == self._sent:
+            return
+        with self._calls("setting inputs"):
+            self._enter_event_mode()
+            super()._send()
+            self._sent = now
+            self._iterate_event(self.request[0])
+            if self._solver is not None:
+                self._solver.reset(self.request[0])
+
+    def _advance(self, begin: float, size: float) -> None:
+        end = begin + size
+        with self._calls(f"the step from t = {begin:g} s"):
+            if self._solver is None:
+                self._solver = Solver(
+                    start_time=begin,
+                    largest_step=size,
+                    tolerance=self._plan.tolerance or _DEFAULT_TOLERANCE,
+                    states=self._plan.states,
+                    event_indicators=self._plan.event_indicators,
+                    functions=self._functions(),
+                )
+            time = begin
+            for _ in range(_MOST_EVENTS_IN_A_STEP):
+                time = self._advance_to_event(self._solver, time, end, 1e-12 * size)
+                if time >= end:
+                    return
+        self._lost = True
+        raise FmuCallError(
+            f"The FMU had {_MOST_EVENTS_IN_A_STEP} events in the step from t = {begin:g} s and is at "
+            f"t = {time:g} s; its events probably pile up. Reset the asset, and try a smaller step_size.",
+            self._texts(),
+        )
+
+    def _advance_to_event(self, solver: Solver, time: float, end: float, close: float) -> float:
+        """Integrate to the end or to the next event, and handle that; return the time reached."""
+        due = self._next_event
+        target = end if due is None or due >= end - close else max(due, time)
+        event = False
+        if target > time + close:
+            try:
+                event, time = solver.advance(time, target)
+            except RuntimeError as error:
+                self._lost = True
+                raise FmuCallError(
+                    f"The solver could not integrate the FMU in the step from t = {time:g} s ({error}); "
+                    "reset "
+                    "the asset, and try a smaller step_size or another tolerance in the binding.",
+                    self._texts(),
+                ) from error
+        if not event and abs(time - end) <= close:
+            time = end
+        self._fmu.setTime(time)
+        if self._plan.completed_step:
+            wanted, finished = self._completed_step()
+            self._refuse_end(finished, time)
+            event = event or wanted
+        if event or (due is not None and time >= due - close):
+            self._enter_event_mode()
+            self._iterate_event(time)
+            solver.reset(time)
+        return time
+
+    def _iterate_event(self, time: float) -> None:
+        """Update the discrete states until they are settled, and go on in continuous time."""
+        for _ in range(_MOST_EVENT_ITERATIONS):
+            more, finished, following = self._update_once()
+            self._refuse_end(finished, time)
+            if not more:
+                break
+        else:
+            self._lost = True
+            raise FmuCallError(
+                f"The FMU's discrete states do not settle at t = {time:g} s: {_MOST_EVENT_ITERATIONS} event "
+                "iterations were made; the instance is lost.",
+                self._texts(),
+            )
+        self._next_event = following if following is None or math.isfinite(following) else None
+        self._enter_continuous_time_mode()
+
+    def _refuse_end(self, finished: bool, time: float) -> None:
+        if finished:
+            self._lost = True
+            raise FmuCallError(
+                f"The FMU asked to end the simulation at t = {time:g} s; it cannot be flown further.",
+                self._texts(),
+            )
+
+    def _close_solver(self) -> None:
+        if self._solver is not None:
+            self._solver.close()
+        self._solver = self._next_event = self._sent = None
+
+    def reset(self) -> None:
+        """Bring the instance back to the moment after its instantiation."""
+        self._close_solver()
+        super().reset()
+
+    def _free(self) -> None:
+        self._close_solver()
+        super()._free()
+
+
+class ModelExchange1(ModelExchange):
+    """FMI 1.0 model exchange; it has no modes."""
+
+    _nominals = "getNominalContinuousStates"
+
+    def _instantiate(self, plan: Plan, mailbox: Mailbox) -> Any:
+        fmu = FMU1Model(**slave_arguments(plan, mailbox))
+        fmu.instantiate(functions=callbacks(1), loggingOn=True)
+        return fmu
+
+    def _function(self, name: str) -> Callable[..., int]:
+        function: Callable[..., int] = getattr(self._fmu.dll, f"{self._plan.model_identifier}_fmi{name}")
+        return function
+
+    def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+        self._fmu.setTime(start_time)
+        self._apply(parameters)
+        if with_inputs:
+            FmuInstance._send(self)
+        converged, _, _, finished, due, time = self._fmu.initialize()
+        self._refuse_end(finished, start_time)
+        self._first: tuple[bool, float | None] | None = (not converged, time if due else None)
+
+    def _update_once(self) -> tuple[bool, bool, float | None]:
+        if self._first is not None:
+            # The initialisation was the first iteration.
+            (more, due), self._first = self._first, None
+            return more, False, due
+        converged, _, _, finished, due_defined, time = self._fmu.eventUpdate()
+        return not converged, finished, time if due_defined else None
+
+    def _enter_event_mode(self) -> None:
+        pass
+
+    def _enter_continuous_time_mode(self) -> None:
+        pass
+
+    def _completed_step(self) -> tuple[bool, bool]:
+        return bool(self._fmu.completedIntegratorStep()), False
+
+    def reset(self) -> None:
+        """Refuse: FMI 1.0 model exchange cannot be reset, so that the asset makes a new instance."""
+        raise FmuCallError("FMI 1.0 model exchange has no reset.")
+
+    def _free(self) -> None:
+        self._close_solver()
+        if self._phase == "stepping":
+            with suppress(FMICallException):
+                self._fmu.terminate()
+        self._fmu.freeInstance()
+
+
+class ModelExchange2(ModelExchange):
+    """FMI 2.0 model exchange."""
+
+    def _instantiate(self, plan: Plan, mailbox: Mailbox) -> Any:
+        fmu = FMU2Model(**slave_arguments(plan, mailbox))
+        fmu.instantiate(callbacks=callbacks(2), loggingOn=True)
+        return fmu
+
+    def _function(self, name: str) -> Callable[..., int]:
+        function: Callable[..., int] = getattr(self._fmu.dll, f"fmi2{name}")
+        return function
+
+    def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+        fmu = self._fmu
+        fmu.setupExperiment(startTime=start_time, tolerance=self._plan.tolerance)
+        self._apply(parameters)
+        fmu.enterInitializationMode()
+        if with_inputs:
+            FmuInstance._send(self)
+        fmu.exitInitializationMode()
+
+    def _update_once(self) -> tuple[bool, bool, float | None]:
+        more, finished, _, _, due, time = self._fmu.newDiscreteStates()
+        return more, finished, time if due else None
+
+
+class ModelExchange3(ModelExchange):
+    """FMI 3.0 model exchange."""
+
+    _derivatives = "getContinuousStateDerivatives"
+
+    def _instantiate(self, plan: Plan, mailbox: Mailbox) -> Any:
+        fmu = FMU3Model(**slave_arguments(plan, mailbox))
+        fmu.instantiate(loggingOn=True, logMessage=mailbox.log)
+        return fmu
+
+    def _function(self, name: str) -> Callable[..., int]:
+        function: Callable[..., int] = getattr(self._fmu.dll, f"fmi3{name}")
+        return function
+
+    def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+        self._apply(parameters)
+        self._fmu.enterInitializationMode(tolerance=self._plan.tolerance, startTime=start_time)
+        if with_inputs:
+            FmuInstance._send(self)
+        self._fmu.exitInitializationMode()
+
+    def _update_once(self) -> tuple[bool, bool, float | None]:
+        more, finished, _, _, due, time = self._fmu.updateDiscreteStates()
+        return more, finished, time if due else None
+
+
+MODEL_EXCHANGE: dict[int, type[ModelExchange]] = {1: ModelExchange1, 2: ModelExchange2, 3: ModelExchange3}

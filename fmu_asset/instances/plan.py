@@ -1,0 +1,96 @@
+"""What an instance exchanges with its FMU: plain values, sent to a worker as JSON."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Literal, Self
+
+Interface = Literal["co-simulation", "model-exchange"]
+
+Settings = list[tuple[str, int, list[float]]]
+"""FMI base type, value reference, values: one for a scalar, all elements for an array."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Variables of one base type, set or read in one call.
+
+    Attributes
+    ----------
+    kind : str
+        FMI base type: Real, Integer, Boolean; Float64, Int32, ... in FMI 3.
+    references : tuple of int
+        Value references, in the order of the block.
+    count : int
+        Number of values; more than references if there are arrays.
+    """
+
+    kind: str
+    references: tuple[int, ...]
+    count: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What an instance is and what it exchanges.
+
+    Attributes
+    ----------
+    folder : str
+        Where the FMU is extracted.
+    fmi_version : int
+        1, 2 or 3.
+    interface : {"co-simulation", "model-exchange"}
+        How the FMU is run.
+    guid, model_identifier, instance_name : str
+        As FMI wants them.
+    inputs, outputs : tuple of Group
+        What is set and read at every step, in the order of the request and of the reply block.
+    substeps : int
+        Communication steps of the FMU between two observations.
+    tolerance : float or None
+        Relative tolerance, for the FMU's solver or, in model exchange, for ours.
+    states, event_indicators : int
+        Numbers of continuous states and event indicators (model exchange).
+    completed_step : bool
+        Whether the FMU wants to hear of completed integrator steps (model exchange).
+    """
+
+    folder: str
+    fmi_version: int
+    interface: Interface
+    guid: str
+    model_identifier: str
+    instance_name: str
+    inputs: tuple[Group, ...]
+    outputs: tuple[Group, ...]
+    substeps: int = 1
+    tolerance: float | None = None
+    states: int = 0
+    event_indicators: int = 0
+    completed_step: bool = False
+
+    @property
+    def input_count(self) -> int:
+        """Number of input values."""
+        return sum(group.count for group in self.inputs)
+
+    @property
+    def output_count(self) -> int:
+        """Number of output values."""
+        return sum(group.count for group in self.outputs)
+
+    def to_json(self) -> str:
+        """Return the plan as JSON."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str | bytes) -> Self:
+        """Return the plan that `to_json` wrote."""
+        record = json.loads(text)
+        for side in ("inputs", "outputs"):
+            record[side] = tuple(
+                Group(group["kind"], tuple(group["references"]), group["count"]) for group in record[side]
+            )
+        return cls(**record)

@@ -1,0 +1,119 @@
+"""SUNDIALS CVODE through fmpy, with the failures and the memory that fmpy's wrapper lets slip."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from typing import Any
+
+from fmpy.fmi1 import FMICallException
+from fmpy.sundials import CVodeSolver
+from fmpy.sundials.libraries import sundials_core
+from fmpy.sundials.nvector_serial import N_VDestroy_Serial
+
+from .base import DISCARD
+
+_MOST_INTERNAL_STEPS = 100_000
+
+for _name in ("SUNLinSolFree", "SUNMatDestroy", "SUNContext_Free"):
+    getattr(sundials_core, _name).argtypes = [ctypes.c_void_p]
+
+
+class _HeldInputs:
+    """Inputs do not change between communication points."""
+
+    def apply(self, time: float) -> None:
+        """Leave them."""
+
+
+class Solver(CVodeSolver):  # type: ignore[misc]
+    """Backward differentiation with root finding for one model-exchange instance.
+
+    Parameters
+    ----------
+    start_time : float
+        Where to begin [s].
+    largest_step : float
+        Limit of internal steps [s], so that an event indicator that changes sign twice is not missed for
+        long.
+    tolerance : float
+        Relative; absolute ones are this times the nominal values.
+    states, event_indicators : int
+        Numbers of continuous states and event indicators.
+    functions : mapping of str to callable
+        `get_x`, `set_x`, `get_dx`, `get_z`, `get_nominals`, `set_time` of fmpy's model.
+    """
+
+    def __init__(
+        self,
+        *,
+        start_time: float,
+        largest_step: float,
+        tolerance: float,
+        states: int,
+        event_indicators: int,
+        functions: dict[str, Callable[..., Any]],
+    ) -> None:
+        self._failure: FMICallException | None = None
+        self._open = True
+        super().__init__(
+            nx=states,
+            nz=event_indicators,
+            input=_HeldInputs(),
+            startTime=start_time,
+            maxStep=largest_step,
+            relativeTolerance=tolerance,
+            maxNumSteps=_MOST_INTERNAL_STEPS,
+            **functions,
+        )
+
+    # An exception that leaves a ctypes callback is printed and forgotten, and CVODE goes on with rubbish.
+
+    def f(self, t: float, y: Any, ydot: Any, user_data: Any) -> int:
+        """Return the right-hand side; 1 asks CVODE for a smaller step, -1 ends the integration."""
+        return self._guarded(super().f, t, y, ydot, user_data)
+
+    def g(self, t: float, y: Any, gout: Any, user_data: Any) -> int:
+        """Return the event indicators."""
+        return self._guarded(super().g, t, y, gout, user_data)
+
+    def _guarded(self, function: Callable[..., int], *arguments: Any) -> int:
+        try:
+            return function(*arguments)
+        except FMICallException as error:
+            self._failure = error
+            return 1 if error.status == DISCARD else -1
+
+    def advance(self, begin: float, end: float) -> tuple[bool, float]:
+        """Integrate until `end` or an event; return whether there was one, and the time reached.
+
+        Raises
+        ------
+        FMICallException
+            If the FMU failed.
+        RuntimeError
+            If CVODE failed.
+        """
+        self._failure = None
+        try:
+            event, _, reached = self.step(begin, end)
+        except Exception as error:
+            if self._failure is not None:
+                raise self._failure from error
+            raise RuntimeError(self.error_info[3] if self.error_info else str(error)) from error
+        return event, reached
+
+    def close(self) -> None:
+        """Free what fmpy's wrapper does not: the vectors, the matrix, the linear solver and the context."""
+        if not self._open:
+            return
+        super().__del__()
+        sundials_core.SUNLinSolFree(self.LS)
+        sundials_core.SUNMatDestroy(self.A)
+        N_VDestroy_Serial(self.x)
+        N_VDestroy_Serial(self.abstol)
+        sundials_core.SUNContext_Free(ctypes.byref(self.sunctx))
+        self._open = False
+
+    def __del__(self) -> None:
+        """Leave it to `close`."""

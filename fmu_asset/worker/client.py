@@ -1,0 +1,276 @@
+"""The twin's side: the calls of an instance, answered by a worker process."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import select
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from .. import errors
+from ..errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
+from ..instances.plan import Plan, Settings
+from .guard import resident_memory
+from .process import CLOSE_LIMIT, WorkerProcess
+from .protocol import FAILURE, HEADER, LARGEST_MESSAGE, QUICK, RESULT, Operation, look, receive, send
+
+_MEBIBYTE = 1024**2
+_GLANCE = 0.05
+"""Seconds between two looks at the memory of a worker that is at work."""
+_OPENING, _INITIALISING, _RESETTING = "loading and instantiation", "initialisation", "reset"
+_RENEWING = "freeing the instance and making another"
+_LOADING = (_OPENING, _INITIALISING, _RESETTING, _RENEWING)
+_ERRORS: Mapping[str, type[FmuError]] = {
+    kind.__name__: kind
+    for kind in vars(errors).values()
+    if isinstance(kind, type) and issubclass(kind, FmuError)
+}
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a worker may take.
+
+    Attributes
+    ----------
+    step_time : float
+        Wall clock for a step, reading, saving or restoring a state [s].
+    load_time : float
+        Wall clock for loading, instantiation, initialisation and reset [s].
+    memory : float
+        Resident memory [MiB].
+    """
+
+    step_time: float = 60.0
+    load_time: float = 60.0
+    memory: float = 4096.0
+
+
+class WorkerInstance:
+    """The same calls as `FmuInstance`, answered by a worker process.
+
+    Parameters
+    ----------
+    plan : Plan
+        What is exchanged.
+    scratch : Path
+        Folder of the worker alone; it is removed when the worker ends.
+    limits : Limits
+        What it may take.
+
+    Attributes
+    ----------
+    request, reply : ctypes array of double
+        The blocks; see `instances`.
+
+    Raises
+    ------
+    FmuWorkerError
+        If the worker cannot be started.
+    FmuCallError
+        If the FMU cannot be instantiated.
+    """
+
+    def __init__(self, plan: Plan, scratch: Path, *, limits: Limits) -> None:
+        self.request = (ctypes.c_double * (2 + plan.input_count))()
+        self.reply = (ctypes.c_double * max(plan.output_count, 1))()
+        self._request = memoryview(self.request).cast("B")
+        self._reply = memoryview(self.reply).cast("B")
+        self._header = bytearray(HEADER.size)
+        self._header_view = memoryview(self._header)
+        self._step_header = HEADER.pack(Operation.STEP, 0, len(self._request))
+        self._limits = limits
+        self._folder = scratch
+        self._logged = False
+        self._lost = False
+        # An exception between question and answer, such as an interruption, leaves the two out of step.
+        self._busy = False
+        self._process = WorkerProcess(scratch)
+        self._out, self._in = self._process.outgoing, self._process.incoming
+        self._next_glance = 0.0
+        self._first_wait = 1000.0 * min(limits.step_time, _GLANCE)
+        self._poll = select.poll()
+        self._poll.register(self._in, select.POLLIN | select.POLLHUP)
+        try:
+            self._call(Operation.OPEN, plan.to_json().encode(), _OPENING, limits.load_time)
+        except BaseException:
+            self.close()
+            raise
+
+    # The next seven have the meaning of their namesakes in FmuInstance.
+
+    def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+        """Set parameters and inputs and initialise."""
+        setting = {
+            "start_time": start_time,
+            "parameters": parameters,
+            "inputs": bytes(self._request[16:]).hex() if with_inputs else "",
+        }
+        self._call(Operation.INITIALISE, json.dumps(setting).encode(), _INITIALISING, self._limits.load_time)
+
+    def step(self) -> None:
+        """Make the step that the request block describes."""
+        what = "the step"
+        self._begin()
+        try:
+            send(self._out, self._step_header, self._request)
+        except BrokenPipeError:
+            raise self._died(what) from None
+        look(self._poll)
+        kind, length = self._await(what, self._limits.step_time)
+        if kind == RESULT and length == len(self._reply):
+            self._fill(self._reply, what)
+            self._busy = False
+        elif kind == FAILURE:
+            self._fail(length, what)
+        else:
+            raise self._died(what)
+        if time.monotonic() > self._next_glance:
+            self._check_memory(what)
+
+    def read(self) -> None:
+        """Read the outputs of this moment."""
+        content = self._call(Operation.READ, b"", "reading the outputs", self._limits.step_time)
+        self._reply[:] = content
+
+    def save(self) -> bytes:
+        """Return the serialised FMU state."""
+        return self._call(Operation.SAVE, b"", "saving the state", self._limits.step_time)
+
+    def restore(self, content: bytes) -> None:
+        """Restore a serialised FMU state."""
+        self._call(Operation.RESTORE, content, "restoring the state", self._limits.step_time)
+
+    def reset(self) -> None:
+        """Bring the instance back to the moment after its instantiation."""
+        self._call(Operation.RESET, b"", _RESETTING, self._limits.load_time)
+
+    def take_log(self) -> list[tuple[int, str]]:
+        """Return and forget the messages that the FMU has logged: status and text."""
+        if not self._logged or self.lost:
+            return []
+        self._logged = False
+        content = json.loads(self._call(Operation.LOG, b"", "reading the log", self._limits.step_time))
+        return [(int(status), str(text)) for status, text in content]
+
+    def renew(self) -> None:
+        """Free the instance and make a new one in the same process."""
+        self._call(Operation.RENEW, b"", _RENEWING, self._limits.load_time)
+
+    @property
+    def has_log(self) -> bool:
+        """Whether there are messages."""
+        return self._logged
+
+    @property
+    def lost(self) -> bool:
+        """Whether worker or instance is gone."""
+        return self._lost or self._busy
+
+    @property
+    def process_id(self) -> int:
+        """Process number of the worker."""
+        return self._process.number
+
+    @property
+    def memory(self) -> int:
+        """Resident memory of the worker [bytes]; 0 if it is gone."""
+        return resident_memory(self._process.number) or 0
+
+    def close(self) -> None:
+        """End the worker, kindly at first, and remove its folder."""
+        if self._out < 0:
+            return
+        kindly = not (self._lost or self._busy)
+        if kindly:
+            with contextlib.suppress(BrokenPipeError):
+                send(self._out, HEADER.pack(Operation.CLOSE, 0, 0))
+        self._lost = True
+        self._process.close_pipes()
+        self._out = self._in = -1
+        self._process.end(CLOSE_LIMIT if kindly else 0.0)
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _call(self, operation: Operation, content: bytes, what: str, limit: float) -> bytes:
+        self._begin()
+        try:
+            send(self._out, HEADER.pack(operation, 0, len(content)), content)
+        except BrokenPipeError:
+            raise self._died(what) from None
+        if operation in QUICK:
+            look(self._poll)
+        kind, length = self._await(what, limit)
+        if kind == FAILURE:
+            self._fail(length, what)
+        answer = bytearray(length)
+        self._fill(memoryview(answer), what)
+        self._busy = False
+        self._check_memory(what)
+        return bytes(answer)
+
+    def _begin(self) -> None:
+        if self._lost or self._busy:
+            raise FmuWorkerError("The FMU's worker is gone or was interrupted; reset the asset to go on.")
+        self._busy = True
+
+    def _await(self, what: str, limit: float) -> tuple[int, int]:
+        # The first wait covers the usual step; a longer one is a chance to look at the worker's memory.
+        if not self._poll.poll(self._first_wait):
+            self._await_long(what, limit)
+        self._fill(self._header_view, what)
+        kind, logged, length = HEADER.unpack(self._header)
+        if kind not in (RESULT, FAILURE) or length > LARGEST_MESSAGE:
+            raise self._died(what)
+        self._logged = self._logged or logged != 0
+        return kind, length
+
+    def _await_long(self, what: str, limit: float) -> None:
+        deadline = time.monotonic() + limit - self._first_wait / 1000.0
+        while True:
+            self._check_memory(what)
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                break
+            if self._poll.poll(1000.0 * min(left, _GLANCE)):
+                return
+        self._lost = True
+        self._process.kill()
+        name = "load_time" if what in _LOADING else "step_time"
+        raise FmuTimeoutError(
+            f"The FMU took longer than {limit:g} s for {what}; its worker was stopped. If it is only slow, "
+            f"give it more `{name}` in the table [limits] of its binding; otherwise it hangs."
+        )
+
+    def _check_memory(self, what: str) -> None:
+        self._next_glance = time.monotonic() + 5.0 * _GLANCE
+        used, limit = self.memory, self._limits.memory * _MEBIBYTE
+        if used > limit:
+            self._lost = True
+            self._process.kill()
+            raise FmuMemoryError(
+                f"The FMU took {used / _MEBIBYTE:.0f} MiB of memory during {what}, more than the limit of "
+                f"{self._limits.memory:g} MiB; its worker was stopped. If it needs that much, "
+                "give it more `memory` in the table [limits] of its binding; otherwise it leaks."
+            )
+
+    def _fill(self, target: memoryview, what: str) -> None:
+        if not receive(self._in, target):
+            raise self._died(what)
+
+    def _fail(self, length: int, what: str) -> None:
+        content = bytearray(length)
+        self._fill(memoryview(content), what)
+        self._busy = False
+        name, sentence, messages, lost = json.loads(content)
+        self._lost = self._lost or bool(lost)
+        self._logged = False
+        raise _ERRORS.get(name, FmuWorkerError)(sentence, messages)
+
+    def _died(self, what: str) -> FmuWorkerError:
+        self._lost = True
+        return self._process.death(what)

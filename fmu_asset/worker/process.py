@@ -1,0 +1,153 @@
+"""A worker process as the twin starts, watches and ends it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from ..errors import FmuWorkerError
+from .protocol import OWN_FAILURE, PIPES_GONE
+
+CLOSE_LIMIT = 2.0
+"""Seconds that a worker has to end by itself."""
+
+_MEANINGS = {
+    "SIGSEGV": "the FMU's code touched memory that is not its own",
+    "SIGBUS": "the FMU's code touched memory that is not its own",
+    "SIGABRT": "the FMU's code gave up with abort()",
+    "SIGFPE": "the FMU's code divided an integer by zero or trapped a floating-point error",
+    "SIGILL": "the FMU's binary was built for another processor",
+    "SIGXFSZ": "the FMU wrote more than 2 GiB to one file",
+    "SIGKILL": "somebody killed it, or the system ran out of memory",
+}
+_REMEDY = "Reset the asset, or resume the run, to go on; if it happens again, the FMU is at fault."
+
+
+class WorkerProcess:
+    """The process and its two pipes.
+
+    Parameters
+    ----------
+    folder : Path
+        Scratch folder: the working directory, and where its output goes.
+
+    Attributes
+    ----------
+    outgoing, incoming : int
+        The twin's ends of the pipes; -1 once closed.
+
+    Raises
+    ------
+    FmuWorkerError
+        If it cannot be started.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        their_in, self.outgoing = os.pipe()
+        self.incoming, their_out = os.pipe()
+        root = str(Path(__file__).parents[2])
+        program = (
+            "import sys; sys.path.append(sys.argv[1]); from fmu_asset.worker.server import serve; "
+            "serve(int(sys.argv[2]), int(sys.argv[3]), sys.argv[4])"
+        )
+        # One thread: the matrices are small, and results do not depend on the number of cores.
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        environment["PYTHONDONTWRITEBYTECODE"] = "1"
+        arguments = [root, str(their_in), str(their_out), str(folder)]
+        try:
+            with (folder / "worker.log").open("wb") as log:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-P", "-c", program, *arguments],
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    cwd=folder,
+                    env=environment,
+                    pass_fds=(their_in, their_out),
+                    # A group of its own, so that what the FMU starts ends with it.
+                    process_group=0,
+                )
+        except OSError as error:
+            os.close(self.outgoing)
+            os.close(self.incoming)
+            raise FmuWorkerError(f"The worker process could not be started ({error}).") from error
+        finally:
+            os.close(their_in)
+            os.close(their_out)
+
+    @property
+    def number(self) -> int:
+        """Process number."""
+        return self._process.pid
+
+    def kill(self) -> None:
+        """End it, and whatever the FMU has started, at once."""
+        if self._process.returncode is None:
+            # Before it is reaped: its number, which is that of its group, cannot belong to anybody else yet.
+            with contextlib.suppress(OSError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.kill()
+            self._process.wait()
+
+    def end(self, limit: float) -> None:
+        """Wait for its end, and kill what is left then."""
+        self._await_end(limit)
+        self.kill()
+
+    def close_pipes(self) -> None:
+        """Close the twin's ends, which is how a worker learns that it is not needed any more."""
+        if self.outgoing >= 0:
+            os.close(self.outgoing)
+            os.close(self.incoming)
+            self.outgoing = self.incoming = -1
+
+    def death(self, what: str) -> FmuWorkerError:
+        """Return the error that says how it died."""
+        ended = self._await_end(CLOSE_LIMIT)
+        self.kill()
+        code = self._process.returncode
+        if not ended:
+            how = "closed its pipe, or wrote something else into it"
+        elif code < 0:
+            name = {item.value: item.name for item in signal.Signals}.get(-code, "a real-time signal")
+            meaning = f": {_MEANINGS[name]}" if name in _MEANINGS else ""
+            how = f"was ended by signal {-code} ({name}){meaning}"
+        elif code == PIPES_GONE:
+            how = "could not answer: the FMU's code closed files that are not its own"
+        elif code == OWN_FAILURE:
+            how = "failed outside the FMU"
+        else:
+            how = f"ended with exit status {code}: the FMU's code ended its own process"
+        return FmuWorkerError(
+            f"During {what} the worker process of the FMU {how}. {_REMEDY}", self._last_words()
+        )
+
+    def _await_end(self, limit: float) -> bool:
+        """Return whether it ended in time; it is not reaped yet."""
+        deadline = time.monotonic() + limit
+        options = os.WEXITED | os.WNOHANG | os.WNOWAIT
+        while True:
+            try:
+                if os.waitid(os.P_PID, self._process.pid, options) is not None:
+                    return True
+            except ChildProcessError:
+                return True
+            if time.monotonic() >= deadline:
+                return False
+            time.sleep(0.002)
+
+    def _last_words(self) -> list[str]:
+        """Return the last lines of its output; of a crash of Python's, not the trace of our own code."""
+        with contextlib.suppress(OSError):
+            with (self._folder / "worker.log").open("rb") as file:
+                file.seek(max(file.seek(0, os.SEEK_END) - 4000, 0))
+                text = file.read().decode("utf-8", "replace")
+            text = text.partition("Fatal Python error")[0]
+            return [line for line in text.splitlines() if line.strip()][-5:]
+        return []

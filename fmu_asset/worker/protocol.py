@@ -1,0 +1,80 @@
+"""What twin and worker say to each other.
+
+Two pipes carry binary messages: a header (operation or kind, whether there are log messages, length), then
+the payload. A step is the request block of an instance one way and the reply block the other, without copies.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import struct
+import time
+from enum import IntEnum
+
+HEADER = struct.Struct("<HHQ")
+LARGEST_MESSAGE = 2**34
+"""Bytes; a header that announces more does not come from the other side's program."""
+
+
+class Operation(IntEnum):
+    """What the twin asks."""
+
+    STEP = 1
+    OPEN = 2
+    INITIALISE = 3
+    READ = 4
+    SAVE = 5
+    RESTORE = 6
+    RESET = 7
+    LOG = 8
+    RENEW = 9
+    CLOSE = 10
+
+
+QUICK = frozenset({Operation.STEP, Operation.READ, Operation.SAVE, Operation.RESTORE})
+"""What is asked often and answered at once: both sides look again for a moment before they sleep."""
+
+RESULT, FAILURE = 1, 2
+OWN_FAILURE, PIPES_GONE = 70, 71
+"""Exit statuses of a worker whose own program failed, or whose pipes were closed by the FMU."""
+
+# Waking a process that sleeps on a pipe costs as much as a whole step. Whoever awaits the other side of a
+# step therefore looks again for a moment before it sleeps, if there is a processor for each of the two.
+_LOOK_AGAIN = 2.5e-4
+_PROCESSORS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def receive(descriptor: int, target: memoryview) -> bool:
+    """Fill `target`; return False if the other side is gone."""
+    filled = 0
+    while filled < len(target):
+        count = os.readv(descriptor, [target[filled:]])
+        if count == 0:
+            return False
+        filled += count
+    return True
+
+
+def send(descriptor: int, *parts: bytes | bytearray | memoryview) -> None:
+    """Write all parts.
+
+    Raises
+    ------
+    BrokenPipeError
+        If the other side is gone.
+    """
+    total = sum(len(part) for part in parts)
+    sent = os.writev(descriptor, parts)
+    if sent < total:
+        rest = memoryview(b"".join(parts))[sent:]
+        while rest:
+            rest = rest[os.write(descriptor, rest) :]
+
+
+def look(poll: select.poll) -> None:
+    """Return as soon as there is something to read, or after a moment without."""
+    if _PROCESSORS > 1:
+        end = time.monotonic() + _LOOK_AGAIN
+        while not poll.poll(0) and time.monotonic() < end:
+            pass

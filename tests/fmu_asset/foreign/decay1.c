@@ -1,0 +1,5 @@
+/* FMI 1.0 model exchange: x' = u - k x. */
+#include "model.h"
+enum { X, U, K };
+void model_start(Model *m) { m->r[X] = 1.0; m->r[K] = 1.0; }
+void model_derivatives(Model *m, double *dx) { dx[0] = m->r[U] - m->r[K] * m->r[X]; }

@@ -1,0 +1,149 @@
+/* FMI 2.0 co-simulation that misbehaves in the way that -D says, in the third step unless it does so earlier
+   (and only while the file named by HOSTILE_FLAG exists, if that is set): otherwise an integrator. */
+#include <fcntl.h>
+#include <math.h>
+#include <signal.h>
+#include <stdio.h>
+#include <unistd.h>
+#include "model.h"
+enum { Y, U, DAMAGE, FACTOR };
+#ifndef AFTER
+#define AFTER 2 /* steps that go well */
+#endif
+
+void model_start(Model *m) { m->r[FACTOR] = 1.0; }
+static void hang(void) { for (volatile long k = 0;; k++) {} }
+static void *volatile kept; /* so that the compiler does not leave the memory out */
+static void take(size_t size) { kept = memset(malloc(size), 1, size); }
+static void crash(void) { *(volatile int *)8 = 1; }
+
+#if defined CRASH_AT_LOAD
+__attribute__((constructor)) static void load(void) { crash(); }
+#elif defined HANG_AT_LOAD
+__attribute__((constructor)) static void load(void) { hang(); }
+#elif defined EXIT_AT_LOAD
+__attribute__((constructor)) static void load(void) { exit(4); }
+#elif defined MISSING_LIBRARY_FUNCTION
+void function_that_no_library_has(void);
+__attribute__((constructor)) static void load(void) { function_that_no_library_has(); }
+#endif
+
+void *frame_instance(Model *m) {
+#ifdef NO_INSTANCE
+    model_say(m, ERROR, "no licence");
+    return NULL;
+#endif
+    return m;
+}
+static double hidden; /* of the process, not of the state */
+
+int frame_get_state(Model *m, Model *copy) {
+#ifdef STATE_ERROR
+    model_say(m, ERROR, "fmi2GetFMUstate is not implemented");
+    return ERROR;
+#endif
+    *copy = *m;
+    return OK;
+}
+int frame_set_state(Model *m, const Model *copy) {
+#ifdef STATE_NOT_RESTORED
+    return OK;
+#elif defined STATE_CRASH
+    crash();
+#endif
+    *m = *copy;
+    return OK;
+}
+int model_initialise(Model *m) {
+#ifdef HANG_IN_INITIALISATION
+    hang();
+#elif defined REFUSE_INITIALISATION
+    model_say(m, ERROR, "the table file is missing");
+    return ERROR;
+#endif
+    hidden = 0.0;
+    return OK;
+}
+int model_step(Model *m, double time, double size) {
+#ifdef STATELESS
+    m->r[Y] = m->r[FACTOR] * m->r[U] * (1.0 - m->r[DAMAGE]);
+#else
+    m->r[Y] += m->r[U] * size;
+#endif
+    hidden += 1.0;
+#if defined STATE_HIDDEN
+    m->r[Y] += 0.001 * hidden;
+#elif defined NOT_DETERMINISTIC
+    m->r[Y] += 1e-9 * (double)getpid() + 1e-12 * hidden;
+#endif
+    if (m->stepped < AFTER) return OK;
+    if (getenv("HOSTILE_FLAG") && access(getenv("HOSTILE_FLAG"), F_OK) != 0) return OK;
+#if defined SEGFAULT
+    crash();
+#elif defined ABORT
+    abort();
+#elif defined DIVIDE
+    raise(SIGFPE);
+#elif defined HANG
+    hang();
+#elif defined EXIT
+    exit(3);
+#elif defined KILL
+    kill(getpid(), SIGKILL);
+#elif defined LEAK_IN_STEP
+    for (;;) take(1 << 20);
+#elif defined LEAK_SLOWLY
+    take(16 << 20);
+#elif defined FILL_DISK
+    {
+        FILE *file = fopen("big.log", "w");
+        ftruncate(fileno(file), (off_t)3 << 30);
+        lseek(fileno(file), (off_t)3 << 30, SEEK_SET);
+        fputs("x", file);
+        fclose(file);
+    }
+#elif defined NOT_A_NUMBER
+    m->r[Y] = NAN;
+#elif defined REFUSE
+    if (m->r[U] > 5.0) {
+        m->r[Y] -= m->r[U] * size;
+        model_say(m, DISCARD, "u is too large");
+        return DISCARD;
+    }
+#elif defined FAIL
+    model_say(m, ERROR, "the iteration does not converge");
+    return ERROR;
+#elif defined FATALLY
+    model_say(m, FATAL, "out of memory");
+    return FATAL;
+#elif defined ASYNCHRONOUS
+    return PENDING;
+#elif defined ODD_STATUS
+    return 42;
+#elif defined CLOSE_FILES
+    for (int k = 3; k < 64; k++) close(k);
+#elif defined WRITE_INTO_PIPES
+    for (int k = 3; k < 64; k++) if (write(k, "rubbish rubbish rubbish", 23) < 0) continue;
+#elif defined START_PROCESS
+    if (m->stepped == 2 && fork() == 0) for (;;) pause();
+#elif defined CHATTER
+    for (int k = 0; k < 100000; k++) puts("step step step step step step step step");
+    fflush(stdout);
+#elif defined REMOVE_FILES
+    if (system("rm -rf \"$PWD\"/*") != 0) return ERROR;
+#elif defined IGNORE_SIGNALS
+    signal(SIGTERM, SIG_IGN);
+    signal(SIGINT, SIG_IGN);
+    hang();
+#endif
+    return OK;
+}
+void model_free(Model *m) {
+#ifdef CRASH_IN_FREE
+    crash();
+#elif defined HANG_IN_FREE
+    hang();
+#elif defined LEAK_IN_FREE
+    take(1 << 18);
+#endif
+}

@@ -1,0 +1,76 @@
+"""Builds small FMUs of FMI 1, 2 and 3 from C sources, as other people's tools export them."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import zipfile
+from pathlib import Path
+
+import fmpy
+import pytest
+
+HERE = Path(__file__).parent
+HEADERS = Path(fmpy.__file__).parent / "c-code"
+
+
+class Workshop:
+    """Compiles each model once.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the FMUs are put.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._built: dict[tuple[str, tuple[str, ...]], Path] = {}
+
+    def __call__(self, model: str, *defines: str) -> Path:
+        """Return the FMU of a model, such as `ball2`, compiled with preprocessor definitions."""
+        key = (model, defines)
+        if key not in self._built:
+            self._built[key] = self._build(model, defines)
+        return self._built[key]
+
+    def _build(self, model: str, defines: tuple[str, ...]) -> Path:
+        compiler = shutil.which("gcc") or shutil.which("cc")
+        if compiler is None:
+            pytest.skip("there is no C compiler (gcc or cc), which the foreign FMUs are built with")
+        version = re.fullmatch(r"[a-z]+(\d)", model)
+        assert version is not None
+        description = (HERE / f"{model}.xml").read_text(encoding="utf-8")
+        exchange = ["-DMODEL_EXCHANGE"] if "<Implementation>" not in description else []
+        name = "_".join([model, *defines]).lower()
+        library = self._folder / f"{name}.so"
+        subprocess.run(
+            [
+                compiler, "-shared", "-fPIC", "-O1", "-w", f"-I{HEADERS}", f"-I{HERE}", *exchange,
+                f"-DIDENTIFIER={model}", *(f"-D{define}" for define in defines),
+                str(HERE / f"{model}.c"), str(HERE / f"frame{version[1]}.c"), "-o", str(library), "-lm",
+            ],
+            check=True,
+        )  # fmt: skip
+        path = self._folder / f"{name}.fmu"
+        platform = fmpy.platform_tuple if version[1] == "3" else fmpy.platform
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("modelDescription.xml", description)
+            archive.write(library, f"binaries/{platform}/{model}.so")
+        return path
+
+    def changed(self, model: str, name: str, *changes: tuple[str, str]) -> Path:
+        """Return a copy of a model's FMU with texts of its model description replaced."""
+        path = self._folder / f"{name}.fmu"
+        with zipfile.ZipFile(self(model)) as source, zipfile.ZipFile(path, "w") as target:
+            for entry in source.namelist():
+                content = source.read(entry)
+                if entry == "modelDescription.xml":
+                    text = content.decode()
+                    for old, new in changes:
+                        assert old in text
+                        text = text.replace(old, new)
+                    content = text.encode()
+                target.writestr(entry, content)
+        return path

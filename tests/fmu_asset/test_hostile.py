@@ -1,0 +1,435 @@
+"""FMUs that do what they must not: the twin lives on, says what happened, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fmu_asset.archive import read_fmu
+from fmu_asset.binding import Binding, parse_binding
+from fmu_asset.draft import draft_binding
+from fmu_asset.errors import (
+    FmuCallError,
+    FmuError,
+    FmuFileError,
+    FmuMemoryError,
+    FmuOutputError,
+    FmuStateError,
+    FmuTimeoutError,
+    FmuUnsupportedError,
+    FmuWorkerError,
+)
+from fmu_asset.session import FmiAsset
+
+ROOT = Path(__file__).parents[2]
+HOSTILE: dict[str, Any] = {
+    "binding": {"name": "hostile", "step_size": 1.0},
+    "control": {"u": {"variable": "u", "unit": "m/s"}},
+    "observation": {"y": {"variables": "y", "unit": "m"}},
+}
+LIMITS = {"step_timeout": 30.0, "load_timeout": 30.0, "memory_limit": 400.0}
+
+
+@pytest.fixture
+def described() -> Binding:
+    return parse_binding(HOSTILE)
+
+
+@pytest.fixture
+def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder in which this test alone makes its temporary folders, here and in subprocesses."""
+    folder = tmp_path / "scratch"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    monkeypatch.setenv("TMPDIR", str(folder))
+    return folder
+
+
+def processes(of: Path) -> list[str]:
+    """Return the processes whose working directory or arguments lie in a folder."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            where = (process / "cwd").readlink()
+            what = (process / "cmdline").read_bytes().decode("utf-8", "replace")
+        except OSError:
+            continue
+        if of in where.parents or of == where or str(of) in what:
+            found.append(process.name)
+    return found
+
+
+def left_behind(scratch: Path, limit: float = 20.0) -> list[str]:
+    """Return what is still there after a while: who is killed does not die in the same moment."""
+    deadline = time.monotonic() + limit
+    while True:
+        left = [*processes(scratch), *(path.name for path in scratch.iterdir())]
+        if not left or time.monotonic() >= deadline:
+            return left
+        time.sleep(0.02)
+
+
+IN_THE_THIRD_STEP = [
+    ("SEGFAULT", FmuWorkerError, r"signal 11 \(SIGSEGV\): the FMU's code touched memory that is not its own"),
+    ("ABORT", FmuWorkerError, r"signal 6 \(SIGABRT\): the FMU's code gave up with abort\(\)"),
+    ("DIVIDE", FmuWorkerError, r"signal 8 \(SIGFPE\): the FMU's code divided an integer by zero"),
+    ("KILL", FmuWorkerError, r"signal 9 \(SIGKILL\): somebody killed it, or the system ran out of memory"),
+    ("EXIT", FmuWorkerError, r"exit status 3: the FMU's code ended its own process"),
+    ("HANG", FmuTimeoutError, r"longer than 0\.5 s for the step.*more `step_time` in .*otherwise it hangs"),
+    ("IGNORE_SIGNALS", FmuTimeoutError, r"longer than 0\.5 s for the step"),
+    ("LEAK_IN_STEP", FmuMemoryError, r"MiB of memory during the step, more than the limit of 400 MiB.*leaks"),
+    ("FILL_DISK", FmuWorkerError, r"SIGXFSZ\): the FMU wrote more than 2 GiB to one file"),
+    ("NOT_A_NUMBER", FmuOutputError, r"values that are not finite at t = 3 s: y\."),
+    ("FAIL", FmuCallError, r"(?s)returned Error.*no longer to be trusted.*does not converge"),
+    ("FATALLY", FmuCallError, r"(?s)returned Fatal.*the instance is lost.*out of memory"),
+    ("ASYNCHRONOUS", FmuCallError, r"returned Pending.*asynchronous steps are not supported"),
+    ("ODD_STATUS", FmuCallError, r"returned 42.*the instance is lost"),
+    ("CLOSE_FILES", FmuWorkerError, r"could not answer: the FMU's code closed files"),
+    ("WRITE_INTO_PIPES", FmuWorkerError, r"closed its pipe, or wrote something else into it"),
+]
+
+
+@pytest.mark.parametrize(
+    ("what", "kind", "sentence"), IN_THE_THIRD_STEP, ids=[c[0] for c in IN_THE_THIRD_STEP]
+)
+def test_a_step_that_goes_wrong_is_one_sentence(
+    foreign_fmu: Any, described: Binding, scratch: Path, what: str, kind: type[FmuError], sentence: str
+) -> None:
+    fmu = foreign_fmu("hostile2", what)
+    descriptors = len(list(Path("/proc/self/fd").iterdir()))
+    limits = LIMITS | ({"step_timeout": 0.5} if kind is FmuTimeoutError else {})
+    with FmiAsset(fmu, described, **limits) as asset:
+        assert [asset.step().values[0] for _ in range(2)] == [1.0, 2.0]
+        saved = asset.save_state()
+        with pytest.raises(kind, match=sentence) as caught:
+            asset.step()
+        assert str(fmu) in str(caught.value)
+        if what != "NOT_A_NUMBER":
+            with pytest.raises(FmuWorkerError, match="reset the asset"):
+                asset.step()
+        # The same instance is never used again; another one goes on from the last state.
+        asset.restore_state(saved)
+        assert (asset.step_index, asset.observe().values[0]) == (2, 2.0)
+    assert not left_behind(scratch)
+    assert len(list(Path("/proc/self/fd").iterdir())) == descriptors
+
+
+def test_a_refused_step_can_be_made_otherwise(foreign_fmu: Any, described: Binding) -> None:
+    with FmiAsset(foreign_fmu("hostile2", "REFUSE"), described, **LIMITS) as asset:
+        asset.step(), asset.step()
+        with pytest.raises(FmuCallError, match=r"(?s)step 2 from t = 2 s.*returned Discard.*u is too large"):
+            asset.step({"u": 6.0})
+        assert asset.step({"u": 5.0}).values[0] == 7.0
+
+
+def test_a_slow_leak_is_noticed_between_short_steps(foreign_fmu: Any, described: Binding) -> None:
+    def fly(asset: FmiAsset) -> None:
+        for _ in range(100):
+            asset.step()
+            time.sleep(0.02)
+
+    with (
+        FmiAsset(foreign_fmu("hostile2", "LEAK_SLOWLY"), described, **LIMITS) as asset,
+        pytest.raises(FmuMemoryError, match=r"more than the limit of 400 MiB"),
+    ):
+        fly(asset)
+
+
+AT_THE_START = [
+    ("CRASH_AT_LOAD", FmuWorkerError, r"During loading and instantiation .*SIGSEGV"),
+    ("EXIT_AT_LOAD", FmuWorkerError, r"During loading and instantiation .*exit status 4"),
+    ("HANG_AT_LOAD", FmuTimeoutError, r"longer than 2 s for loading and instantiation.*more `load_time`"),
+    (
+        "MISSING_LIBRARY_FUNCTION",
+        FmuCallError,
+        r"cannot be loaded on this machine \(undefined symbol: function",
+    ),
+    ("NO_INSTANCE", FmuCallError, r"(?s)could not be instantiated.*no licence"),
+    ("HANG_IN_INITIALISATION", FmuTimeoutError, r"longer than 2 s for initialisation"),
+    ("REFUSE_INITIALISATION", FmuCallError, r"(?s)returned Error in initialisation.*table file is missing"),
+]
+
+
+@pytest.mark.parametrize(("what", "kind", "sentence"), AT_THE_START, ids=[case[0] for case in AT_THE_START])
+def test_a_start_that_goes_wrong_is_one_sentence(
+    foreign_fmu: Any, described: Binding, scratch: Path, what: str, kind: type[FmuError], sentence: str
+) -> None:
+    asset = FmiAsset(foreign_fmu("hostile2", what), described, load_timeout=2.0)
+    for _ in range(2):
+        with pytest.raises(kind, match=sentence):
+            asset.reset()
+        assert not left_behind(scratch)
+
+
+@pytest.mark.parametrize("what", ["CRASH_IN_FREE", "HANG_IN_FREE", "START_PROCESS", "CHATTER"])
+def test_what_goes_wrong_at_the_end_leaves_nothing(
+    foreign_fmu: Any, described: Binding, scratch: Path, what: str
+) -> None:
+    with FmiAsset(foreign_fmu("hostile2", what), described) as asset:
+        assert [asset.step().values[0] for _ in range(4)] == [1.0, 2.0, 3.0, 4.0]
+    assert not left_behind(scratch)
+
+
+def test_an_fmu_that_removes_its_files_is_extracted_again(
+    foreign_fmu: Any, described: Binding, scratch: Path
+) -> None:
+    with FmiAsset(foreign_fmu("hostile2", "REMOVE_FILES"), described) as asset:
+        for _ in range(4):
+            asset.step()
+        asset.close()
+        asset.reset()
+        assert asset.step().values[0] == 1.0
+    assert not list(scratch.iterdir())
+
+
+STATES = [
+    (
+        "STATE_ERROR",
+        FmuCallError,
+        r"(?s)fmi2GetFMUstate returned Error in saving the state.*`state = \"replay\"`.*not implemented",
+    ),
+    ("STATE_CRASH", FmuWorkerError, r"During restoring the state .*SIGSEGV"),
+    (
+        "STATE_NOT_RESTORED",
+        FmuStateError,
+        r'gives y = 3\.0 instead of 2\.0: it declares canGetAndSetFMUstate but does not .*`state = "replay"`',
+    ),
+]
+
+
+@pytest.mark.parametrize(("what", "kind", "sentence"), STATES, ids=[case[0] for case in STATES])
+def test_a_state_that_lies_is_found_and_can_be_replayed(
+    foreign_fmu: Any, described: Binding, what: str, kind: type[FmuError], sentence: str
+) -> None:
+    fmu = foreign_fmu("hostile2", what)
+    with FmiAsset(fmu, described) as asset:
+        asset.step(), asset.step()
+        with pytest.raises(kind, match=sentence):  # noqa: PT012 - either of the two may tell
+            saved = asset.save_state()
+            asset.step()
+            asset.restore_state(saved)
+    header = {**HOSTILE["binding"], "state": "replay"}
+    with FmiAsset(fmu, parse_binding({**HOSTILE, "binding": header})) as asset:
+        asset.step(), asset.step({"u": 3.0})
+        saved = asset.save_state()
+        asset.step()
+        asset.restore_state(saved)
+        assert asset.observe().values[0] == 4.0
+
+
+def test_what_cannot_be_replayed_says_so(foreign_fmu: Any) -> None:
+    header = {**HOSTILE["binding"], "state": "replay"}
+    with FmiAsset(
+        foreign_fmu("hostile2", "NOT_DETERMINISTIC"), parse_binding({**HOSTILE, "binding": header})
+    ) as asset:
+        asset.step()
+        saved = asset.save_state()
+        asset.close()
+        with pytest.raises(FmuStateError, match="does not give equal outputs for equal inputs"):
+            asset.restore_state(saved)
+
+
+@pytest.mark.parametrize("what", ["HANG", "START_PROCESS"])
+def test_nothing_is_left_when_the_twin_is_killed_during_a_step(
+    foreign_fmu: Any, scratch: Path, what: str
+) -> None:
+    program = (
+        "import sys\n"
+        "from fmu_asset.binding import parse_binding\n"
+        "from fmu_asset.session import FmiAsset\n"
+        f"asset = FmiAsset(sys.argv[1], parse_binding({HOSTILE!r}))\n"
+        "for _ in range(2): asset.step()\n"
+        "print('third', flush=True)\n"
+        "asset.step()\n"
+        "print('fourth', flush=True)\n"
+        "sys.stdin.read()\n"
+    )
+    twin = subprocess.Popen(
+        [sys.executable, "-c", program, foreign_fmu("hostile2", what)],
+        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    assert twin.stdout is not None
+    assert twin.stdin is not None
+    assert twin.stdout.readline() == b"third\n"
+    if what == "START_PROCESS":
+        assert twin.stdout.readline() == b"fourth\n"
+        assert len(processes(scratch)) == 2
+    os.kill(twin.pid, signal.SIGKILL)
+    twin.wait()
+    twin.stdin.close()
+    twin.stdout.close()
+    assert not left_behind(scratch, 30.0)
+
+
+def test_what_a_dead_twin_left_is_removed_by_the_next(
+    foreign_fmu: Any, described: Binding, scratch: Path
+) -> None:
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    with FmiAsset(foreign_fmu("hostile2"), described) as asset:
+        own = next(scratch.iterdir()).name
+        asset.step()
+    (scratch / own.replace(f"-{os.getpid()}-", f"-{dead.pid}-")).mkdir()
+    (scratch / "somebody-else").mkdir()
+    program = "import sys\nfrom fmu_asset.archive import plain_folder\nprint(plain_folder())\n"
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    left = {Path(done.stdout.strip()).name, "somebody-else"}
+    assert {path.name for path in scratch.iterdir()} == left
+
+
+# ---------------------------------------------------------------------- the file
+
+
+def packed(path: Path, entries: dict[str, bytes]) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+    return path
+
+
+@pytest.fixture
+def parts(foreign_fmu: Any) -> dict[str, bytes]:
+    with zipfile.ZipFile(foreign_fmu("hostile2")) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def test_an_archive_that_would_fill_the_disk(parts: dict[str, bytes], tmp_path: Path) -> None:
+    bomb = packed(tmp_path / "bomb.fmu", {**parts, "resources/zeros": bytes(300 * 1024**2)})
+    with pytest.raises(FmuFileError, match=r"would extract to 300 MiB, which looks like an archive made"):
+        read_fmu(bomb)
+
+
+def test_a_description_that_would_fill_the_memory(parts: dict[str, bytes], tmp_path: Path) -> None:
+    entities = b'<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;">]>'
+    head, _, rest = parts["modelDescription.xml"].partition(b"?>")
+    laughs = {**parts, "modelDescription.xml": head + b"?>" + entities + rest}
+    with pytest.raises(FmuFileError, match="defines a document type or entities"):
+        read_fmu(packed(tmp_path / "laughs.fmu", laughs))
+
+
+def test_entries_that_come_twice(parts: dict[str, bytes], tmp_path: Path) -> None:
+    path = packed(tmp_path / "twice.fmu", parts)
+    with warnings.catch_warnings(), zipfile.ZipFile(path, "a") as archive:
+        warnings.simplefilter("ignore")
+        archive.writestr("modelDescription.xml", b"<other/>")
+    with pytest.raises(FmuFileError, match="too many or some twice"):
+        read_fmu(path)
+
+
+def test_an_identifier_that_leads_elsewhere(parts: dict[str, bytes], tmp_path: Path) -> None:
+    text = parts["modelDescription.xml"].replace(b'"hostile2"', b'"../../../../tmp/x"')
+    with pytest.raises(FmuFileError, match="is no name of a C function"):
+        read_fmu(packed(tmp_path / "elsewhere.fmu", {**parts, "modelDescription.xml": text}))
+
+
+def test_a_truncated_archive(foreign_fmu: Any, tmp_path: Path) -> None:
+    content = foreign_fmu("hostile2").read_bytes()
+    path = tmp_path / "short.fmu"
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(FmuFileError, match=r"not a sound FMU archive .* fetch or build it again"):
+        read_fmu(path)
+
+
+def test_a_binary_of_another_processor(
+    parts: dict[str, bytes], described: Binding, tmp_path: Path, scratch: Path
+) -> None:
+    library = bytearray(parts["binaries/linux64/hostile2.so"])
+    struct.pack_into("<H", library, 18, 183)  # ELF e_machine: AArch64
+    path = packed(tmp_path / "arm.fmu", {**parts, "binaries/linux64/hostile2.so": bytes(library)})
+    with pytest.raises(FmuCallError, match=r"binary cannot be loaded on this machine .*another processor"):
+        FmiAsset(path, described).reset()
+    without = {name: content for name, content in parts.items() if not name.startswith("binaries")}
+    with pytest.raises(FmuUnsupportedError, match=r"no binary for this platform .*binaries there: none"):
+        read_fmu(packed(tmp_path / "none.fmu", without))
+    assert not list(scratch.iterdir())
+
+
+def test_odd_characters_in_paths(parts: dict[str, bytes], described: Binding, tmp_path: Path) -> None:
+    folder = tmp_path / "Flügel é # % + 翼 'x' \"y\" $z"
+    folder.mkdir()
+    path = packed(folder / "flügel %20 #1.fmu", {**parts, "resources/Größe ß.txt": b"x"})
+    with FmiAsset(path, described) as asset:
+        assert asset.step().values[0] == 1.0
+
+
+def test_an_fmu_without_its_authoring_tool(foreign_fmu: Any, described: Binding, tmp_path: Path) -> None:
+    fmu = foreign_fmu("hostile2", "NO_INSTANCE")
+    with zipfile.ZipFile(fmu) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    text = entries["modelDescription.xml"]
+    entries["modelDescription.xml"] = text.replace(
+        b"<CoSimulation ", b'<CoSimulation needsExecutionTool="true" '
+    )
+    with pytest.raises(FmuCallError, match=r"could not be instantiated .*needs its authoring tool"):
+        FmiAsset(packed(tmp_path / "tool.fmu", entries), described).reset()
+
+
+def test_an_fmu_in_python_that_loops(spring_mass: Path, spring_binding: Binding, scratch: Path) -> None:
+    """It holds the interpreter of the worker; neither the limit nor the death of the twin needs that."""
+    with (
+        FmiAsset(spring_mass, spring_binding, step_timeout=0.5) as asset,
+        pytest.raises(FmuTimeoutError, match=r"longer than 0\.5 s for the step"),
+    ):
+        asset.step(load={"misbehaviour": 8})
+    program = (
+        "import json, sys\n"
+        "from fmu_asset.binding import parse_binding\n"
+        "from fmu_asset.session import FmiAsset\n"
+        "asset = FmiAsset(sys.argv[1], parse_binding(json.loads(sys.argv[2])))\n"
+        "asset.step()\n"
+        "print('loops', flush=True)\n"
+        "asset.step(load={'misbehaviour': 8})\n"
+    )
+    described = spring_binding.model_dump_json(exclude_none=True)
+    twin = subprocess.Popen(
+        [sys.executable, "-c", program, spring_mass, described], cwd=ROOT, stdout=subprocess.PIPE
+    )
+    assert twin.stdout is not None
+    assert twin.stdout.readline() == b"loops\n"
+    os.kill(twin.pid, signal.SIGKILL)
+    twin.wait()
+    twin.stdout.close()
+    assert not left_behind(scratch, 30.0)
+
+
+@settings(max_examples=100, deadline=None)
+@given(data=st.data())
+def test_a_description_with_one_odd_attribute(
+    foreign_fmu: Any, tmp_path_factory: Any, data: st.DataObject
+) -> None:
+    """Whatever one attribute says, or if it is missing: a description and a draft, or one sentence."""
+    model = data.draw(st.sampled_from(["lag1", "room2", "array3", "swing3", "ball2"]))
+    with zipfile.ZipFile(foreign_fmu(model)) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    text = entries["modelDescription.xml"].decode()
+    places = list(re.finditer(r'\s[A-Za-z]+="([^"]*)"', text))
+    place = data.draw(st.sampled_from(places))
+    odd = st.sampled_from(["", "-1", "1e999", "nan", "x", "0", "99999999999999999999", "true", "1 2", "<"])
+    if data.draw(st.booleans()):
+        text = text[: place.start()] + text[place.end() :]
+    else:
+        text = text[: place.start(1)] + data.draw(odd).replace("<", "&lt;") + text[place.end(1) :]
+    entries["modelDescription.xml"] = text.encode()
+    path = packed(tmp_path_factory.mktemp("odd") / "odd.fmu", entries)
+    sentence = ""
+    try:
+        draft_binding(read_fmu(path))
+    except FmuError as error:
+        sentence = str(error)
+    assert "\n" not in sentence

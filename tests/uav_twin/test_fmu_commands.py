@@ -1,0 +1,58 @@
+"""`uav-twin fmu bind` and `uav-twin fmu check` as a user calls them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+
+
+def call(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "uav_twin", "fmu", *map(str, arguments)],
+        cwd=ROOT,
+        env={**os.environ, "COLUMNS": "200"},
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_an_fmu_is_bound_and_checked(foreign_fmu: Any, tmp_path: Path) -> None:
+    fmu, file = foreign_fmu("ball2"), tmp_path / "ball.toml"
+    drafted = call("bind", fmu, "--out", file, "--step-size", "0.05")
+    assert drafted.returncode == 0, drafted.stderr
+    assert f"uav-twin fmu check {fmu} --binding {file}" in " ".join(drafted.stdout.split())
+    assert call("bind", fmu, "--step-size", "0.05").stdout == file.read_text(encoding="utf-8")
+    again = call("bind", fmu, "--out", file)
+    assert again.returncode != 0
+    assert "exists: choose another --out or give --replace" in again.stderr
+    checked = call("check", fmu, "--binding", file, "--cycles", "5")
+    assert checked.returncode == 0, checked.stderr
+    rows = [line.split("│")[1:4] for line in checked.stdout.splitlines() if line.startswith("│")]
+    found = {name.strip(): verdict.strip() for name, verdict, _ in rows if name.strip()}
+    assert found["fmpy validate"] == "ok"
+    assert found["state"] == "warning"
+    assert found["instances"] == "ok"
+    assert "no problem found" in checked.stdout
+
+
+def test_a_problem_is_named_and_the_exit_code_says_so(foreign_fmu: Any, tmp_path: Path) -> None:
+    checked = call("check", foreign_fmu("hostile2", "SEGFAULT"), "--cycles", "0")
+    assert checked.returncode == 1
+    assert "SIGSEGV" in checked.stdout
+    assert "1 problem." in checked.stderr
+    assert "Traceback" not in checked.stdout + checked.stderr
+    for command in ("bind", "check"):
+        missing = call(command, tmp_path / "none.fmu")
+        assert missing.returncode != 0
+        assert "There is no FMU" in missing.stderr
+        assert "Traceback" not in missing.stderr
+    (tmp_path / "wrong.toml").write_text("[binding]\nname = 1\n", encoding="utf-8")
+    wrong = call("check", foreign_fmu("ball2"), "--binding", tmp_path / "wrong.toml")
+    assert wrong.returncode != 0
+    assert "wrong.toml" in wrong.stderr

@@ -1,0 +1,35 @@
+"""`uav-twin fmu bind`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def bind(
+    file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option(help="The binding file to write; on the terminal by default.")
+    ] = None,
+    step_size: Annotated[
+        float | None,
+        typer.Option(help="Communication step size in seconds; the FMU's own by default.", min=0.0),
+    ] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
+) -> None:
+    """Draft a binding for an FMU: which variable is which role, in which unit."""
+    from fmu_asset.archive import read_fmu
+    from fmu_asset.draft import draft_binding
+    from fmu_asset.errors import BindingError
+    from reporting.files import atomic_write_text
+
+    if out is not None and out.exists() and not replace:
+        raise BindingError(f"{out} exists: choose another --out or give --replace.")
+    text = draft_binding(read_fmu(file), step_size=step_size)
+    if out is None:
+        typer.echo(text, nl=False)
+        return
+    atomic_write_text(out, text)
+    typer.echo(f"{out}: drafted; correct the roles, then run `uav-twin fmu check {file} --binding {out}`.")
