@@ -11,7 +11,13 @@ from scipy.linalg import expm
 
 from fmu_asset.coupling.asset import Algorithm, CoupledAsset
 from fmu_asset.coupling.structure import Component
-from fmu_asset.errors import AlgebraicLoopError, CouplingError, IterationError
+from fmu_asset.errors import (
+    AlgebraicLoopError,
+    BindingError,
+    CouplingError,
+    FmuInputError,
+    IterationError,
+)
 
 from .conftest import linear, system, watch
 
@@ -247,3 +253,25 @@ def test_iterations_need_a_state_that_can_be_restored(spring_mass: Path, linear_
     )
     with pytest.raises(CouplingError, match="component 'spring' cannot save and restore its state"):
         CoupledAsset(joined, watch("law.y1"), iterations=3)
+
+
+def test_a_binding_of_several_fmus_keeps_its_ranges_and_has_no_decimation(
+    state_fmu: Path, linear_fmu: Path
+) -> None:
+    structure = system(
+        [*oscillator(state_fmu, linear_fmu).components],
+        [("push", "first.u1"), ("first.y1", "second.u1"), ("first.y2", "second.u2")],
+    )
+    binding = watch("first.y1", inputs=["push"])
+    limited = binding.control["push"].model_copy(update={"minimum": -1.0, "maximum": 2.0})
+    ranged = binding.model_copy(update={"control": {"push": limited}})
+    with CoupledAsset(structure, ranged, isolated=False) as asset:
+        asset.step({"push": 2.0})
+        before = asset.observe()
+        with pytest.raises(FmuInputError, match=r"control.push = 2.5 lies outside -1 to 2, .* watch"):
+            asset.step({"push": 2.5})
+        assert asset.step_index == 1
+        np.testing.assert_array_equal(asset.observe().values, before.values)
+    header = binding.binding.model_copy(update={"decimation": 2})
+    with pytest.raises(BindingError, match="watch of several FMUs has a decimation"):
+        CoupledAsset(structure, binding.model_copy(update={"binding": header}), isolated=False)
