@@ -69,7 +69,7 @@ class Weights:
     strain: float = 0.02
     limiting_strain: float = 0.002
     ratio: float = 0.01
-    limiting_ratio: float = 0.003
+    limiting_ratio: float = 0.0015
     slope: float = 0.02
     stiffness: float = 0.0003
     stiffness_slope: float = 0.0015
