@@ -27,6 +27,7 @@ MODELLING_FILES = (
     "compression.py",
     "design.py",
     "fields.py",
+    "gauges.py",
     "grid.py",
     "lift.py",
     "mesh.py",
@@ -41,6 +42,7 @@ MODELLING_FILES = (
     "responses.py",
     "statics.py",
     "subspace.py",
+    "turn_load.py",
 )
 """The files that decide what a reduced model holds; a change in any of them makes a new cache entry."""
 

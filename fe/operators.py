@@ -17,17 +17,15 @@ from .assembly import (
     cell_axes,
     gauss_points,
     isotropic_elasticity,
-    jacobians,
     orthotropic_elasticity,
-    point_jacobians,
     positions,
     rotate_elasticity,
-    shape_functions,
 )
 from .design import WingDesign
-from .lift import DISTRIBUTIONS
+from .gauges import gauge_output
 from .mesh import DEFECT_1, DEFECT_2, SKIN, SurfacePoint, WingMesh, build_mesh
 from .parts import PointMassPlace
+from .turn_load import inertia_relief, lift_load
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -35,8 +33,6 @@ IntArray = NDArray[np.int64]
 STIFFNESS_TERM_NAMES: tuple[str, ...] = ("skin", "defect_1", "defect_2", "base")
 MASS_TERM_NAMES: tuple[str, ...] = ("base", "servo", "pitot")
 ROOT_UNKNOWNS = 3
-STANDARD_GRAVITY = 9.80665
-"""m/s^2."""
 
 
 @dataclass(frozen=True)
@@ -218,40 +214,6 @@ def root_expansion(design: WingDesign, discretisation: Discretisation) -> sparse
     ).tocsr()
 
 
-def lift_load(mesh: WingMesh, discretisation: Discretisation) -> FloatArray:
-    """Load (full,) [N] at load factor 1: up and forward, half on each skin.
-
-    Along the span the design's distribution, along the chord (1 - xi)^p with the design's exponent p; each
-    skin cell is loaded on its outer face. The sums are exactly those of the design, without the inertia.
-    """
-    design, plan = mesh.design, mesh.design.planform
-    per_length = DISTRIBUTIONS[design.lift.distribution](plan)
-    face, weight = gauss_points(4, 2)
-    load = np.zeros(discretisation.unknowns // 3)
-    for upper in (True, False):
-        cells = mesh.skin_cells(upper=upper)
-        local = np.column_stack([face, np.full(len(face), 1.0 if upper else 0.0)])
-        values, _ = shape_functions(local)
-        corners = mesh.corners[cells]
-        place = positions(corners, local)
-        jacobian = jacobians(corners, local)
-        area = (
-            jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0]
-        )  # in the plan view
-        station = np.clip(place[..., 1] / plan.semi_span, 0.0, 1.0)
-        chord = plan.root_chord + (plan.tip_chord - plan.root_chord) * station
-        xi = place[..., 0] / chord + plan.straight_chord_line
-        pressure = per_length(station) * (1.0 - xi) ** design.lift.chordwise_exponent / chord
-        np.add.at(
-            load, discretisation.cell_nodes[cells], np.einsum("nq,qa->na", pressure * area * weight, values)
-        )
-    load /= load.sum() * design.lift.load_factor
-    full = np.zeros(discretisation.unknowns)
-    full[2::3] = design.lift.force * load
-    full[0::3] = -design.lift.forward_force * load
-    return full
-
-
 def _through_thickness(
     mesh: WingMesh, distance: float, chord_fraction: float
 ) -> tuple[SurfacePoint, SurfacePoint]:
@@ -288,99 +250,10 @@ def _upward(weights: FloatArray) -> FloatArray:
     return full
 
 
-def _pieces(middle: float, length: float, lines: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Gauss points and weights of the mean over a length, piece by piece between mesh lines."""
-    if length == 0.0:
-        return np.array([middle]), np.array([1.0])
-    start, end = middle - 0.5 * length, middle + 0.5 * length
-    breaks = np.array([start, *lines[(lines > start) & (lines < end)], end])
-    line, weight = np.polynomial.legendre.leggauss(3)
-    pieces = np.diff(breaks)[:, None]
-    points = breaks[:-1, None] + 0.5 * (1.0 + line) * pieces
-    return points.ravel(), (0.5 * weight * pieces / length).ravel()
-
-
-def gauge_output(mesh: WingMesh, discretisation: Discretisation) -> sparse.csr_array:
-    """Strain of each gauge, csr (gauges, full) [1/m]: eq. (15) at the true gauge points.
-
-    The strain along the span of the upper skin, on its outer surface or in the middle of its thickness,
-    averaged over the gauge's patch piece by piece between the mesh lines, positive in compression.
-    """
-    design = mesh.design
-    gauges, plan = design.gauges, design.planform
-    owner: list[int] = []
-    share: list[float] = []
-    points: list[SurfacePoint] = []
-    for gauge, (distance, chord_fraction) in enumerate(gauges.positions):
-        # The patch is a rectangle: the same distances fore and aft of the gauge's own chord line.
-        middle = (chord_fraction - plan.straight_chord_line) * plan.chord(distance / plan.semi_span)
-        for place, span_weight in zip(
-            *_pieces(distance, gauges.averaging_spanwise, mesh.span_lines), strict=True
-        ):
-            lead = plan.straight_chord_line * plan.chord(place / plan.semi_span)
-            _, _, lines = mesh.upper_skin_lines(place)
-            behind = _pieces(middle + lead, gauges.averaging_chordwise, lines)
-            for chordwise, chord_weight in zip(*behind, strict=True):
-                owner.append(gauge)
-                share.append(span_weight * chord_weight)
-                points.append(mesh.skin_point(place, chordwise))
-    cells = np.array([point.cell for point in points])
-    local = np.array([point.local for point in points])
-    if gauges.surface == "middle":
-        local[:, 2] = 0.5
-    dofs, weights = discretisation.strain_along(cells, local, _span_direction(mesh, cells, local))
-    weights = -np.array(share)[:, None] * weights
-    rows = np.repeat(owner, dofs.shape[1])
-    return sparse.coo_array(
-        (weights.ravel(), (rows, dofs.ravel())), shape=(len(gauges.positions), discretisation.unknowns)
-    ).tocsr()
-
-
-def _span_direction(mesh: WingMesh, cells: IntArray, local: FloatArray) -> FloatArray:
-    """Find the unit direction (p, 3) along the span in the surface, at one point of each of p cells."""
-    jacobian = point_jacobians(mesh.corners[cells], local)
-    normal = np.cross(jacobian[:, :, 0], jacobian[:, :, 1])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    direction = np.array([0.0, 1.0, 0.0]) - normal[:, 1:2] * normal
-    return np.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True))
-
-
 def point_mass_weights(mesh: WingMesh, discretisation: Discretisation, place: PointMassPlace) -> FloatArray:
     """Weights (nodes,) of the displacement of a point mass: half on each skin."""
     distance = place.station * mesh.design.planform.semi_span
     return section_displacement(mesh, discretisation, distance, place.chord)
-
-
-def inertia_relief(
-    design: WingDesign,
-    discretisation: Discretisation,
-    density: FloatArray,
-    point_masses: tuple[tuple[FloatArray, ...], ...],
-    lift: FloatArray,
-) -> FloatArray:
-    """Load (full,) [N] to add at load factor 1: the weight where it lies, and as much lift against it.
-
-    Parameters
-    ----------
-    design : WingDesign
-        The wing; its nominal masses count.
-    discretisation : Discretisation
-        Degrees of freedom.
-    density : (nc,) kg/m^3
-        Of the cells.
-    point_masses : tuple of two tuples of (nodes,)
-        `point_mass_weights` of the servos, and of the pitot.
-    lift : (full,) N
-        `lift_load`.
-    """
-    weight = discretisation.nodal_mass(density)
-    for mass, places in zip((design.masses.servo, design.masses.pitot), point_masses, strict=True):
-        for weights in places:
-            weight = weight + mass * weights
-    weight = STANDARD_GRAVITY * weight
-    added = np.zeros(len(lift))
-    added[2::3] = lift[2::3] * (weight.sum() / lift[2::3].sum()) - weight
-    return added
 
 
 def _point_mass(weights: FloatArray) -> sparse.csr_array:

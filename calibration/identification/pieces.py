@@ -16,20 +16,19 @@ from scipy import sparse
 from calibration.errors import IdentificationError
 from fe.assembly import Discretisation
 from fe.design import WingDesign
+from fe.gauges import gauge_output
 from fe.mesh import DEFECT_1, DEFECT_2, SKIN, WingMesh, build_mesh
 from fe.operators import (
     ROOT_UNKNOWNS,
     STIFFNESS_TERM_NAMES,
     cell_density,
     cell_elasticity,
-    gauge_output,
-    inertia_relief,
-    lift_load,
     modulus_variation,
     point_mass_weights,
     root_expansion,
     section_displacement,
 )
+from fe.turn_load import inertia_relief, lift_load
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

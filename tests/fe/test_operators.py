@@ -3,19 +3,19 @@ import pytest
 from scipy.sparse.linalg import norm
 
 from fe.assembly import Discretisation
+from fe.gauges import gauge_output
 from fe.mesh import DEFECT_1, DEFECT_2, SKIN, build_mesh
 from fe.operators import (
     ROOT_UNKNOWNS,
-    STANDARD_GRAVITY,
     STIFFNESS_TERM_NAMES,
     AffineOperators,
     assemble,
     cell_density,
     cell_elasticity,
-    gauge_output,
     modulus_variation,
 )
 from fe.statics import tip_stiffness
+from fe.turn_load import STANDARD_GRAVITY
 
 
 def _heave(operators):
