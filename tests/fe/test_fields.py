@@ -96,9 +96,9 @@ def test_strain_is_that_of_the_full_model(written: meshio.Mesh, coarse_operators
     plan = mesh.design.planform
     cells = [
         mesh.skin_point(distance, chord * plan.chord(distance / plan.semi_span)).cell
-        for distance, chord in mesh.design.gauges.positions[:4]
+        for distance, chord in mesh.design.gauges.positions[1:4]
     ]
-    np.testing.assert_allclose(written.cell_data["spanwise_strain"][0][cells], full.strain[:4], rtol=0.35)
+    np.testing.assert_allclose(written.cell_data["spanwise_strain"][0][cells], full.strain[1:4], rtol=0.35)
 
 
 def test_damage_is_written_where_it_is(written: meshio.Mesh, coarse_operators: AffineOperators) -> None:
