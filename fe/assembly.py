@@ -89,6 +89,12 @@ def jacobians(corners: FloatArray, local: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nai,qaj->nqij", corners, gradients))
 
 
+def point_jacobians(corners: FloatArray, local: FloatArray) -> FloatArray:
+    """Jacobians dx_i/dX_j (p, 3, 3) at one local point (p, 3) of each of p cells with corners (p, 8, 3)."""
+    _, gradients = _corner_functions(local)
+    return np.asarray(np.einsum("pai,paj->pij", corners, gradients))
+
+
 def global_gradients(corners: FloatArray, local: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Gradients (n, q, 20, 3) of the shape functions in space and Jacobian determinants (n, q)."""
     jacobian = jacobians(corners, local)
@@ -166,6 +172,12 @@ class Discretisation:
     def _numbering(self) -> Any:
         return Dofs(self.mesh, ElementVector(ElementHexS2()))
 
+    def moved(self, mesh: Any) -> "Discretisation":
+        """Return the same degrees of freedom on a mesh with the same cells and other vertices."""
+        other = Discretisation(mesh)
+        other.__dict__["_numbering"] = self._numbering  # the cache of `cached_property`
+        return other
+
     @property
     def unknowns(self) -> int:
         """Number of degrees of freedom, three for each node."""
@@ -188,23 +200,38 @@ class Discretisation:
         points[self.cell_nodes] = positions(self.corners, ElementHexS2().doflocs)
         return points
 
-    def stiffness(self, cells: IntArray, elasticity: FloatArray) -> sparse.csr_array:
-        """Stiffness (ndof, ndof) [N/m] of cells (n,) with elasticity (n, 6, 6) [Pa] in space."""
+    def nodes_of(self, cells: IntArray) -> FloatArray:
+        """Places (n, 20, 3) [m] of the nodes of cells (n,)."""
+        return positions(self.corners[cells], ElementHexS2().doflocs)
+
+    def stiffness_blocks(
+        self, cells: IntArray, elasticity: FloatArray, factor: FloatArray | None = None
+    ) -> FloatArray:
+        """Element stiffness (n, 60, 60) [N/m] of cells (n,) with elasticity (n, 6, 6) [Pa] in space.
+
+        `factor` (n, 27) scales the elasticity at the points of `gauss_points(3)`; without it, it is one.
+        """
         local, weight = gauss_points(3)
         blocks = np.empty((len(cells), 3 * NODES, 3 * NODES))
         for start in range(0, len(cells), _BATCH):
             part = slice(start, start + _BATCH)
             gradients, determinant = global_gradients(self.corners[cells[part]], local)
             B = strain_matrix(gradients)
-            scaled = (elasticity[part, None] @ B) * (weight * determinant)[..., None, None]
+            measure = weight * determinant if factor is None else weight * determinant * factor[part]
+            scaled = (elasticity[part, None] @ B) * measure[..., None, None]
             n, q = determinant.shape
             left = B.reshape(n, q * 6, 3 * NODES).swapaxes(1, 2)
             blocks[part] = left @ scaled.reshape(n, q * 6, 3 * NODES)
-        blocks = 0.5 * (blocks + blocks.swapaxes(1, 2))
-        return self._assembled(blocks, self.cell_dofs[cells])
+        return np.asarray(0.5 * (blocks + blocks.swapaxes(1, 2)))
 
-    def mass(self, cells: IntArray, density: FloatArray) -> sparse.csr_array:
-        """Consistent mass (ndof, ndof) [kg] of cells (n,) with density (n,) [kg/m^3]."""
+    def stiffness(
+        self, cells: IntArray, elasticity: FloatArray, factor: FloatArray | None = None
+    ) -> sparse.csr_array:
+        """Stiffness (ndof, ndof) [N/m] of cells (n,), see `stiffness_blocks`."""
+        return self._assembled(self.stiffness_blocks(cells, elasticity, factor), self.cell_dofs[cells])
+
+    def mass_blocks(self, cells: IntArray, density: FloatArray) -> FloatArray:
+        """Element mass (n, 60, 60) [kg] of cells (n,) with density (n,) [kg/m^3]."""
         local, weight = gauss_points(3)
         values, _ = shape_functions(local)
         determinant = np.linalg.det(jacobians(self.corners[cells], local))
@@ -213,7 +240,20 @@ class Discretisation:
         blocks = np.zeros((len(cells), NODES, 3, NODES, 3))
         for component in range(3):
             blocks[:, :, component, :, component] = scalar
-        return self._assembled(blocks.reshape(len(cells), 3 * NODES, 3 * NODES), self.cell_dofs[cells])
+        return blocks.reshape(len(cells), 3 * NODES, 3 * NODES)
+
+    def mass(self, cells: IntArray, density: FloatArray) -> sparse.csr_array:
+        """Consistent mass (ndof, ndof) [kg] of cells (n,) with density (n,) [kg/m^3]."""
+        return self._assembled(self.mass_blocks(cells, density), self.cell_dofs[cells])
+
+    def nodal_mass(self, density: FloatArray) -> FloatArray:
+        """Share (nn,) [kg] of each node in the mass of all cells with density (nc,) [kg/m^3]: row sums."""
+        local, weight = gauss_points(3)
+        values, _ = shape_functions(local)
+        factor = np.linalg.det(jacobians(self.corners, local)) * weight * density[:, None]
+        shares = np.zeros(self.unknowns // 3)
+        np.add.at(shares, self.cell_nodes, factor @ values)
+        return shares
 
     def _assembled(self, blocks: FloatArray, dofs: IntArray) -> sparse.csr_array:
         shape = (self.unknowns, self.unknowns)
@@ -229,9 +269,20 @@ class Discretisation:
         return self.cell_nodes[cell], values[0]
 
     def strain_along(
-        self, cell: int, local: FloatArray, direction: FloatArray
+        self, cells: IntArray, local: FloatArray, direction: FloatArray
     ) -> tuple[IntArray, FloatArray]:
-        """Unknowns (60,) and weights (60,) [1/m] of the strain along a unit direction (3,) at a point."""
-        gradients, _ = global_gradients(self.corners[cell][None], local[None])
-        weights = np.outer(gradients[0, 0] @ direction, direction)
-        return self.cell_dofs[cell], weights.ravel()
+        """Unknowns (p, 60) and weights (p, 60) [1/m] of the strain at one point of each of p cells.
+
+        Parameters
+        ----------
+        cells : (p,)
+            The cells.
+        local : (p, 3)
+            The point of each.
+        direction : (p, 3)
+            Unit direction of the strain at each.
+        """
+        _, gradients = shape_functions(local)
+        inverse = np.linalg.inv(point_jacobians(self.corners[cells], local))
+        slope = np.einsum("pai,pij,pj->pa", gradients, inverse, direction)
+        return self.cell_dofs[cells], (slope[:, :, None] * direction[:, None, :]).reshape(len(cells), -1)

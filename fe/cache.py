@@ -29,6 +29,7 @@ MODELLING_FILES = (
     "design.py",
     "dissection.py",
     "fields.py",
+    "gauges.py",
     "grid.py",
     "lift.py",
     "mesh.py",
@@ -43,6 +44,7 @@ MODELLING_FILES = (
     "responses.py",
     "statics.py",
     "subspace.py",
+    "turn_load.py",
 )
 """The files that decide what a reduced model holds; a change in any of them makes a new cache entry."""
 

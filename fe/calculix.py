@@ -159,28 +159,50 @@ class CalculixModel:
         factor[mesh.region == SKIN] = self.young_modulus_factor
         for region, loss in zip((DEFECT_1, DEFECT_2), self.stiffness_loss, strict=True):
             factor[mesh.region == region] = 1.0 - loss
-        constants = np.column_stack(
-            [local[:, row, column] for row, column in _ORTHOTROPIC] + [cell_density(mesh) / factor]
-        )
+        constants = np.column_stack([local[:, row, column] for row, column in _ORTHOTROPIC])
         constants *= factor[:, None]
-        rounded = [tuple(f"{value:.10E}" for value in row) for row in constants]
+        density = cell_density(mesh)
+        graded = self._graded
+        if graded.any():
+            centre = mesh.design.skin.young_modulus(mesh.centres[graded, 1] / mesh.design.planform.semi_span)
+            constants[graded] /= centre[:, None]
+        stations = mesh.design.skin.stations
+        rounded = [
+            (bool(varies), *(f"{value:.10E}" for value in (*row, mass)))
+            for varies, row, mass in zip(graded, constants, density, strict=True)
+        ]
         materials = {key: number for number, key in enumerate(dict.fromkeys(rounded))}
         for key, number in materials.items():
-            first = constants[rounded.index(key)]
+            first = rounded.index(key)
+            courses = [(place.station, place.young_modulus) for place in stations] if key[0] else [(0.0, 1.0)]
             yield f"*MATERIAL, NAME=M{number}"
             yield "*ELASTIC, TYPE=ORTHO"
-            yield _numbers(first[:8])
-            yield f"{_numbers(first[8:9])},293."
+            for temperature, modulus in courses:
+                row = modulus * constants[first]
+                yield _numbers(row[:8])
+                yield _numbers((*row[8:], temperature))
             yield "*DENSITY"
-            yield _numbers(first[9:])
+            yield _numbers(density[first : first + 1])
             if self.damping_alpha or self.damping_beta:
                 yield f"*DAMPING, ALPHA={self.damping_alpha:.12E}, BETA={self.damping_beta:.12E}"
+        if graded.any():
+            # The station of a node stands as its temperature, on which the skin's constants depend.
+            yield "*INITIAL CONDITIONS, TYPE=TEMPERATURE"
+            span = mesh.design.planform.semi_span
+            for node, place in enumerate(self.operators.discretisation.node_points[:, 1] / span, start=1):
+                yield f"{node},{place:.13E}"
         for cell, key in enumerate(rounded):
             yield f"*ORIENTATION, NAME=O{cell}, SYSTEM=RECTANGULAR"
             yield _numbers(axes[cell, :2].ravel())
             yield f"*ELSET, ELSET=E{cell}"
             yield str(cell + 1)
             yield f"*SOLID SECTION, ELSET=E{cell}, MATERIAL=M{materials[key]}, ORIENTATION=O{cell}"
+
+    @property
+    def _graded(self) -> NDArray[np.bool_]:
+        """Whether Young's modulus changes inside a cell (nc,)."""
+        mesh = self.operators.wing_mesh
+        return (mesh.web < 0) & (mesh.rib < 0) & bool(mesh.design.skin.stations)
 
     def _root(self) -> Iterator[str]:
         """Yield the reference node, whose displacements are heave, flap and yaw, its springs and the rib."""

@@ -79,6 +79,14 @@ def span_lines(design: WingDesign) -> FloatArray:
     for place in sorted(set(soft)):
         if min(abs(place - line) for line in firm) > 0.1 * design.mesh.span_size:
             firm.append(place)
+    edge = design.mesh.edge_size
+    if edge is not None:
+        edge /= design.mesh.refinement
+        for defect in design.defects:
+            for place in (defect.span_start, defect.span_end):
+                for beside in (place - edge, place + edge):
+                    if 0.0 < beside < span and min(abs(beside - line) for line in firm) > 0.5 * edge:
+                        firm.append(beside)
     return np.array(_subdivide(sorted(firm), size))
 
 
@@ -90,6 +98,36 @@ def web_faces(design: WingDesign, index: int) -> tuple[ChordLine, ChordLine]:
         ChordLine(web.chord, front, f"the front of webs[{index}]"),
         ChordLine(web.chord, front + web.thickness, f"the rear of webs[{index}]"),
     )
+
+
+def _with_edge_lines(design: WingDesign, firm: list[ChordLine]) -> list[ChordLine]:
+    """Lines beside the edges of the defects, where the chord holds no other line near by."""
+    if design.mesh.edge_size is None:
+        return firm
+    edge = design.mesh.edge_size / design.mesh.refinement
+    chords = design.planform.root_chord, design.planform.tip_chord
+    lines = list(firm)
+    for defect in design.defects:
+        for fraction in (defect.chord_start, defect.chord_end):
+            for offset in (-edge, edge):
+                line = ChordLine(fraction, offset, "beside a defect")
+                gaps = [
+                    [line.behind_leading_edge(c) - other.behind_leading_edge(c) for c in chords]
+                    for other in lines
+                ]
+                ends = [firm[0], firm[-1]]
+                inside = all(
+                    ends[0].behind_leading_edge(c)
+                    < line.behind_leading_edge(c)
+                    < ends[1].behind_leading_edge(c)
+                    for c in chords
+                )
+                # Lines must not cross between root and tip either.
+                if inside and all(
+                    min(map(abs, pair)) > 0.5 * edge and pair[0] * pair[1] > 0.0 for pair in gaps
+                ):
+                    lines.append(line)
+    return sorted(lines, key=lambda line: line.behind_leading_edge(design.planform.root_chord))
 
 
 def chord_lines(design: WingDesign) -> tuple[ChordLine, ...]:
@@ -122,6 +160,7 @@ def chord_lines(design: WingDesign) -> tuple[ChordLine, ...]:
                     f"between root and tip; move one of them or put them on the same chord fraction."
                 )
         firm.append(line)
+    firm = _with_edge_lines(design, firm)
     lines = [firm[0]]
     size = design.mesh.chord_size / design.mesh.refinement * root
     for start, end in itertools.pairwise(firm):

@@ -30,6 +30,9 @@ SKIN, DEFECT_1, DEFECT_2, WEBS, RIBS = range(5)
 _CORNERS = np.array([(1, 1, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)])
 
 
+_NARROW = 0.2  # of the widest cell
+
+
 class SurfacePoint(NamedTuple):
     """A point of a skin cell: the cell's number and local coordinates (3,) in 0..1."""
 
@@ -175,6 +178,46 @@ class WingMesh:
         return np.flatnonzero(self.grid_index[:, 2] == (self.height_cells + 1 if upper else 0))
 
 
+def straight_edged(behind: FloatArray, chord: FloatArray, thickness_ratio: float) -> FloatArray:
+    """Half thickness (nx + 1, ny + 1) [m] at the mesh lines: the straight edges nearest to the airfoil.
+
+    Straight edges between points of the airfoil would make the section thinner, the more so the coarser the
+    mesh. Here each line is moved off the airfoil so that the straight edges are nearest to it in the sense of
+    least squares; that keeps the area and, to fourth order, the second moment. Lines that bound a narrow
+    cell, such as a web, move together, so that the skin does not kink there.
+
+    Parameters
+    ----------
+    behind : (nx + 1, ny + 1) m
+        Mesh lines behind the leading edge at each station.
+    chord : (ny + 1,) m
+        Chord at the stations.
+    thickness_ratio : float
+        Largest thickness over the chord.
+    """
+
+    def airfoil(place: FloatArray) -> FloatArray:
+        return four_digit_half_thickness(place / chord, thickness_ratio) * chord
+
+    width, on_airfoil = np.diff(behind, axis=0), airfoil(behind)
+    nodes, stations = behind.shape
+    gram = np.zeros((stations, nodes, nodes))
+    i = np.arange(nodes - 1)
+    gram[:, i, i] += width.T / 3.0
+    gram[:, i + 1, i + 1] += width.T / 3.0
+    gram[:, i, i + 1] = gram[:, i + 1, i] = width.T / 6.0
+    moment = np.zeros((stations, nodes))
+    for point, weight in zip(*np.polynomial.legendre.leggauss(5), strict=True):
+        share = 0.5 * (1.0 + point)
+        gap = airfoil(behind[:-1] + share * width) - (1.0 - share) * on_airfoil[:-1] - share * on_airfoil[1:]
+        moment[:, :-1] += ((1.0 - share) * gap * width * (0.5 * weight)).T
+        moment[:, 1:] += (share * gap * width * (0.5 * weight)).T
+    group = np.concatenate([[0], np.cumsum(width[:, 0] > _NARROW * width[:, 0].max())])
+    tie = (group[:, None] == np.arange(group[-1] + 1)).astype(np.float64)
+    offset = np.linalg.solve(tie.T @ gram @ tie, (moment @ tie)[..., None])[..., 0]
+    return np.asarray(on_airfoil + tie @ offset.T)
+
+
 def _grid_points(
     design: WingDesign, across: FloatArray, along: tuple[ChordLine, ...], height_cells: int
 ) -> FloatArray:
@@ -186,7 +229,7 @@ def _grid_points(
     behind = fraction[:, None] * chord + offset[:, None]
     xi = behind / chord
     ratio = design.airfoil.thickness_ratio
-    outer = four_digit_half_thickness(xi, ratio) * chord
+    outer = straight_edged(behind, chord, ratio)
     # The skin's thickness is measured across it, the grid line runs upright.
     inner = outer - design.skin.thickness * np.sqrt(1.0 + four_digit_slope(xi, ratio) ** 2)
     levels = np.linspace(-1.0, 1.0, height_cells + 1)

@@ -17,15 +17,15 @@ from .assembly import (
     cell_axes,
     gauss_points,
     isotropic_elasticity,
-    jacobians,
     orthotropic_elasticity,
     positions,
     rotate_elasticity,
-    shape_functions,
 )
 from .design import WingDesign
-from .lift import DISTRIBUTIONS
+from .gauges import gauge_output
 from .mesh import DEFECT_1, DEFECT_2, SKIN, SurfacePoint, WingMesh, build_mesh
+from .parts import PointMassPlace
+from .turn_load import inertia_relief, lift_load
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -136,10 +136,8 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
         skin.transverse_shear_ratio,
         skin.transverse_shear_ratio,
     )
-    ends = np.array([band.end for band in skin.bands])
-    moduli = np.array([band.young_modulus for band in skin.bands])
     station = mesh.centres[:, 1] / design.planform.semi_span
-    modulus = moduli[np.searchsorted(ends, station)]
+    modulus = skin.young_modulus(station)
     shell = (mesh.web < 0) & (mesh.rib < 0)
     local[shell] = np.where(mesh.leading_edge[shell, None, None], wall, unit) * modulus[shell, None, None]
     for index, web in enumerate(design.webs):
@@ -154,6 +152,22 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
         second_moment = design.webs[rod.web].thickness * _web_height(mesh)[inside] ** 3 / 12.0
         local[inside, 1, 1] += rod.bending_stiffness / second_moment
     return rotate_elasticity(local, cell_axes(mesh.corners))
+
+
+def modulus_variation(mesh: WingMesh) -> FloatArray:
+    """Young's modulus (nc, 27) at the points of `gauss_points(3)` over that at the centre of the cell.
+
+    It differs from one where the skin's modulus is given at stations and therefore changes inside a cell.
+    """
+    factor = np.ones((len(mesh.cells), 27))
+    if mesh.design.skin.stations:
+        shell = np.flatnonzero((mesh.web < 0) & (mesh.rib < 0))
+        local, _ = gauss_points(3)
+        span, skin = mesh.design.planform.semi_span, mesh.design.skin
+        place = positions(mesh.corners[shell], local)[..., 1] / span
+        centre = skin.young_modulus(mesh.centres[shell, 1] / span)
+        factor[shell] = skin.young_modulus(place) / centre[:, None]
+    return factor
 
 
 def _web_height(mesh: WingMesh) -> FloatArray:
@@ -200,40 +214,6 @@ def root_expansion(design: WingDesign, discretisation: Discretisation) -> sparse
     ).tocsr()
 
 
-def lift_load(mesh: WingMesh, discretisation: Discretisation) -> FloatArray:
-    """Load (full,) [N] at load factor 1: up and forward, half on each skin.
-
-    Along the span the design's distribution, along the chord 2 (1 - xi); each skin cell is loaded on its
-    outer face and the sums are exactly those of the design.
-    """
-    design, plan = mesh.design, mesh.design.planform
-    per_length = DISTRIBUTIONS[design.lift.distribution](plan)
-    face, weight = gauss_points(4, 2)
-    load = np.zeros(discretisation.unknowns // 3)
-    for upper in (True, False):
-        cells = mesh.skin_cells(upper=upper)
-        local = np.column_stack([face, np.full(len(face), 1.0 if upper else 0.0)])
-        values, _ = shape_functions(local)
-        corners = mesh.corners[cells]
-        place = positions(corners, local)
-        jacobian = jacobians(corners, local)
-        area = (
-            jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0]
-        )  # in the plan view
-        station = np.clip(place[..., 1] / plan.semi_span, 0.0, 1.0)
-        chord = plan.root_chord + (plan.tip_chord - plan.root_chord) * station
-        xi = place[..., 0] / chord + plan.straight_chord_line
-        pressure = per_length(station) * 2.0 * (1.0 - xi) / chord
-        np.add.at(
-            load, discretisation.cell_nodes[cells], np.einsum("nq,qa->na", pressure * area * weight, values)
-        )
-    load /= load.sum() * design.lift.load_factor
-    full = np.zeros(discretisation.unknowns)
-    full[2::3] = design.lift.force * load
-    full[0::3] = -design.lift.forward_force * load
-    return full
-
-
 def _through_thickness(
     mesh: WingMesh, distance: float, chord_fraction: float
 ) -> tuple[SurfacePoint, SurfacePoint]:
@@ -241,10 +221,22 @@ def _through_thickness(
     return mesh.skin_point(distance, behind, upper=True), mesh.skin_point(distance, behind, upper=False)
 
 
-def _section_displacement(
+def section_displacement(
     mesh: WingMesh, discretisation: Discretisation, distance: float, chord_fraction: float
 ) -> FloatArray:
-    """Weights (nodes,) of the mean displacement of the upper and lower skin at a place."""
+    """Weights (nodes,) of the mean displacement of the upper and lower skin at a place.
+
+    Parameters
+    ----------
+    mesh : WingMesh
+        The mesh.
+    discretisation : Discretisation
+        Its degrees of freedom.
+    distance : float
+        Distance from the root [m].
+    chord_fraction : float
+        Place along the local chord.
+    """
     weights = np.zeros(discretisation.unknowns // 3)
     for point in _through_thickness(mesh, distance, chord_fraction):
         nodes, values = discretisation.point_values(point.cell, point.local)
@@ -258,51 +250,10 @@ def _upward(weights: FloatArray) -> FloatArray:
     return full
 
 
-def _pieces(middle: float, length: float, lines: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Gauss points and weights of the mean over a length, piece by piece between mesh lines."""
-    if length == 0.0:
-        return np.array([middle]), np.array([1.0])
-    start, end = middle - 0.5 * length, middle + 0.5 * length
-    breaks = np.array([start, *lines[(lines > start) & (lines < end)], end])
-    line, weight = np.polynomial.legendre.leggauss(3)
-    pieces = np.diff(breaks)[:, None]
-    points = breaks[:-1, None] + 0.5 * (1.0 + line) * pieces
-    return points.ravel(), (0.5 * weight * pieces / length).ravel()
-
-
-def gauge_output(mesh: WingMesh, discretisation: Discretisation) -> sparse.csr_array:
-    """Strain of each gauge, csr (gauges, full) [1/m]: eq. (15) at the true gauge points.
-
-    The strain along the span on the outer surface of the upper skin, averaged over the gauge's patch piece
-    by piece between the mesh lines, positive in compression.
-    """
-    design = mesh.design
-    gauges, plan = design.gauges, design.planform
-    output = np.zeros((len(gauges.positions), discretisation.unknowns))
-    for gauge, (distance, chord_fraction) in enumerate(gauges.positions):
-        # The patch is a rectangle: the same distances fore and aft of the gauge's own chord line.
-        middle = (chord_fraction - plan.straight_chord_line) * plan.chord(distance / plan.semi_span)
-        for place, span_weight in zip(
-            *_pieces(distance, gauges.averaging_spanwise, mesh.span_lines), strict=True
-        ):
-            lead = plan.straight_chord_line * plan.chord(place / plan.semi_span)
-            _, _, lines = mesh.upper_skin_lines(place)
-            behind = _pieces(middle + lead, gauges.averaging_chordwise, lines)
-            for chordwise, chord_weight in zip(*behind, strict=True):
-                dofs, weights = _span_strain(mesh, discretisation, mesh.skin_point(place, chordwise))
-                output[gauge, dofs] -= span_weight * chord_weight * weights
-    return sparse.csr_array(output)
-
-
-def _span_strain(
-    mesh: WingMesh, discretisation: Discretisation, point: SurfacePoint
-) -> tuple[IntArray, FloatArray]:
-    """Unknowns and weights of the strain along the span, tangent to the surface, at a point of the skin."""
-    jacobian = jacobians(mesh.corners[point.cell][None], point.local[None])[0, 0]
-    normal = np.cross(jacobian[:, 0], jacobian[:, 1])
-    normal /= np.linalg.norm(normal)
-    direction = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
-    return discretisation.strain_along(point.cell, point.local, direction / np.linalg.norm(direction))
+def point_mass_weights(mesh: WingMesh, discretisation: Discretisation, place: PointMassPlace) -> FloatArray:
+    """Weights (nodes,) of the displacement of a point mass: half on each skin."""
+    distance = place.station * mesh.design.planform.semi_span
+    return section_displacement(mesh, discretisation, distance, place.chord)
 
 
 def _point_mass(weights: FloatArray) -> sparse.csr_array:
@@ -337,40 +288,50 @@ def assemble(design: WingDesign) -> AffineOperators:
     def reduced(matrix: sparse.csr_array) -> sparse.csr_array:
         return (restriction @ (matrix @ expansion)).tocsr()
 
-    elasticity, density = cell_elasticity(mesh), cell_density(mesh)
+    elasticity, density, variation = cell_elasticity(mesh), cell_density(mesh), modulus_variation(mesh)
     terms = []
     for regions in ((SKIN,), (DEFECT_1,), (DEFECT_2,)):
         cells = np.flatnonzero(np.isin(mesh.region, regions))
-        terms.append(reduced(discretisation.stiffness(cells, elasticity[cells])))
+        terms.append(reduced(discretisation.stiffness(cells, elasticity[cells], variation[cells])))
     cells = np.flatnonzero(mesh.region > DEFECT_2)
     springs = np.zeros(expansion.shape[1])
     root = design.root
     springs[-ROOT_UNKNOWNS:] = root.transverse_spring, root.flap_spring, root.yaw_spring
     terms.append(
-        (reduced(discretisation.stiffness(cells, elasticity[cells])) + sparse.diags_array(springs)).tocsr()
+        (
+            reduced(discretisation.stiffness(cells, elasticity[cells], variation[cells]))
+            + sparse.diags_array(springs)
+        ).tocsr()
     )
 
+    weights = tuple(
+        tuple(
+            point_mass_weights(mesh, discretisation, place)
+            for place in design.point_masses
+            if place.kind == kind
+        )
+        for kind in ("servo", "pitot")
+    )
     masses = [discretisation.mass(np.arange(len(mesh.cells)), density)]
-    for kind in ("servo", "pitot"):
+    for places in weights:
         matrix = sparse.csr_array(masses[0].shape)
-        for place in design.point_masses:
-            if place.kind == kind:
-                distance = place.station * design.planform.semi_span
-                matrix = matrix + _point_mass(
-                    _section_displacement(mesh, discretisation, distance, place.chord)
-                )
+        for place in places:
+            matrix = matrix + _point_mass(place)
         masses.append(matrix)
 
     load_place = design.planform.semi_span - design.tip_load.distance_from_tip
-    at_load = _upward(_section_displacement(mesh, discretisation, load_place, design.tip_load.chord))
+    at_load = _upward(section_displacement(mesh, discretisation, load_place, design.tip_load.chord))
     at_tip = _upward(
-        _section_displacement(mesh, discretisation, design.planform.semi_span, design.tip_load.chord)
+        section_displacement(mesh, discretisation, design.planform.semi_span, design.tip_load.chord)
     )
     at_load_free = np.asarray(restriction @ at_load)
+    lift = lift_load(mesh, discretisation)
+    if design.lift.inertia_relief:
+        lift = lift + inertia_relief(design, discretisation, density, weights, lift)
     return AffineOperators(
         stiffness_terms=tuple(terms),
         mass_terms=tuple(reduced(mass) for mass in masses),
-        load_lift=np.asarray(restriction @ lift_load(mesh, discretisation)),
+        load_lift=np.asarray(restriction @ lift),
         load_tip=at_load_free,
         gauge_output=(gauge_output(mesh, discretisation) @ expansion).tocsr(),
         displacement_output=at_load_free.copy(),

@@ -4,6 +4,8 @@ import itertools
 import math
 from typing import Annotated, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -47,8 +49,19 @@ class SkinBand(Part):
     young_modulus: Modulus
 
 
+class SkinStation(Part):
+    """Young's modulus [Pa] of the skin at a fraction of the span."""
+
+    station: Fraction
+    young_modulus: Modulus
+
+
 class Skin(Part):
-    """Shell of the wing; orthotropic with equal moduli, the shear moduli as ratios to Young's modulus."""
+    """Shell of the wing; orthotropic with equal moduli, the shear moduli as ratios to Young's modulus.
+
+    Young's modulus along the span is given either in `bands`, each of one modulus, or at `stations`, between
+    which it runs straight.
+    """
 
     thickness: Thickness
     density: Density
@@ -56,14 +69,34 @@ class Skin(Part):
     in_plane_shear_ratio: ShearRatio
     transverse_shear_ratio: ShearRatio
     closed_leading_edge: bool = True
-    bands: tuple[SkinBand, ...] = Field(min_length=1)
+    bands: tuple[SkinBand, ...] = ()
+    stations: tuple[SkinStation, ...] = ()
 
     @model_validator(mode="after")
-    def _bands_cover_the_span(self) -> "Skin":
+    def _one_course_of_the_modulus(self) -> "Skin":
+        if bool(self.bands) == bool(self.stations):
+            raise ValueError("Young's modulus must be given either in bands or at stations")
+        places = [place.station for place in self.stations]
+        if places and (
+            len(places) < 2
+            or any(after <= before for before, after in itertools.pairwise(places))
+            or (places[0], places[-1]) != (0.0, 1.0)
+        ):
+            raise ValueError(f"the stations must rise from 0 to 1, but are {places}")
         ends = [band.end for band in self.bands]
-        if any(after <= before for before, after in itertools.pairwise([0.0, *ends])) or ends[-1] != 1.0:
+        if ends and (
+            any(after <= before for before, after in itertools.pairwise([0.0, *ends])) or ends[-1] != 1.0
+        ):
             raise ValueError(f"the ends of the bands must rise from above 0 to 1, but are {ends}")
         return self
+
+    def young_modulus(self, station: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Young's modulus (...,) [Pa] at fractions of the span (...,)."""
+        if self.stations:
+            places = [place.station for place in self.stations]
+            return np.asarray(np.interp(station, places, [place.young_modulus for place in self.stations]))
+        moduli = np.array([band.young_modulus for band in self.bands])
+        return moduli[np.searchsorted([band.end for band in self.bands], station)]
 
 
 class Web(Part):
@@ -145,11 +178,13 @@ class Gauges(Part):
     """Strain gauges on the upper skin, along the span.
 
     Positions are (distance from the root [m], chord fraction); a gauge reads the strain averaged over a
-    patch of `averaging_chordwise` by `averaging_spanwise` [m].
+    patch of `averaging_chordwise` by `averaging_spanwise` [m], on the outer surface of the skin or in the
+    middle of its thickness, where the bending of the thin skin between its supports does not show.
     """
 
     averaging_chordwise: float = Field(ge=0.0, lt=1.0, description="m")
     averaging_spanwise: float = Field(default=0.0, ge=0.0, lt=1.0, description="m")
+    surface: Literal["outer", "middle"] = "outer"
     positions: tuple[tuple[float, float], ...] = Field(min_length=1)
 
 
@@ -165,14 +200,18 @@ class Defect(Part):
 class Lift(Part):
     """Net load of a level turn, linear in the load factor.
 
-    `force` [N] and `forward_force` [N] are the totals on the half-wing at `load_factor`. The lift per
-    chord is weighted by 2 (1 - xi), xi the chord fraction.
+    `force` [N] and `forward_force` [N] are the totals on the half-wing at `load_factor`. The lift is weighted
+    along the chord by (1 - xi)^`chordwise_exponent`, xi the chord fraction. With `inertia_relief` the weight
+    of the structure and of the nominal point masses, times the load factor, acts against the lift where it
+    lies; `force` stays the net total.
     """
 
     distribution: Literal["schrenk", "lifting_line"]
     force: float = Field(gt=0.0, lt=1e6)
     forward_force: float = Field(ge=0.0, lt=1e6)
     load_factor: float = Field(gt=0.0, lt=20.0)
+    chordwise_exponent: float = Field(default=1.0, ge=0.0, le=10.0)
+    inertia_relief: bool = False
 
 
 class TipLoad(Part):
@@ -183,8 +222,12 @@ class TipLoad(Part):
 
 
 class MeshSettings(Part):
-    """Largest cell: along the span [m] and along the chord (fraction); both are divided by `refinement`."""
+    """Largest cell: along the span [m] and along the chord (fraction), and beside the edges of defects [m].
+
+    All are divided by `refinement`. Without `edge_size` the cells beside the edges are like the others.
+    """
 
     span_size: float = Field(gt=1e-3, lt=10.0)
     chord_size: float = Field(gt=0.005, le=1.0)
+    edge_size: float | None = Field(default=None, gt=1e-3, lt=1.0)
     refinement: float = Field(default=1.0, ge=0.25, le=8.0)

@@ -9,6 +9,7 @@ from skfem import MeshQuad
 from .airfoil import four_digit_half_thickness, four_digit_slope
 from .design import WingDesign, rib_interval
 from .grid import chord_lines, span_lines, web_faces
+from .mesh import straight_edged
 from .plate import Plate, Surface, tensor_mesh
 
 FloatArray = NDArray[np.float64]
@@ -113,7 +114,15 @@ class PlateLayout:
         start, end = (
             np.take_along_axis(lines, (before + step)[..., None], axis=-1)[..., 0] for step in (0, 1)
         )
-        first, second = (self._section(place / chord, chord, depth)[0] for place in (start, end))
+        ratio = self.design.airfoil.thickness_ratio
+        flat = lines.reshape(-1, lines.shape[-1])
+        outer = straight_edged(flat.T, np.broadcast_to(chord, behind.shape).ravel(), ratio).T.reshape(
+            lines.shape
+        )
+        height = outer - depth * np.sqrt(1.0 + four_digit_slope(lines / chord[..., None], ratio) ** 2)
+        first, second = (
+            np.take_along_axis(height, (before + step)[..., None], axis=-1)[..., 0] for step in (0, 1)
+        )
         slope = (second - first) / (end - start)
         return first + slope * (behind - start), slope
 
@@ -127,9 +136,7 @@ class PlateLayout:
 
     def skin_modulus_at(self, station: FloatArray) -> FloatArray:
         """Young's modulus (...,) of the skin [Pa] at fractions (...,) of the semi-span."""
-        bands = self.design.skin.bands
-        ends = np.array([band.end for band in bands[:-1]])
-        return np.array([band.young_modulus for band in bands])[np.searchsorted(ends, station)]
+        return self.design.skin.young_modulus(station)
 
     @cached_property
     def skin_modulus(self) -> FloatArray:

@@ -20,6 +20,7 @@ from .plate import FIELDS, A, B, Plate, Surface, U, V, W, plane_stress, surface_
 from .plate_frame import frame_stiffness
 from .plate_layout import PlateLayout
 from .subspace import affine_sum
+from .turn_load import STANDARD_GRAVITY
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -250,8 +251,8 @@ def _rods(layout: PlateLayout) -> sparse.csr_array:
     return total.tocsr()
 
 
-def _mass_terms(layout: PlateLayout) -> tuple[sparse.csr_array, ...]:
-    """Mass of the structure and of 1 kg in each servo and in the pitot, all (5 N, 5 N)."""
+def _mass_per_area(layout: PlateLayout) -> tuple[FloatArray, FloatArray]:
+    """Mass of the structure per area of the plan, and its rotary part, both (cells, q) [kg/m^2], [kg]."""
     design, plate, skin = layout.design, layout.plate, layout.design.skin
     every, added = np.arange(plate.mesh.nelements), layout.added_density
     face = layout.surface(plate.points, 0.5 * skin.thickness)
@@ -272,7 +273,13 @@ def _mass_terms(layout: PlateLayout) -> tuple[sparse.csr_array, ...]:
         reached = plate.points[..., 1] < rod.reach * design.planform.semi_span
         per_area = rod.mass_per_length / design.webs[rod.web].thickness
         translation += per_area * (inside[:, None] & reached)
-    terms = [plate.mass(every, translation, rotation)]
+    return translation, rotation
+
+
+def _mass_terms(layout: PlateLayout) -> tuple[sparse.csr_array, ...]:
+    """Mass of the structure and of 1 kg in each servo and in the pitot, all (5 N, 5 N)."""
+    design, plate = layout.design, layout.plate
+    terms = [plate.mass(np.arange(plate.mesh.nelements), *_mass_per_area(layout))]
     for kind in ("servo", "pitot"):
         total = sparse.csr_array((plate.unknowns, plate.unknowns))
         for place in design.point_masses:
@@ -286,15 +293,35 @@ def _mass_terms(layout: PlateLayout) -> tuple[sparse.csr_array, ...]:
 
 
 def _lift(layout: PlateLayout) -> FloatArray:
-    """Load (5 N,) [N] at load factor 1: up and forward; the sums are exactly those of the design."""
+    """Load (5 N,) [N] at load factor 1: up and forward, less the weight where the design says so.
+
+    The sums are exactly those of the design.
+    """
     design, plate = layout.design, layout.plate
     points, plan = plate.points, design.planform
     per_length = DISTRIBUTIONS[design.lift.distribution](plan)(points[..., 1] / plan.semi_span)
     chord = plan.root_chord + (plan.tip_chord - plan.root_chord) * points[..., 1] / plan.semi_span
-    pressure = per_length * 2.0 * (1.0 - layout.chord_fraction(points)) / chord
-    pressure = pressure / (pressure * plate.weights).sum() / design.lift.load_factor
     lift = design.lift
-    return plate.load(W, lift.force * pressure) - plate.load(U, lift.forward_force * pressure)
+    pressure = per_length * (1.0 - layout.chord_fraction(points)) ** lift.chordwise_exponent / chord
+    pressure = pressure / (pressure * plate.weights).sum()
+    forward = plate.load(U, lift.forward_force / lift.load_factor * pressure)
+    weight = np.zeros(plate.unknowns)
+    if lift.inertia_relief:
+        weight = STANDARD_GRAVITY * (plate.load(W, _mass_per_area(layout)[0]) + _point_mass_loads(layout))
+    return plate.load(W, (lift.force / lift.load_factor + weight.sum()) * pressure) - forward - weight
+
+
+def _point_mass_loads(layout: PlateLayout) -> FloatArray:
+    """Nominal point masses (5 N,) [kg] as a load on the deflection."""
+    design = layout.design
+    masses = {"servo": design.masses.servo, "pitot": design.masses.pitot}
+    return sum(
+        (
+            masses[place.kind] * _deflection(layout, place.station * design.planform.semi_span, place.chord)
+            for place in design.point_masses
+        ),
+        start=np.zeros(layout.plate.unknowns),
+    )
 
 
 def _deflection(layout: PlateLayout, distance: float, chord_fraction: float) -> FloatArray:
@@ -308,7 +335,7 @@ def _deflection(layout: PlateLayout, distance: float, chord_fraction: float) -> 
 
 
 def _gauge_output(layout: PlateLayout) -> sparse.csr_array:
-    """Strain of each gauge, csr (gauges, 5 N): along the span, tangent to the outer surface, patch mean."""
+    """Strain of each gauge, csr (gauges, 5 N): along the span, tangent to its surface, patch mean."""
     design, plate = layout.design, layout.plate
     gauges, plan = design.gauges, design.planform
     across, along = (
@@ -327,7 +354,7 @@ def _gauge_output(layout: PlateLayout) -> sparse.csr_array:
     places = middle[:, None] + offsets
     flat = places.reshape(-1, 2)
     dofs, *shapes = plate.at(flat)
-    surface = layout.surface(flat)
+    surface = layout.surface(flat, 0.5 * design.skin.thickness if gauges.surface == "middle" else 0.0)
     strain = surface_strain(surface, *shapes)
     # The unit tangent nearest to the span is p a_x + q a_y with a_x = (1, 0, z_x), a_y = (0, 1, z_y).
     normal_x, normal_y = (-slope / surface.area_ratio for slope in (surface.slope_x, surface.slope_y))

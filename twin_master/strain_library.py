@@ -7,15 +7,15 @@ whose state may lie between the levels of the grid.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.errors import CalibrationError
+from calibration.published_strains import FILE_NAME, PublishedStrains, read_published_strains
 from twin_master.errors import InvalidStrainLibraryError
 from twin_master.graphical_model import Factor, StateSpace
 
@@ -23,10 +23,7 @@ __all__ = ["FILE_NAME", "StrainLibrary", "load_strain_library"]
 
 Float = NDArray[np.float64]
 
-FILE_NAME = "UAVconfig.json"
 REGION_NAMES = ("z1", "z2")
-PERCENT = 1e-2
-MICROSTRAIN = 1e-6
 
 
 @dataclass(frozen=True)
@@ -124,65 +121,33 @@ def load_strain_library(path: str | Path) -> StrainLibrary:
     path = Path(path)
     file = path / FILE_NAME if path.is_dir() else path
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InvalidStrainLibraryError(
-            f"cannot read the strain library {file}: {error.strerror}; give the file {FILE_NAME} of the "
-            "authors' repository UAV-Digital-Twin, or its folder"
-        ) from error
-    except ValueError as error:
-        raise InvalidStrainLibraryError(f"the strain library {file} is no JSON file: {error}") from error
-    try:
-        return _from_content(content)
+        return _arranged(read_published_strains(file))
+    except CalibrationError as error:
+        raise InvalidStrainLibraryError(str(error)) from error
     except KeyError as error:
         raise InvalidStrainLibraryError(
             f"the strain library {file} lacks the entry {error}; is it the file {FILE_NAME} as published?"
         ) from error
-    except (TypeError, ValueError, AttributeError, IndexError) as error:
+    except (TypeError, ValueError, AttributeError) as error:
         raise InvalidStrainLibraryError(
             f"the strain library {file} is not in the published format: {error}"
         ) from error
 
 
-def _from_content(content: Mapping[str, Any]) -> StrainLibrary:
-    """Arrange the content of the file in arrays."""
-    levels = content["states"]
-    if len(levels) != len(REGION_NAMES):
-        raise ValueError(
-            f"expected the levels of {len(REGION_NAMES)} regions under 'states', got {len(levels)}"
-        )
+def _arranged(published: PublishedStrains) -> StrainLibrary:
+    """Add the states and the planning problem to the published arrays."""
     states = StateSpace(
-        tuple(
-            Factor(name, tuple(float(level) * PERCENT for level in given))
-            for name, given in zip(REGION_NAMES, levels, strict=True)
-        )
+        tuple(Factor(name, levels) for name, levels in zip(REGION_NAMES, published.levels, strict=True))
     )
-    controls = tuple(str(control) for control in content["controls"])
-    observations = content["observations"]
-    first = observations[str(levels[0][0])][str(levels[1][0])][controls[0]]
-    draws = [key for key in first if key != "mean"]
-    gauges = len(first["mean"])
-    table = np.empty((len(draws) + 1, *states.shape, len(controls), gauges))
-    for i, z1 in enumerate(levels[0]):
-        for j, z2 in enumerate(levels[1]):
-            for u, control in enumerate(controls):
-                entry = observations[str(z1)][str(z2)][control]
-                for e, draw in enumerate(["mean", *draws]):
-                    row = np.asarray(entry[draw], dtype=np.float64)
-                    if row.shape != (gauges,) or not np.all(np.isfinite(row)):
-                        raise ValueError(
-                            f"observations[{z1}][{z2}][{control}][{draw}] must hold {gauges} finite strains"
-                        )
-                    table[e, i, j, u] = row
-    strain = table.reshape(len(draws) + 1, states.size, len(controls), gauges) * MICROSTRAIN
-    strain.setflags(write=False)
-    probabilities = content["transition_probabilities"]
+    strain = published.strain.reshape(states.size, *published.strain.shape[2:])
+    per_draw = published.strain_per_draw
+    probabilities = published.content["transition_probabilities"]
     return StrainLibrary(
         states=states,
-        controls=controls,
-        young_modulus_factor=np.array([float(draw) for draw in draws]),
-        strain_per_draw=strain[1:],
-        strain=strain[0],
-        discount=float(content["gamma"]),
-        worsening_probability={control: float(probabilities[control]) for control in controls},
+        controls=published.controls,
+        young_modulus_factor=published.young_modulus_factor,
+        strain_per_draw=per_draw.reshape(len(per_draw), *strain.shape),
+        strain=strain,
+        discount=float(published.content["gamma"]),
+        worsening_probability={control: float(probabilities[control]) for control in published.controls},
     )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from uav_twin.identify import identify
 from uav_twin.verify import verify
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ PUBLISHED = {
 
 wing_app = typer.Typer(no_args_is_help=False)
 wing_app.command("verify")(verify)
+wing_app.command("identify")(identify)
 
 
 @wing_app.callback(invoke_without_command=True)

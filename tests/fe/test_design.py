@@ -1,6 +1,7 @@
 import json
 import tomllib
 
+import numpy as np
 import pytest
 
 from fe.design import SHIPPED_DESIGN, load_design, parse_design, rib_interval
@@ -60,8 +61,12 @@ def _set(content, path, value):
         (("defects", 0, "span_start"), 1.0, r"defects\[0\] must end behind its start"),
         (("defects", 1, "span_start"), 0.1, r"defects\[0\] and defects\[1\] overlap"),
         (("defects",), [], r"exactly 2 defect regions"),
-        (("skin", "bands", 1, "end"), 0.2, r"the ends of the bands must rise"),
-        (("skin", "bands", -1, "end"), 0.9, r"the ends of the bands must rise"),
+        (("skin", "stations", 1, "station"), 0.9, r"the stations must rise from 0 to 1"),
+        (("skin", "stations", -1, "station"), 0.98, r"the stations must rise from 0 to 1"),
+        (("skin", "stations"), [], r"either in bands or at stations"),
+        (("skin", "bands"), [{"end": 1.0, "young_modulus": 9e9}], r"either in bands or at stations"),
+        (("lift", "chordwise_exponent"), -1.0, r"lift.chordwise_exponent"),
+        (("gauges", "surface"), "inner", r"gauges.surface"),
         (("point_masses", 0, "kind"), "engine", r"point_masses\[0\].kind"),
         (("point_masses", 0, "chord"), 0.99, r"point_masses\[0\] at chord 0.99"),
         (("tip_load", "distance_from_tip"), 2.0, r"tip_load.distance_from_tip"),
@@ -83,6 +88,19 @@ def test_a_wrong_design_is_refused_with_one_sentence_that_names_the_place(conten
     assert message.startswith("wing.toml: ")
     assert "\n" not in message
     assert message.endswith(".")
+
+
+def test_the_modulus_runs_straight_between_stations_and_steps_between_bands(shipped_design):
+    stations = [{"station": s, "young_modulus": m} for s, m in ((0.0, 8e9), (0.5, 10e9), (1.0, 6e9))]
+    skin = shipped_design.changed(skin={"stations": stations}).skin
+    assert skin.young_modulus(np.array([0.0, 0.25, 0.5, 0.75])) == pytest.approx([8e9, 9e9, 10e9, 8e9])
+    bands = [{"end": 0.5, "young_modulus": 8e9}, {"end": 1.0, "young_modulus": 6e9}]
+    skin = shipped_design.changed(skin={"stations": [], "bands": bands}).skin
+    assert skin.young_modulus(np.array([0.1, 0.5, 0.51])).tolist() == [8e9, 8e9, 6e9]
+    for ends in ((0.5, 0.4), (0.5, 0.9)):
+        wrong = [{"end": end, "young_modulus": 8e9} for end in ends]
+        with pytest.raises(InvalidDesignError, match="the ends of the bands must rise"):
+            shipped_design.changed(skin={"stations": [], "bands": wrong})
 
 
 def test_a_missing_section_is_named(content):

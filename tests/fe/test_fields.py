@@ -92,7 +92,13 @@ def test_strain_is_that_of_the_full_model(written: meshio.Mesh, coarse_operators
     np.testing.assert_allclose(found, wanted, atol=1e-2 * np.abs(wanted).max())
     np.testing.assert_array_equal(written.cell_data["spanwise_strain"][0], -found[:, 1])
     # the upper skin is compressed where the gauges are
-    assert written.cell_data["spanwise_strain"][0].max() == pytest.approx(full.strain.max(), rel=0.5)
+    mesh = coarse_operators.wing_mesh
+    plan = mesh.design.planform
+    cells = [
+        mesh.skin_point(distance, chord * plan.chord(distance / plan.semi_span)).cell
+        for distance, chord in mesh.design.gauges.positions[1:4]
+    ]
+    np.testing.assert_allclose(written.cell_data["spanwise_strain"][0][cells], full.strain[1:4], rtol=0.35)
 
 
 def test_damage_is_written_where_it_is(written: meshio.Mesh, coarse_operators: AffineOperators) -> None:

@@ -3,9 +3,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from fe.airfoil import four_digit_half_thickness
 from fe.assembly import gauss_points, jacobians, positions
 from fe.errors import InvalidDesignError, MeshError
-from fe.mesh import REGION_NAMES, build_mesh
+from fe.grid import chord_lines
+from fe.mesh import REGION_NAMES, _straight_edged, build_mesh
 
 RIB = {"thickness": 0.003, "young_modulus": 6e9, "poisson_ratio": 0.3, "density": 500.0}
 
@@ -99,6 +101,34 @@ def test_a_point_of_the_skin_is_found_where_it_is(coarse_mesh):
         assert (place[2] > 0.0) == upper
     with pytest.raises(MeshError, match="does not lie on the skin"):
         coarse_mesh.skin_point(0.8, 0.99 * chord)
+
+
+def test_straight_edges_keep_the_area_and_inertia_of_the_airfoil(shipped_design):
+    # Points on the airfoil would make the section thinner, by 1.5 % in inertia on the coarse mesh.
+    ratio = shipped_design.airfoil.thickness_ratio
+    line = np.linspace(0.03, 0.9116, 20001)
+    exact = four_digit_half_thickness(line, ratio)
+    for refinement, limit in ((0.25, 1e-3), (1.0, 1e-4)):
+        design = shipped_design.changed(mesh={"refinement": refinement})
+        lines = np.array([[entry.behind_leading_edge(0.433)] for entry in chord_lines(design)])
+        half = _straight_edged(lines, np.array([0.433]), ratio)[:, 0] / 0.433
+        inside = (line >= lines[0, 0] / 0.433) & (line <= lines[-1, 0] / 0.433)
+        found = np.interp(line[inside], lines[:, 0] / 0.433, half)
+        assert found.mean() == pytest.approx(exact[inside].mean(), rel=limit)
+        assert (found**2).mean() == pytest.approx((exact[inside] ** 2).mean(), rel=2.0 * limit)
+        assert np.abs(found - exact[inside]).max() < 0.03 * exact.max()
+
+
+def test_cells_beside_the_edges_of_defects_are_small(shipped_design):
+    size = 0.012
+    mesh = build_mesh(shipped_design.changed(mesh={"edge_size": size}))
+    for defect in shipped_design.defects:
+        for place in (defect.span_start, defect.span_end):
+            at = int(np.argmin(np.abs(mesh.span_lines - place)))
+            assert mesh.span_lines[at] == pytest.approx(place)
+            assert np.diff(mesh.span_lines)[at - 1 : at + 1].max() <= 1.5 * size + 1e-9
+    local, _ = gauss_points(3)
+    assert np.linalg.det(jacobians(mesh.corners, local)).min() > 0.0
 
 
 def test_the_shipped_mesh_is_of_the_intended_size(shipped_operators):

@@ -76,5 +76,5 @@ def test_an_unsupported_structure_is_refused():
 def test_the_wing_has_the_published_frequencies(shipped_operators):
     # The published model after calibration: 5.632 Hz and 28.544 Hz at e = 1, one other mode between them.
     modes = eigenmodes(shipped_operators, 1.0, (0.0, 0.0), *MASSES)
-    assert modes.frequency[modes.flapwise_bending] == pytest.approx([5.632, 28.544], rel=0.002)
+    assert modes.frequency[modes.flapwise_bending] == pytest.approx([5.632, 28.544], rel=0.0007)
     assert modes.flapwise_bending.tolist() == [0, 2]

@@ -3,16 +3,19 @@ import pytest
 from scipy.sparse.linalg import norm
 
 from fe.assembly import Discretisation
-from fe.mesh import DEFECT_1, DEFECT_2, SKIN
+from fe.gauges import gauge_output
+from fe.mesh import DEFECT_1, DEFECT_2, SKIN, build_mesh
 from fe.operators import (
     ROOT_UNKNOWNS,
     STIFFNESS_TERM_NAMES,
     AffineOperators,
     assemble,
+    cell_density,
     cell_elasticity,
-    gauge_output,
+    modulus_variation,
 )
 from fe.statics import tip_stiffness
+from fe.turn_load import STANDARD_GRAVITY
 
 
 def _heave(operators):
@@ -31,7 +34,9 @@ def test_the_affine_sum_equals_direct_assembly(coarse_operators):
     scale[mesh.region == SKIN] = factor
     scale[mesh.region == DEFECT_1] = 1.0 - loss[0]
     scale[mesh.region == DEFECT_2] = 1.0 - loss[1]
-    direct = body.stiffness(np.arange(len(scale)), cell_elasticity(mesh) * scale[:, None, None])
+    direct = body.stiffness(
+        np.arange(len(scale)), cell_elasticity(mesh), modulus_variation(mesh) * scale[:, None]
+    )
     direct = (coarse_operators.expansion.T @ direct @ coarse_operators.expansion).tocsr()
     springs = mesh.design.root
     spring_values = np.array([springs.transverse_spring, springs.flap_spring, springs.yaw_spring])
@@ -85,6 +90,60 @@ def test_gauges_read_a_uniform_strain_exactly(coarse_operators):
     sideways = np.zeros_like(points)
     sideways[:, 0] = points[:, 0]
     assert np.abs(gauge_output(mesh, body) @ sideways.ravel()).max() < 1e-4
+
+
+def test_a_gauge_in_the_middle_does_not_see_the_bending_of_the_skin(coarse_design):
+    # w = y^2 bends a plate at height h: strain -2 (z - h) on the surface, -2 * 0 in its middle plane.
+    readings = {}
+    for surface in ("outer", "middle"):
+        design = coarse_design.changed(gauges={"surface": surface})
+        mesh = build_mesh(design)
+        body = Discretisation(mesh.skfem_mesh)
+        field = np.zeros_like(body.node_points)
+        field[:, 1] = -2.0 * body.node_points[:, 1] * body.node_points[:, 2]
+        field[:, 2] = body.node_points[:, 1] ** 2
+        readings[surface] = gauge_output(mesh, body) @ field.ravel()
+    half = 0.5 * coarse_design.skin.thickness
+    # The plane sections turn about z = 0: the surface reads more by the curvature times half the thickness.
+    assert readings["outer"] - readings["middle"] == pytest.approx(np.full(24, 2.0 * half), rel=0.15)
+
+
+def test_the_weight_relieves_the_lift_and_keeps_its_sum(coarse_design):
+    plain = assemble(coarse_design.changed(lift={"inertia_relief": False}))
+    relieved = assemble(coarse_design.changed(lift={"inertia_relief": True}))
+    heave = _heave(plain)
+    assert heave @ relieved.load_lift == pytest.approx(heave @ plain.load_lift, rel=1e-12)
+    # Lift grows by the weight and the weight acts where it is: the moment of the difference is known.
+    masses = coarse_design.masses
+    mass = plain.mass(masses.servo, masses.pitot)
+    flap = np.zeros(plain.expansion.shape[0])
+    flap[2::3] = plain.discretisation.node_points[:, 1]
+    flap_free = plain.expansion.T @ flap
+    weight = STANDARD_GRAVITY * (heave @ (mass @ heave))
+    arm = (flap_free @ (mass @ heave)) / (heave @ (mass @ heave))
+    lift_arm = (flap_free @ plain.load_lift) / (heave @ plain.load_lift)
+    found = flap_free @ (relieved.load_lift - plain.load_lift)
+    assert found == pytest.approx(weight * (lift_arm - arm), rel=1e-6)
+
+
+def test_shares_of_the_nodes_are_the_row_sums_of_the_mass(coarse_operators):
+    mesh, body = coarse_operators.wing_mesh, coarse_operators.discretisation
+    heave = np.zeros(body.unknowns)
+    heave[2::3] = 1.0
+    mass = body.mass(np.arange(len(mesh.cells)), cell_density(mesh))
+    assert body.nodal_mass(cell_density(mesh)) == pytest.approx((mass @ heave)[2::3], abs=1e-15)
+
+
+def test_the_exponent_moves_the_centre_of_the_lift(coarse_design):
+    centre = {}
+    for exponent in (0.5, 1.0, 2.0):
+        operators = assemble(
+            coarse_design.changed(lift={"chordwise_exponent": exponent, "inertia_relief": False})
+        )
+        points = operators.discretisation.node_points
+        lift = (operators.expansion @ operators.load_lift)[2::3]
+        centre[exponent] = lift @ points[:, 0] / lift.sum()
+    assert centre[0.5] > centre[1.0] + 0.01 > centre[2.0] + 0.02
 
 
 def test_the_root_moves_as_a_rigid_rib(coarse_operators):

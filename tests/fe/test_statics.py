@@ -85,25 +85,25 @@ def test_the_static_test_is_reciprocal(coarse_operators):
 def test_tip_stiffness_is_the_published_one(shipped_operators):
     # Kapteyn et al. 2021, eq. (14): k(e) = 0.5752 e + 0.1018 N/mm.
     for factor in (0.98, 1.02):
-        assert tip_stiffness(shipped_operators, factor) == pytest.approx(575.2 * factor + 101.8, rel=0.002)
+        assert tip_stiffness(shipped_operators, factor) == pytest.approx(575.2 * factor + 101.8, rel=0.001)
 
 
 def test_healthy_strains_at_3g_are_those_of_the_library(shipped_strain, library):
     ratio = shipped_strain[0, 0] / library(0, 0)
-    assert np.abs(ratio - 1.0).max() < 0.09
-    assert np.sqrt(np.mean((ratio - 1.0) ** 2)) < 0.04
+    assert np.abs(ratio - 1.0).max() < 0.055
+    assert np.sqrt(np.mean((ratio - 1.0) ** 2)) < 0.03
 
 
 @pytest.mark.parametrize("state", [(40, 0), (80, 0), (0, 80)])
 def test_damage_raises_each_strain_as_in_the_library(shipped_strain, library, state):
     ours = shipped_strain[state] / shipped_strain[0, 0]
     theirs = library(*state) / library(0, 0)
-    assert np.sqrt(np.mean((ours - theirs) ** 2)) < 0.015
-    assert np.abs(ours - theirs).max() < 0.045
+    assert np.sqrt(np.mean((ours - theirs) ** 2)) < 0.016
+    assert np.abs(ours - theirs).max() < 0.040
 
 
 @pytest.mark.parametrize("z1", [0, 40, 80])
 def test_the_gauge_that_limits_the_flight_is_that_of_the_library(shipped_strain, library, z1):
     ours, theirs = shipped_strain[z1, 0], library(z1, 0)
     assert ours.argmax() == theirs.argmax() == 16
-    assert ours.max() == pytest.approx(theirs.max(), rel=0.004)
+    assert ours.max() == pytest.approx(theirs.max(), rel=0.011)

@@ -1,0 +1,141 @@
+"""The strain library of the authors' model, `UAVconfig.json`, as arrays."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import ExperimentDataError, ExperimentFileError
+
+FILE_NAME = "UAVconfig.json"
+"""Name of the file in the authors' repository UAV-Digital-Twin."""
+
+LIBRARY_FACTOR = 1.0073
+"""The factor e that the library's entry "mean" belongs to; it is not the average of the draws."""
+
+REGIONS = 2
+PERCENT = 1e-2
+MICROSTRAIN = 1e-6
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PublishedStrains:
+    """Strains of the published model for every damage state, control and draw of Young's modulus.
+
+    Attributes
+    ----------
+    levels : tuple of two tuples
+        Stiffness losses of z1 and of z2, fractions.
+    controls : tuple of str
+        For example "2g", "3g".
+    young_modulus_factor : (E,) dimensionless
+        The draws e.
+    strain_per_draw : (E, n1, n2, U, G) dimensionless
+        Strain of each draw, z1, z2, control and gauge.
+    strain : (n1, n2, U, G) dimensionless
+        The entry "mean": the solution at e = `LIBRARY_FACTOR`.
+    content : mapping
+        The file as it is, for what else it holds.
+    """
+
+    levels: tuple[tuple[float, ...], tuple[float, ...]]
+    controls: tuple[str, ...]
+    young_modulus_factor: FloatArray
+    strain_per_draw: FloatArray
+    strain: FloatArray
+    content: Mapping[str, Any]
+
+
+def find_strain_file(path: Path | str) -> Path:
+    """Return the library's file: `path` itself, or in that folder, or in one of the folders inside it.
+
+    Raises
+    ------
+    ExperimentFileError
+        If there is no such file, or more than one.
+    """
+    path = Path(path)
+    if path.is_file():
+        return path
+    if (path / FILE_NAME).is_file():
+        return path / FILE_NAME
+    found = sorted(path.glob(f"*/{FILE_NAME}")) + sorted(path.glob(f"*/src/{FILE_NAME}"))
+    if len(found) != 1:
+        raise ExperimentFileError(
+            f"{path} holds {len(found)} files {FILE_NAME} instead of one, in it or one folder below; "
+            "give the folder with the authors' repository UAV-Digital-Twin."
+        )
+    return found[0]
+
+
+def read_published_strains(file: Path | str) -> PublishedStrains:
+    """Read the authors' strain library.
+
+    Raises
+    ------
+    ExperimentFileError
+        If the file cannot be read, is no JSON, or lacks an entry; the entry is named.
+    ExperimentDataError
+        If its values are not in the published format.
+    """
+    try:
+        content = json.loads(Path(file).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ExperimentFileError(
+            f"cannot read the strain library {file}: {error.strerror}; give the file {FILE_NAME} of the "
+            "authors' repository UAV-Digital-Twin, or its folder"
+        ) from error
+    except ValueError as error:
+        raise ExperimentFileError(f"the strain library {file} is no JSON file: {error}") from error
+    try:
+        return _arranged(content)
+    except KeyError as error:
+        raise ExperimentFileError(
+            f"the strain library {file} lacks the entry {error}; is it the file {FILE_NAME} as published?"
+        ) from error
+    except (TypeError, ValueError, AttributeError, IndexError) as error:
+        raise ExperimentDataError(
+            f"the strain library {file} is not in the published format: {error}"
+        ) from error
+
+
+def _arranged(content: Mapping[str, Any]) -> PublishedStrains:
+    levels = content["states"]
+    if len(levels) != REGIONS:
+        raise ValueError(f"expected the levels of {REGIONS} regions under 'states', got {len(levels)}")
+    controls = tuple(str(control) for control in content["controls"])
+    observations = content["observations"]
+    first = observations[str(levels[0][0])][str(levels[1][0])][controls[0]]
+    draws = [key for key in first if key != "mean"]
+    gauges = len(first["mean"])
+    table = np.empty((len(draws) + 1, len(levels[0]), len(levels[1]), len(controls), gauges))
+    for i, z1 in enumerate(levels[0]):
+        for j, z2 in enumerate(levels[1]):
+            for u, control in enumerate(controls):
+                entry = observations[str(z1)][str(z2)][control]
+                for e, draw in enumerate(["mean", *draws]):
+                    row = np.asarray(entry[draw], dtype=np.float64)
+                    if row.shape != (gauges,) or not np.all(np.isfinite(row)):
+                        raise ValueError(
+                            f"observations[{z1}][{z2}][{control}][{draw}] must hold {gauges} finite strains"
+                        )
+                    table[e, i, j, u] = row
+    table *= MICROSTRAIN
+    table.setflags(write=False)
+    one, two = (tuple(float(level) * PERCENT for level in given) for given in levels)
+    return PublishedStrains(
+        levels=(one, two),
+        controls=controls,
+        young_modulus_factor=np.array([float(draw) for draw in draws]),
+        strain_per_draw=table[1:],
+        strain=table[0],
+        content=content,
+    )

@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+import tomllib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibration.identification.design_file import DIGITS, _number, design_toml, rounded
+from fe.design import SHIPPED_DESIGN, load_design, parse_design
+
+
+def test_a_written_design_is_read_back() -> None:
+    design = load_design()
+    text = design_toml(design, {"skin.stations.0.young_modulus": "identified", "webs.*.shear_modulus": "too"})
+    again = parse_design(tomllib.loads(text))
+    assert again == parse_design(rounded(design))
+    assert sum(line.endswith("# too") for line in text.splitlines()) == len(design.webs)
+    assert design_toml(again, {}) == design_toml(design, {})
+
+
+def test_the_shipped_file_is_such_a_file() -> None:
+    shipped = load_design()
+    assert "wing identify" in SHIPPED_DESIGN.read_text(encoding="utf-8")
+    assert parse_design(rounded(shipped)) == shipped
+
+
+@given(st.floats(1e-9, 1e13))
+def test_numbers_keep_their_digits(value: float) -> None:
+    text = _number(float(f"{value:.{DIGITS}g}"))
+    assert tomllib.loads(f"x = {text}")["x"] == pytest.approx(value, rel=10.0 ** (1 - DIGITS))
+
+
+def test_text_is_quoted() -> None:
+    design = load_design().changed(name='a "wing" \\ of mine')
+    assert tomllib.loads(design_toml(design, {}))["name"] == design.name

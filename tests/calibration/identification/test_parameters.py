@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibration.errors import IdentificationError
+from calibration.identification.parameters import (
+    CLUSTERS,
+    FreeParameter,
+    fixed_parameters,
+    layout_of,
+    scaled,
+    set_layout,
+    values_of,
+    wing_parameters,
+    with_values,
+)
+from fe.design import WingDesign, load_design
+
+DESIGN = load_design()
+PARAMETERS = wing_parameters(DESIGN)
+
+
+def test_every_parameter_is_documented_and_bounded() -> None:
+    names = [parameter.name for parameter in (*PARAMETERS, *fixed_parameters())]
+    assert len(names) == len(set(names))
+    for parameter, value in zip(PARAMETERS, values_of(DESIGN, PARAMETERS), strict=True):
+        assert parameter.why
+        assert parameter.lower < parameter.mean < parameter.upper or parameter.lower == 0.0
+        assert parameter.standard_deviation > 0.0
+        assert parameter.lower <= value <= parameter.upper
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.floats(-0.4, 0.4), min_size=len(PARAMETERS), max_size=len(PARAMETERS)))
+def test_what_is_written_is_read_back(steps: list[float]) -> None:
+    values = values_of(DESIGN, PARAMETERS)
+    width = np.array([parameter.standard_deviation for parameter in PARAMETERS])
+    lower = np.array([parameter.lower for parameter in PARAMETERS])
+    upper = np.array([parameter.upper for parameter in PARAMETERS])
+    wanted = np.clip(values + width * np.array(steps), lower, upper)
+    found = values_of(with_values(DESIGN, PARAMETERS, wanted), PARAMETERS)
+    assert found == pytest.approx(wanted, rel=1e-9, abs=1e-12)
+
+
+def test_writing_one_number_changes_nothing_else() -> None:
+    for parameter in PARAMETERS:
+        if not parameter.path:
+            continue
+        moved = with_values(DESIGN, [parameter], np.array([parameter.mean * 1.001 + 1e-6]))
+        others = [other for other in PARAMETERS if other.name != parameter.name]
+        assert values_of(moved, others).tolist() == values_of(DESIGN, others).tolist()
+
+
+def test_the_layout_is_two_rows_and_two_staggered_clusters() -> None:
+    content = {"planform": {"semi_span": 2.0}, "gauges": {"positions": [(0.0, 0.0)] * 24}}
+    layout = {
+        "row A first": 0.1, "row A pitch": 0.06, "row A gap": 0.2, "row A chord": 0.5,
+        "row A chord slope": -0.2,
+        "cluster 1 stagger": -0.04, "cluster 1 chord": 0.36, "cluster 1 chord slope": 0.7,
+        "cluster 2 stagger": 0.02, "cluster 2 chord": 0.15, "cluster 2 chord slope": -1.0,
+    }  # fmt: skip
+    set_layout(content, layout)
+    positions = np.array(content["gauges"]["positions"])
+    assert positions[7, 0] == pytest.approx(0.1 + 7 * 0.06)
+    assert positions[8, 0] == pytest.approx(0.1 + 8 * 0.06 + 0.2)
+    assert positions[:16, 1] == pytest.approx(0.5 - 0.2 * (positions[:16, 0] / 2.0 - 0.5))
+    for (start, beside), stagger in zip(CLUSTERS, (-0.04, 0.02), strict=True):
+        assert positions[start : start + 4, 0] == pytest.approx(positions[beside : beside + 4, 0] + stagger)
+    assert positions[20:, 1].mean() == pytest.approx(0.15)
+    assert layout_of(content) == pytest.approx(layout)
+
+
+def test_scaled_values_count_prior_deviations() -> None:
+    parameter = FreeParameter("k", "N/m", 4.0, 2.0, 0.0, 9.0, "why", ("root", "flap_spring"))
+    assert scaled([parameter], np.array([7.0])).tolist() == [1.5]
+
+
+def test_a_start_laid_out_otherwise_is_refused() -> None:
+    webs = [web.model_dump() for web in DESIGN.webs]
+    webs[1]["shear_modulus"] *= 2.0
+    with pytest.raises(
+        IdentificationError, match=r"'web shear modulus' stands at webs\.\*\.shear_modulus .*differ"
+    ):
+        values_of(DESIGN.changed(webs=webs), PARAMETERS)
+    bare: WingDesign = DESIGN.changed(added_density=[])
+    with pytest.raises(IdentificationError, match="has nothing there"):
+        values_of(bare, PARAMETERS)
+    with pytest.raises(IdentificationError, match="24 gauges"):
+        values_of(DESIGN.changed(gauges={"positions": DESIGN.gauges.positions[:8]}), PARAMETERS)

@@ -1,0 +1,84 @@
+"""`uav-twin wing identify`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from calibration.identification.workflow import Identification
+
+
+def identify(
+    data: Annotated[
+        Path,
+        typer.Option(help="Folder with the authors' UAV-Digital-Twin and UAV-Experimental-Calibration."),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the design file, the record and the report.")
+    ] = None,
+    design: Annotated[Path | None, typer.Option(help="Start; the shipped wing design by default.")] = None,
+    from_prior: Annotated[
+        bool, typer.Option("--from-prior", help="Begin with every free number at its prior mean.")
+    ] = False,
+    steps: Annotated[int, typer.Option(min=1, help="Largest number of full models.")] = 15,
+    remesh: Annotated[
+        list[float] | None,
+        typer.Option(help="Evaluate the result again on a mesh this much finer; may be given several times."),
+    ] = None,
+) -> None:
+    """Fit the free numbers of the wing design to outputs of the published model; takes minutes."""
+    from rich.console import Console
+
+    from calibration.identification.workflow import run_identification, write_identification
+    from fe.design import load_design
+    from reporting.errors import FileNotWrittenError
+    from reporting.progress import RichProgress
+
+    if out is not None and out.exists() and not out.is_dir():
+        raise FileNotWrittenError(f"{out} exists and is no folder: choose another --out.")
+    result = run_identification(
+        data,
+        load_design(design),
+        from_prior=from_prior,
+        largest_count=steps,
+        refinements=remesh or (),
+        progress=RichProgress(),
+    )
+    console = Console(highlight=False)
+    _show(result, console)
+    if out is not None:
+        for path in write_identification(result, out):
+            console.print(f"Wrote {path}", soft_wrap=True)
+    if not result.fit.converged:
+        typer.echo("The fit has not converged; repeat with more --steps.", err=True)
+        raise typer.Exit(1)
+
+
+def _show(result: Identification, console: object) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    assert isinstance(console, Console)
+    table = Table("output", "unit", "wanted", "start", "identified", "kept", "fitted")
+    for row, old in zip(result.comparison, result.before, strict=True):
+        wanted = [f"{limit:g}" for limit in (row.wanted_rms, row.wanted_largest) if limit is not None]
+        table.add_row(
+            row.name,
+            "" if row.unit == "1" else row.unit,
+            " / ".join(wanted),
+            f"{old.rms:.3g} / {old.largest:+.3g}",
+            f"{row.rms:.3g} / {row.largest:+.3g}",
+            {True: "yes", False: "no", None: ""}[row.reached],
+            "" if row.fitted else "held out",
+        )
+    console.print(table)
+    fit = result.fit
+    last = fit.iterations[-1]
+    console.print(
+        f"Objective {last.objective:.3f} after {len(fit.iterations)} models; the next step would change no "
+        f"number by more than {last.largest_step:.4f} prior deviations, and the start lies "
+        f"{result.largest_change:.4f} away."
+    )
