@@ -28,9 +28,9 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from .errors import BindingError
 
@@ -61,10 +61,32 @@ class Parameter(Scalar):
 
 
 class Vector(_Record):
-    """Several variables in order; a text with `{a..b}` stands for all numbers from a to b."""
+    """Several variables in order; a text with `{a..b}` stands for all numbers from a to b.
+
+    `unit` is one for all variables, or one for each.
+    """
 
     variables: tuple[_Text, ...]
-    unit: _Text
+    unit: _Text | tuple[_Text, ...]
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each variable."""
+        return (self.unit,) * len(self.variables) if isinstance(self.unit, str) else self.unit
+
+    @field_validator("unit", mode="before")
+    @classmethod
+    def _listed(cls, given: object) -> object:
+        return tuple(given) if isinstance(given, list) else given
+
+    @model_validator(mode="after")
+    def _one_or_each(self) -> Self:
+        if len(self.units) != len(self.variables):
+            raise ValueError(
+                f"`unit` must be one text, or one for each of the {len(self.variables)} variables, and "
+                f"{len(self.units)} came"
+            )
+        return self
 
     @field_validator("variables", mode="before")
     @classmethod

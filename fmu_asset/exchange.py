@@ -79,9 +79,9 @@ class Exchange:
                 name: slot._replace(position=2 + labels.index(slot.label)) for name, slot in slots.items()
             }
         observed = [
-            (name, self._resolve(name, f"observation.{key}", "output"), vector.unit, f"observation.{key}")
+            (name, self._resolve(name, f"observation.{key}", "output"), unit, f"observation.{key}")
             for key, vector in binding.observation.items()
-            for name in vector.variables
+            for name, unit in zip(vector.variables, vector.units, strict=True)
         ]
         monitored = [
             (

@@ -54,12 +54,14 @@ class FmuAsset:
         self._load = dict(load)
         binding = session.binding
         self._units = {
-            name: scalar.unit for name, scalar in [*binding.control.items(), *binding.monitor.items()]
+            name: scalar.unit
+            for table in (binding.parameter, binding.monitor, binding.control)
+            for name, scalar in table.items()
         }
 
     @property
     def units(self) -> Mapping[str, str]:
-        """Units of control inputs and monitors, as the binding has them."""
+        """Units of control inputs, monitors and parameters, as the binding has them."""
         return self._units
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
