@@ -1,11 +1,11 @@
 """Packing a model that is one Python script for pythonfmu as an FMU that other tools can check.
 
-pythonfmu's own builder takes the same scripts, but leaves out units and ranges, and stamps a time and a random
-GUID, so that no two builds are alike. Here equal scripts give equal bytes. A script may say more in two class
-attributes, both optional:
+pythonfmu's own builder takes the same scripts, but leaves out units and ranges, and stamps a time and a
+random GUID, so that no two builds are alike. Here equal scripts give equal bytes. A script may say more in
+two class attributes, both optional:
 
-- `unit_table`: for each unit its exponents of `kg, m, s, A, K, mol, cd, rad`, a `factor` and an `offset` to them
-  (1 and 0 by default), and `displays`, the factors of display units;
+- `unit_table`: for each unit its exponents of `kg, m, s, A, K, mol, cd, rad`, a `factor` and an `offset` to
+  them (1 and 0 by default), and `displays`, the factors of display units;
 - `variable_table`: for each variable causality, unit, least, largest and start value (or None), and meaning.
 
 The script runs once in this process, to be asked for its variables.

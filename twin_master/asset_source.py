@@ -32,6 +32,7 @@ BINDING_COPY = f"{ASSET_FOLDER}/binding.toml"
 DESIGN_COPY = f"{ASSET_FOLDER}/design.toml"
 FMU_COPY = f"{ASSET_FOLDER}/asset.fmu"
 LIBRARY_COPY = f"{ASSET_FOLDER}/{LIBRARY_NAME}"
+OBSERVATIONS_COPY = f"{ASSET_FOLDER}/observation_library.nc"
 
 
 @dataclass(frozen=True)

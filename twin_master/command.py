@@ -42,6 +42,10 @@ def run(
             "scenario that flies a library, its file."
         ),
     ] = None,
+    library: Annotated[
+        Path | None,
+        typer.Option(help="Believe this observation library, made by `uav-twin library sample`."),
+    ] = None,
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Run the FMU in this process instead of a worker.")
     ] = False,
@@ -53,7 +57,7 @@ def run(
     from twin_master.scenario_file import load_scenario
     from twin_master.workflow import new_run, resume_run
 
-    overrides = Overrides(seed, fmu, binding, strain_library, in_process)
+    overrides = Overrides(seed, fmu, binding, strain_library, in_process, library)
     progress = SilentProgress() if quiet else RichProgress()
     if resume is not None:
         if out is not None or replace or overrides != Overrides():
@@ -106,7 +110,7 @@ def show_outcome(outcome: RunOutcome) -> None:
         entry = outcome.timing.get(f"{part}_seconds")
         if entry:
             median, largest = 1e3 * entry["median"], 1e3 * entry["largest"]
-            table.add_row(f"{part}, per turn", f"{median:.3g} ms (largest {largest:.3g} ms)")
+            table.add_row(f"{part}, per {outcome.step_name}", f"{median:.3g} ms (largest {largest:.3g} ms)")
     table.add_row("whole run", f"{outcome.timing['total_seconds']:.3g} s")
     console.print(table)
     if outcome.origin.differ:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from fe.design import load_design
 from fe.reduced import ReducedModel
 from fmu_asset.binding import Binding, load_binding
 from fmu_asset.build import build_fmu
+from fmu_asset.script import script_fmu
 from fmu_asset.session import FmiAsset
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
@@ -95,11 +97,21 @@ class FmuSource:
         Wing design: the twin's model, and what is packed where no FMU is given.
     fmu : Path or None
         The FMU to fly.
+    script : Path or None
+        A model script that is packed as the FMU to fly.
     """
 
-    def __init__(self, scenario: Scenario, binding: Path, design: Path | None, fmu: Path | None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        binding: Path,
+        design: Path | None,
+        fmu: Path | None,
+        script: Path | None = None,
+    ) -> None:
         self._scenario = scenario
         self._binding = binding
+        self._script = script
         self._given = {BINDING_COPY: binding, DESIGN_COPY: design, FMU_COPY: fmu}
         self._folder: Path | None = None
         self._wing: ReducedModel | None = None
@@ -111,9 +123,8 @@ class FmuSource:
 
         An FMU that is given may hold any model, also that of the design: whether they differ is not known.
         """
-        design = self._given[DESIGN_COPY]
         model = f"reduced model of the design {self._design_name}".rstrip()
-        if design is None or self._scenario.asset.observation_model == "asset":
+        if not self._scenario.asset.model_of_the_design:
             return Origin("FMU", "FMU")
         return Origin("FMU" if self._given[FMU_COPY] else f"FMU of the {model}", model)
 
@@ -144,20 +155,30 @@ class FmuSource:
         self._check_names(binding)
         if design is not None:
             gauges = len(load_design(design).gauges.positions)
-            if self._scenario.asset.observation_model != "asset":
+            if self._scenario.asset.model_of_the_design:
                 check_wing_scenario(self._scenario, gauges)
         if fmu is not None:
             FmiAsset(fmu, binding, parameters=self._scenario.asset.parameters)
+        elif self._script is not None:
+            with TemporaryDirectory(prefix="uav_twin_") as folder:
+                packed = Path(folder) / "asset.fmu"
+                packed.write_bytes(script_fmu(self._script)[0])
+                FmiAsset(packed, binding, parameters=self._scenario.asset.parameters)
 
     def files(self) -> dict[str, bytes]:
-        """Return binding, design and FMU as they are given.
+        """Return binding, design and FMU as they are given; a model script is packed.
 
         Raises
         ------
         MissionInputError
             A file cannot be read.
+        FmuBuildError
+            The model script cannot be packed.
         """
-        return {name: read_content(path) for name, path in self._given.items() if path is not None}
+        contents = {name: read_content(path) for name, path in self._given.items() if path is not None}
+        if self._script is not None:
+            contents[FMU_COPY] = script_fmu(self._script)[0]
+        return contents
 
     def _check_names(self, binding: Binding) -> None:
         scenario = self._scenario
@@ -185,9 +206,9 @@ class FmuSource:
             A design, binding or FMU is wrong.
         """
         self._folder = folder
-        for name, path in self._given.items():
-            if path is not None and not self._path(name).exists():
-                atomic_write_bytes(self._path(name), read_content(path))
+        for name, content in self.files().items():
+            if not self._path(name).exists():
+                atomic_write_bytes(self._path(name), content)
         self._observed(load_binding(self._path(BINDING_COPY)))
         hashes = {"binding": hash_file(self._path(BINDING_COPY))}
         if self._given[DESIGN_COPY] is not None:

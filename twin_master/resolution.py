@@ -7,12 +7,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from reporting.provenance import hash_file
-from scenarios import binding_files
+from scenarios import asset_scripts, binding_files
 from twin_master.asset_source import (
     BINDING_COPY,
     DESIGN_COPY,
     FMU_COPY,
     LIBRARY_COPY,
+    OBSERVATIONS_COPY,
     AssetSource,
     StrainLibrarySource,
 )
@@ -40,6 +41,8 @@ class Overrides:
     strain_library : Path or None
         Fly the library instead of an FMU, as asset and model; where the scenario flies a library anyway, the
         file of that library.
+    library : Path or None
+        Believe this observation library.
     in_process : bool
         Fly the FMU in this process instead of a worker.
     """
@@ -49,6 +52,7 @@ class Overrides:
     binding: Path | None = None
     strain_library: Path | None = None
     in_process: bool = False
+    library: Path | None = None
 
 
 def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
@@ -67,21 +71,29 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
     asset, folder = table["asset"], loaded.path.resolve().parent
     if overrides.strain_library and (overrides.fmu or overrides.binding):
         raise MissionInputError("--strain-library flies no FMU: give either it or --fmu and --binding.")
+    if overrides.strain_library and overrides.library:
+        raise MissionInputError("--strain-library is asset and model itself: give either it or --library.")
     if asset["design"] and asset["design"] != SHIPPED_DESIGN_NAME:
         asset["design"] = str(folder / asset["design"])
     if asset["file"]:
         asset["file"] = str(folder / asset["file"])
+    if asset["script"] and asset["script"] not in asset_scripts():
+        asset["script"] = str(folder / asset["script"])
+    if asset["library"]:
+        asset["library"] = str(folder / asset["library"])
     if asset["binding"] and asset["binding"] not in binding_files():
         asset["binding"] = str(folder / asset["binding"])
     if overrides.fmu:
-        asset |= {"kind": "fmu", "file": str(overrides.fmu.resolve())}
+        asset |= {"kind": "fmu", "file": str(overrides.fmu.resolve()), "script": None}
     if overrides.binding:
         asset["binding"] = str(overrides.binding.resolve())
     if overrides.strain_library:
         if asset["kind"] != "strain_library":
             asset |= {"kind": "strain_library", "design": None, "binding": None, "observation_model": None}
-            asset["parameters"] = {}  # those of the FMU
+            asset |= {"script": None, "library": None, "parameters": {}}  # those of the FMU
         asset["file"] = str(_library_file(overrides.strain_library))
+    if overrides.library:
+        asset |= {"observation_model": "library", "library": str(overrides.library.resolve())}
     if overrides.in_process:
         asset["isolated"] = False
     if overrides.seed is not None:
@@ -97,7 +109,9 @@ def portable_scenario(scenario: Scenario) -> Scenario:
     """Return a resolved scenario that names the copies in the run folder, so that it holds on any machine."""
     library = scenario.asset.kind == "strain_library"
     copies = {"file": LIBRARY_COPY if library else FMU_COPY, "design": DESIGN_COPY, "binding": BINDING_COPY}
-    return _with_asset(scenario, {key: copies[key] for key in _given_paths(scenario)})
+    copies["library"] = OBSERVATIONS_COPY
+    # A script is packed once; from then on the FMU is what is flown.
+    return _with_asset(scenario, {key: copies[key] for key in _given_paths(scenario)} | {"script": None})
 
 
 def located_scenario(scenario: Scenario, folder: Path) -> Scenario:
@@ -109,9 +123,11 @@ def located_scenario(scenario: Scenario, folder: Path) -> Scenario:
 def _given_paths(scenario: Scenario) -> dict[str, str]:
     """Return the files that the asset names, without what is shipped."""
     asset = scenario.asset
-    given = {"file": asset.file, "design": asset.design, "binding": asset.binding}
+    given = {"file": asset.file or asset.script, "library": asset.library}
     shipped = {SHIPPED_DESIGN_NAME, *binding_files()}
-    return {key: path for key, path in given.items() if path and (key == "file" or path not in shipped)}
+    for key, path in (("design", asset.design), ("binding", asset.binding)):
+        given[key] = None if path in shipped else path
+    return {key: path for key, path in given.items() if path}
 
 
 def _with_asset(scenario: Scenario, changes: dict[str, Any]) -> Scenario:
@@ -142,9 +158,19 @@ def asset_source(scenario: Scenario) -> AssetSource:
         check_load_factors(scenario)
         return MismatchedSource(library, DesignSource(scenario, Path(design or "")))
     binding = binding_files().get(asset.binding or "", Path(asset.binding or ""))
-    return FmuSource(
-        scenario, binding, Path(design) if design else None, Path(asset.file) if asset.file else None
+    script = asset_scripts().get(asset.script or "", Path(asset.script)) if asset.script else None
+    source = FmuSource(
+        scenario,
+        binding,
+        Path(design) if design else None,
+        Path(asset.file) if asset.file else None,
+        script,
     )
+    if asset.library is None:
+        return source
+    from twin_master.library_source import LibrarySource
+
+    return LibrarySource(scenario, source, binding, Path(asset.library))
 
 
 def _library_source(scenario: Scenario) -> StrainLibrarySource:

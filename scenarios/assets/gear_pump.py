@@ -1,16 +1,16 @@
 """A hydraulic gear pump with a filter, in steady operation: a script that is packed as an FMU.
 
-The pump lifts oil from a tank through a pressure filter to a load whose pressure is held. Its clearances wear,
-and the filter clogs. Units here are SI; the interface has those of the trade.
+The pump lifts oil from a tank through a pressure filter to a load whose pressure is held. Its clearances
+wear, and the filter clogs. Units here are SI; the interface has those of the trade.
 
-- Flow and torque of a positive displacement pump with laminar slip, after Wilson: H. E. Merritt, Hydraulic
-  Control Systems, Wiley 1967, chapter 4; D. McCloy, H. R. Martin, Control of Fluid Power, Ellis Horwood 1980:
-  Q = D w - C_s D p / mu, T = D p (1 + C_f) + C_v D mu w.
-- Slip is flow through plane gaps, so it grows with the cube of the clearance: F. M. White, Viscous Fluid Flow,
-  section 3-2 (plane Poiseuille flow).
+- Flow and torque of a positive displacement pump with laminar slip, after Wilson: H. E. Merritt,
+  Hydraulic Control Systems, Wiley 1967, chapter 4; D. McCloy, H. R. Martin, Control of Fluid Power,
+  Ellis Horwood 1980: Q = D w - C_s D p / mu, T = D p (1 + C_f) + C_v D mu w.
+- Slip is flow through plane gaps (plane Poiseuille flow), so it grows with the cube of the clearance:
+  F. M. White, Viscous Fluid Flow, McGraw-Hill 1991, section 3-3.
 - The filter is a porous layer: Darcy's law, p_f = mu R Q / (1 - c) with the share c of its area blocked.
-- Viscosity falls exponentially with temperature (Merritt, section 2-2); the oil is ISO VG 46, 46 mm2/s at 40 C
-  within 10 % (ISO 3448), and 6.8 mm2/s at 100 C, as mineral oils with a viscosity index near 100 have it.
+- Viscosity falls exponentially with temperature (Merritt, chapter 2); the oil is ISO VG 46, 46 mm2/s at
+  40 C within 10 % (ISO 3448), and 6.8 mm2/s at 100 C, as mineral oils with a viscosity index near 100.
 - The steady temperature of the tank follows from what is lost in pump and filter, and a cooler.
 """
 
@@ -81,7 +81,7 @@ def operation(
 
 
 def steady_temperature(speed: float, pressure: float, wear: float, clogging: float, factor: float) -> float:
-    """Return the temperature [C] at which the cooler takes what is lost, by bisection; NaN if there is none."""
+    """Return the temperature [C] at which the cooler takes what is lost, by bisection; NaN without one."""
 
     def surplus(temperature: float) -> float:
         loss = operation(temperature, speed, pressure, wear, clogging, factor)[3]
@@ -99,7 +99,7 @@ def steady_temperature(speed: float, pressure: float, wear: float, clogging: flo
     return 0.5 * (low + high)
 
 
-class GearPump(Fmi2Slave):
+class GearPump(Fmi2Slave):  # type: ignore[misc]
     """The pump. Each step is the steady operation under its inputs: there is no memory from step to step."""
 
     description = "Hydraulic gear pump with filter in steady operation; clearances wear and the filter clogs."
@@ -120,7 +120,7 @@ class GearPump(Fmi2Slave):
         self._operate()
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Set the outputs for the inputs of the step; False (fmi2Discard) where there is no steady operation."""
+        """Set the outputs for the inputs of the step; False (fmi2Discard) without a steady operation."""
         return self._operate()
 
     def _operate(self) -> bool:

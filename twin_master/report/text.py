@@ -72,9 +72,9 @@ def mission_caption(record: RunRecord, now: int) -> str:
             f"The {record.horizon} {step}s to come are predicted through the policy, eqs. (37)–(39) "
             "(vermilion, dashed)."
         )
-    shown = unit or "each in its unit"
+    shown, name = unit or "each in its unit", record.observation_name
     sentences.append(
-        f"{sensor_word(record)}s: {record.observation_name} without noise at the control flown ({shown}) with "
+        f"{sensor_word(record)}s: {name} without noise at the control flown ({shown}) with "
         f"95 % intervals, {past}, and observations (dots; {hollow}crosses: lost)."
     )
     later = "" if last else "; triangles: flown later"
