@@ -161,8 +161,8 @@ def grid_of_scenario(
     scenario = resolve_scenario(plain, overrides or Overrides())
     if scenario.asset.kind != "fmu":
         raise InvalidObservationLibraryError(
-            f"the scenario {scenario.mission.name} flies no FMU but a {scenario.asset.kind.replace('_', ' ')}, "
-            "so there is nothing to sample."
+            f"the scenario {scenario.mission.name} flies no FMU but a "
+            f"{scenario.asset.kind.replace('_', ' ')}, so there is nothing to sample."
         )
     source = asset_source(scenario)
     source.check()

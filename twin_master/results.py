@@ -178,7 +178,7 @@ def _observed(result: MissionResult, labels: _Labels) -> xr.Dataset:
         role: (("step", "sensor"), flight.observed, unit, f"{role} as received; NaN where a sensor is lost"),
         "control_index": (("step",), flight.control_index, "1", "control in force"),
     }
-    for name in scenario.control[0].values:
+    for name in sorted(scenario.control[0].values):  # config.json does not keep their order
         values = np.array([control.values[name] for control in scenario.control])[flight.control_index]
         variables[name] = (("step",), values, result.units.get(name, "1"), f"{name} in force")
     return labels.dataset(variables)
