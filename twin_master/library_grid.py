@@ -21,7 +21,7 @@ MEMORY_TOLERANCE = 1e-8
 SETTLED_TOLERANCE = 1e-3
 """What may still change, as a share of the value, when a point is given as many steps again to settle."""
 
-_LONGEST_BLOCK = 512
+_LONGEST_BLOCK = 4096
 _BLOCKS = 64
 
 

@@ -21,7 +21,14 @@ import numpy as np
 from fmu_asset.binding import Binding, load_binding
 from fmu_asset.session import FmiAsset
 from reporting.errors import DamagedFileError
-from reporting.files import atomic_write_text, read_npz, remove_leftovers, write_npz
+from reporting.files import (
+    TEMPORARY_SUFFIX,
+    atomic_write_text,
+    npz_bytes,
+    read_npz,
+    remove_leftovers,
+    write_error,
+)
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_file
 from twin_master.errors import InvalidObservationLibraryError
@@ -125,7 +132,7 @@ def sample_library(
         ) as stage:
             stage.advance(len(found))
             for number, values in _sampled(grid, todo, min(count, max(len(todo), 1))):
-                write_npz(_block_file(folder, number), {"values": values})
+                _keep_block(_block_file(folder, number), values)
                 found[number] = values
                 stage.advance(1)
         seconds = time.perf_counter() - begin
@@ -240,6 +247,20 @@ def _difference(kept: str, record: dict[str, Any]) -> str:
 
 def _block_file(folder: Path, number: int) -> Path:
     return folder / f"block_{number:05d}.npz"
+
+
+def _keep_block(path: Path, values: Float) -> None:
+    """Keep a finished block, whole or not at all.
+
+    It is not flushed to the disk, which can take longer than sampling it: a block that a power failure
+    damages is recognised by its checksum and sampled again.
+    """
+    temporary = path.with_name(f".{path.stem}{TEMPORARY_SUFFIX}{path.suffix}")
+    try:
+        temporary.write_bytes(npz_bytes({"values": values}))
+        temporary.replace(path)
+    except OSError as error:
+        raise write_error(error, path) from error
 
 
 def _read_blocks(grid: SamplingGrid, folder: Path) -> dict[int, Float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +88,13 @@ class LibrarySource:
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the parameter, from the calibration of the scenario."""
-        return self._asset.draws(seed)
+        draws = self._asset.draws(seed)
+        library = self._library or self._read()
+        if not library.parameter or library.holds_draws(draws.values):
+            return draws
+        return replace(
+            draws, source=f"{draws.source}; the observation library is interpolated between its own"
+        )
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Return the observations (E, S, U, G) in the order of the scenario's states and controls.

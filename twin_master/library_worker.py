@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -34,7 +33,6 @@ def serve(descriptor: int, grid: str) -> None:
     grid : str
         The grid as text.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interruption means
     connection = Connection(descriptor)
     sampler: GridSampler | None = None
     try:
@@ -89,6 +87,8 @@ class SamplingProcess:
                 stderr=self._log,
                 env=environment,
                 pass_fds=(theirs.fileno(),),
+                # What the terminal sends is for the parent alone; the process ends with its connection.
+                start_new_session=True,
             )
         except OSError as error:
             ours.close()

@@ -99,6 +99,18 @@ def test_a_run_with_a_library_keeps_it_and_can_be_resumed(
         resume_run(tmp_path / "part")
 
 
+def test_a_library_of_the_same_draws_gives_the_same_run(tmp_path: Path) -> None:
+    grid = grid_of_scenario(small_pump(), tmp_path / "made", progress=SilentProgress())
+    path = sample_library(grid, tmp_path / "pump.nc", workers=1).path
+    new_run(small_pump(), tmp_path / "asked")
+    new_run(small_pump(), tmp_path / "sampled", Overrides(library=path))
+    for file in (tmp_path / "asked" / "csv").iterdir():
+        assert (tmp_path / "sampled" / "csv" / file.name).read_bytes() == file.read_bytes()
+    # With another seed the draws are others, inside the sampled range only for some.
+    with pytest.raises(InvalidObservationLibraryError, match="scenario and seed"):
+        new_run(small_pump(), tmp_path / "other", Overrides(library=path, seed=3))
+
+
 def test_a_library_of_another_fmu_is_flown_with_a_notice(
     made: tuple[Path, SamplingGrid], tmp_path: Path
 ) -> None:
