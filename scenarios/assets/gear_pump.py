@@ -7,7 +7,7 @@ wear, and the filter clogs. Units here are SI; the interface has those of the tr
   Hydraulic Control Systems, Wiley 1967, chapter 4; D. McCloy, H. R. Martin, Control of Fluid Power,
   Ellis Horwood 1980: Q = D w - C_s D p / mu, T = D p (1 + C_f) + C_v D mu w.
 - Slip is flow through plane gaps (plane Poiseuille flow), so it grows with the cube of the clearance:
-  F. M. White, Viscous Fluid Flow, McGraw-Hill 1991, section 3-3.
+  F. M. White, Viscous Fluid Flow, McGraw-Hill 1991, chapter 3.
 - The filter is a porous layer: Darcy's law, p_f = mu R Q / (1 - c) with the share c of its area blocked.
 - Viscosity falls exponentially with temperature (Merritt, chapter 2); the oil is ISO VG 46, 46 mm2/s at
   40 C within 10 % (ISO 3448), and 6.8 mm2/s at 100 C, as mineral oils with a viscosity index near 100.

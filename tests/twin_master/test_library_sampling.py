@@ -94,9 +94,9 @@ def test_the_bytes_do_not_depend_on_the_number_of_processes(files: tuple[Path, P
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
-@pytest.mark.parametrize("twice", [False, True])
-def test_what_a_killed_sampling_finished_is_kept(
-    files: tuple[Path, Path], tmp_path: Path, twice: bool
+@pytest.mark.parametrize("signals", [[signal.SIGKILL], [signal.SIGINT, signal.SIGKILL]])
+def test_what_an_interrupted_sampling_finished_is_kept(
+    files: tuple[Path, Path], tmp_path: Path, signals: list[signal.Signals]
 ) -> None:
     slow = grid(files, SLOW, draws=tuple(np.linspace(0.8, 1.2, 40)))
     whole = sample_library(slow, tmp_path / "whole.nc", workers=2)
@@ -106,14 +106,19 @@ def test_what_a_killed_sampling_finished_is_kept(
     command += ["--fmu", str(fmu), "--binding", str(binding), "--out", str(out), "--grid", "wear=0,0.25,0.5"]
     command += ["--grid", "gain=0.8:1.2:40", "--grid", "push=2,4", "--grid", f"mode={SLOW}"]
     wanted = 0
-    for _ in range(2 if twice else 1):
+    for end in signals:
         wanted += 5
         root = str(Path(__file__).parents[2])
-        process = subprocess.Popen([*command, *(["--resume"] if wanted > 5 else [])], cwd=root)
+        resume = ["--resume"] if wanted > 5 else []
+        process = subprocess.Popen([*command, *resume], cwd=root, stderr=subprocess.PIPE)
         while len(list(blocks_folder(out).glob("block_*.npz"))) < wanted and process.poll() is None:
             time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        process.send_signal(end)
+        words = process.communicate()[1].decode()
+        if end == signal.SIGINT:
+            assert process.returncode == 130
+            assert words.startswith("Interrupted; finished blocks are kept")
+            assert "Traceback" not in words
     assert not out.exists()
     with pytest.raises(InvalidObservationLibraryError, match=r"part\.nc\.blocks holds the finished blocks"):
         sample_library(slow, out)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from reporting import figures as style
 from twin_master.report.data import RunRecord
-from twin_master.report.view import capital, state_label, state_scale, state_scales
+from twin_master.report.view import capital, short_number, state_label, state_scale, state_scales
 
 Float = NDArray[np.floating[Any]]
 
@@ -136,7 +136,7 @@ def _marginal_figure(record: RunRecord) -> Figure:
             truth = np.interp(record.truth_state[:, factor], levels, np.arange(len(levels)))
             axes.plot(np.arange(record.step_count), truth, color=style.TRUTH, linewidth=1.0, label="truth")
         scale, _ = state_scale(record, factor)
-        axes.set_yticks(np.arange(len(levels)), [f"{scale * level:g}" for level in levels])
+        axes.set_yticks(np.arange(len(levels)), [short_number(scale * level) for level in levels.tolist()])
         axes.set_ylabel(state_label(record, factor))
         style.panel_label(axes, "abcdefghijklmnopqrstuvwxyz"[factor % 26], capital(title))
         figure.colorbar(image, ax=axes, pad=0.02, label="probability")
@@ -161,8 +161,8 @@ def _map(axes: Axes, record: RunRecord, values: NDArray[Any], **options: Any) ->
     )
     x, y = _edges(first), _edges(second)
     image = axes.pcolormesh(x, y, values, edgecolors="#d9d9d9", linewidth=0.4, **options)
-    axes.set_xticks(first)
-    axes.set_yticks(second)
+    axes.set_xticks(first, [short_number(level) for level in first.tolist()])
+    axes.set_yticks(second, [short_number(level) for level in second.tolist()])
     axes.tick_params(length=2.0)
     for side in ("top", "right"):
         axes.spines[side].set_visible(True)

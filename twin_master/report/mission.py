@@ -23,6 +23,7 @@ from twin_master.report.view import (
     reward_course,
     sensor_course,
     sensor_title,
+    short_number,
     state_course,
     state_label,
     state_scale,
@@ -148,7 +149,7 @@ def _state_panel(axes: Axes, record: RunRecord, factor: int, now: int) -> str:
     levels = scale * record.levels[factor]
     margin = 0.075 * (levels[-1] - levels[0]) or 6.0
     axes.set_ylim(levels[0] - margin, levels[-1] + margin)
-    axes.set_yticks(levels)
+    axes.set_yticks(levels, [short_number(level) for level in levels.tolist()])
     axes.set_ylabel(state_label(record, factor))
     return capital(record.state_titles[factor])
 

@@ -71,6 +71,15 @@ def state_scale(record: RunRecord, factor: int) -> tuple[float, str]:
     return (100.0, "%") if unit == "1" else (1.0, unit)
 
 
+def short_number(value: float) -> str:
+    """Return a number that fits beside an axis: 0.5, 1500, 1e-4."""
+    text = f"{value:g}"
+    if len(text.lstrip("-")) <= 4:
+        return text
+    mantissa, exponent = f"{value:.2e}".split("e")
+    return f"{float(mantissa):g}e{int(exponent)}"
+
+
 def state_scales(record: RunRecord) -> Float:
     """Return the factors from the stored units to the printed ones: (K,)."""
     return np.array([state_scale(record, factor)[0] for factor in range(len(record.state_names))])
