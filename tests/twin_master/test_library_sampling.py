@@ -98,13 +98,13 @@ def test_the_bytes_do_not_depend_on_the_number_of_processes(files: tuple[Path, P
 def test_what_an_interrupted_sampling_finished_is_kept(
     files: tuple[Path, Path], tmp_path: Path, signals: list[signal.Signals]
 ) -> None:
-    slow = grid(files, SLOW, draws=tuple(np.linspace(0.8, 1.2, 40)))
+    slow = grid(files, SLOW, draws=tuple(np.linspace(0.8, 1.2, 20)))
     whole = sample_library(slow, tmp_path / "whole.nc", workers=2)
     fmu, binding = files
     out = tmp_path / "part.nc"
     command = [sys.executable, "-m", "uav_twin", "library", "sample", "--quiet", "--workers", "1"]
     command += ["--fmu", str(fmu), "--binding", str(binding), "--out", str(out), "--grid", "wear=0,0.25,0.5"]
-    command += ["--grid", "gain=0.8:1.2:40", "--grid", "push=2,4", "--grid", f"mode={SLOW}"]
+    command += ["--grid", "gain=0.8:1.2:20", "--grid", "push=2,4", "--grid", f"mode={SLOW}"]
     wanted = 0
     for end in signals:
         wanted += 5
