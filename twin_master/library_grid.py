@@ -23,6 +23,7 @@ SETTLED_TOLERANCE = 1e-3
 
 _LONGEST_BLOCK = 4096
 _BLOCKS = 64
+_LONG_BLOCK = 32
 
 
 @dataclass(frozen=True)
@@ -148,8 +149,9 @@ class GridSampler:
         if self._grid.settling_steps:
             self._check_settled(last - 1, values[-1])
         else:
-            # Once more, with other points in between and in another order.
-            for index in {begin, (begin + last) // 2}:
+            # Once more, with other points in between and in another order; one is enough of a short block.
+            again = {begin, (begin + last) // 2} if last - first >= _LONG_BLOCK else {begin}
+            for index in sorted(again):
                 self._check_memory(index, values[index - first])
         return values
 
