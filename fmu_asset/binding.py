@@ -29,7 +29,7 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -86,10 +86,32 @@ class Parameter(Input):
 
 
 class Vector(_Record):
-    """Several variables in order; a text with `{a..b}` stands for all numbers from a to b."""
+    """Several variables in order; a text with `{a..b}` stands for all numbers from a to b.
+
+    `unit` is one for all variables, or one for each.
+    """
 
     variables: tuple[_Text, ...]
-    unit: _Text
+    unit: _Text | tuple[_Text, ...]
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each variable."""
+        return (self.unit,) * len(self.variables) if isinstance(self.unit, str) else self.unit
+
+    @field_validator("unit", mode="before")
+    @classmethod
+    def _listed(cls, given: object) -> object:
+        return tuple(given) if isinstance(given, list) else given
+
+    @model_validator(mode="after")
+    def _one_or_each(self) -> Self:
+        if len(self.units) != len(self.variables):
+            raise ValueError(
+                f"`unit` must be one text, or one for each of the {len(self.variables)} variables, and "
+                f"{len(self.units)} came"
+            )
+        return self
 
     @field_validator("variables", mode="before")
     @classmethod
@@ -121,6 +143,8 @@ class Port(_Record):
         if self.displacement is None and self.velocity is None:
             raise ValueError("a port needs a displacement or a velocity beside its force")
         for name, vector in self.quantities.items():
+            if not isinstance(vector.unit, str):
+                raise ValueError(f"{name} must have one unit, and {len(vector.unit)} came")
             allowed = [same_dimension(vector.unit, unit) for unit in PORT_QUANTITIES[name]]
             if allowed == [False, False]:
                 raise ValueError(
@@ -287,7 +311,18 @@ class Binding(_Record):
             return tuple(element for name in names for element in elements(name))
 
         observation = {
-            key: vector.model_copy(update={"variables": of(vector.variables)})
+            key: vector.model_copy(
+                update={
+                    "variables": of(vector.variables),
+                    "unit": vector.unit
+                    if isinstance(vector.unit, str)
+                    else tuple(
+                        unit
+                        for name, unit in zip(vector.variables, vector.unit, strict=True)
+                        for _ in elements(name)
+                    ),
+                }
+            )
             for key, vector in self.observation.items()
         }
         monitor = {}

@@ -125,7 +125,7 @@ class Exchange:
     def _port_vectors(self, *, read: bool) -> list[tuple[str, tuple[str, ...], str]]:
         """Return name, variables and unit of the ports' quantities that are read, or that are sent."""
         return [
-            (f"{name}.{quantity}", vector.variables, vector.unit)
+            (f"{name}.{quantity}", vector.variables, vector.units[0])
             for name, port in self._binding.port.items()
             for quantity, vector in port.quantities.items()
             if self._reads_ports[f"{name}.{quantity}"] == read
@@ -213,9 +213,9 @@ class Exchange:
         """Lay out the reply block: observations, monitors, records, outputs of ports."""
         binding = self._binding
         wanted = [
-            (name, name, vector.unit, f"observation.{key}")
+            (name, name, unit, f"observation.{key}")
             for key, vector in binding.observation.items()
-            for name in vector.variables
+            for name, unit in zip(vector.variables, vector.units, strict=True)
         ]
         self._observation_count = len(wanted)
         wanted += [

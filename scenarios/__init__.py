@@ -1,4 +1,4 @@
-"""What to run: scenario and binding files, shipped as package data."""
+"""What to run: scenario files, bindings and models of assets, shipped as package data."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 SCENARIO_FOLDER = Path(str(resources.files(__name__)))
 BINDING_FOLDER = SCENARIO_FOLDER / "bindings"
+ASSET_FOLDER = SCENARIO_FOLDER / "assets"
 
 
 def scenario_files() -> dict[str, Path]:
@@ -17,3 +18,8 @@ def scenario_files() -> dict[str, Path]:
 def binding_files() -> dict[str, Path]:
     """Return the shipped bindings by name, in alphabetical order."""
     return {path.stem: path for path in sorted(BINDING_FOLDER.glob("*.toml"))}
+
+
+def asset_scripts() -> dict[str, Path]:
+    """Return the shipped model scripts by name, in alphabetical order."""
+    return {path.stem: path for path in sorted(ASSET_FOLDER.glob("*.py")) if path.stem != "__init__"}

@@ -50,6 +50,10 @@ def run(
         Path | None,
         typer.Option(help="Fly with this calibration of the wing, a calibration.nc of `uav-twin calibrate`."),
     ] = None,
+    library: Annotated[
+        Path | None,
+        typer.Option(help="Believe this observation library, made by `uav-twin library sample`."),
+    ] = None,
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Run the FMU in this process instead of a worker.")
     ] = False,
@@ -73,7 +77,7 @@ def run(
         scenario, ssp = with_scenario, Path(scenario)
     elif with_scenario is not None:
         raise typer.BadParameter("belongs to an SSP file as SCENARIO.", param_hint="--scenario")
-    overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration, ssp)
+    overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration, ssp, library)
     progress = SilentProgress() if quiet else RichProgress()
     if resume is not None:
         if out is not None or replace or overrides != Overrides():
@@ -126,7 +130,7 @@ def show_outcome(outcome: RunOutcome) -> None:
         entry = outcome.timing.get(f"{part}_seconds")
         if entry:
             median, largest = 1e3 * entry["median"], 1e3 * entry["largest"]
-            table.add_row(f"{part}, per turn", f"{median:.3g} ms (largest {largest:.3g} ms)")
+            table.add_row(f"{part}, per {outcome.step_name}", f"{median:.3g} ms (largest {largest:.3g} ms)")
     table.add_row("whole run", f"{outcome.timing['total_seconds']:.3g} s")
     console.print(table)
     if outcome.origin.differ:

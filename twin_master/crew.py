@@ -105,4 +105,7 @@ def reward_settings(scenario: Scenario) -> RewardSettings:
         control_reward=tuple(section.control[name] for name in scenario.control_names),
         error_scale=section.error_scale,
         control_normaliser=None if norm is None else tuple(c.values[norm] for c in scenario.control),
+        health_sensors=None
+        if section.health_sensors == "all"
+        else tuple(number - 1 for number in section.health_sensors),
     )

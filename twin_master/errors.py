@@ -10,6 +10,7 @@ __all__ = [
     "InvalidDistributionError",
     "InvalidModelError",
     "InvalidObservationError",
+    "InvalidObservationLibraryError",
     "InvalidStrainLibraryError",
     "MissingObservationModelError",
     "MissionError",
@@ -42,6 +43,10 @@ class InvalidObservationError(TwinMasterError, ValueError):
 
 class InvalidStrainLibraryError(TwinMasterError, ValueError):
     """A strain library file is missing, damaged or incomplete."""
+
+
+class InvalidObservationLibraryError(TwinMasterError, ValueError):
+    """An observation library is missing, damaged, or cannot be sampled as asked."""
 
 
 class PlanningError(TwinMasterError, RuntimeError):

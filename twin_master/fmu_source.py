@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from fe.reduced import ReducedModel
 from fmu_asset.binding import Binding, load_binding
 from fmu_asset.build import build_fmu
 from fmu_asset.coupling.asset import CoupledAsset
+from fmu_asset.script import script_fmu
 from fmu_asset.session import FmiAsset
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
@@ -94,15 +96,19 @@ class FmuAsset:
         self._observation = observation
         self._load = dict(load)
         self._inner = inner
-        recorded = session.recorded_units
-        taken = {*session.binding.control, *session.binding.observation, *_TAKEN}
+        binding, recorded = session.binding, session.recorded_units
+        taken = {*binding.control, *binding.observation, *_TAKEN}
         self._names = {name: _plain_name(name, taken) for name in recorded}
-        self._units = {name: scalar.unit for name, scalar in session.binding.control.items()}
+        self._units = {
+            name: scalar.unit
+            for table in (binding.parameter, binding.control)
+            for name, scalar in table.items()
+        }
         self._units |= {self._names[name]: unit for name, unit in recorded.items()}
 
     @property
     def units(self) -> Mapping[str, str]:
-        """Units of control inputs and of what is recorded beside the observations."""
+        """Units of parameters, control inputs and of what is recorded beside the observations."""
         return self._units
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
@@ -148,6 +154,8 @@ class FmuSource:
         Calibration file of the wing.
     tailored : bool
         Whether the design is that of the calibration file.
+    script : Path or None
+        A model script that is packed as the FMU to fly.
     """
 
     def __init__(
@@ -159,10 +167,12 @@ class FmuSource:
         *,
         calibration: Path | None = None,
         tailored: bool = False,
+        script: Path | None = None,
     ) -> None:
         self._scenario = scenario
         self._binding = binding
         self._tailored = tailored
+        self._script = script
         self._given = {
             BINDING_COPY: binding,
             DESIGN_COPY: design,
@@ -182,8 +192,7 @@ class FmuSource:
         An FMU that is given may hold any model, also that of the design: whether they differ is not known.
         """
         model = f"reduced model of the design {self._design_name}".rstrip()
-        has_design = self._tailored or self._given[DESIGN_COPY] is not None
-        if not has_design or self._scenario.asset.observation_model == "asset":
+        if not self._scenario.asset.model_of_the_design:
             return Origin("FMU", "FMU")
         return Origin("FMU" if self._given[FMU_COPY] else f"FMU of the {model}", model)
 
@@ -223,23 +232,33 @@ class FmuSource:
         fmu = self._given[FMU_COPY]
         binding = load_binding(self._binding)
         self._check_names(binding)
-        if design is not None and self._scenario.asset.observation_model != "asset":
+        if design is not None and self._scenario.asset.model_of_the_design:
             check_wing_scenario(self._scenario, len(design.gauges.positions))
+        # Only with the FMU it is known how many values an array has.
         if fmu is not None:
-            # Only with the FMU it is known how many values an array has.
             binding = FmiAsset(fmu, binding, parameters=self.parameters()).binding
+        elif self._script is not None:
+            with TemporaryDirectory(prefix="uav_twin_") as folder:
+                packed = Path(folder) / "asset.fmu"
+                packed.write_bytes(script_fmu(self._script)[0])
+                binding = FmiAsset(packed, binding, parameters=self.parameters()).binding
         self._observed(binding)
         self._inner_roles(binding)
 
     def files(self) -> dict[str, bytes]:
-        """Return binding, design, calibration and FMU as they are given.
+        """Return binding, design, calibration and FMU as they are given; a model script is packed.
 
         Raises
         ------
         MissionInputError
             A file cannot be read.
+        FmuBuildError
+            The model script cannot be packed.
         """
-        return {name: read_content(path) for name, path in self._given.items() if path is not None}
+        contents = {name: read_content(path) for name, path in self._given.items() if path is not None}
+        if self._script is not None:
+            contents[FMU_COPY] = script_fmu(self._script)[0]
+        return contents
 
     def _check_names(self, binding: Binding) -> None:
         scenario = self._scenario
@@ -267,9 +286,9 @@ class FmuSource:
             A design, binding or FMU is wrong.
         """
         self._folder = folder
-        for name, path in self._given.items():
-            if path is not None and not self._path(name).exists():
-                atomic_write_bytes(self._path(name), read_content(path))
+        for name, content in self.files().items():
+            if not self._path(name).exists():
+                atomic_write_bytes(self._path(name), content)
         hashes = {"binding": hash_file(self._path(BINDING_COPY))}
         hashes |= self._prepare_model(progress)
         if self._wing is not None and self._given[FMU_COPY] is None:

@@ -7,12 +7,14 @@ differ is a `Misfit`, which says what the difference does to an estimate.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fmu_asset.errors import FmuCallError
 from reporting.progress import Progress
 from twin_master.asset_source import AssetSource, Origin
 from twin_master.assets import Asset
@@ -162,7 +164,7 @@ class Misfit:
 def find_misfit(
     scenario: Scenario, model: GraphicalModel, sensor_model: GaussianSensorModel, asset: Asset
 ) -> Misfit:
-    """Ask an asset without memory for every state and control, and compare.
+    """Ask an asset without memory for every state and control, and compare; NaN where it refuses the step.
 
     Parameters
     ----------
@@ -176,15 +178,12 @@ def find_misfit(
         What is flown.
     """
     names = scenario.state_names
-    observation = np.array(
-        [
-            [
-                asset.step(control.values, dict(zip(names, levels.tolist(), strict=True))).values
-                for control in scenario.control
-            ]
-            for levels in model.states.coordinates
-        ]
-    )
+    observation = np.full(sensor_model.mean.shape, np.nan)
+    for state, levels in enumerate(model.states.coordinates):
+        health = dict(zip(names, levels.tolist(), strict=True))
+        for index, control in enumerate(scenario.control):
+            with suppress(FmuCallError):
+                observation[state, index] = asset.step(control.values, health).values
     return Misfit(sensor_model.mean - observation, observation, _gain(model, sensor_model))
 
 

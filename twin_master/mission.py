@@ -119,7 +119,8 @@ def fly(
         controls = checkpoint.control_index.tolist()
         plant.restore(checkpoint.plant, checkpoint.asset_state)
     resumed_at = len(turns)
-    with (progress or SilentProgress()).stage("Flying", total=steps, unit="turns") as stage:
+    unit = f"{scenario.mission.step_name}s"
+    with (progress or SilentProgress()).stage("Flying", total=steps, unit=unit) as stage:
         stage.advance(resumed_at)
         for step in range(resumed_at, steps):
             begin = time.perf_counter()

@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from reporting.provenance import hash_file
-from scenarios import binding_files
+from scenarios import asset_scripts, binding_files
 from twin_master.asset_source import (
     BINDING_COPY,
     CALIBRATED_DESIGN_NAME,
@@ -15,6 +15,7 @@ from twin_master.asset_source import (
     DESIGN_COPY,
     FMU_COPY,
     LIBRARY_COPY,
+    OBSERVATIONS_COPY,
     SHIPPED_DESIGN_NAME,
     SSP_COPY,
     AssetSource,
@@ -44,6 +45,8 @@ class Overrides:
     strain_library : Path or None
         Fly the library instead of an FMU, as asset and model; where the scenario flies a library anyway, the
         file of that library.
+    library : Path or None
+        Believe this observation library.
     in_process : bool
         Fly the FMU in this process instead of a worker.
     calibration : Path or None
@@ -59,6 +62,7 @@ class Overrides:
     in_process: bool = False
     calibration: Path | None = None
     ssp: Path | None = None
+    library: Path | None = None
 
 
 def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
@@ -78,6 +82,8 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
     calibration = table["calibration"]
     if overrides.strain_library and (overrides.fmu or overrides.binding):
         raise MissionInputError("--strain-library flies no FMU: give either it or --fmu and --binding.")
+    if overrides.strain_library and overrides.library:
+        raise MissionInputError("--strain-library is asset and model itself: give either it or --library.")
     if overrides.calibration:
         calibration |= {"source": "file", "file": str(overrides.calibration.resolve())}
     elif calibration["file"]:
@@ -108,6 +114,10 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
         asset["design"] = str(folder / asset["design"])
     if asset["file"]:
         asset["file"] = str(folder / asset["file"])
+    if asset["script"] and asset["script"] not in asset_scripts():
+        asset["script"] = str(folder / asset["script"])
+    if asset["library"]:
+        asset["library"] = str(folder / asset["library"])
     if asset["binding"] and asset["binding"] not in binding_files():
         asset["binding"] = str(folder / asset["binding"])
     for component, section in zip(asset["component"], loaded.scenario.asset.component, strict=True):
@@ -115,14 +125,17 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
     if overrides.ssp:
         asset |= {"kind": "coupled", "file": str(overrides.ssp.resolve()), "component": [], "connection": []}
     if overrides.fmu:
-        asset |= {"kind": "fmu", "file": str(overrides.fmu.resolve())}
+        asset |= {"kind": "fmu", "file": str(overrides.fmu.resolve()), "script": None}
     if overrides.binding:
         asset["binding"] = str(overrides.binding.resolve())
     if overrides.strain_library:
         if asset["kind"] != "strain_library":
             asset |= {"kind": "strain_library", "design": None, "binding": None, "observation_model": None}
             asset |= {"parameters": {}, "component": [], "connection": [], "seeds": []}  # those of FMUs
+            asset |= {"script": None, "library": None}
         asset["file"] = str(_library_file(overrides.strain_library))
+    if overrides.library:
+        asset |= {"observation_model": "library", "library": str(overrides.library.resolve())}
     if overrides.in_process:
         asset["isolated"] = False
     if overrides.seed is not None:
@@ -137,10 +150,12 @@ def _library_file(path: Path) -> Path:
 def portable_scenario(scenario: Scenario) -> Scenario:
     """Return a resolved scenario that names the copies in the run folder, so that it holds on any machine."""
     file = {"strain_library": LIBRARY_COPY, "coupled": SSP_COPY}.get(scenario.asset.kind, FMU_COPY)
-    copies = {"file": file, "design": DESIGN_COPY, "binding": BINDING_COPY}
+    copies = {"file": file, "design": DESIGN_COPY, "binding": BINDING_COPY, "library": OBSERVATIONS_COPY}
     portable = _with_asset(
         scenario,
         {key: copies[key] for key in _given_paths(scenario)}
+        # A script is packed once; from then on the FMU is what is flown.
+        | {"script": None}
         | {"component": tuple(c.model_copy(update=component_copies(c)) for c in scenario.asset.component)},
     )
     return _with_calibration_file(portable, CALIBRATION_COPY)
@@ -161,9 +176,11 @@ def located_scenario(scenario: Scenario, folder: Path) -> Scenario:
 def _given_paths(scenario: Scenario) -> dict[str, str]:
     """Return the files that the asset names, without what is shipped."""
     asset = scenario.asset
-    given = {"file": asset.file, "design": asset.design, "binding": asset.binding}
+    given = {"file": asset.file or asset.script, "library": asset.library}
     shipped = {SHIPPED_DESIGN_NAME, CALIBRATED_DESIGN_NAME, *binding_files()}
-    return {key: path for key, path in given.items() if path and (key == "file" or path not in shipped)}
+    for key, path in (("design", asset.design), ("binding", asset.binding)):
+        given[key] = None if path in shipped else path
+    return {key: path for key, path in given.items() if path}
 
 
 def _with_asset(scenario: Scenario, changes: dict[str, Any]) -> Scenario:
@@ -209,19 +226,31 @@ def asset_source(scenario: Scenario) -> AssetSource:
         )
         return MismatchedSource(library, believed)
     binding = binding_files().get(asset.binding or "", Path(asset.binding or ""))
-    source: type[FmuSource] = FmuSource
+    script = asset_scripts().get(asset.script or "", Path(asset.script)) if asset.script else None
+    believed_design = Path(design) if design and not tailored else None
+    file, calibrated = Path(asset.file) if asset.file else None, Path(calibration) if calibration else None
+    source: FmuSource
     if asset.kind == "coupled":  # who flies one FMU does not pay for the reading of SSP files
         from twin_master.coupled_source import CoupledSource
 
-        source = CoupledSource
-    return source(
-        scenario,
-        binding,
-        Path(design) if design and not tailored else None,
-        Path(asset.file) if asset.file else None,
-        calibration=Path(calibration) if calibration else None,
-        tailored=tailored,
-    )
+        source = CoupledSource(
+            scenario, binding, believed_design, file, calibration=calibrated, tailored=tailored
+        )
+    else:
+        source = FmuSource(
+            scenario,
+            binding,
+            believed_design,
+            file,
+            calibration=calibrated,
+            tailored=tailored,
+            script=script,
+        )
+    if asset.library is None:
+        return source
+    from twin_master.library_source import LibrarySource
+
+    return LibrarySource(scenario, source, binding, Path(asset.library))
 
 
 def _library_source(scenario: Scenario) -> StrainLibrarySource:

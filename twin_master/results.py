@@ -21,6 +21,9 @@ from twin_master.truth import SensorStatus, Truth
 
 Float = NDArray[np.float64]
 
+SEVERAL_UNITS = "see sensor_unit"
+"""Unit of a variable over sensors of different units."""
+
 
 @dataclass(frozen=True)
 class MissionResult:
@@ -45,7 +48,7 @@ class MissionResult:
     flight : Flight
         The mission.
     units : dict of str to str
-        Units of control inputs and monitors; those that are missing are dimensionless.
+        Units of control inputs, monitors and parameters; those that are missing are dimensionless.
     """
 
     scenario: Scenario
@@ -65,8 +68,14 @@ class MissionResult:
 
     @property
     def observation_unit(self) -> str:
-        """Unit of the observed values."""
-        return self.scenario.observation.unit
+        """Unit of the observed values; where they have several, each sensor has its own, `sensor_unit`."""
+        units = dict.fromkeys(self.scenario.observation.sensor_units)
+        return next(iter(units)) if len(units) == 1 else SEVERAL_UNITS
+
+    @property
+    def parameter_unit(self) -> str:
+        """Unit of the uncertain parameter."""
+        return self.units.get(self.scenario.calibration.parameter, "1")
 
 
 def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.DataTree:
@@ -91,7 +100,7 @@ def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.Data
                 "draw_value": (
                     ("draw",),
                     result.draws,
-                    "1",
+                    result.parameter_unit,
                     "draws of the uncertain parameter, equally weighted",
                 )
             }
@@ -129,6 +138,14 @@ class _Labels:
                 "draw", np.arange(len(result.draws)), {"long_name": "draw of the parameter", "units": "1"}
             ),
         }
+        observation = scenario.observation
+        self.sensors: dict[str, xr.Variable] = {}
+        if result.observation_unit == SEVERAL_UNITS:
+            unit = np.array(observation.sensor_units)
+            self.sensors["sensor_unit"] = xr.Variable("sensor", unit, {"long_name": "unit of each sensor"})
+        if observation.titles:
+            title = np.array(observation.titles)
+            self.sensors["sensor_title"] = xr.Variable("sensor", title, {"long_name": "name of each sensor"})
         self.states = {
             factor.name: xr.Variable(
                 "state", model.states.coordinates[:, index], {"long_name": factor.name, "units": factor.unit}
@@ -143,6 +160,8 @@ class _Labels:
         }
         if "state" in dimensions:
             coordinates |= self.states
+        if "sensor" in dimensions:
+            coordinates |= self.sensors
         return xr.Dataset(
             {
                 name: (dims, values, {"units": unit, "long_name": text})
@@ -159,7 +178,7 @@ def _observed(result: MissionResult, labels: _Labels) -> xr.Dataset:
         role: (("step", "sensor"), flight.observed, unit, f"{role} as received; NaN where a sensor is lost"),
         "control_index": (("step",), flight.control_index, "1", "control in force"),
     }
-    for name in scenario.control[0].values:
+    for name in sorted(scenario.control[0].values):  # config.json does not keep their order
         values = np.array([control.values[name] for control in scenario.control])[flight.control_index]
         variables[name] = (("step",), values, result.units.get(name, "1"), f"{name} in force")
     return labels.dataset(variables)

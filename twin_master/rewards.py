@@ -27,17 +27,18 @@ __all__ = [
 Float = NDArray[np.float64]
 
 
-def health_reward(value: ArrayLike, limit: float) -> Float:
+def health_reward(value: ArrayLike, limit: ArrayLike) -> Float:
     """Return the health reward (9) of sensor values (..., G): one minus the largest share of the limit.
 
-    One without load, zero where a sensor reaches the limit, negative beyond.
+    One without load, zero where a sensor reaches its limit, one or (G,), and negative beyond.
     """
-    result: Float = 1.0 - np.asarray(value, dtype=np.float64).max(axis=-1) / limit
+    # As a share first: rounding is monotonic, so that for one limit the result is that of the largest value.
+    result: Float = 1.0 - (np.asarray(value, dtype=np.float64) / np.asarray(limit)).max(axis=-1)
     return result
 
 
 def error_reward(
-    observation: ArrayLike, value: ArrayLike, scale: float, normaliser: ArrayLike = 1.0
+    observation: ArrayLike, value: ArrayLike, scale: ArrayLike, normaliser: ArrayLike = 1.0
 ) -> Float:
     """Return the error reward (11): minus the mean distance of observation and model over the sensors.
 
@@ -45,7 +46,7 @@ def error_reward(
     ----------
     observation, value : (..., G)
         What the sensors show and what the model says, SI; NaN for a lost sensor, which is left out.
-    scale : float
+    scale : float or (G,)
         The distance, after normalisation, that costs one.
     normaliser : (...)
         Both are divided by it first (for a structure: the load factor).
@@ -56,11 +57,13 @@ def error_reward(
         NaN where every sensor is lost.
     """
     distance = np.abs(np.asarray(observation, dtype=np.float64) - np.asarray(value, dtype=np.float64))
+    if np.ndim(scale):
+        distance, scale = distance / np.asarray(scale), 1.0
     seen = ~np.isnan(distance)
     count = seen.sum(axis=-1)
     total = np.where(seen, distance, 0.0).sum(axis=-1)
     result: Float = np.where(
-        count > 0, -total / np.maximum(count, 1) / (scale * np.asarray(normaliser)), np.nan
+        count > 0, -total / np.maximum(count, 1) / (np.asarray(scale) * np.asarray(normaliser)), np.nan
     )
     return result
 
@@ -71,26 +74,30 @@ class RewardSettings:
 
     Attributes
     ----------
-    limit : float
-        Sensor value at which the health reward is zero, SI, positive.
+    limit : float or tuple of float
+        Sensor value at which the health reward is zero, in its unit, positive; one, or one for each of the
+        sensors that count.
     control_reward : tuple of float
         One for each control.
-    error_scale : float
-        Normalised error that costs one, SI, positive.
+    error_scale : float or tuple of float
+        Normalised error that costs one, in its unit, positive; one, or one for each sensor.
     control_normaliser : tuple of float or None
         For each control the figure by which observation and model are divided before their distance is
         taken (the load factor); None for ones.
+    health_sensors : tuple of int or None
+        Indices of the sensors that count for the health reward; None for all.
     """
 
-    limit: float
+    limit: float | tuple[float, ...]
     control_reward: tuple[float, ...]
-    error_scale: float
+    error_scale: float | tuple[float, ...]
     control_normaliser: tuple[float, ...] | None = None
+    health_sensors: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         for name in ("limit", "error_scale"):
             value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0.0):
+            if not np.all(np.isfinite(value) & (np.asarray(value) > 0.0)):
                 raise InvalidModelError(f"reward setting {name!r} must be finite and positive, got {value}")
         if not np.all(np.isfinite(self.control_reward)):
             raise InvalidModelError(f"control rewards must be finite, got {self.control_reward}")
@@ -146,7 +153,8 @@ class RewardModel:
     @cached_property
     def health_per_draw(self) -> Float:
         """Health reward of each draw, state and control (E, S, U)."""
-        return health_reward(self.quantity.value_per_draw, self.settings.limit)
+        values, chosen = self.quantity.value_per_draw, self.settings.health_sensors
+        return health_reward(values if chosen is None else values[..., list(chosen)], self.settings.limit)
 
     @cached_property
     def _health_moments(self) -> tuple[Float, Float]:

@@ -18,10 +18,12 @@ from twin_master.scenario_section import (
     Name,
     NotNegative,
     Number,
+    PerSensor,
     Positive,
     Probability,
     Section,
     Step,
+    check_one_or_each,
 )
 
 ROW_SUM_TOLERANCE = 1e-12
@@ -50,6 +52,8 @@ class Mission(Section):
     prediction_steps: Count = 10
     first_control: Name
     seed: Step = 0
+    step_name: Name = "turn"
+    """What a step of the mission is called in the report."""
 
 
 class StateFactor(Section):
@@ -93,15 +97,32 @@ class ObservationSection(Section):
     units: ClassVar[Mapping[str, str]] = {"standard_deviation": "microstrain", "model_error": "percent"}
     role: Name = "strain"
     count: Count
-    unit: str = "1"
-    """Unit of the observed values; a dimensionless one is a strain, printed in microstrain."""
-    standard_deviation: Positive
+    titles: tuple[str, ...] = ()
+    """What each sensor is called in the report; without them they have numbers."""
+    unit: str | tuple[str, ...] = "1"
+    """Unit of the observed values, one for all sensors or one for each; a strain without unit is printed in
+    microstrain."""
+    standard_deviation: PerSensor
+    """Of the noise that the twin assumes, one for all sensors or one for each."""
     model_error: NotNegative | tuple[NotNegative, ...] = 0.0
     """Standard deviation of the predicted value as a share of it, one for all sensors or one for each; added
     to the noise in quadrature."""
     average_over_draws: Literal["outside", "inside"] = "outside"
     """Where the average over the draws of the parameter stands: outside the product over the sensors as in
     the integral (30), or inside it as eq. (32) is printed."""
+
+    @property
+    def sensor_units(self) -> tuple[str, ...]:
+        """Unit of each sensor."""
+        return (self.unit,) * self.count if isinstance(self.unit, str) else self.unit
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for key, value in (("unit", self.unit), ("standard_deviation", self.standard_deviation)):
+            check_one_or_each(f"observation.{key}", value, self.count)
+        if self.titles:
+            check_one_or_each("observation.titles", self.titles, self.count)
+        return self
 
 
 class Transition(Section):
@@ -118,10 +139,14 @@ class Rewards(Section):
     """Figures of the rewards, eqs. (9)-(11), and their weights in planning."""
 
     units: ClassVar[Mapping[str, str]] = {"health_limit": "microstrain", "error_scale": "microstrain"}
-    health_limit: Positive
+    health_limit: PerSensor
+    """Value at which the health reward is zero, one for all sensors that count for it or one for each."""
+    health_sensors: Literal["all"] | Annotated[tuple[Count, ...], Field(min_length=1)] = "all"
+    """Sensors, numbered from 1, that have a limit and so count for the health reward."""
     health_weight: Number = 1.0
     control_weight: Number = 1.0
-    error_scale: Positive
+    error_scale: PerSensor
+    """Distance of observation and model that costs one, one for all sensors or one for each."""
     normalise_error_by: Name | None = None
     control: dict[str, Number]
 
@@ -176,14 +201,18 @@ class AssetSection(Section):
     kind: Literal["fmu", "coupled", "strain_library"] = "fmu"
     design: str | None = None
     file: str | None = None
+    script: str | None = None
+    """A pythonfmu script that is packed as the FMU: a shipped one, or a file."""
     binding: str | None = None
     isolated: Flag = True
     step_timeout: Positive | None = None
     parameters: dict[str, Number] = Field(default_factory=dict)
     load: dict[str, Number] = Field(default_factory=dict)
-    observation_model: Literal["design", "asset"] | None = None
+    observation_model: Literal["design", "asset", "library"] | None = None
     """Where the twin's predicted observations come from: the model of the design (the default where there is
-    one), or the asset itself."""
+    one), the asset itself, or the observation library `library`."""
+    library: str | None = None
+    """An observation library, as `uav-twin library sample` writes it."""
     seeds: tuple[Name, ...] = ()
     """Parameters of the binding that are given a number drawn from the seed of the run."""
     component: tuple[ComponentSection, ...] = ()
@@ -195,7 +224,7 @@ class AssetSection(Section):
     @property
     def model_of_the_design(self) -> bool:
         """Whether the twin believes the model of the design."""
-        return self.design is not None and self.observation_model != "asset"
+        return self.design is not None and self.observation_model in (None, "design")
 
     @property
     def another_model(self) -> bool:
@@ -216,8 +245,20 @@ class AssetSection(Section):
         for name in self.seeds:
             if name in self.parameters:
                 raise ValueError(f"`{name}` is both in `parameters` and in `seeds`: keep one of them")
-        if self.kind == "fmu" and (not self.binding or not (self.design or self.file)):
-            raise ValueError("an FMU asset needs `binding` and one of `design` and `file`")
+        if self.kind == "fmu" and (not self.binding or not (self.design or self.file or self.script)):
+            raise ValueError("an FMU asset needs `binding` and one of `design`, `file` and `script`")
+        if self.script and self.kind != "fmu":
+            raise ValueError("`script` is packed as one FMU, and belongs to the kind `fmu`")
+        if self.script and (self.file or self.design):
+            raise ValueError(
+                f"`script` is packed as the FMU that is flown, and `{'file' if self.file else 'design'}` "
+                "names another: keep one of them"
+            )
+        if (self.observation_model == "library") != (self.library is not None):
+            raise ValueError(
+                '`observation_model = "library"` and `library`, the file of an observation library, go '
+                f"together, and only {'the second' if self.library else 'the first'} was given"
+            )
         if self.observation_model == "design" and self.design is None:
             raise ValueError(
                 '`observation_model = "design"` needs `design`, the wing whose model the twin believes'
@@ -227,7 +268,7 @@ class AssetSection(Section):
         return self
 
     def _check_library(self) -> None:
-        for key in ("binding", "parameters", "load"):
+        for key in ("binding", "parameters", "load", "script", "library"):
             if getattr(self, key):
                 raise ValueError(
                     f"`{key}` belongs to an FMU, and the asset is a strain library, which is what it is: "
@@ -288,7 +329,8 @@ class Noise(Section):
     """Noise of the real sensors, Gaussian and independent."""
 
     units: ClassVar[Mapping[str, str]] = {"standard_deviation": "microstrain"}
-    standard_deviation: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
+    standard_deviation: NotNegative | tuple[NotNegative, ...]
+    """One for all sensors or one for each."""
 
 
 class SensorFault(Section):
@@ -380,7 +422,7 @@ class Scenario(Section):
             names += ["lost_observations", "blind_steps"]
         if self.asset.another_model:
             names += [*MISFIT_FIGURES]
-        if self.observation.unit == "1":
+        if set(self.observation.sensor_units) == {"1"}:
             names += ["strain_error_bound"]
         return tuple(names)
 
@@ -426,6 +468,7 @@ class Scenario(Section):
         for gain in self.truth.gains:
             _known(gain.state, states, "truth.gains.state", "state")
         self._check_model_error()
+        self._check_sensors()
         for fault in self.truth.sensor_faults:
             if fault.sensors != "all" and max(fault.sensors) > self.observation.count:
                 raise ValueError(
@@ -441,6 +484,18 @@ class Scenario(Section):
                 f"`observation.model_error_percent` must be one number or one for each of the "
                 f"{self.observation.count} sensors, and {len(error)} came"
             )
+
+    def _check_sensors(self) -> None:
+        count, chosen = self.observation.count, self.rewards.health_sensors
+        if chosen != "all" and (max(chosen) > count or len(set(chosen)) != len(chosen)):
+            raise ValueError(
+                f"`rewards.health_sensors` must name different sensors from 1 to {count}, and "
+                f"{_short(chosen)} came"
+            )
+        limited = count if chosen == "all" else len(chosen)
+        check_one_or_each("rewards.health_limit", self.rewards.health_limit, limited)
+        check_one_or_each("rewards.error_scale", self.rewards.error_scale, count)
+        check_one_or_each("truth.noise.standard_deviation", self.truth.noise.standard_deviation, count)
 
     def _check_transition(self) -> None:
         transition = self.transition

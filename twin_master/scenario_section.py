@@ -12,6 +12,8 @@ UNIT_DIVISOR = {"percent": 100.0, "microstrain": 1.0e6, "microstrain_per_step": 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
 NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
+PerSensor = Positive | tuple[Positive, ...]
+"""One positive number for all sensors, or one for each."""
 Probability = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=1.0)]
 Count = Annotated[int, Field(strict=True, ge=1)]
 Step = Annotated[int, Field(strict=True, ge=0)]
@@ -31,6 +33,14 @@ def _check_percent(key: object, value: object) -> None:
     for item in value if isinstance(value, list | tuple) else [value]:
         if isinstance(item, int | float) and not isinstance(item, bool) and not -100 <= item <= 100:
             raise ValueError(f"`{key}` is in percent, at most 100, and {item} came")
+
+
+def check_one_or_each(key: str, value: object, count: int) -> None:
+    """Check that what may be given for each sensor is given once, or once for each of `count` of them."""
+    if isinstance(value, tuple) and len(value) != count:
+        raise ValueError(
+            f"`{key}` must be one value, or one for each of the {count} sensors, and {len(value)} came"
+        )
 
 
 class Section(BaseModel):

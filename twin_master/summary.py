@@ -154,7 +154,7 @@ def summarise(
         model, result.plan.control_index, first, flight.control_index, flight.truth.state
     )
     units = {factor.name: factor.unit for factor in scenario.state}
-    figures = _fallback_figures(fallback, units)
+    figures = _fallback_figures(fallback, units, scenario.mission.step_name)
     errors = filtered_rms_error(model, flight.filtered, flight.truth.state)
     for factor, error in zip(scenario.state, errors, strict=True):
         name, fraction = factor.name, factor.unit == "1"
@@ -179,11 +179,11 @@ def summarise(
     figures.append(
         Figure("log_evidence", "log evidence of all observations", float(flight.log_evidence.sum()))
     )
-    figures += _sensor_figures(flight.observed)
+    figures += _sensor_figures(flight.observed, scenario.mission.step_name)
     if misfit is not None:
         figures += _misfit_figures(misfit)
     bound = flight.truth.monitors.get("strain_error_bound")
-    if bound is not None and scenario.observation.unit == "1":
+    if bound is not None and set(scenario.observation.sensor_units) == {"1"}:
         figures.append(
             Figure(
                 "strain_error_bound", "worst certified strain error", 1e6 * float(bound.max()), "microstrain"
@@ -199,7 +199,7 @@ def _beside(figure: Figure, reference: Reference | None) -> Figure:
     return replace(figure, reference=reference.value, reference_source=reference.source)
 
 
-def _fallback_figures(fallback: Fallback, units: Mapping[str, str]) -> list[Figure]:
+def _fallback_figures(fallback: Fallback, units: Mapping[str, str], step_name: str) -> list[Figure]:
     level, name = fallback.switch_level, fallback.switch_state
     unit = units.get(name or "", "")
     if level is not None and unit == "1":
@@ -216,14 +216,16 @@ def _fallback_figures(fallback: Fallback, units: Mapping[str, str]) -> list[Figu
         return [switch]
     return [
         switch,
-        Figure(damage_step, "turn of the damage that calls for it", fallback.called_for_step),
-        Figure(fallback_step, "turn of the fallback", fallback.fallback_step),
-        Figure(fallback_delay, "delay of the fallback", fallback.delay, "turn" if one else "turns"),
-        Figure(early_step, "turn of a fallback before the damage", fallback.early_step),
+        Figure(damage_step, f"{step_name} of the damage that calls for it", fallback.called_for_step),
+        Figure(fallback_step, f"{step_name} of the fallback", fallback.fallback_step),
+        Figure(
+            fallback_delay, "delay of the fallback", fallback.delay, step_name if one else f"{step_name}s"
+        ),
+        Figure(early_step, f"{step_name} of a fallback before the damage", fallback.early_step),
     ]
 
 
-def _sensor_figures(observed: Float) -> list[Figure]:
+def _sensor_figures(observed: Float, step_name: str) -> list[Figure]:
     received = np.isfinite(observed)
     blind = np.flatnonzero(~received.any(axis=1))
     if received.all():
@@ -232,7 +234,9 @@ def _sensor_figures(observed: Float) -> list[Figure]:
     if len(blind):
         steps = ", ".join(str(step) for step in blind)
         figures.append(
-            Figure("blind_steps", "turns without any observation (belief follows the dynamics)", steps)
+            Figure(
+                "blind_steps", f"{step_name}s without any observation (belief follows the dynamics)", steps
+            )
         )
     return figures
 

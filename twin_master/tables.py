@@ -1,7 +1,7 @@
 """The CSV files of a run, for people: the unit is in each header.
 
-A dimensionless observation is a strain and given in microstrain, a dimensionless state is a fraction and
-given in percent; anything else stays in its unit.
+A strain is given in microstrain, a dimensionless state is a fraction and given in percent; anything else
+stays in its unit.
 """
 
 from __future__ import annotations
@@ -46,9 +46,17 @@ def tables_of(groups: Mapping[str, xr.Dataset], role: str) -> dict[str, str]:
 
 
 def _observations(steps: list[str], group: xr.Dataset, variable: str, role: str) -> Table:
-    factor, unit = _edge(group[variable].attrs["units"], MICROSTRAIN, "microstrain")
-    header = ["step", *(f"{role}_{sensor}_{unit}" for sensor in group["sensor"].values)]
-    rows = zip(steps, group[variable].values * factor, strict=True)
+    sensors = group["sensor"].values
+    units = [group[variable].attrs["units"]] * len(sensors)
+    if "sensor_unit" in group.coords:
+        units = _names(group["sensor_unit"].values)
+    if role == "strain":
+        edges = [_edge(unit, MICROSTRAIN, "microstrain") for unit in units]
+    else:
+        edges = [(1.0, unit) for unit in units]
+    header = ["step", *(f"{role}_{s}_{unit}" for s, (_, unit) in zip(sensors, edges, strict=True))]
+    factors = np.array([factor for factor, _ in edges])
+    rows = zip(steps, group[variable].values * factors, strict=True)
     return header, [[step, *_numbers(row)] for step, row in rows]
 
 

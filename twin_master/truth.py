@@ -60,7 +60,7 @@ class Truth:
 
     def __init__(self, scenario: Scenario, model: GraphicalModel, seed: int) -> None:
         steps, sensors = scenario.mission.steps, scenario.observation.count
-        deviation = scenario.truth.noise.standard_deviation
+        deviation = np.asarray(scenario.truth.noise.standard_deviation)  # one, or one for each sensor
         self.noise: Float = generator(seed, "noise").standard_normal((steps, sensors)) * deviation
         self.drift: Float = np.zeros((steps, sensors))
         self.status: NDArray[np.int8] = np.zeros((steps, sensors), dtype=np.int8)

@@ -66,6 +66,8 @@ class RunOutcome:
         Content of `timing.json`.
     origin : Origin
         What was flown and what the twin believed, in words.
+    step_name : str
+        What a step is called.
     """
 
     folder: Path
@@ -73,6 +75,7 @@ class RunOutcome:
     figures: tuple[Figure, ...]
     timing: Mapping[str, Any]
     origin: Origin
+    step_name: str = "turn"
 
 
 @dataclass
@@ -212,7 +215,7 @@ def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Pro
             report = _report(folder)
         timing = _timing(result.flight, clock)
         write_timing(folder, timing)
-        return RunOutcome(folder, report, figures, timing, source.origin)
+        return RunOutcome(folder, report, figures, timing, source.origin, scenario.mission.step_name)
     finally:
         os.close(lock)
 

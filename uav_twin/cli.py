@@ -8,6 +8,7 @@ from twin_master.command import guarded
 from twin_master.command import run as run_command
 from uav_twin.calibrate import calibrate_app
 from uav_twin.fmu import fmu_app
+from uav_twin.library import library_app
 from uav_twin.scenarios import list_scenarios
 from uav_twin.ssp import ssp_app
 from uav_twin.wing import wing_app
@@ -23,6 +24,7 @@ app.command("scenarios")(list_scenarios)
 app.add_typer(wing_app, name="wing")
 app.add_typer(calibrate_app, name="calibrate")
 app.add_typer(fmu_app, name="fmu")
+app.add_typer(library_app, name="library")
 app.add_typer(ssp_app, name="ssp")
 
 

@@ -25,9 +25,13 @@ def build(
         Path | None,
         typer.Option(help="Tailor it to a wing: the calibration.nc of `uav-twin calibrate`."),
     ] = None,
+    script: Annotated[
+        str | None,
+        typer.Option(help="Pack this model script instead of a wing: gear_pump, or a file."),
+    ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
-    """Pack the wing as an FMI 2.0 co-simulation FMU; equal designs and calibrations give equal bytes."""
+    """Pack the wing (or a model script) as an FMI 2.0 co-simulation FMU; equal input gives equal bytes."""
     from fe.cache import reduced_model
     from fe.design import load_design
     from fmu_asset.build import build_fmu
@@ -39,6 +43,10 @@ def build(
         raise typer.BadParameter("the calibration holds its design: give either it or --design.")
     if out.exists() and not replace:
         raise FmuBuildError(f"{out} exists: choose another --out or give --replace.")
+    if script is not None:
+        for_the_wing = design is not None or calibration is not None or kind != "python"
+        _build_script(script, out, replace=replace, other=for_the_wing)
+        return
     if kind == "compiled":
         find_compiler()  # before the wing is modelled, which can take a minute
     if calibration is None:
@@ -53,6 +61,19 @@ def build(
         info = pack_calibrated_wing(model, wing, out, kind=kind, replace=replace)
         typer.echo(f"Calibrated for {wing.asset}.")
     typer.echo(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
+
+
+def _build_script(script: str, out: Path, *, replace: bool, other: bool) -> None:
+    """Pack a model script, shipped or a file."""
+    from fmu_asset.script import build_script_fmu
+    from scenarios import asset_scripts
+
+    if other:
+        raise typer.BadParameter(
+            "--design, --calibration and --kind are for the wing.", param_hint="--script"
+        )
+    info = build_script_fmu(asset_scripts().get(script, Path(script)), out, replace=replace)
+    typer.echo(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}")
 
 
 @fmu_app.command("info")

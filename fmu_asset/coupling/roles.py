@@ -69,9 +69,9 @@ def resolve_roles(wiring: Wiring, binding: Binding) -> Roles:
             for name, scalar in binding.parameter.items()
         },
         observations=tuple(
-            _source(wiring, variable, vector.unit, f"observation.{name}")
+            _source(wiring, variable, unit, f"observation.{name}")
             for name, vector in binding.observation.items()
-            for variable in vector.variables
+            for variable, unit in zip(vector.variables, vector.units, strict=True)
         ),
         monitors={
             name: _source(wiring, scalar.variable, scalar.unit, f"monitor.{name}")

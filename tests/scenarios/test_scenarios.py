@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from scenarios import binding_files, scenario_files
+from scenarios import asset_scripts, binding_files, scenario_files
 from twin_master.scenario_file import load_scenario
 from twin_master.truth import Truth
 from twin_master.twin import build_graphical_model
 
 
 def test_what_is_shipped() -> None:
-    expected = {"level_turns", "growing_damage", "failing_gauges", "model_mismatch", "three_fmus"}
-    assert set(scenario_files()) == expected
-    assert set(binding_files()) == {"uav_wing", "uav_wing_laboratory", "three_fmus"}
+    wings = {"level_turns", "growing_damage", "failing_gauges", "model_mismatch", "three_fmus"}
+    assert set(scenario_files()) == {*wings, "pump_wear"}
+    assert set(binding_files()) == {"gear_pump", "three_fmus", "uav_wing", "uav_wing_laboratory"}
+    assert set(asset_scripts()) == {"gear_pump"}
 
 
 @pytest.mark.parametrize("name", sorted(scenario_files()))
@@ -22,7 +23,7 @@ def test_each_scenario_names_a_shipped_binding_and_can_be_flown(name: str) -> No
     assert scenario.asset.kind == "strain_library" or scenario.asset.binding in binding_files()
     model = build_graphical_model(scenario)
     assert model.states.size == 25
-    assert Truth(scenario, model, 0).noise.shape == (50, 24)
+    assert Truth(scenario, model, 0).noise.shape == ((60, 4) if name == "pump_wear" else (50, 24))
 
 
 def test_the_papers_figures() -> None:

@@ -37,7 +37,7 @@ from twin_master.report.text import (
     number,
     turn_ranges,
 )
-from twin_master.report.view import choose_sensors, default_now
+from twin_master.report.view import choose_sensors, default_now, short_number
 from twin_master.run_folder import to_json
 
 # The tests are no package, so the generator beside this file is loaded by its path.
@@ -200,6 +200,44 @@ def test_sensors_worth_a_panel_are_the_highest_the_first_and_one_for_each_region
 ) -> None:
     # built into the made-up wing: 17 is strained most, 19 answers to region 1 and 23 to region 2
     assert choose_sensors(record) == [16, 0, 18, 22]
+
+
+def test_states_and_sensors_have_units_and_names_of_their_own(record: report_data.RunRecord) -> None:
+    units = ("bar", *["L/min"] * 23)
+    titles = ("pressure", *[f"flow {number}" for number in range(2, 25)])
+    mission = {**record.config["scenario"]["mission"], "step_name": "shift"}
+    noise = {**record.config["scenario"]["observation"], "standard_deviation": [2e-4] * 24}
+    other = replace(
+        record,
+        state_units=("m2.K/W", "1"),
+        sensor_units=units,
+        sensor_titles=titles,
+        observation_name="operation",
+        config={"scenario": {**record.config["scenario"], "mission": mission, "observation": noise}},
+    )
+    figures = {figure.name: figure for figure in report.report_figures(other, 20)}
+    axes = panel(figures["mission_now"].figure, "Stiffness loss of region 1")
+    assert axes.get_ylabel() == "z₁ (m2.K/W)"
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["0", "0.2", "0.4", "0.6", "0.8"]
+    assert_array_equal(line(axes, "at the time")[:, 1], record.filtered.mean[:21, 0])
+    assert panel(figures["mission_now"].figure, "Stiffness loss of region 2").get_ylabel() == "z₂ (%)"
+    pressure = panel(figures["mission_now"].figure, "Pressure")
+    assert pressure.get_ylabel() == "bar"
+    assert record.observation is not None
+    assert_array_equal(line(pressure, "observed")[:, 1], record.observation[:21, 0])
+    assert panel(figures["mission_now"].figure, "Flow 4").get_ylabel() == "L/min"
+    assert "in m2.K/W, percent; the past" in figures["mission_now"].caption
+    assert "0.0002 bar (pressure), 0.0002 L/min (flow 2)" in figures["check"].caption
+    words = " ".join(figure.caption + figure.title for figure in figures.values())
+    for word in ("turn", "gauge", "microstrain", "µε", "strain"):
+        assert word not in words.lower(), word
+
+
+def test_numbers_beside_an_axis_are_short() -> None:
+    numbers = (0.0, 0.5, -20.0, 1500.0, 1e-4, 25000.0, -0.000125)
+    assert [short_number(n) for n in numbers] == [
+        "0", "0.5", "-20", "1500", "1e-4", "2.5e4", "-1.25e-4",
+    ]  # fmt: skip
 
 
 def test_belief_maps_show_the_joint_belief(record: report_data.RunRecord) -> None:

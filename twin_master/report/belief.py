@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from reporting import figures as style
 from twin_master.report.data import RunRecord
-from twin_master.report.view import capital, symbol
+from twin_master.report.view import capital, short_number, state_label, state_scale, state_scales
 
 Float = NDArray[np.floating[Any]]
 
@@ -53,14 +53,14 @@ def _joint_figure(record: RunRecord) -> Figure:
         rows, columns, left=0.075, right=0.02 + width + 0.045, top=1 - 0.52 / height, bottom=0.43 / height,
         wspace=0.12, hspace=0.30,
     )  # fmt: skip
-    first, second = record.state_names
+    scales = state_scales(record)
     image = None
     for number, turn in enumerate(turns):
         row, column = divmod(number, columns)
         axes = figure.add_subplot(grid[row, column])
         image = _map(axes, record, joint_belief(record, turn), cmap=_PROBABILITY_COLORS, vmin=0.0, vmax=1.0)
-        axes.set_title(f"turn {turn}", fontweight="normal", pad=3.0)
-        mean = 100.0 * record.filtered.mean[turn]
+        axes.set_title(f"{record.step_word} {turn}", fontweight="normal", pad=3.0)
+        mean = scales * record.filtered.mean[turn]
         axes.plot(
             *mean,
             marker="D",
@@ -70,7 +70,7 @@ def _joint_figure(record: RunRecord) -> Figure:
             markeredgewidth=1.1,
         )
         if record.truth_state is not None:
-            x, y = 100.0 * record.truth_state[turn]
+            x, y = scales * record.truth_state[turn]
             axes.plot(
                 x,
                 y,
@@ -90,11 +90,11 @@ def _joint_figure(record: RunRecord) -> Figure:
                 markeredgewidth=1.2,
             )
         if row == rows - 1:
-            axes.set_xlabel(f"{symbol(first)} (%)", labelpad=2.0)
+            axes.set_xlabel(state_label(record, 0), labelpad=2.0)
         else:
             axes.tick_params(labelbottom=False)
         if column == 0:
-            axes.set_ylabel(f"{symbol(second)} (%)", labelpad=2.0)
+            axes.set_ylabel(state_label(record, 1), labelpad=2.0)
         else:
             axes.tick_params(labelleft=False)
     if image is not None:
@@ -120,13 +120,11 @@ def _marginal_figure(record: RunRecord) -> Figure:
     count = len(record.state_names)
     figure = style.new_figure(0.6 + 1.3 * count)
     grid = figure.add_gridspec(count, 1, left=0.09, right=0.90, top=0.92, bottom=0.12, hspace=0.5)
-    for factor, (name, title, levels) in enumerate(
-        zip(record.state_names, record.state_titles, record.levels, strict=True)
-    ):
+    for factor, (title, levels) in enumerate(zip(record.state_titles, record.levels, strict=True)):
         axes = figure.add_subplot(grid[factor, 0])
         marginal = np.stack(
             [
-                record.filtered.probability[:, np.isclose(record.coordinates[:, factor], level)].sum(1)
+                record.filtered.probability[:, record.coordinates[:, factor] == level].sum(1)
                 for level in levels
             ]
         )
@@ -137,29 +135,34 @@ def _marginal_figure(record: RunRecord) -> Figure:
         if record.truth_state is not None:
             truth = np.interp(record.truth_state[:, factor], levels, np.arange(len(levels)))
             axes.plot(np.arange(record.step_count), truth, color=style.TRUTH, linewidth=1.0, label="truth")
-        axes.set_yticks(np.arange(len(levels)), [f"{100 * level:g}" for level in levels])
-        axes.set_ylabel(f"{symbol(name)} (%)")
+        scale, _ = state_scale(record, factor)
+        axes.set_yticks(np.arange(len(levels)), [short_number(scale * level) for level in levels.tolist()])
+        axes.set_ylabel(state_label(record, factor))
         style.panel_label(axes, "abcdefghijklmnopqrstuvwxyz"[factor % 26], capital(title))
         figure.colorbar(image, ax=axes, pad=0.02, label="probability")
-    axes.set_xlabel("turn")
+    axes.set_xlabel(record.step_word)
     return figure
 
 
 def _edges(levels: Float) -> Float:
-    """Return the borders half way between the levels, percent: (L + 1,)."""
+    """Return the borders half way between the levels: (L + 1,)."""
     if len(levels) == 1:
-        return 100.0 * np.array([levels[0] - 0.5, levels[0] + 0.5])
+        half = 0.5 * abs(float(levels[0])) or 0.5
+        return np.array([levels[0] - half, levels[0] + half])
     middle = (levels[1:] + levels[:-1]) / 2
     first, last = levels[0] - (middle[0] - levels[0]), levels[-1] + (levels[-1] - middle[-1])
-    return 100.0 * np.concatenate([[first], middle, [last]])
+    return np.concatenate([[first], middle, [last]])
 
 
 def _map(axes: Axes, record: RunRecord, values: NDArray[Any], **options: Any) -> Any:
-    """Draw a value for each joint state of two factors in a plane whose axes are in percent."""
-    x, y = (_edges(levels) for levels in record.levels)
+    """Draw a value for each joint state of two factors in a plane whose axes are as printed."""
+    first, second = (
+        scale * levels for scale, levels in zip(state_scales(record), record.levels, strict=True)
+    )
+    x, y = _edges(first), _edges(second)
     image = axes.pcolormesh(x, y, values, edgecolors="#d9d9d9", linewidth=0.4, **options)
-    axes.set_xticks(100.0 * record.levels[0])
-    axes.set_yticks(100.0 * record.levels[1])
+    axes.set_xticks(first, [short_number(level) for level in first.tolist()])
+    axes.set_yticks(second, [short_number(level) for level in second.tolist()])
     axes.tick_params(length=2.0)
     for side in ("top", "right"):
         axes.spines[side].set_visible(True)
@@ -194,12 +197,12 @@ def policy_figure(record: RunRecord) -> Figure | None:
 
 def _policy_map(axes: Axes, record: RunRecord, shape: tuple[int, ...]) -> None:
     assert record.policy is not None
-    count = len(record.controls)
+    count, scales = len(record.controls), state_scales(record)
     colors = [_CONTROL_COLORS[number % len(_CONTROL_COLORS)] for number in range(count)]
     chosen = record.policy.control_index.reshape(shape).T
     _map(axes, record, chosen, cmap=ListedColormap(colors), vmin=-0.5, vmax=count - 0.5)
     axes.plot(
-        *(100.0 * record.filtered.mean.T),
+        *(scales * record.filtered.mean).T,
         color=style.PRESENT,
         linewidth=1.3,
         marker=".",
@@ -208,21 +211,21 @@ def _policy_map(axes: Axes, record: RunRecord, shape: tuple[int, ...]) -> None:
     )
     if record.truth_state is not None:
         axes.plot(
-            *(100.0 * record.truth_state.T),
+            *(scales * record.truth_state).T,
             color=style.TRUTH,
             linewidth=1.1,
             linestyle=(0, (4, 1.5, 1, 1.5)),
             label="truth",
         )
     axes.plot(
-        *(100.0 * record.filtered.mean[0]),
+        *(scales * record.filtered.mean[0]),
         marker="o",
         markersize=6,
         color="white",
         markeredgecolor=style.PRESENT,
     )
-    axes.set_xlabel(f"{symbol(record.state_names[0])} (%)")
-    axes.set_ylabel(f"{symbol(record.state_names[1])} (%)")
+    axes.set_xlabel(state_label(record, 0))
+    axes.set_ylabel(state_label(record, 1))
     style.panel_label(axes, "a", "Policy, and the way through it")
     handles: list[Any] = [
         Rectangle((0, 0), 1, 1, facecolor=color, edgecolor=style.REFERENCE, linewidth=0.5, label=name)
@@ -246,14 +249,15 @@ def _margin_map(figure: Figure, axes: Axes, record: RunRecord, margin: Float, sh
         image = _map(axes, record, values, cmap="Purples", vmin=0.0, vmax=largest)
     else:
         image = _map(axes, record, values, cmap="PuOr", norm=TwoSlopeNorm(0.0, -largest, largest))
-    for i, x in enumerate(100.0 * record.levels[0]):
-        for j, y in enumerate(100.0 * record.levels[1]):
+    scales = state_scales(record)
+    for i, x in enumerate(scales[0] * record.levels[0]):
+        for j, y in enumerate(scales[1] * record.levels[1]):
             strong = abs(values[j, i]) > 0.62 * largest
             axes.text(
                 x, y, f"{values[j, i]:+.3f}".replace("-", "−"), ha="center", va="center", fontsize=7.0,
                 color="white" if strong else style.TRUTH,
             )  # fmt: skip
-    axes.set_xlabel(f"{symbol(record.state_names[0])} (%)")
+    axes.set_xlabel(state_label(record, 0))
     style.panel_label(axes, "b", "Margin of the decision")
     bar = figure.colorbar(image, ax=axes, pad=0.03, fraction=0.05)
     bar.set_label(label)

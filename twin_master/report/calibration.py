@@ -37,6 +37,8 @@ class CalibrationView:
     ----------
     parameter : str
         Name of the uncertain parameter.
+    unit : str
+        Its unit.
     draws : (E,)
         Draws that the twin averages over.
     true_value : float or None
@@ -54,6 +56,7 @@ class CalibrationView:
     """
 
     parameter: str
+    unit: str
     draws: Float
     true_value: float | None
     prior: tuple[float, float] | None
@@ -81,6 +84,7 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
     data = _table(kept, "data")
     return CalibrationView(
         parameter=record.parameter_name,
+        unit=record.parameter_unit,
         draws=draws,
         true_value=float(true_value) if isinstance(true_value, int | float) else None,
         prior=_moments(_table(kept, "prior")),
@@ -201,7 +205,7 @@ def _density_panel(axes: Axes, view: CalibrationView, label: str) -> None:
         )
     axes.set_xlim(low, high)
     axes.set_ylim(bottom=0.0)
-    axes.set_xlabel(view.parameter.replace("_", " "))
+    axes.set_xlabel(view.parameter.replace("_", " ") + ("" if view.unit == "1" else f" ({view.unit})"))
     axes.set_ylabel("density")
     axes.legend(loc="upper right", handlelength=1.5)
     style.panel_label(axes, label, "The uncertain parameter")
@@ -217,8 +221,9 @@ def calibration_caption(view: CalibrationView) -> str:
             f"a: {len(view.pairs[0])} measured pairs of load and displacement, and the calibrated tip "
             f"stiffness {mean:.1f} ± {deviation:.1f} N/m (band: two standard deviations). b:"
         )
+    unit = "dimensionless" if view.unit == "1" else view.unit
     sentences.append(
-        f"The {name} (dimensionless): the twin averages over {len(view.draws)} draws, mean "
+        f"The {name} ({unit}): the twin averages over {len(view.draws)} draws, mean "
         f"{number(float(view.draws.mean()))}, standard deviation {number(float(view.draws.std()))}."
     )
     if view.true_value is not None:

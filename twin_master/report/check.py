@@ -57,11 +57,16 @@ class PredictiveCheck:
         return float(np.sqrt(np.mean(self.residual[known] ** 2))) if known.any() else float("nan")
 
 
-def assumed_noise(record: RunRecord) -> float | None:
-    """Return the sensor noise that the twin assumes, SI; None if the run folder does not tell."""
+def assumed_noise(record: RunRecord) -> Float | None:
+    """Return the sensor noise that the twin assumes, one or (G,); None if the run folder does not tell."""
     section = record.scenario.get("observation")
     value = section.get("standard_deviation") if isinstance(section, dict) else None
-    return float(value) if isinstance(value, int | float) and value > 0.0 else None
+    try:
+        noise = np.asarray(np.nan if value is None else value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    fits = noise.shape in ((), (len(record.sensors),)) and np.all(np.isfinite(noise) & (noise > 0.0))
+    return noise if fits else None
 
 
 def assumed_model_error(record: RunRecord) -> Float | None:
@@ -115,7 +120,7 @@ def _residual_panel(figure: Figure, axes: Axes, record: RunRecord, check: Predic
         np.ma.masked_invalid(check.residual.T), cmap="PuOr_r", vmin=-4.0, vmax=4.0,
         rasterized=check.residual.size > _MOST_CELLS,
     )  # fmt: skip
-    axes.set_xlabel("turn")
+    axes.set_xlabel(record.step_word)
     axes.set_ylabel(sensor_word(record).lower())
     axes.xaxis.set_major_locator(MaxNLocator(10, integer=True))
     axes.set_yticks(np.arange(1, len(record.sensors) + 1, 4 if len(record.sensors) > 8 else 1))

@@ -122,6 +122,12 @@ class RunRecord:
         Root attributes of ``run.nc``.
     config, summary : mapping
         The JSON files of the run folder; empty if there is none.
+    state_units : tuple of str
+        Stored unit of each factor; empty stands for dimensionless.
+    sensor_units, sensor_titles : tuple of str
+        Unit and name of each sensor; empty where all have the unit of the observation, and no names.
+    parameter_unit : str
+        Unit of the draws.
     """
 
     state_names: tuple[str, ...]
@@ -151,6 +157,17 @@ class RunRecord:
     attributes: Mapping[str, Any]
     config: Mapping[str, Any]
     summary: Mapping[str, Any]
+    state_units: tuple[str, ...] = ()
+    sensor_units: tuple[str, ...] = ()
+    sensor_titles: tuple[str, ...] = ()
+    parameter_unit: str = "1"
+
+    @property
+    def step_word(self) -> str:
+        """What a step is called."""
+        mission = self.scenario.get("mission")
+        word = mission.get("step_name") if isinstance(mission, Mapping) else None
+        return str(word or "turn")
 
     @property
     def step_count(self) -> int:

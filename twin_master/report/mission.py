@@ -22,9 +22,11 @@ from twin_master.report.view import (
     observation_scale,
     reward_course,
     sensor_course,
-    sensor_word,
+    sensor_title,
+    short_number,
     state_course,
-    symbol,
+    state_label,
+    state_scale,
 )
 
 Float = NDArray[np.floating[Any]]
@@ -88,7 +90,7 @@ def mission_figure(record: RunRecord, now: int, sensors: Sequence[int] | None = 
                 title = _PANELS[kind](axes, record, index, now)
                 style.panel_label(axes, next(labels), title)
                 if row == len(panels) - 1:
-                    axes.set_xlabel("turn")
+                    axes.set_xlabel(record.step_word)
                 else:
                     axes.tick_params(labelbottom=False)
         _legend(figure, record, now)
@@ -140,18 +142,20 @@ def _draw_course(axes: Axes, course: Course, now: int) -> None:
 
 
 def _state_panel(axes: Axes, record: RunRecord, factor: int, now: int) -> str:
-    at_the_time = 100.0 * record.filtered.mean[: now + 1, factor]
+    scale, _ = state_scale(record, factor)
+    at_the_time = scale * record.filtered.mean[: now + 1, factor]
     axes.plot(np.arange(now + 1), at_the_time, color=style.PRESENT, linewidth=0.9, label="at the time")
     _draw_course(axes, state_course(record, factor, now), now)
-    levels = 100.0 * record.levels[factor]
-    axes.set_ylim(levels[0] - 6.0, levels[-1] + 6.0)
-    axes.set_yticks(levels)
-    axes.set_ylabel(f"{symbol(record.state_names[factor])} (%)")
+    levels = scale * record.levels[factor]
+    margin = 0.075 * (levels[-1] - levels[0]) or 6.0
+    axes.set_ylim(levels[0] - margin, levels[-1] + margin)
+    axes.set_yticks(levels, [short_number(level) for level in levels.tolist()])
+    axes.set_ylabel(state_label(record, factor))
     return capital(record.state_titles[factor])
 
 
 def _sensor_panel(axes: Axes, record: RunRecord, sensor: int, now: int) -> str:
-    scale, unit = observation_scale(record)
+    scale, unit = observation_scale(record, sensor)
     if record.observation is not None:
         observation = scale * record.observation[: now + 1 + record.horizon, sensor]
         turn = np.arange(len(observation))
@@ -166,8 +170,8 @@ def _sensor_panel(axes: Axes, record: RunRecord, sensor: int, now: int) -> str:
             )
     _draw_course(axes, sensor_course(record, sensor, now), now)
     axes.margins(y=0.12)
-    axes.set_ylabel(f"{record.observation_name} ({unit})")
-    return f"{sensor_word(record)} {record.sensors[sensor]}"
+    axes.set_ylabel(unit if record.sensor_titles else f"{record.observation_name} ({unit})")
+    return capital(sensor_title(record, sensor))
 
 
 def _control_panel(axes: Axes, record: RunRecord, _index: int, now: int) -> str:

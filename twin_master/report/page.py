@@ -37,7 +37,7 @@ from twin_master.report.text import (
     policy_caption,
     turn_ranges,
 )
-from twin_master.report.view import choose_sensors, default_now, sensor_word
+from twin_master.report.view import choose_sensors, default_now, sensor_title, sensor_word, state_scale
 
 REPORT_NAME = "report.html"
 FIGURE_FOLDER = "figures"
@@ -117,12 +117,13 @@ def report_figures(record: RunRecord, now: int) -> list[ReportFigure]:
     last = record.step_count - 1
     if not 0 <= now <= last:
         raise RunFolderError(f"The present turn of the report must lie in 0..{last}, and {now} came.")
+    step = record.step_word
     drawing = mission_figure(record, now, sensors)
-    title = f"The mission as the twin sees it at turn {now}"
+    title = f"The mission as the twin sees it at {step} {now}"
     figures = [ReportFigure(MAIN_FIGURE, drawing, title, mission_caption(record, now))]
     if now != last:
         drawing = mission_figure(record, last, sensors)
-        title = "The whole mission, seen from its last turn"
+        title = f"The whole mission, seen from its last {step}"
         figures.append(ReportFigure("mission_whole", drawing, title, mission_caption(record, last)))
     figures.append(
         ReportFigure("belief", belief_figure(record), "The belief about the state", belief_caption(record))
@@ -145,7 +146,7 @@ def report_figures(record: RunRecord, now: int) -> list[ReportFigure]:
         ReportFigure(
             "network",
             network_figure(),
-            "The dynamic decision network for a few turns",
+            f"The dynamic decision network for a few {step}s",
             network_caption(record),
         )
     )
@@ -159,7 +160,7 @@ def render_page(record: RunRecord, figures: Mapping[str, ReportFigure], drawings
     name = str(mission.get("name") or record.attributes.get("scenario") or "run")
     page = Page(
         title=str(mission.get("title") or name),
-        subtitle=f"Scenario {name}, {record.step_count} turns, seed {_seed(record)}",
+        subtitle=f"Scenario {name}, {record.step_count} {record.step_word}s, seed {_seed(record)}",
         footer=_SOURCES,
     )
     page.add_section("Outcome")
@@ -213,27 +214,36 @@ def _add_outcome(page: Page, record: RunRecord) -> None:
     if rows:
         page.add_table(
             Table(tuple(columns), rows),
-            "Points are percentage points of stiffness loss. A dash means that it did not happen.",
+            f"{_points(record)}A dash means that it did not happen.",
             title="Figures of the run" + (", beside their references" if referred else ""),
         )
+
+
+def _points(record: RunRecord) -> str:
+    titles = [title for k, title in enumerate(record.state_titles) if state_scale(record, k)[1] == "%"]
+    return f"Points are percentage points of {' and '.join(titles)}. " if titles else ""
 
 
 def _highlights(record: RunRecord) -> list[tuple[str, str]]:
     items = []
     final = record.filtered
     for factor, title in enumerate(record.state_titles):
-        mean, deviation = 100.0 * final.mean[-1, factor], 100.0 * final.standard_deviation[-1, factor]
-        truth = (
-            "" if record.truth_state is None else f" (truth {100.0 * record.truth_state[-1, factor]:.0f} %)"
+        scale, unit = state_scale(record, factor)
+        mean, deviation = scale * final.mean[-1, factor], scale * final.standard_deviation[-1, factor]
+        (estimate, width), true = ((".1f", ".1f"), ".0f") if unit == "%" else ((".3g", ".2g"), ".3g")
+        truth = ""
+        if record.truth_state is not None:
+            truth = f" (truth {scale * record.truth_state[-1, factor]:{true}} {unit})"
+        items.append(
+            (f"{mean:{estimate}}\u00a0±\u00a0{deviation:{width}} {unit}", f"{title} at the end{truth}")
         )
-        items.append((f"{mean:.1f}\u00a0±\u00a0{deviation:.1f} %", f"{title} at the end{truth}"))
     changes = np.flatnonzero(np.diff(record.control_index)) + 1
     if len(changes):
         first = int(changes[0])
         before, after = (record.controls[record.control_index[turn]] for turn in (first - 1, first))
-        items.append((f"turn {first}", f"first change of control, from {before} to {after}"))
+        items.append((f"{record.step_word} {first}", f"first change of control, from {before} to {after}"))
     else:
-        items.append((record.controls[record.control_index[0]], "control of every turn"))
+        items.append((record.controls[record.control_index[0]], f"control of every {record.step_word}"))
     check = predictive_check(record)
     if check is not None and np.isfinite(check.overall_coverage):
         items.append(
@@ -302,18 +312,19 @@ def _loss_notices(record: RunRecord) -> list[str]:
     blind = np.flatnonzero(lost.all(axis=1))
     if len(blind):
         notices.append(
-            f"No {word} reported at {turn_ranges(blind)}: there the belief followed the dynamics alone."
+            f"No {word} reported at {turn_ranges(blind, record.step_word)}: there the belief followed the "
+            "dynamics alone."
         )
     return notices
 
 
 def _add_run(page: Page, record: RunRecord) -> None:
     rows: list[tuple[str, str]] = [
-        ("turns flown", str(record.step_count)),
-        ("turns predicted", str(record.horizon)),
+        (f"{record.step_word}s flown", str(record.step_count)),
+        (f"{record.step_word}s predicted", str(record.horizon)),
         ("states", f"{len(record.coordinates)} ({' × '.join(str(len(level)) for level in record.levels)})"),
         ("controls", ", ".join(record.controls)),
-        (f"{sensor_word(record).lower()}s", str(len(record.sensors))),
+        (f"{sensor_word(record).lower()}s", _sensor_list(record)),
         ("seed", _seed(record)),
     ]
     for title, key in (("asset", "asset"), ("model that the twin believes", "twin_model")):
@@ -339,6 +350,13 @@ def _add_run(page: Page, record: RunRecord) -> None:
             "config.json has them in full.",
             title="Provenance",
         )
+
+
+def _sensor_list(record: RunRecord) -> str:
+    count = str(len(record.sensors))
+    if not record.sensor_titles:
+        return count
+    return f"{count}: {', '.join(sensor_title(record, k) for k in range(len(record.sensors)))}"
 
 
 def _origin(record: RunRecord) -> list[tuple[str, str]]:

@@ -180,6 +180,31 @@ def _record(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], fol
         attributes=attributes,
         config=config,
         summary=_read_json(folder / "summary.json"),
+        state_units=_state_units(groups, names),
+        sensor_units=_sensor_texts(observed, "sensor_unit"),
+        sensor_titles=_sensor_texts(observed, "sensor_title"),
+        parameter_unit=_draw_unit(draws_group),
+    )
+
+
+def _state_units(groups: Mapping[str, xr.Dataset], names: tuple[str, ...]) -> tuple[str, ...]:
+    for dataset in groups.values():
+        if all(name in dataset.coords for name in names):
+            return tuple(str(dataset.coords[name].attrs.get("units", "1")) for name in names)
+    return ()
+
+
+def _sensor_texts(observed: xr.Dataset | None, name: str) -> tuple[str, ...]:
+    if observed is None or name not in observed.coords:
+        return ()
+    return tuple(_text(value) for value in observed.coords[name].values)
+
+
+def _draw_unit(draws: xr.Dataset | None) -> str:
+    return (
+        "1"
+        if draws is None or "draw_value" not in draws
+        else str(draws["draw_value"].attrs.get("units", "1"))
     )
 
 

@@ -33,6 +33,13 @@ def sensor_word(record: RunRecord) -> str:
     return "Gauge" if record.observation_name == "strain" else "Sensor"
 
 
+def sensor_title(record: RunRecord, sensor: int) -> str:
+    """Return the name of one sensor, or its number."""
+    if record.sensor_titles:
+        return record.sensor_titles[sensor]
+    return f"{sensor_word(record)} {record.sensors[sensor]}"
+
+
 def default_now(record: RunRecord) -> int:
     """Return the turn that shows most: a few turns before the flown control first changes.
 
@@ -45,11 +52,42 @@ def default_now(record: RunRecord) -> int:
     return int(np.clip(round(2 * last / 3), 0, last))
 
 
-def observation_scale(record: RunRecord) -> tuple[float, str]:
-    """Return the factor from the stored unit of the observations to the printed one, and its name."""
-    if record.observation_name == "strain" and record.observation_unit in {"1", ""}:
+def observation_scale(record: RunRecord, sensor: int | None = None) -> tuple[float, str]:
+    """Return the factor from the stored unit of a sensor to the printed one, and its name.
+
+    Without a sensor those of all sensors; an empty name where they have several.
+    """
+    unit = record.observation_unit
+    if record.sensor_units:
+        unit = "" if sensor is None else record.sensor_units[sensor]
+    elif record.observation_name == "strain" and unit in {"1", ""}:
         return 1.0e6, "µε"
-    return 1.0, record.observation_unit
+    return 1.0, unit
+
+
+def state_scale(record: RunRecord, factor: int) -> tuple[float, str]:
+    """Return the factor from the stored unit of a state factor to the printed one, and its name."""
+    unit = record.state_units[factor] if factor < len(record.state_units) else "1"
+    return (100.0, "%") if unit == "1" else (1.0, unit)
+
+
+def short_number(value: float) -> str:
+    """Return a number that fits beside an axis: 0.5, 1500, 1e-4."""
+    text = f"{value:g}"
+    if len(text.lstrip("-")) <= 4:
+        return text
+    mantissa, exponent = f"{value:.2e}".split("e")
+    return f"{float(mantissa):g}e{int(exponent)}"
+
+
+def state_scales(record: RunRecord) -> Float:
+    """Return the factors from the stored units to the printed ones: (K,)."""
+    return np.array([state_scale(record, factor)[0] for factor in range(len(record.state_names))])
+
+
+def state_label(record: RunRecord, factor: int) -> str:
+    """Return symbol and printed unit of a state factor."""
+    return f"{symbol(record.state_names[factor])} ({state_scale(record, factor)[1]})"
 
 
 def choose_sensors(record: RunRecord, count: int = 4) -> list[int]:
@@ -60,6 +98,8 @@ def choose_sensors(record: RunRecord, count: int = 4) -> list[int]:
     """
     if record.observation is None or not len(record.sensors):
         return []
+    if record.sensor_units:  # what has different units cannot be compared: the first ones
+        return list(range(min(count, len(record.sensors))))
     quantity = None if record.filtered.quantity is None else record.filtered.quantity.mean
     reference = np.abs(record.observation if quantity is None else quantity)
     level = np.nanmax(np.where(np.isfinite(reference), reference, 0.0), axis=0)
@@ -97,7 +137,7 @@ class Course:
 
 
 def state_course(record: RunRecord, factor: int, now: int) -> Course:
-    """Return one factor of the state, percent: mean and two standard deviations, within the levels.
+    """Return one factor of the state as printed: mean and two standard deviations, within the levels.
 
     The past is p(D_t | o_0..o_now), the prediction p(D_{now+h} | o_0..o_now).
     """
@@ -109,16 +149,17 @@ def state_course(record: RunRecord, factor: int, now: int) -> Course:
         if belief is not None:
             mean, deviation = moments(belief, record.coordinates)
     low, high = float(record.levels[factor][0]), float(record.levels[factor][-1])
+    scale, _ = state_scale(record, factor)
 
     def band(first: int, mean: Float, deviation: Float) -> Band:
         lower, upper = (np.clip(mean + sign * deviation, low, high) for sign in (-2.0, 2.0))
-        return Band(np.arange(float(first), first + len(mean)), 100.0 * mean, 100.0 * lower, 100.0 * upper)
+        return Band(np.arange(float(first), first + len(mean)), scale * mean, scale * lower, scale * upper)
 
     predicted = None
     if record.predicted is not None and record.horizon:
         coming = record.predicted
         predicted = band(now + 1, coming.mean[now, :, factor], coming.standard_deviation[now, :, factor])
-    truth = None if record.truth_state is None else 100.0 * record.truth_state[: _end(record, now), factor]
+    truth = None if record.truth_state is None else scale * record.truth_state[: _end(record, now), factor]
     return Course(band(0, mean[:, factor], deviation[:, factor]), predicted, truth)
 
 
@@ -127,7 +168,7 @@ def sensor_course(record: RunRecord, sensor: int, now: int) -> Course:
 
     The past is seen in hindsight at the last turn and as seen at the time before that.
     """
-    scale, _ = observation_scale(record)
+    scale, _ = observation_scale(record, sensor)
     past = _past(record, now).quantity
     predicted = None if record.predicted is None else record.predicted.quantity
     truth = record.truth_observation

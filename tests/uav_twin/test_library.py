@@ -1,0 +1,103 @@
+"""`uav-twin library sample`, `fmu build --script` and a run with a library, as a user calls them."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from scenarios import binding_files, scenario_files
+from uav_twin import cli
+
+GRID = [
+    "--grid",
+    "wear=0,0.3",
+    "--grid",
+    "clogging=0,0.6",
+    "--grid",
+    "speed=1000",
+    "--grid",
+    "pressure=100:140:2",
+]
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["uav-twin", *arguments])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    code = caught.value.code
+    return 0 if code is None else int(code)
+
+
+def test_from_a_script_to_a_library(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    fmu, out = tmp_path / "pump.fmu", tmp_path / "pump.nc"
+    assert call(monkeypatch, "fmu", "build", "--script", "gear_pump", "--out", str(fmu)) == 0
+    assert call(monkeypatch, "fmu", "check", str(fmu)) == 0
+    sample = ["library", "sample", "--fmu", str(fmu), "--binding", str(binding_files()["gear_pump"]), *GRID]
+    capsys.readouterr()
+    assert call(monkeypatch, *sample, "--out", str(out), "--workers", "2") == 0
+    assert re.search(
+        r"pump\.nc: 1 x 4 x 2 x 4 \(draws, states, controls, sensors\), 2 proc", capsys.readouterr().out
+    )
+    content = out.read_bytes()
+    for extra, words in (
+        ([], "exists: choose another --out or give --replace"),
+        (["--replace", "--grid", "wear=0,2"], "wear = 2.0 lies outside the range of 'wear'"),
+        (["--replace", "--role", "flow"], "no observation 'flow'; it has operation"),
+    ):
+        assert call(monkeypatch, *sample, "--out", str(out), *extra) == 1
+        assert words in capsys.readouterr().err
+        assert out.read_bytes() == content
+
+
+def test_a_wrong_command_line_is_said_to_be_so(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = ["--out", str(tmp_path / "x.nc")]
+    for arguments, words in (
+        (["library", "sample", *out], "give a scenario, or --fmu and --binding"),
+        (["library", "sample", "pump_wear", *out, "--resume", "--replace"], "either --resume or --replace"),
+        (["library", "sample", "pump_wear", *out, "--role", "flow"], "the scenario says what is observed"),
+        (["fmu", "build", "--script", "gear_pump", "--kind", "source"], "are for the wing"),
+    ):
+        assert call(monkeypatch, *arguments) == 2
+        assert words in capsys.readouterr().err
+    assert call(monkeypatch, "library", "sample", "pump_wear", *out, "--grid", "speed=1000") == 1
+    assert "the rest is said by the scenario" in capsys.readouterr().err
+    missing = str(tmp_path / "missing.nc")
+    assert call(monkeypatch, "run", "pump_wear", "--library", missing, "--out", str(tmp_path / "run")) == 1
+    assert "there is no observation library" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_of_the_pump_speaks_of_pumps(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    text = scenario_files()["pump_wear"].read_text(encoding="utf-8")
+    scenario = tmp_path / "short.toml"
+    scenario.write_text(
+        re.sub(r"^steps = 60$", "steps = 12", text, flags=re.M).replace("draws = 40", "draws = 6")
+    )
+    folder = tmp_path / "run"
+    assert call(monkeypatch, "run", str(scenario), "--out", str(folder), "--in-process") == 0
+    shown = capsys.readouterr()
+    assert "twin, per shift" in shown.out
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    words = re.sub(r"<svg.*?</svg>|<style.*?</style>", " ", page, flags=re.S)
+    words = (
+        re.sub(r"<[^>]+>", " ", words)
+        + shown.out
+        + "".join(file.read_text(encoding="utf-8") for file in (folder / "csv").iterdir())
+    )
+    for word in ("wing", "strain", "gauge", "stiffness", "turn", "µε", "flight"):
+        assert not re.search(rf"\b{word}s?\b", words, flags=re.I), word
+    for word in ("shift 11", "oil temperature", "0.15 bar", "growth of the clearances", "L/min"):
+        assert word in words.replace("\u00a0", " ")
+    drawings = "".join(path.read_text(encoding="utf-8") for path in (folder / "figures").glob("*.svg"))
+    assert "microstrain" not in drawings
+    assert "Gauge" not in drawings

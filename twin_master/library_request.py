@@ -1,0 +1,193 @@
+"""What a user asks to be sampled: a scenario, or an FMU with values for its inputs."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fmu_asset.binding import Binding, load_binding
+from reporting.progress import Progress
+from twin_master.asset_source import BINDING_COPY, FMU_COPY
+from twin_master.errors import InvalidObservationLibraryError
+from twin_master.library_grid import STEP_TIMEOUT, SamplingGrid
+from twin_master.resolution import Overrides, asset_source, resolve_scenario
+from twin_master.scenario_file import LoadedScenario
+
+_ROLES = ("health", "control", "load", "parameter")
+
+
+def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tuple[float, ...]]]:
+    """Return the values of `NAME=VALUES` texts by role and name.
+
+    NAME is a name of the binding, or ROLE.NAME where two roles share it; VALUES are numbers with commas, or
+    FIRST:LAST:COUNT.
+
+    Raises
+    ------
+    InvalidObservationLibraryError
+        A text is no such thing, or the binding has no such name.
+    """
+    found: dict[str, dict[str, tuple[float, ...]]] = {role: {} for role in _ROLES}
+    tables = {role: getattr(binding, role) for role in _ROLES}
+    for text in texts:
+        name, equals, values = text.partition("=")
+        role, dot, inner = name.partition(".")
+        if dot and role in tables and inner in tables[role]:
+            places = [(role, inner)]
+        else:
+            places = [(role, name) for role in _ROLES if name in tables[role]]
+        if not equals or not places:
+            known = ", ".join(f"{role}.{key}" for role in _ROLES for key in tables[role])
+            raise InvalidObservationLibraryError(
+                f"--grid must be NAME=VALUES with a name of the binding {binding.name} ({known}), and {text} "
+                "came."
+            )
+        if len(places) > 1:
+            full = " or ".join(f"{role}.{key}" for role, key in places)
+            raise InvalidObservationLibraryError(f"{name} is a name of several roles: write {full}.")
+        role, key = places[0]
+        found[role][key] = _values(text, values)
+    return found
+
+
+def _values(text: str, values: str) -> tuple[float, ...]:
+    try:
+        if ":" in values:
+            first, last, count = values.split(":")
+            if int(count) < 1:
+                raise ValueError
+            numbers = np.linspace(float(first), float(last), int(count)).tolist()
+        else:
+            numbers = [float(part) for part in values.split(",")]
+        if not all(math.isfinite(number) for number in numbers):
+            raise ValueError
+    except ValueError:
+        raise InvalidObservationLibraryError(
+            f"--grid must give numbers, as 0,0.2,0.4 or as FIRST:LAST:COUNT, and {text} came."
+        ) from None
+    return tuple(numbers)
+
+
+def grid_of_fmu(
+    fmu: Path,
+    binding_file: Path,
+    texts: Sequence[str],
+    *,
+    role: str | None = None,
+    settling_steps: int = 0,
+    step_timeout: float = STEP_TIMEOUT,
+) -> SamplingGrid:
+    """Return the grid over the values of the inputs; controls are all their combinations.
+
+    Raises
+    ------
+    InvalidObservationLibraryError
+        A text is wrong, something has several values that can have one, or the role is not told.
+    """
+    binding = load_binding(binding_file)
+    given = parse_grid(texts, binding)
+    if role is None:
+        if len(binding.observation) != 1:
+            raise InvalidObservationLibraryError(
+                f"the binding {binding.name} observes {', '.join(binding.observation)}: say which one by "
+                "--role."
+            )
+        role = next(iter(binding.observation))
+    swept = [name for name, values in given["parameter"].items() if len(values) > 1]
+    if len(swept) > 1:
+        raise InvalidObservationLibraryError(
+            f"a library has one uncertain parameter, and {', '.join(swept)} came with several values."
+        )
+    parameter = swept[0] if swept else ""
+    inputs = given["control"]
+    controls = {}
+    for values in itertools.product(*inputs.values()):
+        setting = dict(zip(inputs, values, strict=True))
+        controls[", ".join(f"{name} = {value:g}" for name, value in setting.items())] = setting
+    return SamplingGrid(
+        fmu=str(fmu),
+        binding=str(binding_file),
+        role=role,
+        parameter=parameter,
+        draws=given["parameter"].get(parameter, (0.0,)),
+        states=given["health"],
+        controls=controls if inputs else {},
+        load=_single("load", given["load"]),
+        parameters={k: v[0] for k, v in given["parameter"].items() if k != parameter},
+        settling_steps=settling_steps,
+        step_timeout=step_timeout,
+    )
+
+
+def _single(role: str, given: dict[str, tuple[float, ...]]) -> dict[str, float]:
+    for name, values in given.items():
+        if len(values) > 1:
+            raise InvalidObservationLibraryError(
+                f"the {role} {name} can have one value, and {len(values)} came."
+            )
+    return {name: values[0] for name, values in given.items()}
+
+
+def grid_of_scenario(
+    loaded: LoadedScenario,
+    folder: Path,
+    texts: Sequence[str] = (),
+    *,
+    overrides: Overrides | None = None,
+    settling_steps: int = 0,
+    progress: Progress,
+) -> SamplingGrid:
+    """Return the grid that a scenario asks for, with its FMU and binding copied into a folder.
+
+    Levels of the states and values of the uncertain parameter may be given otherwise by `texts`; the draws
+    are those of the scenario's calibration and seed.
+
+    Raises
+    ------
+    InvalidObservationLibraryError
+        The scenario flies no FMU, or a text gives something else.
+    TwinMasterError, FmuError, FiniteElementError, CalibrationError
+        The asset of the scenario cannot be prepared.
+    """
+    asset = loaded.scenario.asset.model_copy(
+        update={"observation_model": None if loaded.scenario.asset.design else "asset", "library": None}
+    )
+    plain = replace(loaded, scenario=loaded.scenario.model_copy(update={"asset": asset}))
+    scenario = resolve_scenario(plain, overrides or Overrides())
+    if scenario.asset.kind != "fmu":
+        raise InvalidObservationLibraryError(
+            f"the scenario {scenario.mission.name} flies no FMU but a "
+            f"{scenario.asset.kind.replace('_', ' ')}, so there is nothing to sample."
+        )
+    source = asset_source(scenario)
+    source.check()
+    source.prepare(folder, progress)
+    binding = load_binding(folder / BINDING_COPY)
+    given = parse_grid(texts, binding)
+    draws = source.draws(scenario.mission.seed)
+    states = {factor.name: factor.levels for factor in scenario.state} | given.pop("health")
+    swept = given.pop("parameter")
+    if any(given.values()) or {*swept} - {draws.name}:
+        raise InvalidObservationLibraryError(
+            f"with a scenario --grid gives states and the uncertain parameter {draws.name}; the rest is said "
+            "by the scenario."
+        )
+    fixed = {name: value for name, value in scenario.asset.parameters.items() if name != draws.name}
+    return SamplingGrid(
+        fmu=str(folder / FMU_COPY),
+        binding=str(folder / BINDING_COPY),
+        role=scenario.observation.role,
+        parameter=draws.name,
+        draws=swept.get(draws.name, tuple(draws.values.tolist())),
+        states=states,
+        controls={control.name: dict(control.values) for control in scenario.control},
+        load=dict(scenario.asset.load),
+        parameters=fixed,
+        settling_steps=settling_steps,
+        step_timeout=scenario.asset.step_timeout or STEP_TIMEOUT,
+    )

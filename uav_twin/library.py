@@ -1,0 +1,96 @@
+"""`uav-twin library`."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+library_app = typer.Typer(no_args_is_help=True, help="Sample FMUs into observation libraries.")
+
+
+@library_app.callback()
+def library() -> None:
+    """Sample FMUs into observation libraries."""
+
+
+@library_app.command("sample")
+def sample(
+    out: Annotated[Path, typer.Option(help="The NetCDF file to write.", show_default=False)],
+    scenario: Annotated[
+        str | None,
+        typer.Argument(help="A scenario, whose FMU is sampled at its states, controls and draws."),
+    ] = None,
+    fmu: Annotated[Path | None, typer.Option(help="The FMU to sample.", show_default=False)] = None,
+    binding: Annotated[Path | None, typer.Option(help="Its binding.", show_default=False)] = None,
+    grid: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="NAME=VALUES with a name of the binding, such as wear=0,0.2,0.4 or wear=0:0.4:3; repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    role: Annotated[
+        str | None, typer.Option(help="Observation of the binding, where it has several.", show_default=False)
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the draws of a scenario.")] = None,
+    settle: Annotated[
+        int,
+        typer.Option(min=0, help="Steps from a fresh start at every point, for an FMU with memory."),
+    ] = 0,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes.", show_default="one for each processor")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the blocks of an interrupted sampling.")
+    ] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress and no summary.")] = False,
+) -> None:
+    """Ask an FMU for its observation at every draw, state and control; write an observation library."""
+    from reporting.progress import RichProgress, SilentProgress
+    from twin_master.command import INTERRUPTED
+    from twin_master.library_request import grid_of_fmu, grid_of_scenario
+    from twin_master.library_sampling import blocks_folder, sample_library
+    from twin_master.resolution import Overrides
+    from twin_master.scenario_file import load_scenario
+
+    progress = SilentProgress() if quiet else RichProgress()
+    if resume and replace:
+        raise typer.BadParameter("give either --resume or --replace.", param_hint="--resume")
+    if scenario is None and (fmu is None or binding is None):
+        raise typer.BadParameter("give a scenario, or --fmu and --binding.", param_hint="SCENARIO")
+    try:
+        with tempfile.TemporaryDirectory(prefix="uav_twin_library_") as folder:
+            if scenario is not None:
+                if role is not None:
+                    raise typer.BadParameter("the scenario says what is observed.", param_hint="--role")
+                wanted = grid_of_scenario(
+                    load_scenario(scenario),
+                    Path(folder),
+                    grid or (),
+                    overrides=Overrides(seed=seed, fmu=fmu, binding=binding),
+                    settling_steps=settle,
+                    progress=progress,
+                )
+            else:
+                assert fmu is not None
+                assert binding is not None
+                wanted = grid_of_fmu(fmu, binding, grid or (), role=role, settling_steps=settle)
+            outcome = sample_library(
+                wanted, out, workers=workers, resume=resume, replace_existing=replace, progress=progress
+            )
+    except KeyboardInterrupt:
+        kept = blocks_folder(out).is_dir()
+        hint = "go on with the same command and --resume" if kept else "nothing was sampled yet"
+        typer.secho(f"Interrupted; finished blocks are kept: {hint}.", fg="red", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+    if not quiet:
+        values = outcome.library.values
+        note = f", {outcome.kept_blocks} of {outcome.block_count} blocks kept" if outcome.kept_blocks else ""
+        typer.echo(
+            f"{outcome.path}: {' x '.join(str(n) for n in values.shape)} (draws, states, controls, sensors), "
+            f"{outcome.workers} processes, {outcome.seconds:.1f} s{note}, FMU {outcome.library.fmu_hash[:12]}"
+        )
