@@ -20,7 +20,8 @@ from twin_master.assets import Asset, AssetReading, StatelessAsset
 from twin_master.errors import MissingObservationModelError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws, draw_parameter
-from twin_master.scenario import ComponentSection, Scenario
+from twin_master.scenario import Scenario
+from twin_master.scenario_asset import ComponentSection
 from twin_master.strain_library import FILE_NAME as LIBRARY_NAME
 from twin_master.strain_library import StrainLibrary
 

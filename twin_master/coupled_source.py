@@ -43,7 +43,8 @@ from twin_master.asset_source import (
 from twin_master.design_source import read_calibration, read_content, read_design
 from twin_master.errors import MissionInputError
 from twin_master.fmu_source import FmuSource, Session
-from twin_master.scenario import ComponentSection, Scenario
+from twin_master.scenario import Scenario
+from twin_master.scenario_asset import ComponentSection
 
 
 class CoupledSource(FmuSource):

@@ -12,19 +12,20 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from twin_master.scenario_asset import AssetSection
 from twin_master.scenario_section import (
     Count,
-    Flag,
     Name,
     NotNegative,
     Number,
     PerSensor,
-    Positive,
     Probability,
     Section,
     Step,
     check_one_or_each,
+    short,
 )
+from twin_master.scenario_truth import Truth
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of probabilities from one, as the graphical model has it."""
@@ -70,7 +71,7 @@ class StateFactor(Section):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if any(b <= a for a, b in zip(self.levels, self.levels[1:], strict=False)):
-            raise ValueError(f"`levels` of state `{self.name}` must increase, and {_short(self.levels)} came")
+            raise ValueError(f"`levels` of state `{self.name}` must increase, and {short(self.levels)} came")
         if len(self.prior) != len(self.levels):
             raise ValueError(
                 f"`prior` of state `{self.name}` must hold one probability for each of its "
@@ -167,120 +168,6 @@ class Reference(Section):
     source: str
 
 
-class ComponentSection(Section):
-    """One FMU of a coupled asset: a file, a companion by its name, or packed from a wing design."""
-
-    name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$")]
-    fmu: str | None = None
-    design: str | None = None
-    substeps: Count = 1
-    """Steps that it makes in one step of the system."""
-    parameters: dict[str, Flag | Number | str] = Field(default_factory=dict)
-    """By the FMU's names and in its units; `gain[{1..4}]` stands for four of them."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if (self.fmu is None) == (self.design is None):
-            raise ValueError(f"the component `{self.name}` needs one of `fmu` and `design`")
-        return self
-
-
-class ConnectionSection(Section):
-    """What flows from one FMU of a coupled asset to another, or to and from the asset itself."""
-
-    source: Annotated[str, Field(min_length=1)]
-    target: Annotated[str, Field(min_length=1)]
-    factor: Number = 1.0
-    offset: Number = 0.0
-    delayed: Flag = False
-
-
-class AssetSection(Section):
-    """What is flown: an FMU (packed from a wing design, or a file), several of them, or a strain library."""
-
-    kind: Literal["fmu", "coupled", "strain_library"] = "fmu"
-    design: str | None = None
-    file: str | None = None
-    script: str | None = None
-    """A pythonfmu script that is packed as the FMU: a shipped one, or a file."""
-    binding: str | None = None
-    isolated: Flag = True
-    step_timeout: Positive | None = None
-    parameters: dict[str, Number] = Field(default_factory=dict)
-    load: dict[str, Number] = Field(default_factory=dict)
-    observation_model: Literal["design", "asset", "library"] | None = None
-    """Where the twin's predicted observations come from: the model of the design (the default where there is
-    one), the asset itself, or the observation library `library`."""
-    library: str | None = None
-    """An observation library, as `uav-twin library sample` writes it."""
-    seeds: tuple[Name, ...] = ()
-    """Parameters of the binding that are given a number drawn from the seed of the run."""
-    component: tuple[ComponentSection, ...] = ()
-    connection: tuple[ConnectionSection, ...] = ()
-    algorithm: Literal["gauss_seidel", "jacobi"] = "gauss_seidel"
-    iterations: Count = 1
-    tolerance: Positive = 1e-9
-
-    @property
-    def model_of_the_design(self) -> bool:
-        """Whether the twin believes the model of the design."""
-        return self.design is not None and self.observation_model in (None, "design")
-
-    @property
-    def another_model(self) -> bool:
-        """Whether what is flown is known to be another model than the one that the twin believes."""
-        return self.kind == "strain_library" and self.model_of_the_design
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if self.kind != "coupled" and (self.component or self.connection):
-            raise ValueError("`component` and `connection` belong to the kind `coupled`")
-        if self.kind == "coupled" and (not self.binding or bool(self.file) == bool(self.component)):
-            raise ValueError("a coupled asset needs `binding` and either `file`, an SSP file, or `component`")
-        if self.kind == "coupled" and self.file and self.connection:
-            raise ValueError("the connections of an SSP file stand in it: leave out `connection`")
-        names = [component.name for component in self.component]
-        if len(set(names)) != len(names):
-            raise ValueError(f"each component needs a name of its own, and the names are {_short(names)}")
-        for name in self.seeds:
-            if name in self.parameters:
-                raise ValueError(f"`{name}` is both in `parameters` and in `seeds`: keep one of them")
-        if self.kind == "fmu" and (not self.binding or not (self.design or self.file or self.script)):
-            raise ValueError("an FMU asset needs `binding` and one of `design`, `file` and `script`")
-        if self.script and self.kind != "fmu":
-            raise ValueError("`script` is packed as one FMU, and belongs to the kind `fmu`")
-        if self.script and (self.file or self.design):
-            raise ValueError(
-                f"`script` is packed as the FMU that is flown, and `{'file' if self.file else 'design'}` "
-                "names another: keep one of them"
-            )
-        if (self.observation_model == "library") != (self.library is not None):
-            raise ValueError(
-                '`observation_model = "library"` and `library`, the file of an observation library, go '
-                f"together, and only {'the second' if self.library else 'the first'} was given"
-            )
-        if self.observation_model == "design" and self.design is None:
-            raise ValueError(
-                '`observation_model = "design"` needs `design`, the wing whose model the twin believes'
-            )
-        if self.kind == "strain_library":
-            self._check_library()
-        return self
-
-    def _check_library(self) -> None:
-        for key in ("binding", "parameters", "load", "script", "library"):
-            if getattr(self, key):
-                raise ValueError(
-                    f"`{key}` belongs to an FMU, and the asset is a strain library, which is what it is: "
-                    f"leave `{key}` out"
-                )
-        if self.design is not None and self.observation_model == "asset":
-            raise ValueError(
-                "a strain library that is both asset and model leaves nothing to do for `design`: leave it "
-                'out, or set `observation_model = "design"`'
-            )
-
-
 class Calibration(Section):
     """The uncertain parameter of the model and where its distribution comes from."""
 
@@ -306,81 +193,6 @@ class Calibration(Section):
             raise ValueError(f"calibration source `{self.source}` needs `mean`")
         if self.source == "normal" and self.standard_deviation is None:
             raise ValueError("calibration source `normal` needs `standard_deviation`")
-        return self
-
-
-class Gain(Section):
-    """What one factor of the true state gains at each step from `first_step` to `last_step`."""
-
-    units: ClassVar[Mapping[str, str]] = {"gain": "percent"}
-    state: Name
-    first_step: Step
-    last_step: Step | None = None
-    gain: Number
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if self.last_step is not None and self.last_step < self.first_step:
-            raise ValueError(f"`last_step` {self.last_step} lies before `first_step` {self.first_step}")
-        return self
-
-
-class Noise(Section):
-    """Noise of the real sensors, Gaussian and independent."""
-
-    units: ClassVar[Mapping[str, str]] = {"standard_deviation": "microstrain"}
-    standard_deviation: NotNegative | tuple[NotNegative, ...]
-    """One for all sensors or one for each."""
-
-
-class SensorFault(Section):
-    """A fault of some sensors (numbered from 1) between two steps, the last one included."""
-
-    units: ClassVar[Mapping[str, str]] = {"rate": "microstrain_per_step"}
-    kind: Literal["dropout", "drift"]
-    sensors: Literal["all"] | Annotated[tuple[Count, ...], Field(min_length=1)]
-    first_step: Step
-    last_step: Step | None = None
-    rate: Number | None = None
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if (self.kind == "drift") != (self.rate is not None):
-            raise ValueError("a drift needs `rate_microstrain_per_step`, and a dropout has none")
-        if self.last_step is not None and self.last_step < self.first_step:
-            raise ValueError(f"`last_step` {self.last_step} lies before `first_step` {self.first_step}")
-        return self
-
-
-class Truth(Section):
-    """What really happens, unseen by the twin: damage, sensor noise and faults.
-
-    With the kind `asset`, all of it happens inside the asset, and is read back for scoring only.
-    """
-
-    kind: Literal["scripted", "random_growth", "asset"]
-    gains: tuple[Gain, ...] = ()
-    noise: Noise = Noise(standard_deviation=0.0)
-    sensor_faults: tuple[SensorFault, ...] = ()
-    state: dict[str, Name] = Field(default_factory=dict)
-    """`asset`: for each state, the monitor of the binding that tells its true value."""
-    observation: Name | None = None
-    """`asset`: the observation of the binding that is free of noise; that of the scenario if absent."""
-    received: Name | None = None
-    """`asset`: the observation of the binding that is 0 where a sensor is lost."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if self.kind == "asset":
-            if self.gains or self.sensor_faults or self.noise.standard_deviation:
-                raise ValueError(
-                    "the kind `asset` leaves damage, noise and faults to the asset: leave out `truth.gains`, "
-                    "`truth.noise` and `truth.sensor_faults`"
-                )
-        elif self.state or self.observation or self.received:
-            raise ValueError("`state`, `observation` and `received` of `truth` belong to the kind `asset`")
-        elif "noise" not in self.model_fields_set:
-            raise ValueError("`truth.noise` is missing")
         return self
 
 
@@ -435,13 +247,13 @@ class Scenario(Section):
         states, controls = self.state_names, self.control_names
         for what, names in (("state", states), ("control", controls)):
             if len(set(names)) != len(names):
-                raise ValueError(f"each {what} needs a name of its own, and the names are {_short(names)}")
+                raise ValueError(f"each {what} needs a name of its own, and the names are {short(names)}")
         roles = set(self.control[0].values)
         for control in self.control:
             if set(control.values) != roles:
                 raise ValueError(
                     f"every control must give a value to the same inputs: `{controls[0]}` gives "
-                    f"{_short(sorted(roles))} and `{control.name}` gives {_short(sorted(control.values))}"
+                    f"{short(sorted(roles))} and `{control.name}` gives {short(sorted(control.values))}"
                 )
         _known(self.mission.first_control, controls, "mission.first_control", "control")
         _same(self.rewards.control, controls, "rewards.control", "control")
@@ -490,7 +302,7 @@ class Scenario(Section):
         if chosen != "all" and (max(chosen) > count or len(set(chosen)) != len(chosen)):
             raise ValueError(
                 f"`rewards.health_sensors` must name different sensors from 1 to {count}, and "
-                f"{_short(chosen)} came"
+                f"{short(chosen)} came"
             )
         limited = count if chosen == "all" else len(chosen)
         check_one_or_each("rewards.health_limit", self.rewards.health_limit, limited)
@@ -528,18 +340,12 @@ class Scenario(Section):
                     )
 
 
-def _short(values: object) -> str:
-    if isinstance(values, list | tuple):
-        return ", ".join(str(value) for value in values)
-    return str(values)
-
-
 def _known(name: str, names: tuple[str, ...], where: str, what: str) -> None:
     if name not in names:
-        raise ValueError(f"`{where}` must name a {what} ({_short(names)}), and `{name}` came")
+        raise ValueError(f"`{where}` must name a {what} ({short(names)}), and `{name}` came")
 
 
 def _same(table: Mapping[str, object], names: tuple[str, ...], where: str, what: str) -> None:
     if set(table) != set(names):
-        came = _short(list(table)) or "none"
-        raise ValueError(f"`{where}` must have one entry for each {what} ({_short(names)}), and has {came}")
+        came = short(list(table)) or "none"
+        raise ValueError(f"`{where}` must have one entry for each {what} ({short(names)}), and has {came}")

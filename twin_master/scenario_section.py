@@ -72,3 +72,10 @@ class Section(BaseModel):
             if key == f"{base}_{unit}":
                 return base, unit
         return key, ""
+
+
+def short(values: object) -> str:
+    """Return values for a sentence."""
+    if isinstance(values, list | tuple):
+        return ", ".join(str(value) for value in values)
+    return str(values)
