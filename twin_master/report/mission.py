@@ -32,7 +32,7 @@ from twin_master.report.view import (
 Float = NDArray[np.floating[Any]]
 
 _ROW_HEIGHT = 1.22
-_NARROW = 0.12  # a share of the time axis that has no room for a name above it
+_NARROW = 0.19
 _MANY_TURNS = 120  # more have no room for gaps between bars
 _DASHES = (0, (3, 1.2))
 _TRUTH: dict[str, Any] = {
