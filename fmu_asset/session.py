@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections import deque
 from collections.abc import Sequence
@@ -26,6 +25,7 @@ from .exchange import Exchange, Values, plain_values
 from .housing import Housing, Instance, limits_of
 from .instances.base import STATUS_NAMES
 from .observation import Observation
+from .reading import Reader
 from .saved_state import SavedState, StateMethod
 from .worker.client import WorkerInstance
 
@@ -270,8 +270,8 @@ class FmiAsset:
             If the worker died or took too long.
         """
         instance = self._opened()
-        request = instance.request
-        before = bytes(request)
+        request = self._request
+        before = request.tobytes()
         begin = self._start_time + self._index * self._interval
         try:
             self._exchange.place(request, control, health, load, port)
@@ -279,11 +279,11 @@ class FmiAsset:
             request[1] = self._step_size
             instance.step()
         except FmuError as error:
-            memoryview(request).cast("B")[:] = before
+            request.cast("B")[:] = before
             self._fail(error, f"step {self._index} from t = {begin:g} s")
         self._index += 1
         if self._recording:
-            self._record.append(bytes(request)[16:])
+            self._record.append(request.tobytes()[16:])
         return self._observation()
 
     def observe(self) -> Observation:
@@ -471,7 +471,9 @@ class FmiAsset:
             instance = self._housing.instance
             if reset or instance is None:
                 instance = self._housing.fresh()
+                self._request = memoryview(instance.request).cast("B").cast("d")
                 self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
+                self._reader = Reader(self._exchange.outputs, self._reply)
             instance.request[:] = list(start)
             instance.initialise(self._start_time, self._settings, with_inputs=with_inputs)
         except FmuError as error:
@@ -491,6 +493,8 @@ class FmiAsset:
 
     def _opened(self) -> Instance:
         """Return the instance, which is opened by its first use but never started again unasked."""
+        if self._phase == "ready" and self._housing.instance is not None:
+            return self._housing.instance
         if self._phase == "broken":
             raise FmuStateError("A state could not be restored; reset the asset to go on.")
         if self._phase == "closed":
@@ -502,20 +506,20 @@ class FmiAsset:
         return instance
 
     def _observation(self) -> Observation:
-        block = self._reply
-        # The sum of squares tells whether all are finite; only a suspicion is looked at more closely.
-        if not math.isfinite(block.dot(block)):
-            bad = self._exchange.not_finite(block)
-            if bad:
-                more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
-                raise FmuOutputError(
-                    f"The FMU {self._description.path} gave values that are not finite at "
-                    f"t = {self.time:g} s: {', '.join(bad[:5])}{more}. Its inputs or its step size are "
-                    "probably beyond what it can compute; reset the asset or restore a state to go on.",
-                    [text for _, text in self.log[-5:]],
-                )
-        values, extra = self._exchange.read(block)
-        return Observation(values, self._start_time + self._index * self._interval, extra)
+        if self._reader.suspicious():
+            self._refuse_not_finite()
+        return self._reader.read(self._start_time + self._index * self._interval)
+
+    def _refuse_not_finite(self) -> None:
+        bad = self._exchange.not_finite(self._reply)
+        if bad:
+            more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+            raise FmuOutputError(
+                f"The FMU {self._description.path} gave values that are not finite at "
+                f"t = {self.time:g} s: {', '.join(bad[:5])}{more}. Its inputs or its step size are "
+                "probably beyond what it can compute; reset the asset or restore a state to go on.",
+                [text for _, text in self.log[-5:]],
+            )
 
     def _collect_log(self) -> None:
         instance = self._housing.instance
