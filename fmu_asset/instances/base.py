@@ -23,6 +23,7 @@ from .block import Block
 from .messages import Mailbox
 from .plan import Group, Plan, Settings
 from .prepared import prepared
+from .series import Series, run
 
 STATUS_NAMES = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 WARNING, DISCARD, ERROR, FATAL, PENDING = 1, 2, 3, 4, 5
@@ -175,6 +176,10 @@ class FmuInstance(ABC):
                     "observations: reset the asset or restore a state to go on.",
                     error.messages,
                 ) from error
+
+    def run(self, series: Series, report: Callable[[], object]) -> None:
+        """Make many steps; see `series.run`."""
+        run(self, series, report)
 
     def read(self) -> None:
         """Read the outputs of this moment into the reply block."""
