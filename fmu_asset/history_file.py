@@ -71,8 +71,8 @@ def read_histories(path: Path, binding: Binding) -> InputHistories:
     table = _table(path)
     if _TIME not in table:
         raise FmuInputError(
-            f"{path} lacks the column `time`; its columns are {', '.join(table)}. Give the time in seconds at "
-            "which each step begins."
+            f"{path} lacks the column `time`; its columns are {', '.join(table)}. Give the time in seconds "
+            "at which each step begins."
         )
     time = table.pop(_TIME)
     _check_time(path, time, binding)
@@ -182,7 +182,8 @@ def _check_time(path: Path, time: npt.NDArray[np.float64], binding: Binding) -> 
         raise FmuInputError(
             f"{path} has the time {time[step]:.12g} s where step {step} begins at {wanted[step]:.12g} s: the "
             f"binding {binding.name} starts at {binding.binding.start_time:g} s and goes on by "
-            f"{binding.interval:g} s. Resample the inputs, or change `step_size` or `start_time` of the binding."
+            f"{binding.interval:g} s. Resample the inputs, or change `step_size` or `start_time` in the "
+            "binding."
         )
 
 
