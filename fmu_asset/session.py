@@ -334,7 +334,7 @@ class FmiAsset:
         index = np.arange(self._index, self._index + len(rows) + 1)
         moments = np.asarray(self._start_time + index * self._interval, dtype=np.float64)
         rows[:, 0], rows[:, 1] = moments[:-1], self._step_size
-        replies = np.empty((len(rows), len(self._reply)))
+        replies = np.full((len(rows), len(self._reply)), np.nan)
         with (progress or SilentProgress()).stage("Simulating", total=len(rows), unit="steps") as stage:
             for series in blocks(rows, replies):
                 self._run(instance, series, stage)
