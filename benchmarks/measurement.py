@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,3 +56,22 @@ def median_seconds(function: Callable[[], object], *, repeats: int = 15, inner: 
             function()
         times.append((time.perf_counter() - begin) / inner)
     return float(np.median(times))
+
+
+def least_seconds(
+    functions: Mapping[str, Callable[[], object]], *, repeats: int, inner: int
+) -> dict[str, float]:
+    """Return the least time of one call of each function in seconds, over batches of `inner` calls in turns.
+
+    On a busy machine the least of many short batches is one that nothing has interrupted.
+    """
+    least = dict.fromkeys(functions, float("inf"))
+    for function in functions.values():
+        function()
+    for _ in range(repeats):
+        for name, function in functions.items():
+            begin = time.perf_counter()
+            for _ in range(inner):
+                function()
+            least[name] = min(least[name], (time.perf_counter() - begin) / inner)
+    return least

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,8 +14,11 @@ from .declared import FLOAT_KINDS, FmuDescription, VariableInfo
 from .errors import BindingError
 from .instances.plan import Plan, Settings
 from .layout import Layout, Place, element_names, find, start_values
+from .reading import OutputTable, Selection
 from .slots import Slot, in_unit, put, value_range
 from .units import IDENTITY, conversion
+
+_LARGEST = sys.float_info.max
 
 Values = Mapping[str, float | Sequence[float]]
 """Values by the binding's names: a number, or as many as the bound array or port has."""
@@ -44,6 +48,8 @@ class Exchange:
         The binding, with arrays that are observed or recorded as their elements.
     plan : Plan
         For the instance; its folder is still empty.
+    outputs : OutputTable
+        What is read of the reply block.
 
     Raises
     ------
@@ -169,6 +175,15 @@ class Exchange:
             self._slots[role][name] = self._slot(
                 f"{role}.{name}", items[role, name], found[0].variable, positions
             )
+        # A float within these limits is sent as it is; NaN and infinities are not within them.
+        self._direct = {
+            role: {
+                name: (slot.position, max(slot.low, -_LARGEST), min(slot.high, _LARGEST))
+                for name, slot in slots.items()
+                if slot.direct
+            }
+            for role, slots in self._slots.items()
+        }
         # Parameters are set once, each for itself; their positions count from the variable's own values.
         self._parameter_slots = {}
         for name, parameter in self._binding.parameter.items():
@@ -217,7 +232,7 @@ class Exchange:
             for key, vector in binding.observation.items()
             for name, unit in zip(vector.variables, vector.units, strict=True)
         ]
-        self._observation_count = len(wanted)
+        count = len(wanted)
         wanted += [
             (name, scalar.variable, scalar.unit, f"monitor.{name}")
             for name, scalar in binding.monitor.items()
@@ -238,20 +253,17 @@ class Exchange:
             )
             for (_, _, unit, where), place in zip(wanted, places, strict=True)
         ]
-        index = np.array([self._outputs.positions(place)[0] for place in places], dtype=np.intp)
-        count = self._observation_count
-        observed = index[:count]
-        self._observation_index = None if np.array_equal(observed, np.arange(count)) else observed
-        own = conversions[:count]
-        self._observation_scale = (
-            None
-            if all(item == IDENTITY for item in own)
-            else (np.array([item.factor for item in own]), np.array([item.offset for item in own]))
+        positions = [self._outputs.positions(place)[0] for place in places]
+        # A name that stands there twice is that of its last value.
+        extra = {name: which for which, (name, *_) in enumerate(wanted[count:], count)}
+        self.outputs = OutputTable(
+            observed=Selection(positions[:count], conversions[:count]),
+            extra_names=tuple(extra),
+            extra=Selection(
+                [positions[which] for which in extra.values()],
+                [conversions[which] for which in extra.values()],
+            ),
         )
-        self._monitors = [
-            (wanted[which][0], int(index[which]), None if scale == IDENTITY else scale)
-            for which, scale in enumerate(conversions[count:], count)
-        ]
         self.recorded_units = {
             name: unit or place.variable.unit or "1"
             for (name, _, unit, _), place in zip(wanted[count:], places[count:], strict=True)
@@ -338,67 +350,46 @@ class Exchange:
         FmuInputError
             If a value is not finite or outside its range.
         """
-        given = False
-        for role, values in (("control", control), ("health", health), ("load", load), ("port", port)):
-            if not values:
-                continue
-            given = True
-            slots = self._slots[role]
-            for name, value in values.items():
-                slot = slots.get(name)
-                if slot is None:
-                    raise self._no_input(role, name)
-                # NaN fails the comparisons; the last one is for an infinity in a range without limit.
-                if (
-                    slot.direct
-                    and isinstance(value, float)
-                    and slot.low <= value <= slot.high
-                    and value - value == 0.0
-                ):
-                    target[slot.position] = value
-                else:
-                    put(target, slot, value)
-        return given
+        if control:
+            self._place_role(target, "control", control)
+        if health:
+            self._place_role(target, "health", health)
+        if load:
+            self._place_role(target, "load", load)
+        if port:
+            self._place_role(target, "port", port)
+        return bool(control or health or load or port)
+
+    def _place_role(self, target: Any, role: str, values: Values) -> None:
+        direct = self._direct[role]
+        for name, value in values.items():
+            limits = direct.get(name)
+            if limits is not None and isinstance(value, float):
+                position, low, high = limits
+                if low <= value <= high:
+                    target[position] = value
+                    continue
+            put(target, self.slot(role, name), value)
+
+    def slot(self, role: str, name: str) -> Slot:
+        """Return where an input goes.
+
+        Raises
+        ------
+        BindingError
+            If the binding has no such input.
+        """
+        slot = self._slots.get(role, {}).get(name)
+        if slot is None:
+            known = ", ".join(self._slots.get(role, {})) or "none"
+            raise BindingError(f"The binding {self._binding.name} has no {role} {name!r}; it has {known}.")
+        return slot
 
     def input_range(self, role: str, name: str) -> tuple[float, float]:
         """Return the range of an input in the binding's unit; see `FmiAsset.input_range`."""
-        slot = self._slots.get(role, {}).get(name)
-        if slot is None:
-            raise self._no_input(role, name)
+        slot = self.slot(role, name)
         low, high = sorted(slot.conversion.from_fmu(end) for end in (slot.low, slot.high))
         return low, high
-
-    def _no_input(self, role: str, name: str) -> BindingError:
-        known = ", ".join(self._slots.get(role, {})) or "none"
-        return BindingError(f"The binding {self._binding.name} has no {role} {name!r}; it has {known}.")
-
-    def read(self, block: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], dict[str, float]]:
-        """Return observations and monitors in the binding's units.
-
-        Parameters
-        ----------
-        block : (n_outputs,) ndarray
-            The reply block.
-
-        Returns
-        -------
-        values : (n_obs,) ndarray
-            The observations in the order of the binding.
-        extra : dict of str to float
-            Monitors, records and outputs of ports.
-        """
-        if self._observation_index is None:
-            values = block[: self._observation_count].copy()
-        else:
-            values = block[self._observation_index]
-        if self._observation_scale is not None:
-            factor, offset = self._observation_scale
-            values = (values - offset) / factor
-        extra = {
-            name: block.item(index) if scale is None else scale.from_fmu(block.item(index))
-            for name, index, scale in self._monitors
-        }
-        return values, extra
 
     def output_name(self, position: int) -> str:
         """Return the name of an output by its position in the reply block."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 
-@dataclass(frozen=True, slots=True)
-class Observation:
+class Observation(NamedTuple):
     """What came out of one communication step.
 
     Attributes
@@ -24,4 +23,4 @@ class Observation:
 
     values: npt.NDArray[np.float64]
     time: float
-    extra: dict[str, float] = field(default_factory=dict)
+    extra: dict[str, float]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections import deque
 from collections.abc import Sequence
@@ -10,6 +9,8 @@ from types import TracebackType
 from typing import Any, Literal, NoReturn, Self
 
 import numpy as np
+
+from reporting.progress import Progress, SilentProgress, Stage
 
 from .archive import read_fmu
 from .binding import INPUT_ROLES, Binding, load_binding
@@ -25,8 +26,11 @@ from .errors import (
 from .exchange import Exchange, Values, plain_values
 from .housing import Housing, Instance, limits_of
 from .instances.base import STATUS_NAMES
+from .instances.series import Series
 from .observation import Observation
+from .reading import Reader
 from .saved_state import SavedState, StateMethod
+from .simulation import Histories, ObservationHistory, blocks, request_rows
 from .worker.client import WorkerInstance
 
 _LOG_LENGTH = 200
@@ -270,8 +274,8 @@ class FmiAsset:
             If the worker died or took too long.
         """
         instance = self._opened()
-        request = instance.request
-        before = bytes(request)
+        request = self._request
+        before = request.tobytes()
         begin = self._start_time + self._index * self._interval
         try:
             self._exchange.place(request, control, health, load, port)
@@ -279,12 +283,91 @@ class FmiAsset:
             request[1] = self._step_size
             instance.step()
         except FmuError as error:
-            memoryview(request).cast("B")[:] = before
+            request.cast("B")[:] = before
             self._fail(error, f"step {self._index} from t = {begin:g} s")
         self._index += 1
         if self._recording:
-            self._record.append(bytes(request)[16:])
+            self._record.append(request.tobytes()[16:])
         return self._observation()
+
+    def simulate(
+        self,
+        control: Histories | None = None,
+        health: Histories | None = None,
+        load: Histories | None = None,
+        port: Histories | None = None,
+        *,
+        steps: int | None = None,
+        progress: Progress | None = None,
+    ) -> ObservationHistory:
+        """Make many communication steps under prescribed inputs, from where the asset is.
+
+        The result is that of as many calls of `step`, to the bit. All inputs are checked before the first
+        step. If a step fails, the steps before it are made and the asset is where it was before that one.
+
+        Parameters
+        ----------
+        control, health, load, port : mapping of str to (N,) array-like or float
+            Inputs by the binding's names and in its units: one for each step, or one for all; (N, n) or (n,)
+            for an array. One that is not given keeps its last value.
+        steps : int, optional
+            Number of steps N; that of the histories if absent.
+        progress : Progress, optional
+            Where progress is shown.
+
+        Returns
+        -------
+        ObservationHistory
+            What was observed at the end of each step.
+
+        Raises
+        ------
+        FmuInputError
+            If a value is not finite or out of range, or histories have different lengths; nothing was sent.
+        BindingError, FmuCallError, FmuOutputError, FmuWorkerError, FmuTimeoutError
+            As `step`; the message says at which step. A worker that dies or takes too long reports every 20
+            ms: the step named may be a little early.
+        """
+        instance = self._opened()
+        roles = {"control": control, "health": health, "load": load, "port": port}
+        rows = request_rows(self._exchange, np.array(self._request), roles, steps)
+        index = np.arange(self._index, self._index + len(rows) + 1)
+        moments = np.asarray(self._start_time + index * self._interval, dtype=np.float64)
+        rows[:, 0], rows[:, 1] = moments[:-1], self._step_size
+        replies = np.full((len(rows), len(self._reply)), np.nan)
+        with (progress or SilentProgress()).stage("Simulating", total=len(rows), unit="steps") as stage:
+            for series in blocks(rows, replies):
+                self._run(instance, series, stage)
+        return ObservationHistory.of(self._exchange.outputs, moments[1:], replies)
+
+    def _run(self, instance: Instance, series: Series, stage: Stage) -> None:
+        """Make a block of steps; whatever happens, the asset is where the last complete one has left it."""
+        before, begin, shown = self._request.tobytes(), self._index, 0
+        width = len(before)
+
+        def report() -> None:
+            nonlocal shown
+            stage.advance(series.done - shown)
+            shown = series.done
+
+        failure: FmuError | None = None
+        try:
+            instance.run(series, report)
+        except FmuError as error:
+            failure = error
+        finally:
+            made = bytes(series.requests[: series.done * width])
+            self._index += series.done
+            self._request.cast("B")[:] = made[-width:] or before
+            if self._recording:
+                self._record += [made[i + 16 : i + width] for i in range(0, len(made), width)]
+        if failure is not None:
+            self._fail(failure, f"step {self._index} from t = {self.time:g} s")
+        end = series.done * series.reply_size
+        self._reply[:] = np.frombuffer(series.replies[end - series.reply_size : end])
+        if self._reader.suspicious():
+            self._refuse_not_finite(f" It was step {begin + series.done - 1}.")
+        report()
 
     def observe(self) -> Observation:
         """Return the observation of this moment without a step, such as the initial one."""
@@ -471,7 +554,9 @@ class FmiAsset:
             instance = self._housing.instance
             if reset or instance is None:
                 instance = self._housing.fresh()
+                self._request = memoryview(instance.request).cast("B").cast("d")
                 self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
+                self._reader = Reader(self._exchange.outputs, self._reply)
             instance.request[:] = list(start)
             instance.initialise(self._start_time, self._settings, with_inputs=with_inputs)
         except FmuError as error:
@@ -491,6 +576,8 @@ class FmiAsset:
 
     def _opened(self) -> Instance:
         """Return the instance, which is opened by its first use but never started again unasked."""
+        if self._phase == "ready" and self._housing.instance is not None:
+            return self._housing.instance
         if self._phase == "broken":
             raise FmuStateError("A state could not be restored; reset the asset to go on.")
         if self._phase == "closed":
@@ -502,20 +589,21 @@ class FmiAsset:
         return instance
 
     def _observation(self) -> Observation:
-        block = self._reply
-        # The sum of squares tells whether all are finite; only a suspicion is looked at more closely.
-        if not math.isfinite(block.dot(block)):
-            bad = self._exchange.not_finite(block)
-            if bad:
-                more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
-                raise FmuOutputError(
-                    f"The FMU {self._description.path} gave values that are not finite at "
-                    f"t = {self.time:g} s: {', '.join(bad[:5])}{more}. Its inputs or its step size are "
-                    "probably beyond what it can compute; reset the asset or restore a state to go on.",
-                    [text for _, text in self.log[-5:]],
-                )
-        values, extra = self._exchange.read(block)
-        return Observation(values, self._start_time + self._index * self._interval, extra)
+        if self._reader.suspicious():
+            self._refuse_not_finite()
+        return self._reader.read(self._start_time + self._index * self._interval)
+
+    def _refuse_not_finite(self, which: str = "") -> None:
+        bad = self._exchange.not_finite(self._reply)
+        if bad:
+            more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+            raise FmuOutputError(
+                f"The FMU {self._description.path} gave values that are not finite at "
+                f"t = {self.time:g} s: {', '.join(bad[:5])}{more}. Its inputs or its step size are "
+                "probably beyond what it can compute; reset the asset or restore a state to go on."
+                f"{which}",
+                [text for _, text in self.log[-5:]],
+            )
 
     def _collect_log(self) -> None:
         instance = self._housing.instance

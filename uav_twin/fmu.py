@@ -9,8 +9,9 @@ import typer
 
 from uav_twin.fmu_bind import bind
 from uav_twin.fmu_check import check
+from uav_twin.fmu_simulate import simulate
 
-fmu_app = typer.Typer(no_args_is_help=True, help="Build, describe, bind and check FMUs.")
+fmu_app = typer.Typer(no_args_is_help=True, help="Build, describe, bind, check and simulate FMUs.")
 
 
 @fmu_app.command("build")
@@ -110,3 +111,4 @@ def info(
 
 fmu_app.command("bind")(bind)
 fmu_app.command("check")(check)
+fmu_app.command("simulate")(simulate)

@@ -22,12 +22,15 @@ from ..errors import FmuCallError, FmuError, FmuStateError, FmuWorkerError
 from .block import Block
 from .messages import Mailbox
 from .plan import Group, Plan, Settings
+from .prepared import prepared
+from .series import Series, run
 
 STATUS_NAMES = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 WARNING, DISCARD, ERROR, FATAL, PENDING = 1, 2, 3, 4, 5
 _MESSAGES_IN_ERROR = 10
 
-_Calls = list[tuple[str, Callable[..., int], Block]]
+_Calls = list[tuple[str, Callable[[], int], Callable[[], None] | None]]
+"""Name of the function, the prepared call, and what converts the values before or after it, if needed."""
 
 
 class FmuInstance(ABC):
@@ -52,6 +55,9 @@ class FmuInstance(ABC):
     def __init__(self, plan: Plan) -> None:
         self.request = (ctypes.c_double * (2 + plan.input_count))()
         self.reply = (ctypes.c_double * max(plan.output_count, 1))()
+        # Communication point and step size of a step, where they stand in the request.
+        self._begin = ctypes.c_double.from_buffer(self.request, 0)
+        self._size = ctypes.c_double.from_buffer(self.request, 8)
         self._plan = plan
         self._substeps = plan.substeps
         self._mailbox = Mailbox(plan.instance_name)
@@ -83,12 +89,21 @@ class FmuInstance(ABC):
         """Bring the instance to its first communication point."""
 
     @abstractmethod
-    def _advance(self, begin: float, size: float) -> None:
-        """Make one communication step; the inputs are set."""
+    def _advance(self) -> None:
+        """Make one communication step from `_begin` over `_size`; the inputs are set."""
 
     def _send(self) -> None:
         """Set the inputs of the request block."""
-        self._exchange(self._set, sending=True)
+        self._set_values(self._set)
+
+    def _receive(self) -> None:
+        """Read the outputs into the reply block."""
+        for name, call, convert in self._get:
+            status = call()
+            if status > WARNING:
+                raise self._call_error(f"fmi{self._plan.fmi_version}{name}", status, "reading outputs")
+            if convert is not None:
+                convert()
 
     def _free(self) -> None:
         """Terminate and free the instance."""
@@ -139,32 +154,37 @@ class FmuInstance(ABC):
         if self._lost:
             raise FmuWorkerError("The instance was lost to a fatal error; reset the asset to go on.")
         self._send()
-        begin, size = self.request[0], self.request[1]
         if self._substeps == 1:
-            self._advance(begin, size)
+            self._advance()
         else:
-            self._advance_many(begin, size)
-        self._exchange(self._get, sending=False)
+            self._advance_many()
+        self._receive()
 
-    def _advance_many(self, begin: float, size: float) -> None:
-        for number in range(self._plan.substeps):
+    def _advance_many(self) -> None:
+        first, size = self._begin.value, self._size.value
+        for number in range(self._substeps):
+            self._begin.value = first + number * size
             try:
-                self._advance(begin + number * size, size)
+                self._advance()
             except FmuError as error:
                 if number == 0:
                     raise
                 # Between two observations it cannot go back to the last one.
                 self._lost = True
                 raise type(error)(
-                    f"{error.sentence} It was step {number + 1} of the {self._plan.substeps} between two "
+                    f"{error.sentence} It was step {number + 1} of the {self._substeps} between two "
                     "observations: reset the asset or restore a state to go on.",
                     error.messages,
                 ) from error
 
+    def run(self, series: Series, report: Callable[[], object]) -> None:
+        """Make many steps; see `series.run`."""
+        run(self, series, report)
+
     def read(self) -> None:
         """Read the outputs of this moment into the reply block."""
         with self._calls("reading the outputs"):
-            self._exchange(self._get, sending=False)
+            self._receive()
 
     def save(self) -> bytes:
         """Return the serialised FMU state."""
@@ -230,11 +250,13 @@ class FmuInstance(ABC):
     # ------------------------------------------------------------------ inside
 
     def _blocks(self, verb: str, groups: tuple[Group, ...], doubles: Any, begin: int) -> _Calls:
-        calls = []
+        calls: _Calls = []
         for group in groups:
             name = f"{verb}{group.kind}"
             block = Block(self._plan.fmi_version, self._component, group, doubles, begin)
-            calls.append((name, self._function(name), block))
+            convert = block.to_fmu if verb == "Set" else block.from_fmu
+            call = prepared(self._function(name), *block.arguments)
+            calls.append((name, call, None if block.direct else convert))
             begin += group.count
         return calls
 
@@ -242,21 +264,19 @@ class FmuInstance(ABC):
         for kind, reference, values in parameters:
             doubles = (ctypes.c_double * len(values))(*values)
             group = Group(kind, (reference,), len(values))
-            self._exchange(self._blocks("Set", (group,), doubles, 0), sending=True)
+            self._set_values(self._blocks("Set", (group,), doubles, 0))
 
-    def _exchange(self, calls: _Calls, *, sending: bool) -> None:
-        for name, function, block in calls:
-            if sending and not block.direct:
-                block.to_fmu()
-            status = function(*block.arguments)
+    def _set_values(self, calls: _Calls) -> None:
+        for name, call, convert in calls:
+            if convert is not None:
+                convert()
+            status = call()
             if status > WARNING:
-                raise self._call_error(
-                    f"fmi{self._plan.fmi_version}{name}",
-                    status,
-                    "setting inputs" if sending else "reading outputs",
-                )
-            if not (sending or block.direct):
-                block.from_fmu()
+                raise self._call_error(f"fmi{self._plan.fmi_version}{name}", status, "setting inputs")
+
+    def _where(self) -> str:
+        """Return which step is made, for an error."""
+        return f"the step from t = {self._begin.value:g} s"
 
     @contextmanager
     def _calls(self, what: str) -> Iterator[None]:

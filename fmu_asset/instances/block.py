@@ -48,7 +48,7 @@ class Block:
     Attributes
     ----------
     arguments : tuple
-        What the C function takes.
+        What the C function takes, already as C values.
     direct : bool
         Whether the FMU reads and writes the block itself, so that nothing is to be converted.
     """
@@ -63,14 +63,15 @@ class Block:
         else:
             self._values = (kind * group.count)()
         references = (ctypes.c_uint * len(group.references))(*group.references)
-        # FMI 1 declares its Booleans as char.
-        values = (
-            (ctypes.c_char * group.count).from_buffer(self._values)
-            if kind is ctypes.c_ubyte
-            else self._values
+        count = ctypes.c_size_t.from_param(len(group.references))
+        counted = (ctypes.c_size_t.from_param(group.count),) if fmi_version == 3 else ()
+        self.arguments: tuple[Any, ...] = (
+            ctypes.c_void_p.from_param(component),
+            ctypes.byref(references),
+            count,
+            ctypes.byref(self._values),
+            *counted,
         )
-        counted = (group.count,) if fmi_version == 3 else ()
-        self.arguments: tuple[Any, ...] = (component, references, len(group.references), values, *counted)
 
     def to_fmu(self) -> None:
         """Convert the doubles for the FMU."""

@@ -14,6 +14,7 @@ from ..errors import FmuCallError
 from .base import WARNING, FmuInstance
 from .messages import Mailbox, callbacks
 from .plan import Plan, Settings
+from .prepared import prepared
 
 
 def slave_arguments(plan: Plan, mailbox: Mailbox) -> dict[str, str]:
@@ -37,7 +38,13 @@ class CoSimulation1(FmuInstance):
         fmu.instantiate(functions=callbacks(1), loggingOn=True)
         if not fmu.component:
             raise FmuCallError("fmiInstantiateSlave returned no instance")
-        self._do_step = getattr(fmu.dll, f"{plan.model_identifier}_fmiDoStep")
+        self._do_step = prepared(
+            getattr(fmu.dll, f"{plan.model_identifier}_fmiDoStep"),
+            ctypes.c_void_p.from_param(fmu.component),
+            self._begin,
+            self._size,
+            ctypes.c_char.from_param(b"\x01"),
+        )
         return fmu
 
     def _function(self, name: str) -> Callable[..., int]:
@@ -50,10 +57,10 @@ class CoSimulation1(FmuInstance):
             self._send()
         self._fmu.initialize(tStart=start_time)
 
-    def _advance(self, begin: float, size: float) -> None:
-        status = self._do_step(self._component, begin, size, b"\x01")
+    def _advance(self) -> None:
+        status = self._do_step()
         if status > WARNING:
-            raise self._call_error("fmiDoStep", status, f"the step from t = {begin:g} s")
+            raise self._call_error("fmiDoStep", status, self._where())
 
 
 class CoSimulation2(FmuInstance):
@@ -62,9 +69,14 @@ class CoSimulation2(FmuInstance):
     def _instantiate(self, plan: Plan, mailbox: Mailbox) -> Any:
         fmu = FMU2Slave(**slave_arguments(plan, mailbox))
         fmu.instantiate(callbacks=callbacks(2), loggingOn=True)
-        # The C functions themselves, with the types that FMU2Slave has given them: its methods log and look
-        # up names at every call.
-        self._do_step = fmu.dll.fmi2DoStep
+        # The C functions themselves: fmpy's methods log and look up names at every call.
+        self._do_step = prepared(
+            fmu.dll.fmi2DoStep,
+            ctypes.c_void_p.from_param(fmu.component),
+            self._begin,
+            self._size,
+            ctypes.c_int.from_param(1),
+        )
         return fmu
 
     def _function(self, name: str) -> Callable[..., int]:
@@ -80,10 +92,10 @@ class CoSimulation2(FmuInstance):
             self._send()
         fmu.exitInitializationMode()
 
-    def _advance(self, begin: float, size: float) -> None:
-        status = self._do_step(self._component, begin, size, 1)
+    def _advance(self) -> None:
+        status = self._do_step()
         if status > WARNING:
-            raise self._call_error("fmi2DoStep", status, f"the step from t = {begin:g} s")
+            raise self._call_error("fmi2DoStep", status, self._where())
 
 
 class CoSimulation3(FmuInstance):
@@ -94,10 +106,14 @@ class CoSimulation3(FmuInstance):
         fmu.instantiate(loggingOn=True, logMessage=mailbox.log)
         self._event, self._terminate, self._early = (ctypes.c_bool() for _ in range(3))
         self._reached = ctypes.c_double()
-        self._flags = tuple(
-            ctypes.byref(flag) for flag in (self._event, self._terminate, self._early, self._reached)
+        self._do_step = prepared(
+            fmu.dll.fmi3DoStep,
+            ctypes.c_void_p.from_param(fmu.component),
+            self._begin,
+            self._size,
+            ctypes.c_bool.from_param(True),
+            *(ctypes.byref(flag) for flag in (self._event, self._terminate, self._early, self._reached)),
         )
-        self._do_step = fmu.dll.fmi3DoStep
         return fmu
 
     def _function(self, name: str) -> Callable[..., int]:
@@ -111,20 +127,18 @@ class CoSimulation3(FmuInstance):
             self._send()
         self._fmu.exitInitializationMode()
 
-    def _advance(self, begin: float, size: float) -> None:
+    def _advance(self) -> None:
         # Outputs of a call that an FMU need not set.
         self._terminate.value = self._early.value = False
-        status = self._do_step(self._component, begin, size, True, *self._flags)
-        what = f"the step from t = {begin:g} s"
+        status = self._do_step()
         if status > WARNING:
-            raise self._call_error("fmi3DoStep", status, what)
+            raise self._call_error("fmi3DoStep", status, self._where())
         if self._terminate.value:
-            raise FmuCallError(f"The FMU asked to end the simulation in {what}.", self._texts())
+            raise FmuCallError(f"The FMU asked to end the simulation in {self._where()}.", self._texts())
         if self._early.value:
             self._lost = True
             raise FmuCallError(
-                f"The FMU returned early, at t = {self._reached.value:g} s, in {what}, though it was told "
-                "that "
-                "this is not supported; try a smaller step_size in the binding.",
+                f"The FMU returned early, at t = {self._reached.value:g} s, in {self._where()}, though it "
+                "was told that this is not supported; try a smaller step_size in the binding.",
                 self._texts(),
             )

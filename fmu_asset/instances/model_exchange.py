@@ -91,7 +91,8 @@ class ModelExchange(FmuInstance):
             if self._solver is not None:
                 self._solver.reset(self.request[0])
 
-    def _advance(self, begin: float, size: float) -> None:
+    def _advance(self) -> None:
+        begin, size = self._begin.value, self._size.value
         end = begin + size
         with self._calls(f"the step from t = {begin:g} s"):
             if self._solver is None:

@@ -8,16 +8,17 @@ import json
 import select
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from .. import errors
 from ..errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
 from ..instances.plan import Plan, Settings
+from ..instances.series import REPORT_PERIOD, Series
 from .guard import resident_memory
 from .process import CLOSE_LIMIT, WorkerProcess
-from .protocol import FAILURE, HEADER, LARGEST_MESSAGE, QUICK, RESULT, Operation, look, receive, send
+from .protocol import FAILURE, HEADER, LARGEST_MESSAGE, PART, QUICK, RESULT, Operation, look, receive, send
 
 _MEBIBYTE = 1024**2
 _GLANCE = 0.05
@@ -102,7 +103,7 @@ class WorkerInstance:
             self.close()
             raise
 
-    # The next seven have the meaning of their namesakes in FmuInstance.
+    # These have the meaning of their namesakes in FmuInstance.
 
     def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
         """Set parameters and inputs and initialise."""
@@ -132,6 +133,31 @@ class WorkerInstance:
             raise self._died(what)
         if time.monotonic() > self._next_glance:
             self._check_memory(what)
+
+    def run(self, series: Series, report: Callable[[], object]) -> None:
+        """Make many steps; each may take the time of a step."""
+        what = "a step"
+        self._begin()
+        try:
+            send(self._out, HEADER.pack(Operation.RUN, 0, len(series.requests)), series.requests)
+        except BrokenPipeError:
+            raise self._died(what) from None
+        kind = PART
+        while kind == PART:
+            kind, length = self._await(what, self._limits.step_time, part=True)
+            if kind == FAILURE:
+                self._fail(length, what)
+            steps, rest = divmod(length, series.reply_size)
+            if rest or series.done + steps > series.count:
+                raise self._died(what)
+            begin = series.done * series.reply_size
+            self._fill(series.replies[begin : begin + length], what)
+            series.done += steps
+            if kind == RESULT:
+                self._busy = False
+            if time.monotonic() > self._next_glance:
+                self._check_memory(what)
+            report()
 
     def read(self) -> None:
         """Read the outputs of this moment."""
@@ -218,19 +244,19 @@ class WorkerInstance:
             raise FmuWorkerError("The FMU's worker is gone or was interrupted; reset the asset to go on.")
         self._busy = True
 
-    def _await(self, what: str, limit: float) -> tuple[int, int]:
+    def _await(self, what: str, limit: float, *, part: bool = False) -> tuple[int, int]:
         # The first wait covers the usual step; a longer one is a chance to look at the worker's memory.
         if not self._poll.poll(self._first_wait):
-            self._await_long(what, limit)
+            self._await_long(what, limit, REPORT_PERIOD if part else 0.0)
         self._fill(self._header_view, what)
         kind, logged, length = HEADER.unpack(self._header)
-        if kind not in (RESULT, FAILURE) or length > LARGEST_MESSAGE:
+        if kind not in (RESULT, FAILURE, PART if part else RESULT) or length > LARGEST_MESSAGE:
             raise self._died(what)
         self._logged = self._logged or logged != 0
         return kind, length
 
-    def _await_long(self, what: str, limit: float) -> None:
-        deadline = time.monotonic() + limit - self._first_wait / 1000.0
+    def _await_long(self, what: str, limit: float, slack: float) -> None:
+        deadline = time.monotonic() + limit + slack - self._first_wait / 1000.0
         while True:
             self._check_memory(what)
             left = deadline - time.monotonic()

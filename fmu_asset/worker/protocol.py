@@ -2,6 +2,8 @@
 
 Two pipes carry binary messages: a header (operation or kind, whether there are log messages, length), then
 the payload. A step is the request block of an instance one way and the reply block the other, without copies.
+A run is many request blocks in one message; their reply blocks come back in parts while it goes on, so that
+the twin sees how far it is and can stop a step that takes too long.
 """
 
 from __future__ import annotations
@@ -30,12 +32,13 @@ class Operation(IntEnum):
     LOG = 8
     RENEW = 9
     CLOSE = 10
+    RUN = 11
 
 
-QUICK = frozenset({Operation.STEP, Operation.READ, Operation.SAVE, Operation.RESTORE})
+QUICK = frozenset({Operation.STEP, Operation.RUN, Operation.READ, Operation.SAVE, Operation.RESTORE})
 """What is asked often and answered at once: both sides look again for a moment before they sleep."""
 
-RESULT, FAILURE = 1, 2
+RESULT, FAILURE, PART = 1, 2, 3
 OWN_FAILURE, PIPES_GONE = 70, 71
 """Exit statuses of a worker whose own program failed, or whose pipes were closed by the FMU."""
 

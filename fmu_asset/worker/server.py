@@ -11,16 +11,38 @@ import signal
 import sys
 import traceback
 
+import numpy as np
+
 from ..errors import FmuError, FmuWorkerError
 from ..instances import open_instance
 from ..instances.base import FmuInstance
 from ..instances.plan import Plan
+from ..instances.series import Series
 from .guard import Household, restrict
-from .protocol import FAILURE, HEADER, OWN_FAILURE, PIPES_GONE, QUICK, RESULT, Operation, look, receive, send
+from .protocol import (
+    FAILURE,
+    HEADER,
+    OWN_FAILURE,
+    PART,
+    PIPES_GONE,
+    QUICK,
+    RESULT,
+    Operation,
+    look,
+    receive,
+    send,
+)
 
-_STEP, _OPEN, _RENEW, _CLOSE, _LOG = (
+_STEP, _RUN, _OPEN, _RENEW, _CLOSE, _LOG = (
     int(operation)
-    for operation in (Operation.STEP, Operation.OPEN, Operation.RENEW, Operation.CLOSE, Operation.LOG)
+    for operation in (
+        Operation.STEP,
+        Operation.RUN,
+        Operation.OPEN,
+        Operation.RENEW,
+        Operation.CLOSE,
+        Operation.LOG,
+    )
 )
 
 
@@ -73,7 +95,10 @@ def serve(incoming: int, outgoing: int, folder: str) -> None:
                             instance = open_instance(plan)
                             request = memoryview(instance.request).cast("B")
                             reply = memoryview(instance.reply).cast("B")
-                    payload = _answer(operation, bytes(content), instance, reply)
+                    if operation == _RUN and instance is not None:
+                        payload = _run(instance, content, outgoing)
+                    else:
+                        payload = _answer(operation, bytes(content), instance, reply)
                 logged = instance is not None and instance.has_log and operation != _LOG
                 HEADER.pack_into(reply_header, 0, RESULT, logged, len(payload))
             except FmuError as error:
@@ -94,6 +119,29 @@ def serve(incoming: int, outgoing: int, folder: str) -> None:
         sys.stderr.flush()
         os._exit(OWN_FAILURE)
     household.leave(asked=asked)
+
+
+def _run(instance: FmuInstance, content: bytearray, outgoing: int) -> memoryview:
+    """Make the steps of a message; send replies in parts, and return those that are not sent yet."""
+    requests = np.frombuffer(content).reshape(-1, len(instance.request))
+    series = Series(requests, np.empty((len(requests), len(instance.reply))))
+    sent = 0
+
+    def rest() -> memoryview:
+        nonlocal sent
+        begin, sent = sent, series.done
+        return series.replies[begin * series.reply_size : sent * series.reply_size]
+
+    def report() -> None:
+        part = rest()
+        send(outgoing, HEADER.pack(PART, instance.has_log, len(part)), part)
+
+    try:
+        instance.run(series, report)
+    except FmuError:
+        report()
+        raise
+    return rest()
 
 
 def _answer(

@@ -1,0 +1,105 @@
+"""What the master adds to an FMU: a step in process and through the worker, a simulation beside fmpy's."""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.bare_fmu import LEVELS, bare_step, fmpy_simulation, minimal_fmu
+from benchmarks.measurement import Measurement, least_seconds
+from fe.cache import reduced_model
+from fmu_asset.binding import Binding, load_binding
+from fmu_asset.build import build_fmu
+from fmu_asset.compiled.compiler import find_compiler
+from fmu_asset.errors import FmuBuildError
+from fmu_asset.session import FmiAsset
+
+BINDING = Path(__file__).parents[1] / "scenarios" / "bindings" / "uav_wing.toml"
+STEPS = 10_000
+SHORT = 500
+"""Steps of a simulation that is over before something interrupts it."""
+
+
+def run() -> list[Measurement]:
+    """Measure all in turns in one run; the least times, since other work only adds to them."""
+    try:
+        find_compiler()
+    except FmuBuildError as error:
+        print(error)
+        return []
+    binding = load_binding(BINDING)
+    with tempfile.TemporaryDirectory() as place, ExitStack() as stack:
+        folder = Path(place)
+        wing = build_fmu(reduced_model(), folder / "compiled.fmu", kind="compiled").path
+        empty = minimal_fmu(wing, folder / "minimal.fmu")
+        steps: dict[str, Callable[[], object]] = {}
+        for name, path in (("wing", wing), ("empty", empty)):
+            steps[f"bare {name}"] = stack.enter_context(bare_step(path))
+            for kind in ("in process", "worker"):
+                asset = stack.enter_context(FmiAsset(path, binding, isolated=kind == "worker"))
+                steps[f"{kind} {name}"] = _stepper(asset)
+        least = {name: 1e6 * value for name, value in least_seconds(steps, repeats=400, inner=25).items()}
+        simulations: dict[str, Callable[[], object]] = {
+            "fmpy": lambda: fmpy_simulation(wing, STEPS),
+            "in process": lambda: _simulation(wing, binding, isolated=False),
+            "worker": lambda: _simulation(wing, binding, isolated=True),
+        }
+        whole = least_seconds(simulations, repeats=12, inner=1)
+        opened = {
+            kind: stack.enter_context(FmiAsset(wing, binding, isolated=kind == "worker"))
+            for kind in ("in process", "worker")
+        }
+        running = least_seconds(
+            {kind: partial(_simulate, asset, SHORT) for kind, asset in opened.items()}, repeats=200, inner=1
+        )
+    bare, nothing = "bare ctypes calls", "an FMU that computes nothing"
+    return [
+        Measurement(
+            "compiled FMU step in process", least["in process wing"], "us", 8.0, bare, least["bare wing"]
+        ),
+        Measurement(
+            "the same, through the worker", least["worker wing"], "us", 60.0, nothing, least["worker empty"]
+        ),
+        Measurement(
+            "master, over bare calls", least["in process empty"] - least["bare empty"], "us", 3.0,
+            bare, least["bare empty"],
+        ),
+        Measurement(
+            "the same, the compiled wing", least["in process wing"] - least["bare wing"], "us", 3.0,
+            bare, least["bare wing"],
+        ),
+        Measurement(
+            f"simulate, {STEPS} steps, times faster than fmpy", whole["fmpy"] / whole["in process"], "x", 2.0,
+            larger_is_better=True,
+        ),
+        Measurement(
+            "the same, through the worker", whole["fmpy"] / whole["worker"], "x", larger_is_better=True
+        ),
+        *(
+            Measurement(
+                f"a step of simulate, {kind}", 1e6 / SHORT * seconds, "us", None, bare, least["bare wing"]
+            )
+            for kind, seconds in running.items()
+        ),
+    ]  # fmt: skip
+
+
+def _stepper(asset: FmiAsset) -> Callable[[], object]:
+    damage = itertools.cycle(range(LEVELS))
+    return lambda: asset.step({"load_factor": 3.0}, {"z1": 0.001 * next(damage), "z2": 0.2})
+
+
+def _simulation(path: Path, binding: Binding, *, isolated: bool) -> None:
+    """Simulate as fmpy does, extraction, start and all outputs included."""
+    with FmiAsset(path, binding, isolated=isolated) as asset:
+        _simulate(asset, STEPS)
+
+
+def _simulate(asset: FmiAsset, steps: int) -> None:
+    asset.simulate({"load_factor": 3.0}, {"z1": 0.001 * (np.arange(steps) % LEVELS), "z2": 0.0})

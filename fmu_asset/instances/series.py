@@ -1,0 +1,81 @@
+"""Many steps in one go: their requests and replies, row by row."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from .base import FmuInstance
+
+REPORT_PERIOD = 0.02
+"""Seconds after which a running series reports what is done, at the end of the step that is being made."""
+
+
+class Series:
+    """Steps that follow one another.
+
+    Parameters
+    ----------
+    requests : (N, 2 + n_inputs) ndarray
+        The request block of each step.
+    replies : (N, n_outputs) ndarray
+        Filled with the reply block of each step.
+
+    Attributes
+    ----------
+    done : int
+        Number of steps made; the replies of these are filled.
+    """
+
+    def __init__(self, requests: npt.NDArray[np.float64], replies: npt.NDArray[np.float64]) -> None:
+        self.requests = memoryview(requests.reshape(-1)).cast("B")  # type: ignore[arg-type]
+        self.replies = memoryview(replies.reshape(-1)).cast("B")  # type: ignore[arg-type]
+        self.count, self.done = len(requests), 0
+        self.reply_size = replies.itemsize * replies.shape[1]
+
+
+def run(instance: FmuInstance, series: Series, report: Callable[[], object]) -> None:
+    """Make the steps of a series; end after one whose outputs are not all finite.
+
+    Parameters
+    ----------
+    instance : FmuInstance
+        An instance in this process.
+    series : Series
+        The steps; `done` counts them also when one fails.
+    report : callable
+        Called now and then between two steps, when `done` has grown.
+
+    Raises
+    ------
+    FmuCallError, FmuWorkerError
+        As `FmuInstance.step`.
+    """
+    request, reply = memoryview(instance.request).cast("B"), memoryview(instance.reply).cast("B")
+    outputs = np.frombuffer(reply)
+    asked, answered = len(request), series.reply_size
+    requests, replies, step, dot, now = (
+        series.requests,
+        series.replies,
+        instance.step,
+        outputs.dot,
+        time.monotonic,
+    )
+    due = now() + REPORT_PERIOD
+    for row in range(series.count):
+        request[:] = requests[row * asked : (row + 1) * asked]
+        step()
+        replies[row * answered : (row + 1) * answered] = reply
+        series.done = row + 1
+        # The sum of squares can be infinite for large values too.
+        if not math.isfinite(dot(outputs)) and not np.isfinite(outputs).all():
+            return
+        if now() > due:
+            report()
+            due = now() + REPORT_PERIOD

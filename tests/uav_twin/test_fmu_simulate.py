@@ -1,0 +1,140 @@
+"""`uav-twin fmu simulate` as a user calls it."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fmu_asset.binding import load_binding
+from fmu_asset.errors import FmuInputError
+from fmu_asset.history_file import read_histories
+from fmu_asset.session import FmiAsset
+
+ROOT = Path(__file__).parents[2]
+ROOM = """
+[binding]
+name = "room"
+step_size = 60.0
+start_time = 120.0
+
+[control.power]
+variable = "heater.u[1].P"
+unit = "kW"
+
+[load.outside]
+variable = "ambient.T"
+unit = "degC"
+minimum = -40.0
+
+[observation.room]
+variables = ["room.T", "room.sensor.T"]
+unit = "degC"
+
+[record]
+variables = ["der(room.T)"]
+"""
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    path = tmp_path / "room.toml"
+    path.write_text(ROOM, encoding="utf-8")
+    return path
+
+
+def call(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "uav_twin", "fmu", "simulate", *map(str, arguments)],
+        cwd=ROOT,
+        env={**os.environ, "COLUMNS": "300"},
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_histories_in_outputs_out(foreign_fmu: Any, room: Path, tmp_path: Path) -> None:
+    fmu, given = foreign_fmu("room2"), tmp_path / "inputs.csv"
+    power, outside = [0.0, 3.0, 1.5, 0.25], [5.0, -3.5, 0.1, 20.0]
+    lines = [f"{120.0 + 60.0 * i},{p},{o}" for i, (p, o) in enumerate(zip(power, outside, strict=True))]
+    given.write_text("time, power, load.outside\n" + "\n".join(lines) + "\n\n", encoding="utf-8")
+    with FmiAsset(fmu, room, isolated=False) as asset:
+        seen = [asset.step({"power": p}, load={"outside": o}) for p, o in zip(power, outside, strict=True)]
+    for out, more in ((tmp_path / "out.csv", ()), (tmp_path / "out.nc", ("--in-process",))):
+        made = call(fmu, "--binding", room, "--inputs", given, "--out", out, *more)
+        assert made.returncode == 0, made.stderr
+        assert "4 steps to t = 360 s" in made.stdout
+    with (tmp_path / "out.csv").open(encoding="utf-8", newline="") as stream:
+        header, *rows = csv.reader(stream)
+    assert header == ["time", "room.T", "room.sensor.T", "der(room.T)"]
+    expected = [[item.time, *item.values.tolist(), item.extra["der(room.T)"]] for item in seen]
+    assert [[float(cell) for cell in row] for row in rows] == expected
+    with xr.open_dataset(tmp_path / "out.nc", engine="h5netcdf", decode_times=False) as data:
+        assert data["time"].values.tolist() == [180.0, 240.0, 300.0, 360.0]
+        assert data["observation"].values.tobytes() == np.array([item.values for item in seen]).tobytes()
+        assert data["observation_unit"].values.tolist() == ["degC", "degC"]
+        assert data["extra"].sel(extra_name="der(room.T)").values.tolist() == [row[-1] for row in expected]
+        assert data["extra_unit"].values.tolist() == ["K/s"]
+    again = call(fmu, "--binding", room, "--inputs", given, "--out", tmp_path / "out.nc")
+    assert again.returncode != 0
+    assert "exists: choose another --out or give --replace" in again.stderr
+
+
+def test_bad_inputs_are_a_sentence_and_nothing_is_written(
+    foreign_fmu: Any, room: Path, tmp_path: Path
+) -> None:
+    fmu, given, out = foreign_fmu("room2"), tmp_path / "inputs.csv", tmp_path / "out.csv"
+    cold = "time,outside\n120,5\n180,-41\n"
+    for content, sentence in ((None, "There is no file"), (cold, "It is the value of step 1 of the 2")):
+        if content is not None:
+            given.write_text(content, encoding="utf-8")
+        refused = call(fmu, "--binding", room, "--inputs", given, "--out", out)
+        assert refused.returncode != 0
+        assert sentence in refused.stderr
+        assert "Traceback" not in refused.stderr
+        assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("", "has no steps"),
+        ("time,power\n", "has no steps"),
+        ("power\n1\n", "lacks the column `time`; its columns are power"),
+        (
+            "time,pwer\n120,1\n",
+            "'pwer' .* is no input of the binding room; it has control.power, load.outside",
+        ),
+        ("time,power,power\n120,1,2\n", "has the column 'power' more than once"),
+        ("time,power,control.power\n120,1,2\n", r"gives control\.power in more than one column"),
+        ("time,power[2]\n120,1\n", r"lacks the column control\.power\[1\]"),
+        ("time,power\n120,1\n180\n", "Line 3 .* has 1 cells, but there are 2 columns"),
+        ("time,power\n120,1\n\n180,nan\n", "Line 4 .*: power must be a finite number, but is 'nan'"),
+        ("time,power\n120,\n", "Line 2 .*: power must be a finite number, but is ''"),
+        ("time,power\n120,1\n180,1\n250,1\n", "the time 250 s where step 2 begins at 240 s"),
+        ("time,power\n0,1\n", "the time 0 s where step 0 begins at 120 s"),
+    ],
+)
+def test_files_that_are_refused(room: Path, tmp_path: Path, content: str, sentence: str) -> None:
+    given = tmp_path / "inputs.csv"
+    given.write_text(content, encoding="utf-8")
+    with pytest.raises(FmuInputError, match=sentence):
+        read_histories(given, load_binding(room))
+
+
+def test_columns_of_arrays_in_any_order_and_time_alone(room: Path, tmp_path: Path) -> None:
+    given = tmp_path / "inputs.csv"
+    given.write_text("power[2],time,power[1]\n1,120,2\n3,180,4\n", encoding="utf-8-sig")
+    steps, roles = read_histories(given, load_binding(room))
+    assert steps == 2
+    assert roles["control"]["power"].tolist() == [[2.0, 1.0], [4.0, 3.0]]
+    given.write_text("time\n120\n180.00001\n240\n", encoding="utf-8")
+    assert read_histories(given, load_binding(room)) == (3, {})
