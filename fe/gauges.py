@@ -11,8 +11,12 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
-def _pieces(middle: float, length: float, lines: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Gauss points and weights of the mean over a length, piece by piece between mesh lines."""
+def patch_pieces(middle: float, length: float, lines: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gauss points (p,) and weights (p,) of the mean over a length, piece by piece between mesh lines.
+
+    Strain jumps at the edge of a defect, which is a mesh line: points that do not know of it misjudge how
+    much of a patch lies beyond.
+    """
     if length == 0.0:
         return np.array([middle]), np.array([1.0])
     start, end = middle - 0.5 * length, middle + 0.5 * length
@@ -38,11 +42,11 @@ def gauge_output(mesh: WingMesh, discretisation: Discretisation) -> sparse.csr_a
         # The patch is a rectangle: the same distances fore and aft of the gauge's own chord line.
         middle = (chord_fraction - plan.straight_chord_line) * plan.chord(distance / plan.semi_span)
         for place, span_weight in zip(
-            *_pieces(distance, gauges.averaging_spanwise, mesh.span_lines), strict=True
+            *patch_pieces(distance, gauges.averaging_spanwise, mesh.span_lines), strict=True
         ):
             lead = plan.straight_chord_line * plan.chord(place / plan.semi_span)
             _, _, lines = mesh.upper_skin_lines(place)
-            behind = _pieces(middle + lead, gauges.averaging_chordwise, lines)
+            behind = patch_pieces(middle + lead, gauges.averaging_chordwise, lines)
             for chordwise, chord_weight in zip(*behind, strict=True):
                 owner.append(gauge)
                 share.append(span_weight * chord_weight)

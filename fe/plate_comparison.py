@@ -14,6 +14,7 @@ from .sandwich_plate import PlateOperators, assemble_plate
 from .statics import Factorisation
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 DAMAGE = 0.8
 """Stiffness loss of either defect at which its effect is compared."""
@@ -96,10 +97,13 @@ class PlateAgreement:
     ----------
     box, plate : WingResults
         What either says.
+    at_edges : (gauges,) bool
+        `gauges_at_edges` of the design.
     """
 
     box: WingResults
     plate: WingResults
+    at_edges: BoolArray
 
     def relative(self, name: str) -> float:
         """Plate over box, less one, of a single figure of `WingResults`."""
@@ -131,8 +135,9 @@ def compare_with_plate(
 ) -> PlateAgreement:
     """Evaluate both models of a design.
 
-    The box's section is straight between its mesh lines, which makes it a little thinner than the design's.
-    With the same section in the plate, what is left is the idealisation alone.
+    The box's section is straight between its mesh lines, along the straight edges that are nearest to the
+    airfoil in the sense of least squares (`fe.mesh.straight_edged`). With the same section in the plate, what
+    is left is the idealisation alone.
 
     Parameters
     ----------
@@ -140,6 +145,8 @@ def compare_with_plate(
         The wing.
     box : AffineOperators, optional
         Its box, where that is at hand.
+    straight_section : bool
+        Whether the plate has the section of the box, or the true one.
 
     Raises
     ------
@@ -153,7 +160,49 @@ def compare_with_plate(
     return PlateAgreement(
         wing_results(solid, design, cantilever_bending_shapes(solid)),
         wing_results(plate, design, plate_bending_shapes(plate)),
+        gauges_at_edges(design),
     )
+
+
+def gauges_at_edges(design: WingDesign) -> BoolArray:
+    """Whether the patch of each gauge (gauges,) comes near an edge of a defect region.
+
+    Near is `mesh.edge_size`, whatever the refinement, so that the answer is the same on every mesh; without
+    it, the largest cell along the span and along the chord. Over an edge the stiffness of the skin jumps, and
+    strain with it; at a corner two idealisations do not agree on how it does.
+    """
+    plan, gauges, mesh = design.planform, design.gauges, design.mesh
+
+    def chordwise(chord_fraction: float, distance: float) -> float:
+        return (chord_fraction - plan.straight_chord_line) * plan.chord(distance / plan.semi_span)
+
+    found = np.zeros(len(gauges.positions), dtype=bool)
+    for gauge, (distance, chord_fraction) in enumerate(gauges.positions):
+        local_chord = plan.chord(distance / plan.semi_span)
+        near_span = mesh.span_size if mesh.edge_size is None else mesh.edge_size
+        near_chord = mesh.chord_size * local_chord if mesh.edge_size is None else mesh.edge_size
+        half_span = 0.5 * gauges.averaging_spanwise + near_span
+        half_chord = 0.5 * gauges.averaging_chordwise + near_chord
+        inner, outer = distance - half_span, distance + half_span
+        middle = chordwise(chord_fraction, distance)
+
+        def reached(ends: tuple[float, float], low: float, high: float) -> bool:
+            return min(ends) <= high and max(ends) >= low
+
+        for defect in design.defects:
+            start, end = max(inner, defect.span_start), min(outer, defect.span_end)
+            if start > end:
+                continue
+            chords = defect.chord_start, defect.chord_end
+            # Front and rear edge over the shared part of the span, then the inner and the outer edge.
+            edges = [(chordwise(chord, start), chordwise(chord, end)) for chord in chords]
+            edges += [
+                (chordwise(chords[0], place), chordwise(chords[1], place))
+                for place in (defect.span_start, defect.span_end)
+                if inner <= place <= outer
+            ]
+            found[gauge] |= any(reached(edge, middle - half_chord, middle + half_chord) for edge in edges)
+    return found
 
 
 def wing_results(model: WingModel, design: WingDesign, bending_shapes: FloatArray) -> WingResults:

@@ -31,6 +31,8 @@ class PlateLayout:
     ----------
     plate : Plate
         The grid; x aft of the straight chord line, y outboard.
+    across : (rows + 1,) m
+        Mesh lines across the span.
     stiff_columns : (columns,) bool
         Columns of cells that a web or the leading-edge wall fills over the whole height.
     web, rib : (cells,)
@@ -84,6 +86,13 @@ class PlateLayout:
         return np.asarray(
             places[..., 0] / self._chord(places[..., 1]) + self.design.planform.straight_chord_line
         )
+
+    def lines_at(self, distance: float) -> FloatArray:
+        """Places (columns + 1,) aft of the straight chord line [m] of the mesh lines at a distance [m]."""
+        plan = self.design.planform
+        chord = plan.chord(distance / plan.semi_span)
+        behind = np.array([line.behind_leading_edge(chord) for line in self._along])
+        return np.asarray(behind - plan.straight_chord_line * chord)
 
     def surface(self, places: FloatArray, depth: float = 0.0) -> Surface:
         """Upper surface at places (..., 2), `depth` [m] below the outer one, measured across it."""

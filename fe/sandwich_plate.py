@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from .design import WingDesign
+from .gauges import patch_pieces
 from .lift import DISTRIBUTIONS
 from .operators import ROOT_UNKNOWNS, AffineOperators
 from .plate import FIELDS, A, B, Plate, Surface, U, V, W, plane_stress, surface_strain
@@ -24,9 +25,6 @@ from .turn_load import STANDARD_GRAVITY
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-
-GAUGE_POINTS = (16, 4)
-"""Points across and along a gauge's patch over which its strain is averaged."""
 
 
 @dataclass(frozen=True)
@@ -338,21 +336,18 @@ def _gauge_output(layout: PlateLayout) -> sparse.csr_array:
     """Strain of each gauge, csr (gauges, 5 N): along the span, tangent to its surface, patch mean."""
     design, plate = layout.design, layout.plate
     gauges, plan = design.gauges, design.planform
-    across, along = (
-        length * ((np.arange(count) + 0.5) / count - 0.5)
-        for length, count in zip(
-            (gauges.averaging_chordwise, gauges.averaging_spanwise), GAUGE_POINTS, strict=True
-        )
-    )
-    offsets = np.stack(np.meshgrid(across, along, indexing="ij"), axis=-1).reshape(-1, 2)
-    middle = np.array(
-        [
-            ((chord - plan.straight_chord_line) * plan.chord(distance / plan.semi_span), distance)
-            for distance, chord in gauges.positions
-        ]
-    )
-    places = middle[:, None] + offsets
-    flat = places.reshape(-1, 2)
+    owner, share, places = [], [], []
+    for gauge, (distance, chord_fraction) in enumerate(gauges.positions):
+        middle = (chord_fraction - plan.straight_chord_line) * plan.chord(distance / plan.semi_span)
+        for y, span_weight in zip(
+            *patch_pieces(distance, gauges.averaging_spanwise, layout.across), strict=True
+        ):
+            across = patch_pieces(middle, gauges.averaging_chordwise, layout.lines_at(y))
+            for x, chord_weight in zip(*across, strict=True):
+                owner.append(gauge)
+                share.append(span_weight * chord_weight)
+                places.append((x, y))
+    flat = np.array(places)
     dofs, *shapes = plate.at(flat)
     surface = layout.surface(flat, 0.5 * design.skin.thickness if gauges.surface == "middle" else 0.0)
     strain = surface_strain(surface, *shapes)
@@ -361,7 +356,7 @@ def _gauge_output(layout: PlateLayout) -> sparse.csr_array:
     length = np.sqrt(1.0 - normal_y**2)
     p, q = -normal_x * normal_y / length, length
     along_span = np.stack((p**2, q**2, p * q), axis=-1)
-    weights = -np.einsum("ps,psn->pn", along_span, strain) / len(offsets)
-    rows = np.repeat(np.arange(len(middle)), len(offsets) * dofs.shape[1])
-    shape = (len(middle), plate.unknowns)
+    weights = -np.array(share)[:, None] * np.einsum("ps,psn->pn", along_span, strain)
+    rows = np.repeat(owner, dofs.shape[1])
+    shape = (len(gauges.positions), plate.unknowns)
     return sparse.coo_array((weights.ravel(), (rows, dofs.ravel())), shape=shape).tocsr()
