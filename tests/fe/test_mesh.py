@@ -7,7 +7,7 @@ from fe.airfoil import four_digit_half_thickness
 from fe.assembly import gauss_points, jacobians, positions
 from fe.errors import InvalidDesignError, MeshError
 from fe.grid import chord_lines
-from fe.mesh import REGION_NAMES, _straight_edged, build_mesh
+from fe.mesh import REGION_NAMES, straight_edged, build_mesh
 
 RIB = {"thickness": 0.003, "young_modulus": 6e9, "poisson_ratio": 0.3, "density": 500.0}
 
@@ -111,7 +111,7 @@ def test_straight_edges_keep_the_area_and_inertia_of_the_airfoil(shipped_design)
     for refinement, limit in ((0.25, 1e-3), (1.0, 1e-4)):
         design = shipped_design.changed(mesh={"refinement": refinement})
         lines = np.array([[entry.behind_leading_edge(0.433)] for entry in chord_lines(design)])
-        half = _straight_edged(lines, np.array([0.433]), ratio)[:, 0] / 0.433
+        half = straight_edged(lines, np.array([0.433]), ratio)[:, 0] / 0.433
         inside = (line >= lines[0, 0] / 0.433) & (line <= lines[-1, 0] / 0.433)
         found = np.interp(line[inside], lines[:, 0] / 0.433, half)
         assert found.mean() == pytest.approx(exact[inside].mean(), rel=limit)
