@@ -67,7 +67,7 @@ def crowded(**sections: object) -> WingDesign:
 @pytest.mark.parametrize(
     ("design", "place"),
     [
-        (crowded(gauges={"positions": [[1.82, 0.4]]}), r"gauges\.positions\[0\] is 1\.82 m from the root"),
+        (crowded(gauges={"positions": [[1.81, 0.4]]}), r"gauges\.positions\[0\] is 1\.81 m from the root"),
         (
             crowded(
                 defects=[
@@ -87,8 +87,8 @@ def test_what_no_longer_fits_is_refused_with_its_place(design: WingDesign, place
 
 
 def test_a_skin_too_thick_for_the_measured_chord_is_refused() -> None:
-    thick = crowded(skin={"thickness": 0.0022})
-    with pytest.raises(InvalidDesignError, match=r"the skin of 0\.0022 m does not fit"):
+    thick = crowded(skin={"thickness": 0.0023})
+    with pytest.raises(InvalidDesignError, match=r"the skin of 0\.0023 m does not fit"):
         tailored_design(thick, lengths(tip_chord=0.24))
 
 

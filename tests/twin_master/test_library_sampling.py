@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -94,6 +95,15 @@ def test_the_bytes_do_not_depend_on_the_number_of_processes(files: tuple[Path, P
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
+@pytest.fixture
+def heard_interruptions() -> Iterator[None]:
+    """What a shell starts in the background ignores SIGINT, and so would its children."""
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, former)
+
+
+@pytest.mark.usefixtures("heard_interruptions")
 @pytest.mark.parametrize("signals", [[signal.SIGKILL], [signal.SIGINT, signal.SIGKILL]])
 def test_what_an_interrupted_sampling_finished_is_kept(
     files: tuple[Path, Path], tmp_path: Path, signals: list[signal.Signals]

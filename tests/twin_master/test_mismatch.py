@@ -343,7 +343,9 @@ class TestOnTheWing:
             prepare_knowledge(scenario, own, 1).sensor_model.value_per_draw,
         )
         misfit = find_misfit(scenario, knowledge.model, knowledge.sensor_model, mixed.open())
-        assert misfit.rms < 5e-4  # the calibration's mean of e is not quite 1.0073
+        # All that is left is the mean of e, which is not quite 1.0073: strains go with 1 / e at most.
+        mean = own.draws(1).mean
+        assert misfit.rms < 1.2 * abs(mean / 1.0073 - 1.0) + 1e-5
         assert np.abs(misfit.bias).max() < 0.01
 
     def test_the_misfit_is_what_was_put_in_and_the_estimate_goes_where_it_says(
@@ -386,7 +388,8 @@ class TestOnTheWing:
             assert tree.attrs["twin_model"].startswith("reduced model of the design")
             flown = load_strain_library(twisted).strain_at((0.0, 0.0), 1)
             np.testing.assert_allclose(tree["truth"]["strain"][0], flown)
-            believed = wing.static_response(1.007, (0.0, 0.0), 3.0).strain
+            mean = float(figures["young_modulus_factor_mean"].value or 0.0)
+            believed = wing.static_response(mean, (0.0, 0.0), 3.0).strain
             np.testing.assert_allclose(tree["filtered"]["quantity_mean"][0], believed, rtol=1e-3)
         assert (whole.folder / "wing.vtu").stat().st_size > 10_000
         config = json.loads((whole.folder / "config.json").read_text(encoding="utf-8"))
