@@ -7,7 +7,7 @@ from fe.airfoil import four_digit_half_thickness
 from fe.assembly import gauss_points, jacobians, positions
 from fe.errors import InvalidDesignError, MeshError
 from fe.grid import chord_lines
-from fe.mesh import REGION_NAMES, straight_edged, build_mesh
+from fe.mesh import REGION_NAMES, build_mesh, straight_edged
 
 RIB = {"thickness": 0.003, "young_modulus": 6e9, "poisson_ratio": 0.3, "density": 500.0}
 
