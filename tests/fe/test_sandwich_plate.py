@@ -224,7 +224,7 @@ def test_the_models_agree_with_either_section_on_a_coarse_mesh(coarse_design, co
         compare_with_plate(coarse_design, coarse_operators, straight_section=section)
         for section in (False, True)
     )
-    # The box of a coarse mesh is too stiff in the second mode; the true section makes up for most of it.
+    # Second bending of a coarse box lies 0.8 % above that of a fine one, of a plate of its section 0.2 %.
     for found, second_bending in ((true, 0.006), (straight, 0.0105)):
         assert abs(found.relative("tip_stiffness")) < 0.003
         assert abs(found.relative("first_bending")) < 0.002
