@@ -11,10 +11,14 @@ import xarray as xr
 
 from fe.cache import reduced_model
 from fe.reduced import ReducedModel
+from fmu_asset.build import build_fmu
+from fmu_asset.compiled.compiler import find_compiler
+from fmu_asset.errors import FmuBuildError
 from twin_master import workflow
 from twin_master.asset_source import ReducedModelSource
 from twin_master.checkpoint import Checkpoint
 from twin_master.crew import prepare_knowledge
+from twin_master.resolution import Overrides
 from twin_master.scenario_file import load_scenario
 from twin_master.study import fly_many
 from twin_master.workflow import new_run, resume_run
@@ -75,3 +79,34 @@ def test_the_whole_chain_and_its_resumption(
     resume_run(tmp_path / "part")
     for name in ("run.nc", "config.json", "summary.json", "calibration.json", "wing.vtu", "asset/asset.fmu"):
         assert (tmp_path / "part" / name).read_bytes() == (outcome.folder / name).read_bytes(), name
+
+
+def test_the_mission_is_the_same_with_the_compiled_wing_and_without_a_worker(
+    wing: ReducedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+    loaded = load_scenario("level_turns")
+
+    def arrays(name: str, overrides: Overrides) -> dict[str, np.ndarray]:
+        folder = new_run(loaded, tmp_path / name, overrides).folder
+        with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
+            return {
+                f"{group}/{variable}": tree[group][variable].values
+                for group in ("observed", "filtered", "smoothed", "predicted", "truth")
+                for variable in tree[group].data_vars
+                if tree[group][variable].dtype.kind == "f"
+            }
+
+    worker, inside = arrays("worker", Overrides()), arrays("inside", Overrides(in_process=True))
+    assert len(worker) > 8
+    for name, values in worker.items():
+        np.testing.assert_array_equal(inside[name], values, err_msg=name)
+    try:
+        find_compiler()
+    except FmuBuildError as error:
+        pytest.skip(f"no C compiler: {error}")
+    fmu = build_fmu(wing, tmp_path / "compiled.fmu", kind="compiled").path
+    compiled = arrays("compiled", Overrides(fmu=fmu))
+    assert {*compiled} == {*worker}
+    for name, values in worker.items():
+        np.testing.assert_allclose(compiled[name], values, rtol=1e-9, atol=1e-12, err_msg=name)
