@@ -269,9 +269,13 @@ def measure_ring_down(
 
 
 def measure_lengths(
-    geometry: Geometry, seed: Seed, *, reading_uncertainty: float = READING_UNCERTAINTY
+    geometry: Geometry,
+    seed: Seed,
+    *,
+    designed: Geometry | None = None,
+    reading_uncertainty: float = READING_UNCERTAINTY,
 ) -> GeometryCalibration:
-    """Measure semi-span and chords of a wing that was built to the published drawing.
+    """Measure semi-span and chords of a wing.
 
     Parameters
     ----------
@@ -279,6 +283,8 @@ def measure_lengths(
         True lengths [m].
     seed : int or SeedSequence
         Of the reading errors.
+    designed : Geometry, optional
+        The drawing that it was built to; the published one by default.
     reading_uncertainty : float
         Half-width of the 95 % interval of a reading [m].
     """
@@ -288,7 +294,10 @@ def measure_lengths(
         error = float(generator.normal(0.0, reading_uncertainty / HALF_WIDTH_95))
         length = getattr(geometry, drawn.name) + error
         measured[drawn.name] = MeasuredLength(
-            drawn.name, drawn.designed, length, reading_uncertainty=reading_uncertainty
+            drawn.name,
+            drawn.designed if designed is None else getattr(designed, drawn.name),
+            length,
+            reading_uncertainty=reading_uncertainty,
         )
     return GeometryCalibration(source="virtual lengths", **measured)
 

@@ -23,7 +23,10 @@ def calibrate_simulate(
     beta: Annotated[float, typer.Option(help="True stiffness-proportional damping [s].")] = 7.66e-4,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all errors.")] = 0,
     fmu: Annotated[
-        Path | None, typer.Option(help="Do the experiments on this wing FMU, not on the reduced model.")
+        Path | None,
+        typer.Option(
+            help="Do the experiments on this wing FMU, not on the reduced model; of the shipped planform."
+        ),
     ] = None,
     design: Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")] = None,
     sampling_rate: Annotated[
@@ -50,6 +53,7 @@ def calibrate_simulate(
         measure_ring_down,
         weigh,
     )
+    from fe.design import load_design
     from fe.state import DigitalState
     from reporting.files import atomic_write_text
 
@@ -59,7 +63,9 @@ def calibrate_simulate(
         raise typer.BadParameter("--fmu and --design exclude each other: the FMU holds its wing.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ExperimentFileError(f"{out} exists and is not an empty folder: choose another --out.")
+    drawn = load_design(design)
     truth = DigitalState(
+        geometry=drawn.geometry,
         young_modulus_factor=e,
         servo_mass=servo_mass,
         pitot_mass=pitot_mass,
@@ -74,7 +80,9 @@ def calibrate_simulate(
         )
         write_lab_folder(
             out,
-            lengths=measure_lengths(truth.geometry, seed),
+            lengths=measure_lengths(
+                truth.geometry, seed, designed=None if design is None else drawn.geometry
+            ),
             load_test=load_test,
             records=records,
             total_mass=weigh(truth, seed),
@@ -93,10 +101,9 @@ def calibrate_simulate(
             write(bench)
     else:
         from fe.cache import reduced_model
-        from fe.design import load_design
         from reporting.progress import RichProgress
 
-        model = reduced_model(None if design is None else load_design(design), progress=RichProgress())
+        model = reduced_model(drawn, progress=RichProgress())
         write(VirtualWing(model, truth, frequency_error))
     typer.echo(f"Laboratory folder: {out}; its truth: {out / TRUTH_FILE}")
 

@@ -53,7 +53,9 @@ def identify(
         for path in write_identification(result, out):
             console.print(f"Wrote {path}", soft_wrap=True)
     if not result.fit.converged:
-        typer.echo("The fit has not converged; repeat with more --steps.", err=True)
+        stopped = len(result.fit.iterations) < steps
+        advice = "no shorter step lowers the objective" if stopped else "repeat with more --steps"
+        typer.echo(f"The fit has not converged; {advice}.", err=True)
         raise typer.Exit(1)
 
 
@@ -79,6 +81,7 @@ def _show(result: Identification, console: object) -> None:
     last = fit.iterations[-1]
     console.print(
         f"Objective {last.objective:.3f} after {len(fit.iterations)} models; the next step would change no "
-        f"number by more than {last.largest_step:.4f} prior deviations, and the start lies "
+        f"number by more than {last.largest_step:.4f} prior deviations"
+        f"{' (as far as allowed)' if last.limited else ''}, and the start lies "
         f"{result.largest_change:.4f} away."
     )

@@ -158,7 +158,8 @@ def profile(fit: Fit, targets: Targets, weights: Weights, analysis: Identifiabil
     width = float(analysis.width[number]) * parameter.standard_deviation
     steps = np.array(PROFILE_STEPS)
     places = np.clip(fit.values[number] + width * steps, parameter.lower, parameter.upper)
-    base = _objective(fit, minimise_local(fit.model, fit.parameters, targets, weights, 1.0), targets, weights)
+    lowest = minimise_local(fit.model, fit.parameters, targets, weights, PROFILE_RADIUS)
+    base = _objective(fit, lowest, targets, weights)
     rise = [
         _objective(
             fit,

@@ -35,11 +35,22 @@ _REFUSED = 1e6  # residual of a point at which the local model has no meaning
 
 @dataclass(frozen=True, eq=False)
 class Iteration:
-    """One accepted point: objective, its part from the data, and the next step in prior deviations."""
+    """One full model tried: the best point so far, and the next step from it.
+
+    Attributes
+    ----------
+    objective, misfit : float
+        At the best point; the part of the data alone.
+    largest_step : float
+        Largest change of a parameter in the next step, in prior deviations.
+    limited : bool
+        Whether that step was cut at the reach of the derivatives, so that its length says nothing.
+    """
 
     objective: float
     misfit: float
     largest_step: float
+    limited: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +68,9 @@ class Fit:
     model : LocalModel
         The wing there, with derivatives.
     iterations : tuple of Iteration
-        Accepted points.
+        Models tried, also those that were refused.
     converged : bool
-        Whether the next step is below the tolerance.
+        Whether the next step is below the tolerance, and not only because it was cut.
     """
 
     design: WingDesign
@@ -196,9 +207,13 @@ def identify(
         proposed = minimise_local(model, parameters, targets, weights, radius)
         step = float(np.abs(scaled(parameters, proposed) - scaled(parameters, values)).max())
         misfit = cost - 0.5 * float(np.sum(scaled(parameters, values) ** 2))
-        iterations.append(Iteration(cost, misfit, step))
-        progress.note(f"model {count + 1}: objective {cost:.3f}, next step {step:.3f} prior deviations")
-        if step <= tolerance:
+        limited = _is_limited(parameters, values, proposed, radius)
+        iterations.append(Iteration(cost, misfit, step, limited))
+        progress.note(
+            f"model {count + 1}: objective {cost:.3f}, next step {step:.3f} prior deviations"
+            + (" (as far as allowed)" if limited else "")
+        )
+        if step <= tolerance and not limited:
             converged = True
             break
         if count == largest_count - 1:
@@ -215,6 +230,20 @@ def identify(
             radius = min(RADIUS, 2.0 * radius)
         else:
             radius = 0.25 * min(radius, step)
-            if radius < 0.25 * tolerance:
+            if radius < tolerance:  # no step that is worth one lowers the objective of the full model
                 break
     return Fit(model.design, parameters, values, first, model, tuple(iterations), converged)
+
+
+def _is_limited(
+    parameters: Sequence[FreeParameter], values: FloatArray, proposed: FloatArray, radius: float
+) -> bool:
+    """Whether a step ends at the reach of the derivatives, and not at a bound of its parameter."""
+    change = np.abs(scaled(parameters, proposed) - scaled(parameters, values))
+    at_reach = change >= 0.99 * radius * np.array([parameter.stride for parameter in parameters])
+    width = deviations(parameters)
+    at_bound = [
+        min(value - p.lower, p.upper - value) <= 1e-6 * w
+        for value, p, w in zip(proposed, parameters, width, strict=True)
+    ]
+    return bool(np.any(at_reach & ~np.array(at_bound)))

@@ -129,6 +129,8 @@ def run_identification(
         )
     if from_prior:
         design = with_values(design, parameters, np.array([parameter.mean for parameter in parameters]))
+    for refinement in refinements:  # what cannot be meshed is said before the minutes of the fit
+        design.changed(mesh={"refinement": design.mesh.refinement * refinement})
     progress.note(f"{len(parameters)} free numbers")
     fit = identify(design, parameters, targets, weights, largest_count=largest_count, progress=progress)
     moved = bool(np.any(fit.values != fit.start))

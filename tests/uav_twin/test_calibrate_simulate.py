@@ -14,6 +14,7 @@ from calibration.laboratory import read_weighed_mass
 from calibration.ringdown import Frequencies
 from calibration.ringdown_records import read_records
 from calibration.ringdown_trials import fit_trials
+from fe.design import SHIPPED_DESIGN
 from uav_twin import cli
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
@@ -96,3 +97,18 @@ def test_refusals(
     assert simulate(monkeypatch, out) != 0
     assert "is not an empty folder" in " ".join(capsys.readouterr().err.split())
     assert [path.name for path in out.iterdir()] == ["mine.txt"]
+
+
+def test_another_wing_is_measured_as_it_was_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    text = SHIPPED_DESIGN.read_text(encoding="utf-8")
+    for old, new in (("semi_span = 1.828", "semi_span = 1.9"), ("refinement = 1.0", "refinement = 0.25")):
+        assert old in text
+        text = text.replace(old, new)
+    design = tmp_path / "longer.toml"
+    design.write_text(text, encoding="utf-8")
+    out = tmp_path / "lab"
+    assert simulate(monkeypatch, out, "--design", design) == 0
+    assert json.loads((out / "truth.json").read_text(encoding="utf-8"))["semi_span"] == 1.9
+    lengths = read_lengths(out)
+    assert lengths.semi_span.designed == pytest.approx(1.9)
+    assert lengths.semi_span.measured == pytest.approx(1.9, abs=5e-4)
