@@ -72,6 +72,8 @@ def calibrate_wing(
         return
     if measured and data is None:
         raise typer.BadParameter("--measured needs --data with ring-down records.")
+    if fitted and (data is None or measured is False):
+        raise typer.BadParameter("--fitted needs --data with ring-down records, and no --published.")
     from calibration.lab_data import Targets, published_data, read_lab_folder
     from calibration.ringdown import Frequencies
     from calibration.wing_calibration import calibrate_wing as calibrate
