@@ -506,6 +506,7 @@ def test_other_refusals(
         (["--out", tmp_path / "a file"], "exists and is no folder", 1),
         (["--asset", "a\nb"], "printable characters", 1),
         (["--measured"], "--measured needs --data", 2),
+        (["--fitted"], "--fitted needs --data", 2),
         (["--procedure", "other"], "other", 2),
         (["--seed", "1", "geometry"], "options go behind the command", 2),
         (["--data", tmp_path, "static"], "options go behind the command", 2),
