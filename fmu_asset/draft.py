@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import tomllib
 from collections.abc import Iterable, Sequence
@@ -60,6 +61,8 @@ def trial_binding(description: FmuDescription, *, step_size: float | None = None
 
 class _Draft:
     def __init__(self, description: FmuDescription, step_size: float | None) -> None:
+        if step_size is not None and not (math.isfinite(step_size) and step_size > 0.0):
+            raise BindingError(f"The step size must be a positive number of seconds, and {step_size:g} came.")
         self._description = description
         usable = [v for v in description.variables if v.numeric and not v.clocked and v.size]
         # A pattern of ours in somebody's name would be expanded.

@@ -69,7 +69,7 @@ def run(
     from twin_master.workflow import new_run, resume_run
 
     ssp = None
-    if scenario is not None and Path(scenario).suffix == ".ssp":
+    if scenario is not None and Path(scenario).suffix.lower() == ".ssp":
         if with_scenario is None:
             raise typer.BadParameter(
                 "an SSP file says what is flown, not how: name a scenario as well.", param_hint="--scenario"

@@ -157,7 +157,7 @@ class CoupledSource(FmuSource):
         target = self._path(f"{COMPONENT_FOLDER}/{component.name}.fmu")
         if target.exists():
             return target
-        if component.design == CALIBRATED_DESIGN_NAME and self._wing is not None:
+        if component.design == CALIBRATED_DESIGN_NAME and self._tailored and self._wing is not None:
             self._pack(self._wing, target, tailored=True)
             return target
         if component.design is not None:

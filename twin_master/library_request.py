@@ -14,6 +14,7 @@ from fmu_asset.binding import Binding, load_binding
 from reporting.progress import Progress
 from twin_master.asset_source import BINDING_COPY, FMU_COPY
 from twin_master.errors import InvalidObservationLibraryError
+from twin_master.fmu_source import FmuSource
 from twin_master.library_grid import STEP_TIMEOUT, SamplingGrid
 from twin_master.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.scenario_file import LoadedScenario
@@ -80,7 +81,7 @@ def grid_of_fmu(
     *,
     role: str | None = None,
     settling_steps: int = 0,
-    step_timeout: float = STEP_TIMEOUT,
+    step_timeout: float | None = None,
 ) -> SamplingGrid:
     """Return the grid over the values of the inputs; controls are all their combinations.
 
@@ -120,7 +121,7 @@ def grid_of_fmu(
         load=_single("load", given["load"]),
         parameters={k: v[0] for k, v in given["parameter"].items() if k != parameter},
         settling_steps=settling_steps,
-        step_timeout=step_timeout,
+        step_timeout=step_timeout or binding.limits.step_time or STEP_TIMEOUT,
     )
 
 
@@ -161,8 +162,9 @@ def grid_of_scenario(
     scenario = resolve_scenario(plain, overrides or Overrides())
     if scenario.asset.kind != "fmu":
         raise InvalidObservationLibraryError(
-            f"the scenario {scenario.mission.name} flies no FMU but a "
-            f"{scenario.asset.kind.replace('_', ' ')}, so there is nothing to sample."
+            f"the scenario {scenario.mission.name} flies "
+            f"{'several coupled FMUs' if scenario.asset.kind == 'coupled' else 'a strain library'}, and one "
+            "FMU can be sampled."
         )
     source = asset_source(scenario)
     source.check()
@@ -177,7 +179,8 @@ def grid_of_scenario(
             f"with a scenario --grid gives states and the uncertain parameter {draws.name}; the rest is said "
             "by the scenario."
         )
-    fixed = {name: value for name, value in scenario.asset.parameters.items() if name != draws.name}
+    assert isinstance(source, FmuSource)  # the kind is `fmu`, and it believes no library here
+    fixed = {name: value for name, value in source.parameters().items() if name != draws.name}
     return SamplingGrid(
         fmu=str(folder / FMU_COPY),
         binding=str(folder / BINDING_COPY),
@@ -189,5 +192,5 @@ def grid_of_scenario(
         load=dict(scenario.asset.load),
         parameters=fixed,
         settling_steps=settling_steps,
-        step_timeout=scenario.asset.step_timeout or STEP_TIMEOUT,
+        step_timeout=scenario.asset.step_timeout or binding.limits.step_time or STEP_TIMEOUT,
     )

@@ -46,13 +46,13 @@ class LibrarySource:
         self._binding = binding
         self._path = library
         self._library: ObservationLibrary | None = None
-        self._differ = False
+        self._other_fmu: bool | None = False
 
     @property
     def origin(self) -> Origin:
         """The asset, and the library; they differ if the library was sampled from another FMU."""
-        other = " of another FMU" if self._differ else " of it"
-        return Origin(self._asset.origin.asset, f"observation library{other}", differ=self._differ)
+        other = {True: " of another FMU", False: " of it", None: ""}[self._other_fmu]
+        return Origin(self._asset.origin.asset, f"observation library{other}", differ=self._other_fmu is True)
 
     def check(self) -> None:
         """Check the asset, and that the library has what the scenario asks for.
@@ -83,7 +83,8 @@ class LibrarySource:
             atomic_write_bytes(copy, self._path.read_bytes())
         self._path = copy
         library = self._read()
-        self._differ = library.fmu_hash != hashes.get("fmu")
+        flown = hashes.get("fmu")  # several FMUs have several
+        self._other_fmu = None if flown is None else library.fmu_hash != flown
         return {**hashes, "observation_library": hashlib.sha256(copy.read_bytes()).hexdigest()}
 
     def draws(self, seed: int) -> ParameterDraws:

@@ -121,9 +121,18 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
     if asset["binding"] and asset["binding"] not in binding_files():
         asset["binding"] = str(folder / asset["binding"])
     for component, section in zip(asset["component"], loaded.scenario.asset.component, strict=True):
-        component |= {key: str(folder / component[key]) for key in component_copies(section)}
+        named = component_copies(section)
+        component |= {k: str(folder / component[k]) for k in named if component[k] == getattr(section, k)}
+    if asset["design"] != CALIBRATED_DESIGN_NAME and any(
+        component["design"] == CALIBRATED_DESIGN_NAME for component in asset["component"]
+    ):
+        raise MissionInputError(
+            "a component asks for the design of a calibration, and the twin's model is not that of one: give "
+            "a calibration file, and name the same `design` in the table `asset`."
+        )
     if overrides.ssp:
-        asset |= {"kind": "coupled", "file": str(overrides.ssp.resolve()), "component": [], "connection": []}
+        asset |= {"kind": "coupled", "file": str(overrides.ssp.resolve()), "script": None}
+        asset |= {"component": [], "connection": []}
     if overrides.fmu:
         asset |= {"kind": "fmu", "file": str(overrides.fmu.resolve()), "script": None}
     if overrides.binding:

@@ -339,7 +339,8 @@ def _store(
 
 def _misfit(knowledge: Knowledge, source: AssetSource) -> Misfit | None:
     """Return by how much the twin's model differs from the asset, where they are known to differ."""
-    if not source.origin.differ:
+    # An asset with damage of its own cannot be asked at a state of the twin's choice.
+    if not source.origin.differ or knowledge.scenario.truth.kind == "asset":
         return None
     asset = source.open()
     try:

@@ -35,6 +35,8 @@ def simulate(
     from fmu_asset.session import FmiAsset
     from reporting.progress import RichProgress
 
+    if out.suffix not in (".csv", ".nc"):
+        raise FmuInputError(f"{out} must end in .csv or .nc: choose another --out.")
     if out.exists() and not replace:
         raise FmuInputError(f"{out} exists: choose another --out or give --replace.")
     asset = FmiAsset(file, binding, isolated=not in_process, step_timeout=step_timeout)

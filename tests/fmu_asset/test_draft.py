@@ -104,3 +104,9 @@ def test_other_units_are_another_observation() -> None:
     assert len(parse_binding(tomllib.loads(draft_binding(fmu))).observation) == 2
     fmu = description(dataclasses.replace(variable("s1", "output"), shape=(3,)), variable("s2", "output"))
     assert len(parse_binding(tomllib.loads(draft_binding(fmu))).observation) == 2
+
+
+@pytest.mark.parametrize("size", [0.0, -1.0, float("nan")])
+def test_a_step_size_must_be_positive(fmu: Path, size: float) -> None:
+    with pytest.raises(BindingError, match="must be a positive number of seconds"):
+        draft_binding(read_fmu(fmu), step_size=size)

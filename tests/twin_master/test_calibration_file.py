@@ -169,3 +169,30 @@ def test_the_wing_among_several_fmus_is_tailored_too(file: Path, tmp_path: Path)
     assert record["asset"] == "Wing 7 (é)"
     moved = located_scenario(portable_scenario(scenario), tmp_path / "run")
     assert moved.asset.component[1].design == "calibration"
+
+
+def test_a_design_file_that_asset_and_component_share_is_tailored_in_both(file: Path, tmp_path: Path) -> None:
+    text = scenario_files()["three_fmus"].read_text(encoding="utf-8")
+    assert text.count('design = "uav_wing"') == 2
+    path = tmp_path / "shared.toml"
+    path.write_text(text.replace('design = "uav_wing"', 'design = "my.toml"'), encoding="utf-8")
+    scenario = resolve_scenario(load_scenario(path), Overrides(calibration=file))
+    assert scenario.asset.design == "calibration"
+    assert scenario.asset.component[1].design == "calibration"
+    asset_source(scenario).check()
+
+
+def test_a_component_cannot_have_the_design_of_a_calibration_that_is_not_there(tmp_path: Path) -> None:
+    text = scenario_files()["three_fmus"].read_text(encoding="utf-8")
+    begin = text.index("[[asset.component]]")
+    path = tmp_path / "mine.toml"
+    changed = text[begin:].replace('design = "uav_wing"', 'design = "calibration"')
+    path.write_text(text[:begin] + changed, encoding="utf-8")
+    with pytest.raises(MissionInputError, match="a component asks for the design of a calibration"):
+        resolve_scenario(load_scenario(path), Overrides())
+
+
+def test_an_ssp_file_takes_the_place_of_a_script(tmp_path: Path) -> None:
+    scenario = resolve_scenario(load_scenario("pump_wear"), Overrides(ssp=tmp_path / "pump.ssp"))
+    assert scenario.asset.kind == "coupled"
+    assert scenario.asset.script is None
