@@ -186,7 +186,9 @@ def test_the_scenario_names_library_and_model_together() -> None:
 
 
 def test_a_scenario_without_an_fmu_cannot_be_sampled(tmp_path: Path, library_file: Path) -> None:
-    with pytest.raises(InvalidObservationLibraryError, match="flies a strain library, and one FMU can be sampled"):
+    with pytest.raises(
+        InvalidObservationLibraryError, match="flies a strain library, and one FMU can be sampled"
+    ):
         grid_of_scenario(
             load_scenario("level_turns"),
             tmp_path,
