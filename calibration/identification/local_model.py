@@ -33,7 +33,7 @@ FloatArray = NDArray[np.float64]
 MODE_COUNT = 6
 DEPENDENT = 1e-11
 """Directions of the static basis whose share of the largest energy is below this are dropped."""
-DEPENDENT_MODES = 1e-6
+DEPENDENT_MODES = 1e-9
 """The same of the modal basis; the mass must stay definite on it."""
 STEP = 5e-3
 """Step of the central differences in prior standard deviations."""
@@ -169,9 +169,12 @@ def _bases(
     bending = shapes[:, list(order)]
     # What the modes become when e or a mass changes a little.
     images = np.hstack([skin @ bending, *(term @ bending for term in operators.mass_terms[1:])])
+    # A change of a mode solves (K - w^2 M) x = image: two terms of K^-1 (1 + w^2 M K^-1 + ...), whose ratio is
+    # small because the lowest modes themselves are in the basis. Derivatives of slopes need the second one.
     changed = healthy.raw_solve(images)
+    inertial = healthy.raw_solve(mass @ changed)
     again = healthy.raw_solve(skin @ changed[:, :2])
-    modal = _orthonormal(np.hstack([shapes, changed, again]), stiffness, DEPENDENT_MODES)
+    modal = _orthonormal(np.hstack([shapes, changed, inertial, again]), stiffness, DEPENDENT_MODES)
     on_basis = modal.T @ (stiffness @ bending)  # the basis is orthonormal in the stiffness
     return static, modal, on_basis, order, np.sqrt(eigenvalues) / (2.0 * np.pi)
 
