@@ -1,1 +1,1 @@
-"""Where simulation and data disagree: reserved for a workflow that is not in this version."""
+"""Where simulation and measured data disagree: locate, name, add, prove (Kapteyn et al. 2021, extended)."""

@@ -25,6 +25,10 @@ class OutsideModelError(FiniteElementError, ValueError):
     """A value lies outside the range for which the model was made."""
 
 
+class InvalidPatchError(FiniteElementError, ValueError):
+    """A model patch cannot be read, or the model cannot carry it."""
+
+
 class SolutionError(FiniteElementError, RuntimeError):
     """A linear or eigenvalue solution did not reach the accuracy that was asked for."""
 

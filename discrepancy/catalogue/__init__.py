@@ -1,0 +1,1 @@
+"""Named physical effects and the patches of primitives that they stand for."""

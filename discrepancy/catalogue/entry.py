@@ -1,0 +1,160 @@
+"""A catalogue entry: a named effect, its parameters with priors, and the patch that it stands for."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from math import exp, log
+from typing import Literal
+
+from scipy.special import ndtr, ndtri
+
+from discrepancy.campaign import Campaign, TrialKind
+from discrepancy.models.interface import Model, Scales
+from fe.patch import ModelPatch
+
+NINETY = 1.6448536269514722
+"""Standard normal quantile of 0.95."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Prior of one number, as a map of a standard normal variable u.
+
+    Attributes
+    ----------
+    shape : {"log_normal", "normal", "uniform"}
+        "log_normal": 90 % of the mass between `low` and `high`, both positive; "normal": the same; "uniform":
+        between them.
+    low, high : float
+        See there.
+    """
+
+    shape: Literal["log_normal", "normal", "uniform"]
+    low: float
+    high: float
+
+    def value(self, u: float) -> float:
+        """Return the value at the standard normal variable `u`."""
+        if self.shape == "uniform":
+            return self.low + (self.high - self.low) * float(ndtr(u))
+        if self.shape == "normal":
+            return 0.5 * (self.low + self.high) + 0.5 * (self.high - self.low) / NINETY * u
+        middle, half = 0.5 * (log(self.low) + log(self.high)), 0.5 * (log(self.high) - log(self.low))
+        return exp(middle + half / NINETY * u)
+
+    def normal(self, value: float) -> float:
+        """Return the standard normal variable of a value; the inverse of `value`."""
+        if self.shape == "uniform":
+            return float(ndtri(min(max((value - self.low) / (self.high - self.low), 1e-12), 1.0 - 1e-12)))
+        if self.shape == "normal":
+            return (value - 0.5 * (self.low + self.high)) / (0.5 * (self.high - self.low) / NINETY)
+        middle, half = 0.5 * (log(self.low) + log(self.high)), 0.5 * (log(self.high) - log(self.low))
+        return (log(value) - middle) / (half / NINETY)
+
+
+@dataclass(frozen=True)
+class EffectParameter:
+    """A parameter of an effect.
+
+    Attributes
+    ----------
+    name, symbol, unit, description : str
+        Full name in snake case, the symbol of the equation, SI unit ("1" without), one line.
+    prior : Prior
+        In the unit.
+    magnitude : bool
+        Whether the effect vanishes with this parameter.
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    description: str
+    prior: Prior
+    magnitude: bool = False
+
+
+@dataclass(frozen=True)
+class ShapeParameter:
+    """A number that is fixed in the named effect and free in its family (the shape gate frees it).
+
+    Attributes
+    ----------
+    name, symbol, description : str
+        As of `EffectParameter`.
+    canonical : float
+        Value in the named effect.
+    prior : Prior
+        Within the family.
+    """
+
+    name: str
+    symbol: str
+    description: str
+    canonical: float
+    prior: Prior
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Where an effect is to be built: campaign, model, natural scales."""
+
+    campaign: Campaign
+    model: Model
+    scales: Scales
+
+
+Build = Callable[[Setting, Mapping[str, float], str], ModelPatch]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A named effect.
+
+    Attributes
+    ----------
+    identifier : str
+        Lower case with underscores, such as "coulomb_friction"; stable.
+    name : str
+        The field's standard term.
+    family : str
+        Name of the free-shape family that it belongs to, such as "damping |v|^p |x|^a".
+    equation, signature, reference : str
+        One line each.
+    acts_on : frozenset of TrialKind
+        Trials that it changes.
+    parameters : tuple of EffectParameter
+        With priors, dimensionless wherever a scale of the setting can make them so.
+    build : callable
+        (setting, values by name of parameters and shape, place) -> patch. A missing shape value is canonical.
+    shape : tuple of ShapeParameter
+        Freed by the shape gate.
+    places : callable
+        setting -> the discrete places where it may act (channel names, ports, runs, mains frequencies); ("",)
+        if there is no choice.
+    unavailable : callable
+        setting -> why it cannot be tested here, or None.
+    confusable : tuple of str
+        Identifiers of effects that some campaigns cannot tell from it.
+    """
+
+    identifier: str
+    name: str
+    family: str
+    equation: str
+    signature: str
+    reference: str
+    acts_on: frozenset[TrialKind]
+    parameters: tuple[EffectParameter, ...]
+    build: Build
+    shape: tuple[ShapeParameter, ...] = ()
+    places: Callable[[Setting], tuple[str, ...]] = field(default=lambda setting: ("",))
+    unavailable: Callable[[Setting], str | None] = field(default=lambda setting: None)
+    confusable: tuple[str, ...] = ()
+
+    def canonical_shape(self) -> dict[str, float]:
+        """Return the shape values of the named effect."""
+        return {item.name: item.canonical for item in self.shape}
+
+    def patch(self, setting: Setting, values: Mapping[str, float], place: str = "") -> ModelPatch:
+        """Return the patch at given values; shape values that are not given are canonical."""
+        return self.build(setting, {**self.canonical_shape(), **values}, place)

@@ -1,0 +1,1 @@
+"""Models that a campaign can be compared with, behind one interface."""

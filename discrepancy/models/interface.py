@@ -1,0 +1,203 @@
+"""What the workflow asks of a model: structural response under a patch, before any sensor touches it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign import Campaign, Quantity, Trial
+from fe.patch import ModelPatch, Primitive
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ModelParameter:
+    """A calibrated parameter of the model; its posterior from calibration is the prior here.
+
+    Attributes
+    ----------
+    name : str
+        Such as "young_modulus_factor".
+    mean, deviation : float
+        Mean and standard deviation [unit].
+    unit : str
+        SI.
+    low, high : float
+        Range in which the model holds.
+    """
+
+    name: str
+    mean: float
+    deviation: float
+    unit: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class PortScale:
+    """Natural scales of a port for the campaign at hand, by which effects without dimension are made physical.
+
+    Attributes
+    ----------
+    displacement : float
+        A, the largest motion of the port in the campaign's trials by the unpatched model [m or rad].
+    stiffness : float
+        k, the stiffness of the first bending mode seen at the port, w1^2 / phi1(port)^2 [N/m or N m/rad].
+    angular_frequency : float
+        w1 [rad/s].
+    """
+
+    displacement: float
+    stiffness: float
+    angular_frequency: float
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Natural scales of a model under a campaign.
+
+    Attributes
+    ----------
+    length : float
+        Semi-span or characteristic length L [m].
+    tip_stiffness : float
+        Static stiffness at the load point [N/m].
+    modal_mass : float
+        Mass of the first mode referred to the load point [kg].
+    angular_frequency : float
+        w1 [rad/s].
+    force, load_factor : float
+        Largest applied force [N] and load factor [1] of the campaign.
+    duration : float
+        Longest dynamic record [s]; 1 without one.
+    campaign_time : float
+        Time from the first to the last sample of the campaign [s]; 1 if unknown.
+    ports : mapping of str to PortScale
+        By port name.
+    """
+
+    length: float
+    tip_stiffness: float
+    modal_mass: float
+    angular_frequency: float
+    force: float
+    load_factor: float
+    duration: float
+    campaign_time: float
+    ports: Mapping[str, PortScale]
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """All that a response depends on besides trial and patch.
+
+    Attributes
+    ----------
+    parameters : (P,) ndarray
+        Values of `Model.parameters`, in order.
+    initial : (R, 2) ndarray
+        Ring-downs. At rest: column 0 holds deviations from the static release shape, in units of the release
+        displacement, by mode, row 0 that of the whole shape (so the motion starts at (1 + initial[0, 0]) times
+        the static shape plus initial[r, 0] of mode r); column 1 is zero. Not at rest: displacement and
+        velocity / w_r of mode r, in units of the release displacement, at the release point.
+    clock : tuple of float
+        (rate, zero): a sample stamped t shows the motion at (1 + rate) t + zero [1], [s].
+    health : (N, 2) ndarray
+        Stiffness losses z1, z2 of each row (dynamic trials: row 0 holds for all).
+    """
+
+    parameters: FloatArray
+    initial: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    clock: tuple[float, float] = (0.0, 0.0)
+    health: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
+
+
+@dataclass(frozen=True)
+class Response:
+    """What perfect sensors would show.
+
+    Attributes
+    ----------
+    values : (N, C) ndarray
+        By output, SI units.
+    rates : (N, C) ndarray or None
+        Their time derivatives, for dynamic trials.
+    transverse, shear : (N, C) ndarray or None
+        Strain across the gauge's direction, and engineering shear strain, for strain outputs (zero for the
+        others); None unless asked for.
+    """
+
+    values: FloatArray
+    rates: FloatArray | None = None
+    transverse: FloatArray | None = None
+    shear: FloatArray | None = None
+
+
+class Model(Protocol):
+    """A model that can be patched."""
+
+    @property
+    def name(self) -> str:
+        """Name for people."""
+
+    @property
+    def parameters(self) -> tuple[ModelParameter, ...]:
+        """Calibrated parameters."""
+
+    def output_quantity(self, output: str) -> Quantity | None:
+        """Return what an output is, or None if the model has no such output."""
+
+    def supports(self, primitive: type[Primitive]) -> bool:
+        """Whether the model can carry a primitive (sensor primitives are not asked for: they need no model)."""
+
+    def ports(self) -> tuple[str, ...]:
+        """Names of the ports where internal forces can act."""
+
+    def stations(self) -> tuple[float, float] | None:
+        """Return the least and largest station [m] for places along the structure, None if it has no length."""
+
+    def scales(self, campaign: Campaign) -> Scales:
+        """Return the natural scales under a campaign."""
+
+    def respond(
+        self,
+        trial: Trial,
+        outputs: tuple[tuple[str, Quantity], ...],
+        patch: ModelPatch,
+        conditions: Conditions,
+        *,
+        components: bool = False,
+        refinement: int = 1,
+    ) -> Response:
+        """Return the response of a trial; sensor primitives in `patch` are ignored here.
+
+        Parameters
+        ----------
+        trial : Trial
+            Inputs and sample times.
+        outputs : tuple of (str, Quantity)
+            Output and the quantity wanted of it (velocity and acceleration are derivatives of displacement;
+            a signal is the output itself).
+        patch : ModelPatch
+            Changes of structure, internal forces and loads.
+        conditions : Conditions
+            The rest.
+        components : bool
+            Whether `transverse` and `shear` are wanted.
+        refinement : int
+            Time steps are this many times smaller than usual, to check the integration.
+
+        Returns
+        -------
+        Response
+            Values without sensors.
+
+        Raises
+        ------
+        ModelError
+            If the model lacks an output or cannot carry a primitive.
+        """

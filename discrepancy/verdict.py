@@ -1,0 +1,198 @@
+"""The verdict and what it rests on, as records."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from fe.patch import ModelPatch
+
+
+class VerdictKind(StrEnum):
+    """What is concluded."""
+
+    NOTHING_MISSING = "nothing missing"  # the model explains the data
+    NAMED = "named"  # one effect, or a set of effects
+    FAMILY = "family"  # an effect of this family with a shape of its own
+    GROUP = "group"  # one of a group that these data cannot separate
+    UNEXPLAINED = "unexplained"  # a gap that no hypothesis fits
+    DATA_ERROR = "data error"  # the data are at fault
+    BELOW_LIMIT = "below detectability"  # something may be there, too small for these data
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its 90 % interval: posterior median and quantiles 0.05, 0.95, in `unit`."""
+
+    name: str
+    value: float
+    low: float
+    high: float
+    unit: str
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class NamedEffect:
+    """An effect in a hypothesis: identifier, standard name, place, parameters with intervals, its patch."""
+
+    identifier: str
+    name: str
+    place: str
+    family: str
+    parameters: tuple[Estimate, ...]
+    shape: tuple[Estimate, ...]
+    patch: ModelPatch
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A fitted hypothesis.
+
+    Attributes
+    ----------
+    effects : tuple of NamedEffect
+        Empty for 'none'.
+    log_evidence : float
+        ln p(data | hypothesis), Laplace.
+    probability : float
+        Posterior probability among the hypotheses compared.
+    chi_square, degrees_of_freedom : float
+        Of the fitted trials against the noise records.
+    """
+
+    effects: tuple[NamedEffect, ...]
+    log_evidence: float
+    probability: float
+    chi_square: float
+    degrees_of_freedom: float
+
+    @property
+    def identifiers(self) -> tuple[str, ...]:
+        """Identifiers of the effects, sorted."""
+        return tuple(sorted(effect.identifier for effect in self.effects))
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Outcome of one gate: "absolute fit" or "shape".
+
+    Attributes
+    ----------
+    name : str
+        Which.
+    passed : bool or None
+        None: it could not be applied, `reason` says why.
+    statistic, limit : float
+        What was compared.
+    reason : str
+        One sentence.
+    """
+
+    name: str
+    passed: bool | None
+    statistic: float
+    limit: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores on a set of trials: by a model without or with the effect.
+
+    Attributes
+    ----------
+    rms : mapping of str to float
+        Root mean square residual by channel [channel's unit].
+    chi_square_per_dof : float
+        Against the noise record.
+    log_score : float
+        Mean predictive log density of a sample, standardised by its noise.
+    coverage_50, coverage_90 : float
+        Share of samples within the central predictive intervals.
+    whiteness : float
+        p-value of the Ljung-Box test, the least over dynamic channels (Holm); nan without dynamic trials.
+    """
+
+    rms: Mapping[str, float]
+    chi_square_per_dof: float
+    log_score: float
+    coverage_50: float
+    coverage_90: float
+    whiteness: float
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What the effect does to data not used: before and after, on held-out and on fitted trials.
+
+    `gap_closed` = 1 - (chi2_after - 1) / (chi2_before - 1) per degree of freedom on held-out trials;
+    `log_score_gain` per sample with its standard error.
+    """
+
+    held_out_before: Scores | None
+    held_out_after: Scores | None
+    fitted_before: Scores
+    fitted_after: Scores
+    gap_closed: float
+    log_score_gain: float
+    log_score_gain_error: float
+    remaining: str = ""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A proposed next experiment: what to do, its mutual information [nat], cost [1], and why."""
+
+    description: str
+    information: float
+    cost: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The conclusion.
+
+    Attributes
+    ----------
+    kind : VerdictKind
+        What is concluded.
+    sentence : str
+        It in one sentence.
+    probability : float
+        Of the named set, family or group.
+    log_bayes_factor : float
+        ln of evidence of the best hypothesis over that of 'none'.
+    effects : tuple of NamedEffect
+        The set that is named; members of the group where a group is; the shape's nearest where a family is.
+    group : tuple of str
+        Identifiers that these data cannot separate.
+    family : str
+        Where the verdict is a family.
+    gates : tuple of Gate
+        Absolute fit and shape.
+    hypotheses : tuple of Hypothesis
+        Compared, most probable first.
+    inclusion : mapping of str to float
+        Probability that an effect is in the set, by identifier.
+    next_experiments : tuple of Experiment
+        Best first; empty where nothing is open.
+    remarks : tuple of str
+        Limits and data errors, one sentence each.
+    resembles : tuple of str
+        What an unexplained rest looks like; never a name.
+    """
+
+    kind: VerdictKind
+    sentence: str
+    probability: float
+    log_bayes_factor: float
+    effects: tuple[NamedEffect, ...] = ()
+    group: tuple[str, ...] = ()
+    family: str = ""
+    gates: tuple[Gate, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] = ()
+    inclusion: Mapping[str, float] = field(default_factory=dict)
+    next_experiments: tuple[Experiment, ...] = ()
+    remarks: tuple[str, ...] = ()
+    resembles: tuple[str, ...] = ()

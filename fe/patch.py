@@ -1,0 +1,446 @@
+"""Primitive changes of a model: what a missing effect is made of, and the patch that carries them.
+
+A patch is plain data. The reduced model, the full model, the FMU and the twin understand the same
+primitives; which physical effect a set of them stands for is not known here (`discrepancy.catalogue` knows).
+
+Standard library only: this file is copied into the FMU.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields
+from math import isfinite
+from typing import Any, ClassVar
+
+from .errors import InvalidPatchError
+
+EVERY_CHANNEL = "*"
+"""Name that stands for every channel of the primitive's quantity."""
+
+
+@dataclass(frozen=True, slots=True)
+class Primitive:
+    """One primitive change; `kind` names its class in a file. All values SI; zero magnitude is no change."""
+
+    kind: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, float | int) and not isinstance(value, bool) and not isfinite(value):
+                raise InvalidPatchError(
+                    f"{item.name} of the primitive {self.kind!r} must be finite, but is {value!r}."
+                )
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return kind and values as plain data."""
+        return {"kind": self.kind, **asdict(self)}
+
+
+# ---------------------------------------------------------------- mass and stiffness
+
+
+@dataclass(frozen=True, slots=True)
+class PointMass(Primitive):
+    """A mass [kg] on the wing's elastic line at `station` [m] from the root (lumped model: at a named place)."""
+
+    kind: ClassVar[str] = "point_mass"
+    mass: float
+    station: float
+
+
+@dataclass(frozen=True, slots=True)
+class RootCompliance(Primitive):
+    """A rotational spring in series with the root: `compliance` [rad/(N m)] about the flapping axis."""
+
+    kind: ClassVar[str] = "root_compliance"
+    compliance: float
+
+
+@dataclass(frozen=True, slots=True)
+class LocalStiffnessLoss(Primitive):
+    """The skin between `start` and `start + length` [m] from the root keeps 1 - `loss` of its stiffness."""
+
+    kind: ClassVar[str] = "local_stiffness_loss"
+    loss: float
+    start: float
+    length: float
+
+
+@dataclass(frozen=True, slots=True)
+class ModulusTemperature(Primitive):
+    """Young's modulus falls with temperature: E (1 - `coefficient` (T - T_ref)), `coefficient` [1/K]."""
+
+    kind: ClassVar[str] = "modulus_temperature"
+    coefficient: float
+
+
+@dataclass(frozen=True, slots=True)
+class StiffnessDrift(Primitive):
+    """The whole stiffness changes with time within a record: K (1 + `rate` t), `rate` [1/s]."""
+
+    kind: ClassVar[str] = "stiffness_drift"
+    rate: float
+
+
+# ---------------------------------------------------------------- internal forces
+#
+# Each acts against the motion x of a port (displacement [m] or rotation [rad]): -F on x, F in N or N m.
+# Ports of the wing: "root" (flapping rotation of the root), "tip" (upward displacement of the tip's load
+# point), "span" (upward displacement of all stations, weighted by the share of planform area; the weights
+# sum to one). A lumped model declares its own.
+
+
+@dataclass(frozen=True, slots=True)
+class PowerDamping(Primitive):
+    """F = coefficient |v / v0|^velocity_exponent |x / x0|^displacement_exponent sgn v.
+
+    Coulomb friction has both exponents zero, quadratic damping velocity_exponent 2, structural damping
+    displacement_exponent 1. `coefficient` [N or N m] is the force at v0 = `reference_velocity` and
+    x0 = `reference_displacement`.
+    """
+
+    kind: ClassVar[str] = "power_damping"
+    port: str
+    coefficient: float
+    velocity_exponent: float
+    displacement_exponent: float
+    reference_velocity: float
+    reference_displacement: float
+
+
+@dataclass(frozen=True, slots=True)
+class PowerStiffness(Primitive):
+    """F = coefficient |x / x0|^exponent sgn x; `side` 0: both signs of x, +1 or -1: that sign only.
+
+    A cubic spring has exponent 3 and side 0; a breathing crack exponent 1, side -1, coefficient negative.
+    `coefficient` [N or N m] is the force at x0 = `reference_displacement`.
+    """
+
+    kind: ClassVar[str] = "power_stiffness"
+    port: str
+    coefficient: float
+    exponent: float
+    side: int
+    reference_displacement: float
+
+
+@dataclass(frozen=True, slots=True)
+class FreePlay(Primitive):
+    """F = -stiffness clip(x, -half_width, half_width): the port's spring is absent inside the gap.
+
+    `stiffness` [N/m or N m/rad] is the part of the stiffness that the gap removes.
+    """
+
+    kind: ClassVar[str] = "free_play"
+    port: str
+    stiffness: float
+    half_width: float
+
+
+@dataclass(frozen=True, slots=True)
+class MicroSlip(Primitive):
+    """Iwan's joint: `element_count` Jenkins elements in parallel, together `stiffness`, in place of that spring.
+
+    At rest the elements carry their share of the stiffness that the linear model already has, so F is the
+    hysteretic force less `stiffness` x: what slip takes away. The slip forces of the elements are those of a
+    density of slip displacements phi ~ d^`chi` on 0 < d <= `slip_force` (2 + chi) / ((1 + chi) stiffness)
+    (Segalman 2005 without the macro-slip impulse), -1 < chi <= 0; chi = 0 is the uniform Iwan joint, and a
+    single Jenkins element has `element_count` 1 and slips at `slip_force`.
+    """
+
+    kind: ClassVar[str] = "micro_slip"
+    port: str
+    slip_force: float
+    stiffness: float
+    chi: float
+    element_count: int = 12
+
+
+@dataclass(frozen=True, slots=True)
+class BoucWen(Primitive):
+    """Bouc-Wen hysteresis: F = stiffness (z - x), z' = v (1 - (0.5 + 0.5 sgn(v z)) |z / yield_displacement|^order).
+
+    `stiffness` is the part of the port's stiffness that is hysteretic ((1 - alpha) k); below yield F is zero.
+    """
+
+    kind: ClassVar[str] = "bouc_wen"
+    port: str
+    stiffness: float
+    yield_displacement: float
+    order: float
+
+
+# ---------------------------------------------------------------- loads
+
+
+@dataclass(frozen=True, slots=True)
+class LoadPlace(Primitive):
+    """Applied forces act `along_span` [m] further outboard and `along_chord` [m] further aft than recorded."""
+
+    kind: ClassVar[str] = "load_place"
+    along_span: float
+    along_chord: float
+
+
+@dataclass(frozen=True, slots=True)
+class LoadGain(Primitive):
+    """The force that acts is (1 + `gain`) times the recorded one plus `tare` [N] (while a force is applied)."""
+
+    kind: ClassVar[str] = "load_gain"
+    gain: float
+    tare: float
+
+
+@dataclass(frozen=True, slots=True)
+class Washout(Primitive):
+    """Lift in flight is l (1 - `coefficient` n eta^`exponent`), eta = y / semi-span, n the load factor."""
+
+    kind: ClassVar[str] = "washout"
+    coefficient: float
+    exponent: float
+
+
+@dataclass(frozen=True, slots=True)
+class InertiaRelief(Primitive):
+    """In flight the structure's weight times n relieves the lift by this `fraction` more than modelled."""
+
+    kind: ClassVar[str] = "inertia_relief"
+    fraction: float
+
+
+# ---------------------------------------------------------------- sensors and clock
+#
+# `channel` is a channel's name, or `EVERY_CHANNEL` for all of `quantity` ("" for all quantities).
+
+
+@dataclass(frozen=True, slots=True)
+class SensorGain(Primitive):
+    """A channel shows (1 + `gain`) times what it should."""
+
+    kind: ClassVar[str] = "sensor_gain"
+    channel: str
+    gain: float
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorDrift(Primitive):
+    """A channel's zero moves: `amplitude` (t / `time`)^`exponent` is added, t since the campaign's start [s]."""
+
+    kind: ClassVar[str] = "sensor_drift"
+    channel: str
+    amplitude: float
+    time: float
+    exponent: float = 1.0
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorRotation(Primitive):
+    """A strain gauge is turned by `angle` [rad] in the skin from the spanwise direction towards the tip's rear."""
+
+    kind: ClassVar[str] = "sensor_rotation"
+    channel: str
+    angle: float
+
+
+@dataclass(frozen=True, slots=True)
+class ThermalStrain(Primitive):
+    """Strain channels show `coefficient` [1/K] times (T - T_ref) more."""
+
+    kind: ClassVar[str] = "thermal_strain"
+    channel: str
+    coefficient: float
+
+
+@dataclass(frozen=True, slots=True)
+class HighPass(Primitive):
+    """Channels pass through `order` equal first-order high-pass filters s tau / (1 + s tau), tau [s].
+
+    They had settled at the value before the record's first sample.
+    """
+
+    kind: ClassVar[str] = "high_pass"
+    channel: str
+    time_constant: float
+    order: float = 1.0
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Clock(Primitive):
+    """A sample that is stamped t was taken at (1 + `rate`) t + `zero` [s]."""
+
+    kind: ClassVar[str] = "clock"
+    rate: float
+    zero: float
+
+
+@dataclass(frozen=True, slots=True)
+class Line(Primitive):
+    """A line at `frequency` [Hz] is added: cosine cos + sine sin (2 pi f t), t since the trial's start.
+
+    Amplitudes in the channel's unit. It is in the noise record too.
+    """
+
+    kind: ClassVar[str] = "line"
+    channel: str
+    frequency: float
+    cosine: float
+    sine: float
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class DecayingLine(Primitive):
+    """A mode that the model does not have, e^(-zeta w t) (cosine cos w_d t + sine sin w_d t), in ring-downs.
+
+    t since the trial's start; amplitudes in the channel's unit per unit of the trial's release amplitude.
+    """
+
+    kind: ClassVar[str] = "decaying_line"
+    channel: str
+    frequency: float
+    damping_ratio: float
+    cosine: float
+    sine: float
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RunOffset(Primitive):
+    """Static readings of the trials labelled `run` have this `offset` (channel's unit): seating, zero of a run."""
+
+    kind: ClassVar[str] = "run_offset"
+    run: str
+    offset: float
+    channel: str = EVERY_CHANNEL
+    quantity: str = "displacement"
+
+
+PRIMITIVES: dict[str, type[Primitive]] = {
+    primitive.kind: primitive
+    for primitive in (
+        PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature, StiffnessDrift,
+        PowerDamping, PowerStiffness, FreePlay, MicroSlip, BoucWen,
+        LoadPlace, LoadGain, Washout, InertiaRelief,
+        SensorGain, SensorDrift, SensorRotation, ThermalStrain, HighPass, Clock, Line, DecayingLine, RunOffset,
+    )
+}  # fmt: skip
+"""Every primitive by its kind."""
+
+STRUCTURE = (PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature)
+"""Primitives that change the linear structure: it is solved anew."""
+INTERNAL_FORCES = (PowerDamping, PowerStiffness, FreePlay, MicroSlip, BoucWen, StiffnessDrift)
+"""Primitives that act as forces inside the structure while it moves."""
+LOADS = (LoadPlace, LoadGain, Washout, InertiaRelief)
+"""Primitives that change what acts on the structure."""
+SENSORS = (
+    SensorGain,
+    SensorDrift,
+    SensorRotation,
+    ThermalStrain,
+    HighPass,
+    Clock,
+    Line,
+    DecayingLine,
+    RunOffset,
+)
+"""Primitives that change what is read, not what happens."""
+
+
+@dataclass(frozen=True)
+class ModelPatch:
+    """A set of primitive changes; the empty patch is the model as it was, to the last bit.
+
+    Attributes
+    ----------
+    primitives : tuple of Primitive
+        The changes, applied together; sensors in the order given.
+    """
+
+    primitives: tuple[Primitive, ...] = ()
+
+    def __iter__(self) -> Iterator[Primitive]:
+        return iter(self.primitives)
+
+    def __len__(self) -> int:
+        return len(self.primitives)
+
+    def __add__(self, other: "ModelPatch") -> "ModelPatch":
+        return ModelPatch(self.primitives + other.primitives)
+
+    def of(self, *kinds: type[Primitive]) -> "ModelPatch":
+        """Return the part whose primitives are of the given classes."""
+        return ModelPatch(tuple(item for item in self.primitives if isinstance(item, kinds)))
+
+    def to_list(self) -> list[dict[str, Any]]:
+        """Return the primitives as plain data; `from_list` gives the patch back, equal to the last bit."""
+        return [primitive.to_mapping() for primitive in self.primitives]
+
+    @classmethod
+    def from_list(cls, rows: object, where: str = "The patch") -> "ModelPatch":
+        """Return the patch that `to_list` wrote.
+
+        Parameters
+        ----------
+        rows : list of mapping
+            Kind and values of each primitive.
+        where : str
+            What is being read, for the error message.
+
+        Raises
+        ------
+        InvalidPatchError
+            If a kind is unknown, a value is missing, superfluous, of the wrong type or not finite.
+        """
+        if not isinstance(rows, list):
+            raise InvalidPatchError(
+                f"{where} must be a list of primitives, but is a {type(rows).__name__}."
+            )
+        return cls(tuple(_primitive(row, f"{where}, primitive {n}") for n, row in enumerate(rows, start=1)))
+
+    def to_json(self) -> str:
+        """Return the patch as JSON; floats keep every bit."""
+        return json.dumps(self.to_list(), allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str, where: str = "The patch") -> "ModelPatch":
+        """Return the patch of a JSON text; raises `InvalidPatchError`."""
+        try:
+            rows = json.loads(text)
+        except json.JSONDecodeError as cause:
+            raise InvalidPatchError(f"{where} is not JSON ({cause}).") from cause
+        return cls.from_list(rows, where)
+
+
+def _primitive(row: object, where: str) -> Primitive:
+    if not isinstance(row, Mapping) or row.get("kind") not in PRIMITIVES:
+        got = row.get("kind") if isinstance(row, Mapping) else row
+        raise InvalidPatchError(f"{where} has the kind {got!r}, but known are {', '.join(PRIMITIVES)}.")
+    primitive = PRIMITIVES[str(row["kind"])]
+    types = {item.name: item.type for item in fields(primitive)}
+    values = {str(name): value for name, value in row.items() if name != "kind"}
+    for name, value in values.items():
+        wanted = types.get(name)
+        if wanted is None:
+            raise InvalidPatchError(f"{where} has no value {name!r}; it has {', '.join(types)}.")
+        fits = (
+            isinstance(value, str)
+            if wanted is str
+            else isinstance(value, int) and not isinstance(value, bool)
+            if wanted is int
+            else isinstance(value, float | int) and not isinstance(value, bool)
+        )
+        if not fits:
+            raise InvalidPatchError(
+                f"{where}: {name} must be {'text' if wanted is str else 'a number'}, but is {value!r}."
+            )
+        if wanted is float:
+            values[name] = float(value)
+    try:
+        return primitive(**values)
+    except TypeError as cause:
+        missing = [item.name for item in fields(primitive) if item.name not in values]
+        raise InvalidPatchError(f"{where} lacks {', '.join(missing)}.") from cause
