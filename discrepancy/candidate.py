@@ -39,7 +39,9 @@ class Term:
 
     def values(self, normal: Sequence[float] | FloatArray) -> dict[str, float]:
         """Return values by name at standard normal variables, one for each parameter."""
-        return {item.name: item.prior.value(float(u)) for item, u in zip(self.parameters, normal, strict=True)}
+        return {
+            item.name: item.prior.value(float(u)) for item, u in zip(self.parameters, normal, strict=True)
+        }
 
     def start(self) -> FloatArray:
         """Return the standard normal variables at prior medians and canonical shapes."""

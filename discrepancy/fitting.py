@@ -272,9 +272,7 @@ def _step(
     )
 
 
-def _finished(
-    problem: Problem, candidate: Candidate, state: _State, converged: bool, evidence: bool
-) -> Fit:
+def _finished(problem: Problem, candidate: Candidate, state: _State, converged: bool, evidence: bool) -> Fit:
     size = problem.shared.size + candidate.size
     covariance, log_evidence = np.zeros((size, size)), -state.objective
     spent = np.zeros(len(problem.channel_names))

@@ -166,9 +166,7 @@ def ljung_box(series: FloatArray, lags: int, fitted: int = 0) -> float:
 def autoregression(series: FloatArray) -> tuple[FloatArray, float]:
     """Return coefficients (p,) and innovation variance of the autoregression with the least BIC."""
     size = len(series)
-    covariance = np.array(
-        [series[: size - lag] @ series[lag:] / size for lag in range(LARGEST_ORDER + 1)]
-    )
+    covariance = np.array([series[: size - lag] @ series[lag:] / size for lag in range(LARGEST_ORDER + 1)])
     best, least = (np.empty(0), float(covariance[0])), inf
     for order in range(LARGEST_ORDER + 1):
         coefficients = solve_toeplitz(covariance[:order], covariance[1 : order + 1]) if order else np.empty(0)

@@ -5,8 +5,8 @@ variance of each channel's noise is marginalised under the inverse gamma distrib
 leaves: -ln L = sum over channels of (n0 + n) / 2 ln(1 + RSS / n0) + constant, RSS in units of s0^2.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from math import inf
 
 import numpy as np
@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from fe.patch import ModelPatch
 
-from .campaign import Campaign, Quantity, Trial
+from .campaign import Campaign, Trial
 from .candidate import Candidate
 from .catalogue.entry import Setting
 from .errors import CampaignDataError
-from .models.interface import Conditions, Model
+from .models.interface import Model
+from .models.memo import MemoModel
 from .noise import NoiseModel, noise_model
 from .sensing import observe
 from .unknowns import GlobalUnknowns, LocalUnknowns, global_unknowns, local_unknowns
@@ -143,7 +144,8 @@ class Problem:
         trials: tuple[Trial, ...] | None = None,
         like: "Problem | None" = None,
     ) -> None:
-        self.campaign, self.model, self.setting = campaign, model, setting
+        self.campaign, self.setting = campaign, setting
+        self.model = model if isinstance(model, MemoModel) else MemoModel(model)
         chosen = campaign.fitted if trials is None else trials
         if not chosen:
             raise CampaignDataError(
@@ -401,7 +403,9 @@ class Problem:
         if acting:
             blocks.append(parts.effect[acting] * gains)
         shared = np.concatenate(blocks)
-        index = np.array([*range(count), *gain_index, *(self.shared.size + k for k in acting)], dtype=np.int64)
+        index = np.array(
+            [*range(count), *gain_index, *(self.shared.size + k for k in acting)], dtype=np.int64
+        )
         size = shape[0] * shape[1]
         return (
             data.standardised(local).reshape(len(local), size),
@@ -424,7 +428,9 @@ class Problem:
         with np.errstate(divide="ignore", invalid="ignore"):
             known = 0.5 * (n0 + n) * np.log1p(sums / n0)
             terms = np.where(
-                np.isinf(n0), 0.5 * sums, np.where(n0 > 0.0, known, 0.5 * n * np.log(np.maximum(sums, 1e-300)))
+                np.isinf(n0),
+                0.5 * sums,
+                np.where(n0 > 0.0, known, 0.5 * n * np.log(np.maximum(sums, 1e-300))),
             )
         return float(terms[n > 0].sum())
 
@@ -457,19 +463,3 @@ def _noise(campaign: Campaign, trials: tuple[Trial, ...]) -> dict[str, NoiseMode
         ]
         found[name] = noise_model(channel, 1e-3 * max([*spans, 1e-12]))
     return found
-
-
-def quantity_columns(problem: Problem, quantity: Quantity) -> Callable[[Trial], list[int]]:
-    """Return a function that gives the columns of a trial that measure a quantity."""
-
-    def columns(trial: Trial) -> list[int]:
-        return [
-            n for n, name in enumerate(trial.channels) if problem.campaign.channels[name].quantity is quantity
-        ]
-
-    return columns
-
-
-def replaced(trial: Trial, values: FloatArray) -> Trial:
-    """Return the trial with other measured values."""
-    return replace(trial, values=values)
