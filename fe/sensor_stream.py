@@ -47,6 +47,11 @@ class Sample(NamedTuple):
     shear: FloatArray | None = None
 
 
+def needs_structure(patch: ModelPatch) -> bool:
+    """Return whether a patch needs more than what its sensors make of the readings of the plain structure."""
+    return any(not isinstance(item, SENSORS) or isinstance(item, SensorRotation) for item in patch)
+
+
 @dataclass(frozen=True)
 class SensorStream:
     """Sensors of a patch, sample by sample; what they remember is handed in and out.

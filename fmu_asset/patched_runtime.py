@@ -24,9 +24,9 @@ from .behaviour import Physics
 from .effect_variables import effect_rows
 from .fe.damping import rayleigh_damping_ratio
 from .fe.errors import FiniteElementError
-from .fe.patch import SENSORS, ModelPatch, SensorRotation
+from .fe.patch import ModelPatch
 from .fe.reduced import ReducedModel
-from .fe.sensor_stream import Sample, SensorStream
+from .fe.sensor_stream import Sample, SensorStream, needs_structure
 from .fe.transient import ModalIntegrator, TransientState
 from .patched_behaviour import PatchedBehaviour, PatchedPhysics
 from .pythonfmu.fmi2slave import Fmi2Slave
@@ -42,11 +42,6 @@ _contents = []
 def keep_alive(thing):
     """Hold one more reference for ever, also while the interpreter shuts down and clears this module."""
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(thing))
-
-
-def needs_structure(patch):
-    """Whether a patch needs a wing of its own: everything but what sensors make of the plain wing."""
-    return any(not isinstance(item, SENSORS) or isinstance(item, SensorRotation) for item in patch)
 
 
 def load_contents(resources):

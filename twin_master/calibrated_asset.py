@@ -14,6 +14,7 @@ from calibration.result import QUANTITIES, STATE, CalibrationResult, Quantity
 from calibration.result_file import result_bytes
 from fe.reduced import ReducedModel
 from fmu_asset.build import FmuInfo, FmuKind, build_fmu
+from fmu_asset.patch_file import PatchFile
 from reporting.provenance import hash_bytes
 from twin_master.run_folder import to_json
 
@@ -31,6 +32,8 @@ def pack_calibrated_wing(
     path: str | os.PathLike[str],
     *,
     kind: FmuKind = "python",
+    patch: PatchFile | None = None,
+    activate: bool = False,
     replace: bool = False,
 ) -> FmuInfo:
     """Pack the tailored model as an FMU that starts at the posterior mean; equal input gives equal bytes.
@@ -46,7 +49,7 @@ def pack_calibrated_wing(
         The wing.
     path : path-like
         Where to write, with the suffix .fmu.
-    kind : {"python", "compiled", "source"}
+    kind, patch, activate
         See `fmu_asset.build.build_fmu`.
     replace : bool
         Whether an existing file may be replaced.
@@ -64,6 +67,8 @@ def pack_calibrated_wing(
         note=description(calibration),
         resources={RESOURCE_NAME: record},
         kind=kind,
+        patch=patch,
+        activate=activate,
         replace=replace,
     )
 
