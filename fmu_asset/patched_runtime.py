@@ -117,7 +117,8 @@ def patched_members(
     """
     own, wing = files("fmu_asset"), files("fe")
     record = {"channels": output_channels(model.gauge_count), "effects": effects}
-    text = json.dumps(record, sort_keys=True, indent=1, allow_nan=False)
+    # The order of keys is that of the variables.
+    text = json.dumps(record, indent=1, allow_nan=False)
     return {
         "resources/effects.json": f"{text}\n".encode(),
         f"{runtime}/entry.py": ENTRY.encode(),
