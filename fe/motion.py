@@ -21,7 +21,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Kernel = Mapping[str, Callable[..., Any]]
 
-SLOWEST_PHASE, FASTEST_PHASE = 0.08, 0.8
+SLOWEST_PHASE, FASTEST_PHASE = 0.05, 0.4
 """Longest substep with laws: radians of the slowest and of the fastest mode that it may span."""
 
 
@@ -230,6 +230,28 @@ def linear_step(system: ModalSystem, shape: FloatArray, constant: FloatArray, h:
     LinearStep
         Arrays over (q, v).
     """
+    key = (
+        system.angular_frequency.tobytes(),
+        system.damping.tobytes(),
+        shape.tobytes(),
+        constant.tobytes(),
+        h,
+    )
+    step = _STEPS.get(key)
+    if step is None:
+        step = _linear_step(system, shape, constant, h)
+        if len(_STEPS) >= MOST_STEPS:
+            _STEPS.pop(next(iter(_STEPS)))
+        _STEPS[key] = step
+    return step
+
+
+_STEPS: dict[tuple[bytes, bytes, bytes, bytes, float], LinearStep] = {}
+MOST_STEPS = 64
+"""Linear steps that are kept, because the same structure is often moved again with other laws."""
+
+
+def _linear_step(system: ModalSystem, shape: FloatArray, constant: FloatArray, h: float) -> LinearStep:
     count = len(system.angular_frequency)
     # Velocities are measured in units of the highest frequency, which balances the matrix.
     unit = max(float(np.max(system.angular_frequency)), float(np.max(np.abs(system.damping))), 1.0 / h if h else 1.0)

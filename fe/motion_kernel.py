@@ -198,6 +198,8 @@ def crossing(
             + b * (u2 * u - 0.5 * u2 * u2)
             + n * (0.25 * u2 * u2 - u2 * u / 3.0)
         )
+        if exponent == 0.0:
+            way -= sign * (strength + max(free, 0.0)) * h * h / 12.0
         return 0.0, way, 1.0
     one = exponent + 1.0
     first, rest = u * h, (1.0 - u) * h
@@ -211,6 +213,10 @@ def crossing(
             - push * rest ** (one + 1.0) * (1.0 / one - 1.0 / (one + 1.0))
         )
     )
+    if exponent == 0.0:
+        # Half kicks at both ends of a step shift the position by force h^2 / 12. The shift is undone when the force
+        # ends, but here the next force begins, of the other sign.
+        moment -= sign * strength * h * h / 6.0
     return impulse + lost, moment + lost * h, 0.0
 
 
