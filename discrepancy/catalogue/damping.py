@@ -135,7 +135,7 @@ QUADRATIC_DAMPING = Effect(
     family=FAMILY,
     equation="F = c |v| v, zeta_eq(A) = 4 c A w^2 / (3 pi k)",
     signature="zeta ~ A: the envelope falls fast at first, then slowly.",
-    reference="Nayfeh and Mook 1979, Nonlinear Oscillations, section 3.3",
+    reference="Worden and Tomlinson 2001, Nonlinearity in Structural Dynamics",
     acts_on=DYNAMIC,
     parameters=(
         EffectParameter(

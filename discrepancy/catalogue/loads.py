@@ -95,7 +95,7 @@ WASHOUT = Effect(
     family="lift",
     equation="l -> l (1 - k n eta^p), p = 1",
     signature="Outboard strain over root strain falls with the load factor.",
-    reference="Hodges and Pierce 2011, Introduction to Structural Dynamics and Aeroelasticity, chapter 4",
+    reference="Hodges and Pierce 2011, Introduction to Structural Dynamics and Aeroelasticity, 2nd ed.",
     acts_on=FLIGHT,
     parameters=(
         EffectParameter(
@@ -123,7 +123,7 @@ INERTIA_RELIEF = Effect(
     family="lift",
     equation="l -> l - r n m g",
     signature="Flight strain is off in proportion to the load factor, most at the root; ground trials fit.",
-    reference="Megson 2017, Aircraft Structures for Engineering Students, 6th ed., part B",
+    reference="Megson 2017, Aircraft Structures for Engineering Students, 6th ed.",
     acts_on=FLIGHT,
     parameters=(
         EffectParameter(

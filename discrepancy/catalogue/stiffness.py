@@ -202,7 +202,7 @@ STIFFNESS_DRIFT = Effect(
     family="time variation",
     equation="K -> K (1 + rho t), rho = delta / T",
     signature="Frequencies move with the time in the record, alike after a large and a small release.",
-    reference="Nayfeh and Mook 1979, Nonlinear Oscillations, chapter 5",
+    reference="Poulimenos and Fassois 2006, Mech. Syst. Signal Process. 20 (4), 763-816",
     acts_on=DYNAMIC,
     parameters=(
         EffectParameter(

@@ -1,4 +1,4 @@
-"""Effects of mass and linear stiffness: point mass, root compliance, stiffness loss, modulus over temperature."""
+"""Effects of mass and linear stiffness: point mass, root compliance, stiffness loss, temperature."""
 
 from collections.abc import Mapping
 
@@ -47,7 +47,7 @@ POINT_MASS = Effect(
     family="mass at a free place",
     equation="M -> M + m delta(y - y_m), m = mu m_1",
     signature="Frequencies fall by phi_r(y_m)^2 m / (2 m_r) each; the static response stays as it is.",
-    reference="Blevins 1979, Formulas for Natural Frequency and Mode Shape, chapter 8",
+    reference="Blevins 1979, Formulas for Natural Frequency and Mode Shape",
     acts_on=DYNAMIC | {TrialKind.FLIGHT},
     parameters=(
         EffectParameter(
