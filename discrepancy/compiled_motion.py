@@ -1,4 +1,4 @@
-"""The loops of `fe.motion_kernel`, compiled; the functions that the FMU runs as plain Python, from the same file."""
+"""The loops of `fe.motion_kernel`, compiled: what the FMU runs as plain Python, from the same file."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def compiled_kernel() -> dict[str, Callable[..., Any]]:
     """Return the compiled functions, for `kernel` of `fe.motion.simulate` and `static_solution`.
 
     The file is loaded a second time under a name of its own, and its functions are replaced there by compiled
-    ones, so that they call each other compiled and `fe.motion_kernel` stays as it is. Machine code is kept beside
-    `fe` (or in the user's cache folder); the first use compiles it.
+    ones, so that they call each other compiled and `fe.motion_kernel` stays as it is. Machine code is kept
+    beside `fe` (or in the user's cache folder); the first use compiles it.
     """
     specification = spec_from_file_location(MODULE, motion_kernel.__file__)
     assert specification is not None

@@ -131,6 +131,7 @@ def fit(
     base: Base | None = None,
     iterations: int = 12,
     evidence: bool = True,
+    local_only: bool = False,
 ) -> Fit:
     """Fit a candidate.
 
@@ -148,6 +149,8 @@ def fit(
         Largest number of steps.
     evidence : bool
         Whether covariance, evidence and spent degrees of freedom are wanted.
+    local_only : bool
+        Shared unknowns and effects stay: only the trials' own nuisances are fitted (held-out trials).
 
     Raises
     ------
@@ -164,7 +167,7 @@ def fit(
         )
     converged = False
     for _ in range(iterations):
-        step, promised, used = _step(problem, candidate, state, damping)
+        step, promised, used = _step(problem, candidate, state, damping, local_only=local_only)
         if promised < CONVERGED:
             converged = True
             break
@@ -232,7 +235,7 @@ def _blocks(problem: Problem, candidate: Candidate, state: _State) -> list[Trial
 
 
 def _step(
-    problem: Problem, candidate: Candidate, state: _State, damping: float
+    problem: Problem, candidate: Candidate, state: _State, damping: float, *, local_only: bool = False
 ) -> tuple[Point, float, float]:
     """Return the step, the decrease it promises [nat] and the damping that was used."""
     shared_size = problem.shared.size
@@ -256,7 +259,7 @@ def _step(
         eliminated.append((inner, inner_gradient))
     matrix += damping * np.diag(damped_diagonal + prior)
     try:
-        step = cho_solve(cho_factor(matrix), gradient)
+        step = np.zeros(size) if local_only else cho_solve(cho_factor(matrix), gradient)
     except LinAlgError as cause:
         raise FitError("The normal equations of a fit are singular; a parameter has no influence.") from cause
     promised = 0.5 * float(gradient @ step)

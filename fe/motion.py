@@ -1,8 +1,8 @@
 """Motion of a structure in few modes with internal forces: laws from a patch, steps, static solution.
 
-`fe.motion_kernel` has the equation and the method. NumPy and relative imports only: this file is copied into the
-FMU. The loops run as plain Python here; `discrepancy.compiled_motion` has the same functions compiled, to be given
-as `kernel`.
+`fe.motion_kernel` has the equation and the method. NumPy and relative imports only: this file is copied into
+the FMU. The loops run as plain Python here; `discrepancy.compiled_motion` has the same functions compiled,
+to be given as `kernel`.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -21,7 +21,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Kernel = Mapping[str, Callable[..., Any]]
 
-SLOWEST_PHASE, FASTEST_PHASE = 0.08, 0.8
+SLOWEST_PHASE, FASTEST_PHASE = 0.05, 0.4
 """Longest substep with laws: radians of the slowest and of the fastest mode that it may span."""
 
 
@@ -73,8 +73,8 @@ NO_LAWS = Laws((), np.zeros(0, dtype=np.int64), np.zeros((0, 5)), np.zeros((0, 1
 def slip_displacements(law: MicroSlip) -> FloatArray:
     """Return the slip displacements (n,) of a joint's elements.
 
-    Quantile midpoints of phi ~ d^chi (Segalman 2005, without the macro-slip impulse), scaled so that the joint as a
-    whole slips at `slip_force` exactly.
+    Quantile midpoints of phi ~ d^chi (Segalman 2005, without the macro-slip impulse), scaled so that the
+    joint as a whole slips at `slip_force` exactly.
     """
     share = (np.arange(law.element_count) + 0.5) / law.element_count
     slips = share ** (1.0 / (1.0 + law.chi))
@@ -82,7 +82,7 @@ def slip_displacements(law: MicroSlip) -> FloatArray:
 
 
 def laws_of(patch: ModelPatch, ports: Collection[str]) -> Laws:
-    """Return the internal forces of a patch; other primitives are passed over, and laws without magnitude left out.
+    """Return the internal forces of a patch; laws without magnitude and other primitives are left out.
 
     Parameters
     ----------
@@ -99,7 +99,8 @@ def laws_of(patch: ModelPatch, ports: Collection[str]) -> Laws:
     Raises
     ------
     InvalidPatchError
-        If a law acts on a port that the model does not have, or a value cannot be (a scale that is not positive).
+        If a law acts on a port that the model does not have, or a value cannot be (a scale that is not
+        positive).
     """
     names, codes, values, slips = [], [], [], []
     rate = 0.0
@@ -136,7 +137,11 @@ def laws_of(patch: ModelPatch, ports: Collection[str]) -> Laws:
             code, magnitude = FREE_PLAY, item.stiffness * item.half_width
             row = (item.stiffness, item.half_width, 0.0, 0.0, 0.0)
         elif isinstance(item, MicroSlip):
-            positive = {"slip_force": item.slip_force, "element_count": item.element_count, "1 + chi": 1 + item.chi}
+            positive = {
+                "slip_force": item.slip_force,
+                "element_count": item.element_count,
+                "1 + chi": 1 + item.chi,
+            }
             least = {"stiffness": item.stiffness, "-chi": -item.chi}
             code, magnitude = MICRO_SLIP, item.stiffness
             row = (item.stiffness, float(item.element_count), 0.0, 0.0, 0.0)
@@ -150,7 +155,9 @@ def laws_of(patch: ModelPatch, ports: Collection[str]) -> Laws:
         if item.port not in ports:
             known = f"it has {', '.join(ports)}" if ports else "it has none"
             raise InvalidPatchError(
-                f"The primitive {item.kind!r} acts on the port {item.port!r}, which this model does not have; {known}."
+                f"The primitive {item.kind!r} acts on the port {item.port!r}, which this model "
+                f"does not have; "
+                f"{known}."
             )
         for name, value in positive.items():
             if not value > 0.0:
@@ -230,9 +237,33 @@ def linear_step(system: ModalSystem, shape: FloatArray, constant: FloatArray, h:
     LinearStep
         Arrays over (q, v).
     """
+    key = (
+        system.angular_frequency.tobytes(),
+        system.damping.tobytes(),
+        shape.tobytes(),
+        constant.tobytes(),
+        h,
+    )
+    step = _STEPS.get(key)
+    if step is None:
+        step = _linear_step(system, shape, constant, h)
+        if len(_STEPS) >= MOST_STEPS:
+            _STEPS.pop(next(iter(_STEPS)))
+        _STEPS[key] = step
+    return step
+
+
+_STEPS: dict[tuple[bytes, bytes, bytes, bytes, float], LinearStep] = {}
+MOST_STEPS = 64
+"""Linear steps that are kept, because the same structure is often moved again with other laws."""
+
+
+def _linear_step(system: ModalSystem, shape: FloatArray, constant: FloatArray, h: float) -> LinearStep:
     count = len(system.angular_frequency)
     # Velocities are measured in units of the highest frequency, which balances the matrix.
-    unit = max(float(np.max(system.angular_frequency)), float(np.max(np.abs(system.damping))), 1.0 / h if h else 1.0)
+    unit = max(
+        float(np.max(system.angular_frequency)), float(np.max(np.abs(system.damping))), 1.0 / h if h else 1.0
+    )
     matrix = np.zeros((2 * count + 3, 2 * count + 3))
     matrix[:count, count : 2 * count] = unit * np.eye(count)
     matrix[count : 2 * count, :count] = -np.diag(system.angular_frequency**2) / unit
@@ -313,8 +344,8 @@ def simulate(
     shape, constant : (M,) ndarray, optional
         Modal shape of the force, and a constant modal force; zero if left out.
     memory : (J, 2 + E) ndarray, optional
-        Of the laws, as `static_solution` or an earlier call returned it. Left out: each law has been loaded from
-        zero to its first position without turning back.
+        Of the laws, as `static_solution` or an earlier call returned it. Left out: each law has been loaded
+        from zero to its first position without turning back.
     start : float
         Time of the first sample since the beginning of the record, for stiffness drift [s].
     refinement : int
@@ -374,7 +405,7 @@ def simulate(
 
 
 class StaticSolution(NamedTuple):
-    """Static states: `positions` and `forces` (L, J) of the laws' ports, and their `memory` after the last."""
+    """Static states: `positions` and `forces` (L, J) of the laws' ports, their `memory` after the last."""
 
     positions: FloatArray
     forces: FloatArray
@@ -401,7 +432,8 @@ def static_solution(
     compliance : (J, J) ndarray
         Position of the port of each law (row) under a unit force at that of another (column).
     memory, start : ndarray, optional
-        Memory and linear positions (J,) from which the first level is reached; by default never loaded, and zero.
+        Memory and linear positions (J,) from which the first level is reached; by default never loaded, and
+        zero.
     kernel : mapping, optional
         Compiled functions.
 

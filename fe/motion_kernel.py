@@ -1,13 +1,14 @@
 """Motion of a few modes with internal forces at ports: loops over numbers, and nothing else.
 
-q'' + D q' + W^2 (1 + r t) q = b f(t) + c - sum_j p_j F_j(p_j . q, p_j . v, memory_j). The linear part is advanced
-exactly (matrix exponential, force linear between samples); internal forces are split off symmetrically (Strang
-1968): damping, displacement forces, linear motion, displacement forces, damping. Damping kicks have a closed form.
-Where friction turns over inside a step, the impulse and its first moment are corrected for the moment of the turn;
-where it holds, the port is held in place by the impulses that this needs, as long as friction can give them.
+q'' + D q' + W^2 (1 + r t) q = b f(t) + c - sum_j p_j F_j(p_j . q, p_j . v, memory_j). The linear part is
+advanced exactly (matrix exponential, force linear between samples); internal forces are split off
+symmetrically (Strang 1968): damping, displacement forces, linear motion, displacement forces, damping.
+Damping kicks have a closed form. Where friction turns over inside a step, the impulse and its first moment
+are corrected for the moment of the turn; where it holds, the port is held in place by the impulses that this
+needs, as long as friction can give them.
 
-Written in the subset of Python that numba compiles too. NumPy only: this file is copied into the FMU. Other code
-may take this file's functions by the names in `COMPILED`, in their order, and compile them.
+Written in the subset of Python that numba compiles too. NumPy only: this file is copied into the FMU. Other
+code may take this file's functions by the names in `COMPILED`, in their order, and compile them.
 """
 
 from typing import Any
@@ -21,12 +22,12 @@ IntArray = npt.NDArray[np.int64]
 POWER_DAMPING, POWER_STIFFNESS, FREE_PLAY, MICRO_SLIP, BOUC_WEN = 0, 1, 2, 3, 4
 """Codes of the laws. Their parameters (5,):
 
-power damping: coefficient, velocity exponent, displacement exponent, reference velocity, reference displacement;
-power stiffness: coefficient, exponent, side, reference displacement; free play: stiffness, half width;
-micro-slip: stiffness, element count; Bouc-Wen: stiffness, yield displacement, order.
+power damping: coefficient, velocity exponent, displacement exponent, reference velocity, reference
+displacement; power stiffness: coefficient, exponent, side, reference displacement; free play: stiffness,
+half width; micro-slip: stiffness, element count; Bouc-Wen: stiffness, yield displacement, order.
 """
 HEAD = 2
-"""Columns of a memory before the hysteretic elements: 1 if friction holds the port; the port's last position."""
+"""Columns of a memory before its hysteretic elements: 1 if friction holds the port; its last position."""
 
 COMPILED = (
     "power", "displacement_force", "displacement_slope", "advance_memory", "damping_kick", "holding_limit",
@@ -54,17 +55,17 @@ def displacement_force(code: int, law: FloatArray, memory: FloatArray, x: float)
         if law[2] * x < 0.0 or x == 0.0:
             return 0.0
         force = law[0] * power(abs(x / law[3]), law[1])
-        return force if x > 0.0 else -force
+        return float(force if x > 0.0 else -force)
     if code == FREE_PLAY:
-        return -law[0] * min(max(x, -law[1]), law[1])
+        return float(-law[0] * min(max(x, -law[1]), law[1]))
     if code == MICRO_SLIP:
         count = int(law[1])
         total = 0.0
         for i in range(count):
             total += memory[HEAD + i]
-        return law[0] * (total / count - x)
+        return float(law[0] * (total / count - x))
     if code == BOUC_WEN:
-        return law[0] * (memory[HEAD] - x)
+        return float(law[0] * (memory[HEAD] - x))
     return 0.0
 
 
@@ -72,21 +73,21 @@ def displacement_slope(code: int, law: FloatArray, slip: FloatArray, memory: Flo
     """Return the derivative of `displacement_force` by x, on the path that led to x."""
     if code == POWER_STIFFNESS:
         if law[2] * x < 0.0 or x == 0.0:
-            return law[0] / law[3] if law[1] == 1.0 and law[2] == 0.0 else 0.0
-        return law[0] * law[1] / law[3] * power(abs(x / law[3]), law[1] - 1.0)
+            return float(law[0] / law[3]) if law[1] == 1.0 and law[2] == 0.0 else 0.0
+        return float(law[0] * law[1] / law[3] * power(abs(x / law[3]), law[1] - 1.0))
     if code == FREE_PLAY:
-        return -law[0] if abs(x) < law[1] else 0.0
+        return float(-law[0]) if abs(x) < law[1] else 0.0
     if code == MICRO_SLIP:
         count = int(law[1])
         free = 0
         for i in range(count):
             if abs(memory[HEAD + i]) >= slip[i]:
                 free += 1
-        return -law[0] * free / count
+        return float(-law[0] * free / count)
     if code == BOUC_WEN:
         z = memory[HEAD] / law[1]
         loading = z * (x - memory[1]) >= 0.0
-        return -law[0] * power(min(abs(z), 1.0), law[2]) if loading else 0.0
+        return float(-law[0] * power(min(abs(z), 1.0), law[2])) if loading else 0.0
     return 0.0
 
 
@@ -133,7 +134,7 @@ def damping_kick(speed: float, strength: float, exponent: float, duration: float
     root = size ** (1.0 - exponent) - (1.0 - exponent) * strength * duration
     if root <= 0.0:
         return 0.0
-    size = root ** (1.0 / (1.0 - exponent))
+    size = float(root ** (1.0 / (1.0 - exponent)))
     return size if speed > 0.0 else -size
 
 
@@ -145,7 +146,14 @@ def holding_limit(strength: float, exponent: float, duration: float) -> float:
 
 
 def crossing(
-    begin: float, end: float, slope_begin: float, slope_end: float, lost: float, strength: float, exponent: float, h: float
+    begin: float,
+    end: float,
+    slope_begin: float,
+    slope_end: float,
+    lost: float,
+    strength: float,
+    exponent: float,
+    h: float,
 ) -> tuple[float, float, float]:
     """Return what must be added where the speed of a port changes sign within a step.
 
@@ -165,7 +173,8 @@ def crossing(
     speed : float
         To be added to the speed at the end.
     position : float
-        To be added to the position at the end; or, if friction holds, the way from the step's begin to the turn.
+        To be added to the position at the end; or, if friction holds, the way from the step's begin to the
+        turn.
     held : float
         1 if friction holds from the turn on.
     """
@@ -185,9 +194,7 @@ def crossing(
         else:
             high = u
     u = 0.5 * (low + high)
-    slope = (
-        6.0 * (b - a) * u * (1.0 - u) + m * (1.0 - u) * (1.0 - 3.0 * u) + n * u * (3.0 * u - 2.0)
-    ) / h
+    slope = (6.0 * (b - a) * u * (1.0 - u) + m * (1.0 - u) * (1.0 - 3.0 * u) + n * u * (3.0 * u - 2.0)) / h
     before = max(-sign * slope, 0.0)
     free = -sign * (slope + 2.0 * lost / h)  # backwards acceleration without this friction
     if free <= 0.0 or 0.5 * h * free <= holding_limit(strength, exponent, 0.5 * h):
@@ -198,6 +205,8 @@ def crossing(
             + b * (u2 * u - 0.5 * u2 * u2)
             + n * (0.25 * u2 * u2 - u2 * u / 3.0)
         )
+        if exponent == 0.0:
+            way -= sign * (strength + max(free, 0.0)) * h * h / 12.0
         return 0.0, way, 1.0
     one = exponent + 1.0
     first, rest = u * h, (1.0 - u) * h
@@ -211,6 +220,10 @@ def crossing(
             - push * rest ** (one + 1.0) * (1.0 / one - 1.0 / (one + 1.0))
         )
     )
+    if exponent == 0.0:
+        # Half kicks at both ends of a step shift the position by force h^2 / 12. The shift is undone when
+        # the force ends, but here the next force begins, of the other sign.
+        moment -= sign * strength * h * h / 6.0
     return impulse + lost, moment + lost * h, 0.0
 
 
@@ -240,13 +253,13 @@ def integrate(
     v_out: FloatArray,
     force_out: FloatArray,
 ) -> None:
-    """Integrate over the samples of `force`; `q`, `v` and `memory` are changed in place and can be taken further.
+    """Integrate over the samples of `force`; `q`, `v` and `memory` are changed in place.
 
     Parameters
     ----------
     transition, drive_begin, drive_end, drive_constant : (2M, 2M), (2M,), (2M,), (2M,) ndarray
-        Exact linear step of (q, v) over `h`: from the state, from the force at its begin and at its end [1/N],
-        and from the constant (`fe.motion.linear_step`).
+        Exact linear step of (q, v) over `h`: from the state, from the force at its begin and at its end
+        [1/N], and from the constant (`fe.motion.linear_step`).
     coupled : bool
         Whether `transition` couples modes.
     stiffness : (M,) ndarray
@@ -504,12 +517,19 @@ def integrate(
 
 
 def static_forces(
-    x: FloatArray, codes: IntArray, laws: FloatArray, slips: FloatArray, memory: FloatArray, parts: IntArray,
-    force: FloatArray, slope: FloatArray,
+    x: FloatArray,
+    codes: IntArray,
+    laws: FloatArray,
+    slips: FloatArray,
+    memory: FloatArray,
+    parts: IntArray,
+    force: FloatArray,
+    slope: FloatArray,
 ) -> FloatArray:
     """Return the memory at positions `x` (J,) reached from `memory`; `force` and `slope` (J,) are filled.
 
-    `parts` (J,) is the least number of parts in which a hysteretic law follows the way; damping is zero at rest.
+    `parts` (J,) is the least number of parts in which a hysteretic law follows the way; damping is zero at
+    rest.
     """  # fmt: skip
     reached = memory.copy()
     for j in range(len(codes)):
@@ -592,7 +612,9 @@ def static_path(
                 better = False
                 for _ in range(12):
                     candidate = guess - fraction * move
-                    trial = static_forces(candidate, codes, laws, slips, memory, parts, trial_force, trial_slope)
+                    trial = static_forces(
+                        candidate, codes, laws, slips, memory, parts, trial_force, trial_slope
+                    )
                     trial_residual = candidate + compliance @ trial_force - goal
                     trial_size = np.max(np.abs(trial_residual))
                     if trial_size < size:
