@@ -134,7 +134,9 @@ class SensorStream:
                 continue
             for item in group:
                 if isinstance(item, HighPass) and self.dynamic:
-                    values = self._filter(item, values, pending if memory is not None else None, after, duration)
+                    values = self._filter(
+                        item, values, pending if memory is not None else None, after, duration
+                    )
         return values, after
 
     def _apply(self, items: tuple, values: FloatArray, sample: Sample) -> FloatArray:  # type: ignore[type-arg]
@@ -172,9 +174,7 @@ class SensorStream:
             if pending is not None:
                 before, *kept = pending[: 1 + order]
                 del pending[: 1 + order]
-                states = high_pass_step(
-                    np.array(kept), signal - before, duration / item.time_constant
-                )
+                states = high_pass_step(np.array(kept), signal - before, duration / item.time_constant)
             shown[column] = states[-1]
             after += [signal, *states.tolist()]
         return shown

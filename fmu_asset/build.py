@@ -20,6 +20,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
+from fe.patch_arrays import PatchArrays
 from fe.reduced import RUNTIME_FILES, ReducedModel
 from fe.state import STIFFNESS_LOSS_NAMES, DigitalState
 from reporting.files import atomic_write_bytes
@@ -147,6 +148,7 @@ def build_fmu(
     resources: Mapping[str, bytes] | None = None,
     patch: PatchFile | None = None,
     activate: bool = False,
+    arrays: PatchArrays | None = None,
     replace: bool = False,
 ) -> FmuInfo:
     """Pack a reduced model as an FMU; equal input gives equal bytes.
@@ -170,6 +172,9 @@ def build_fmu(
         Missing effects that the FMU is to carry as tunable parameters.
     activate : bool
         Whether these are switched on from the start.
+    arrays : PatchArrays, optional
+        The wing in the basis for patches (`fe.patch_cache.patch_arrays`); needed where an effect changes
+        structure or loads, or turns a gauge.
     replace : bool
         Whether an existing file may be replaced.
 
@@ -193,7 +198,7 @@ def build_fmu(
     if target.exists() and not replace:
         raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
     content, content_hash = fmu_bytes(
-        model, state, kind, note=note, resources=resources, patch=patch, activate=activate
+        model, state, kind, note=note, resources=resources, patch=patch, activate=activate, arrays=arrays
     )
     atomic_write_bytes(target, content)
     return _info(model, target, content, content_hash)
@@ -219,6 +224,7 @@ def fmu_bytes(
     resources: Mapping[str, bytes] | None = None,
     patch: PatchFile | None = None,
     activate: bool = False,
+    arrays: PatchArrays | None = None,
 ) -> tuple[bytes, str]:
     """Return the archive and its content hash; see `build_fmu`."""
     start = start_values(state or DigitalState())
@@ -240,7 +246,7 @@ def fmu_bytes(
     if kind == "python":
         template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start}, description)
         if effects:
-            template |= patched_members(f"resources/uav_wing_{_PLACEHOLDER}_runtime", model, effects)
+            template |= patched_members(f"resources/uav_wing_{_PLACEHOLDER}_runtime", model, effects, arrays)
     else:
         template = compiled_members(
             model,

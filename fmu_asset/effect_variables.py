@@ -143,7 +143,9 @@ def effect_rows(
     """
     rows: list[FmuVariable] = []
 
-    def add(name: str, description: str, value: float, unit: str, *, whole: bool = False, top: float | None = None) -> None:
+    def add(
+        name: str, description: str, value: float, unit: str, *, whole: bool = False, top: float | None = None
+    ) -> None:
         rows.append(
             FmuVariable(
                 name=name,

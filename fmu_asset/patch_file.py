@@ -21,6 +21,7 @@ from typing import Any
 
 from fe.errors import InvalidPatchError
 from fe.patch import EVERY_CHANNEL, Clock, HighPass, ModelPatch, Primitive, RunOffset
+from fe.sensor_stream import needs_structure
 from fe.sensors import check_channels
 
 from .errors import PatchFileError
@@ -67,6 +68,11 @@ class PatchFile:
     def patch(self) -> ModelPatch:
         """All effects together."""
         return sum((effect.patch for effect in self.effects), ModelPatch())
+
+    @property
+    def needs_arrays(self) -> bool:
+        """Whether an effect changes more than what sensors show, so that the FMU needs arrays for it."""
+        return needs_structure(self.patch)
 
     def for_outputs(self, outputs: Sequence[tuple[str, str]], where: str = "The patch") -> tuple[Effect, ...]:
         """Return the effects with channels replaced by the outputs that they are.

@@ -211,14 +211,16 @@ class PatchedBehaviour(WingBehaviour):
         if steps is None or applied != self._applied or tuple(inputs[1:3]) != self._inputs[1:3]:
             steps = self._make_steps(parameters, inputs, patch, applied)
             if before is not None:
-                self._motion = steps.take_over(self._motion, before)
+                self._motion = steps.take_over(self._motion, before, moving=moved)
             elif self._integrator is not None and self._transient is not None:
                 self._motion = steps.take_over_unpatched(self._transient, self._integrator)
             else:
                 self._motion = []
         n, force = inputs[0], inputs[3]
         if moved:
-            self._motion = steps.advance(self._motion, duration, n, force, moment.time - duration - self._start)
+            self._motion = steps.advance(
+                self._motion, duration, n, force, moment.time - duration - self._start
+            )
         else:
             self._motion = steps.settled(self._motion, n, force)
         self._steps, self._applied, self._inputs = steps, applied, tuple(inputs)
@@ -244,7 +246,7 @@ class PatchedBehaviour(WingBehaviour):
             point = super().load_point_displacement()
             values = self._patched.join(response.strain, (response.tip_displacement, point))
         elif self._steps is not None:
-            values, across, shear = self._steps.read(self._motion)
+            values, across, shear = self._steps.read(self._motion, moving=parameters.response == TRANSIENT)
         else:
             raise RuntimeError("there is nothing to show")
         transient = parameters.response == TRANSIENT

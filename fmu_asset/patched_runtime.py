@@ -3,19 +3,48 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.resources import files
 from typing import Any
 
+from fe.errors import FiniteElementError
+from fe.patch import LocalStiffnessLoss, ModelPatch
+from fe.patch_arrays import PatchArrays
+from fe.patched_steps import PatchedSteps
+from fe.patched_wing import PatchedWing
 from fe.reduced import ReducedModel
+from fe.sensor_stream import needs_structure
+from fe.state import DigitalState
 
+from .errors import PatchFileError
 from .patch_file import Effect
+
+_STATE = DigitalState()
+PLAIN_STATE: dict[str, Any] = {
+    "young_modulus_factor": _STATE.young_modulus_factor,
+    "stiffness_loss": _STATE.stiffness_loss,
+    "servo_mass": _STATE.servo_mass,
+    "pitot_mass": _STATE.pitot_mass,
+    "damping_alpha": _STATE.damping_alpha,
+    "damping_beta": _STATE.damping_beta,
+}
+"""The healthy wing, on which a patch is tried when it is packed."""
 
 OWN_FILES = ("effect_variables.py", "patched_behaviour.py")
 SENSOR_FILES = ("patch.py", "sensors.py", "sensor_stream.py")
+STRUCTURE_FILES = (
+    "motion.py",
+    "motion_kernel.py",
+    "patch_arrays.py",
+    "patched_wing.py",
+    "patched_steps.py",
+)
+ARRAYS_FILE = "resources/patch_arrays.npz"
 
 ENTRY = '''"""Joins the slave, the reduced model, missing effects and pythonfmu's base class."""
 import ctypes
+import functools
 import json
 
 import numpy as np
@@ -79,7 +108,14 @@ def load_contents(resources):
 
 def load_steps(resources, model):
     """Return what makes the wing of a patch, if there are arrays for it."""
-    return None
+    path = resources / "patch_arrays.npz"
+    if not path.is_file():
+        return None
+    from .fe.patch_arrays import PatchArrays
+    from .fe.patched_steps import PatchedSteps
+    from .fe.patched_wing import PatchedWing
+
+    return functools.partial(PatchedSteps, model, PatchedWing(PatchArrays.load(path)))
 
 
 class WingSlave(_WingSlave):
@@ -102,7 +138,10 @@ def plain_effects(effects: Sequence[Effect]) -> list[dict[str, Any]]:
 
 
 def patched_members(
-    runtime: str, model: ReducedModel, effects: Sequence[dict[str, Any]]
+    runtime: str,
+    model: ReducedModel,
+    effects: Sequence[dict[str, Any]],
+    arrays: PatchArrays | None,
 ) -> dict[str, bytes]:
     """Return the further files of an FMU that carries effects, by their names in the archive.
 
@@ -114,14 +153,62 @@ def patched_members(
         The wing.
     effects : sequence of dict
         As `plain_effects` returns them.
+    arrays : PatchArrays or None
+        The same wing in the basis for patches; needed where an effect is of more than sensors.
+
+    Raises
+    ------
+    PatchFileError
+        If the arrays are missing or are those of another wing, or the wing cannot carry an effect.
     """
     own, wing = files("fmu_asset"), files("fe")
     record = {"channels": output_channels(model.gauge_count), "effects": effects}
     # The order of keys is that of the variables.
     text = json.dumps(record, indent=1, allow_nan=False)
-    return {
+    members = {
         "resources/effects.json": f"{text}\n".encode(),
         f"{runtime}/entry.py": ENTRY.encode(),
         **{f"{runtime}/{name}": (own / name).read_bytes() for name in OWN_FILES},
         **{f"{runtime}/fe/{name}": (wing / name).read_bytes() for name in SENSOR_FILES},
     }
+    patch = whole_patch(effects)
+    if needs_structure(patch):
+        if arrays is None:
+            raise PatchFileError(
+                "The patch changes structure or loads, for which the FMU needs the wing in the basis for patches: "
+                "give `arrays`, as `fe.patch_cache.patch_arrays` returns them."
+            )
+        _check_arrays(model, arrays, patch)
+        if not len(patch.of(LocalStiffnessLoss)):
+            arrays = without_strips(arrays)
+        members[ARRAYS_FILE] = arrays.to_bytes()
+        members |= {f"{runtime}/fe/{name}": (wing / name).read_bytes() for name in STRUCTURE_FILES}
+    return members
+
+
+def whole_patch(effects: Sequence[Mapping[str, Any]]) -> ModelPatch:
+    """Return all effects together."""
+    return ModelPatch.from_list([primitive for effect in effects for primitive in effect["primitives"]])
+
+
+def _check_arrays(model: ReducedModel, arrays: PatchArrays, patch: ModelPatch) -> None:
+    if arrays.design_hash != model.design_hash:
+        raise PatchFileError(
+            f"The wing for patches is of the design {arrays.design_hash[:12]}, and the reduced model of "
+            f"{model.design_hash[:12]}; make both of one design."
+        )
+    try:
+        steps = PatchedSteps(model, PatchedWing(arrays), **PLAIN_STATE, patch=patch)
+        steps.modal_data()
+    except FiniteElementError as cause:
+        raise PatchFileError(f"The wing cannot carry the patch: {cause}") from cause
+
+
+def without_strips(arrays: PatchArrays) -> PatchArrays:
+    """Return the arrays without the parts that only a local stiffness loss needs; they are most of the bytes."""
+    return replace(
+        arrays,
+        strip_stiffness=arrays.strip_stiffness[:0],
+        strip_of=arrays.strip_of[:0],
+        term_of=arrays.term_of[:0],
+    )

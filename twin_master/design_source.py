@@ -143,7 +143,7 @@ class DesignSource:
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Return the strains (E, S, U, G)."""
-        return model_observation_table(self._model, self._scenario, draws, model, self._patch)
+        return model_observation_table(self._model, self._scenario, draws, model, self._patch, self._design)
 
     def open(self) -> Asset:
         """Return the model as an asset."""

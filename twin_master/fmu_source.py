@@ -21,7 +21,7 @@ from fmu_asset.patch_file import load_patch
 from fmu_asset.script import script_fmu
 from fmu_asset.session import FmiAsset
 from reporting.files import atomic_write_bytes
-from reporting.progress import Progress
+from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_file
 from twin_master.asset_source import (
     BINDING_COPY,
@@ -39,7 +39,7 @@ from twin_master.design_source import read_calibration, read_content, read_desig
 from twin_master.errors import MissionInputError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws, draw_parameter
-from twin_master.patches import check_model_patch, effect_names, model_observation_table
+from twin_master.patches import arrays_of, check_model_patch, effect_names, model_observation_table
 from twin_master.scenario import Scenario
 from twin_master.seeds import generator
 
@@ -310,7 +310,7 @@ class FmuSource:
         hashes |= self._prepare_model(progress)
         if self._wing is not None and self._given[FMU_COPY] is None:
             with progress.stage("Packing the FMU"):
-                self._pack(self._wing, self._path(FMU_COPY), tailored=self._tailored)
+                self._pack(self._wing, self._path(FMU_COPY), tailored=self._tailored, progress=progress)
         hashes["fmu"] = hash_file(self._path(FMU_COPY))
         return hashes
 
@@ -332,15 +332,18 @@ class FmuSource:
             hashes["design"] = self._wing.design_hash
         return hashes
 
-    def _pack(self, wing: ReducedModel, target: Path, *, tailored: bool) -> None:
+    def _pack(
+        self, wing: ReducedModel, target: Path, *, tailored: bool, progress: Progress | None = None
+    ) -> None:
         """Pack an FMU to fly; where the scenario names no parameter, the start value is flown."""
         patch = None if self._given[PATCH_COPY] is None else load_patch(self._path(PATCH_COPY))
+        arrays = arrays_of(self._design, patch, progress or SilentProgress())
         if tailored and self._calibration is not None:
             pack_calibrated_wing(
-                wing, self._calibration, target, patch=patch, activate=True, replace=True
+                wing, self._calibration, target, patch=patch, activate=True, arrays=arrays, replace=True
             )
         else:
-            build_fmu(wing, target, patch=patch, activate=True, replace=True)
+            build_fmu(wing, target, patch=patch, activate=True, arrays=arrays, replace=True)
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the calibrated parameter."""
@@ -351,7 +354,7 @@ class FmuSource:
         if self._scenario.asset.observation_model == "asset" or self._wing is None:
             return self._tabulate(draws, model)
         patch = None if self._given[MODEL_PATCH_COPY] is None else self._path(MODEL_PATCH_COPY)
-        return model_observation_table(self._wing, self._scenario, draws, model, patch)
+        return model_observation_table(self._wing, self._scenario, draws, model, patch, self._design)
 
     def _tabulate(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Ask the FMU for its observation at every draw, state and control: for assets without memory."""

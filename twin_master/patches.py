@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fe.design import WingDesign
 from fe.patch import BoucWen, MicroSlip, SensorDrift
+from fe.patch_arrays import PatchArrays
+from fe.patch_cache import patch_arrays
+from fe.patched_steps import PatchedSteps
+from fe.patched_wing import PatchedWing
 from fe.reduced import ReducedModel
 from fe.state import DigitalState
 from fmu_asset.behaviour import Moment, UnacceptableEffectError, WingParameters
@@ -16,6 +21,7 @@ from fmu_asset.patch_file import PatchFile, load_patch
 from fmu_asset.patched_model import effect_values, patched_behaviour
 from fmu_asset.patched_runtime import output_channels, plain_effects
 from fmu_asset.variables import QUASI_STATIC
+from reporting.progress import Progress, SilentProgress
 from twin_master.asset_source import check_wing_scenario, wing_observation_table
 from twin_master.errors import MissionInputError
 from twin_master.graphical_model import GraphicalModel
@@ -52,6 +58,7 @@ def model_observation_table(
     draws: ParameterDraws,
     model: GraphicalModel,
     patch_file: Path | None,
+    design: WingDesign | None,
 ) -> Float:
     """Return the strains (E, S, U, G) that the twin predicts, with the effects of its patch if it has one.
 
@@ -68,7 +75,9 @@ def model_observation_table(
     patch = load_patch(patch_file)
     check_model_patch(patch, wing.gauge_count, str(patch_file))
     effects = plain_effects(patch.for_outputs(output_channels(wing.gauge_count)))
-    behaviour = patched_behaviour(wing, effects, steps_of(wing, patch))
+    arrays = arrays_of(design, patch, SilentProgress())
+    steps = None if arrays is None else partial(PatchedSteps, wing, PatchedWing(arrays))
+    behaviour = patched_behaviour(wing, effects, steps)
     moment = Moment(0.0, 0.0, effect_values(effects, active=True))
     states, controls = model.states.coordinates, scenario.control
     first, second = (scenario.state_names.index(name) for name in ("z1", "z2"))
@@ -79,7 +88,12 @@ def model_observation_table(
             parameters = _parameters(float(value))
             for state, levels in enumerate(states):
                 for index, control in enumerate(controls):
-                    inputs = (control.values["load_factor"], float(levels[first]), float(levels[second]), force)
+                    inputs = (
+                        control.values["load_factor"],
+                        float(levels[first]),
+                        float(levels[second]),
+                        force,
+                    )
                     table[row, state, index] = behaviour.start(parameters, inputs, moment).strain
     except UnacceptableEffectError as error:
         raise MissionInputError(f"the twin's model cannot carry {patch_file}: {error}") from error
@@ -113,6 +127,14 @@ def effect_names(patch_file: Path | None, gauge_count: int) -> tuple[str, ...]:
     return tuple(effect_values(effects, active=False))
 
 
-def steps_of(wing: ReducedModel, patch: PatchFile) -> Any:
-    """Return what makes the patched structure of a wing; None where the patch does not need it."""
-    return None
+def arrays_of(design: WingDesign | None, patch: PatchFile | None, progress: Progress) -> PatchArrays | None:
+    """Return the wing in the basis for patches; None where the patch does not need it.
+
+    Raises
+    ------
+    FiniteElementError
+        The design cannot be modelled.
+    """
+    if design is None or patch is None or not patch.needs_arrays:
+        return None
+    return patch_arrays(design, progress)

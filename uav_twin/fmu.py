@@ -42,6 +42,7 @@ def build(
     """Pack the wing (or a model script) as an FMI 2.0 co-simulation FMU; equal input gives equal bytes."""
     from fe.cache import reduced_model
     from fe.design import load_design
+    from fe.patch_cache import patch_arrays
     from fmu_asset.build import build_fmu
     from fmu_asset.compiled.compiler import find_compiler
     from fmu_asset.errors import FmuBuildError
@@ -62,16 +63,25 @@ def build(
     if kind == "compiled":
         find_compiler()  # before the wing is modelled, which can take a minute
     if calibration is None:
-        model = reduced_model(load_design(design), progress=RichProgress())
-        info = build_fmu(model, out, kind=kind, patch=effects, activate=activate, replace=replace)
+        shape = load_design(design)
+        model = reduced_model(shape, progress=RichProgress())
+        arrays = patch_arrays(shape, RichProgress()) if effects is not None and effects.needs_arrays else None
+        info = build_fmu(
+            model, out, kind=kind, patch=effects, activate=activate, arrays=arrays, replace=replace
+        )
     else:
         from calibration.result import CalibrationResult
         from twin_master.calibrated_asset import pack_calibrated_wing
 
         wing = CalibrationResult.load(calibration)
         model = reduced_model(wing.design, progress=RichProgress())
+        arrays = (
+            patch_arrays(wing.design, RichProgress())
+            if effects is not None and effects.needs_arrays
+            else None
+        )
         info = pack_calibrated_wing(
-            model, wing, out, kind=kind, patch=effects, activate=activate, replace=replace
+            model, wing, out, kind=kind, patch=effects, activate=activate, arrays=arrays, replace=replace
         )
         typer.echo(f"Calibrated for {wing.asset}.")
     typer.echo(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
