@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from .motion import Laws, ModalSystem, laws_of, simulate, static_solution
 from .patch import LOADS, LoadGain, ModelPatch
-from .patched_wing import LOAD_PLACE, PORTS, PatchedStructure, PatchedWing
+from .patched_wing import LOAD_PLACE, PORTS, PatchedStructure, PatchedWing, motion_basis
 from .reduced import ReducedModel
 from .transient import ModalIntegrator, TransientState
 
@@ -38,12 +38,11 @@ class _Moving(NamedTuple):
 
 
 class _Modes(NamedTuple):
-    """A structure in the basis of motion: modes, stiffness, mass."""
+    """Modes that move: angular frequencies (M,) [rad/s], shapes (n, M), and what takes displacements to them."""
 
     frequency: FloatArray
     shapes: FloatArray
-    stiffness: FloatArray
-    mass: FloatArray
+    to_modes: FloatArray
 
 
 class PatchedSteps:
@@ -171,15 +170,18 @@ class PatchedSteps:
     # ------------------------------------------------------------ in motion
 
     def _modes_of(self, structure: PatchedStructure) -> _Modes:
-        stiffness, mass = structure.motion_stiffness, structure.motion_mass
-        basis = self._wing.arrays.motion_basis
+        arrays = self._wing.arrays
+        held = np.vstack((arrays.load_tip, *(self._wing.port_row(name) for name in PORTS)))
+        solutions = structure.static(held.T)
+        basis = motion_basis(structure.static, structure.mass, arrays.start_shapes, solutions)
         # M x = K x / w^2: the low modes are the largest eigenvalues, which keep all their digits
-        to_standard = np.linalg.inv(np.linalg.cholesky(stiffness))
-        inverse_square, vectors = np.linalg.eigh(to_standard @ mass @ to_standard.T)
+        to_standard = np.linalg.inv(np.linalg.cholesky(_symmetric(basis.T @ structure.stiffness @ basis)))
+        mass = _symmetric(basis.T @ structure.mass @ basis)
+        inverse_square, vectors = np.linalg.eigh(_symmetric(to_standard @ mass @ to_standard.T))
         inverse_square = inverse_square[::-1][:MODE_COUNT]
-        shapes = to_standard.T @ vectors[:, ::-1][:, :MODE_COUNT] / np.sqrt(inverse_square)
-        shapes = shapes * np.where(self._wing.arrays.tip_row @ basis @ shapes < 0.0, -1.0, 1.0)
-        return _Modes(1.0 / np.sqrt(inverse_square), shapes, stiffness, mass)
+        shapes = basis @ (to_standard.T @ vectors[:, ::-1][:, :MODE_COUNT] / np.sqrt(inverse_square))
+        shapes = shapes * np.where(arrays.tip_row @ shapes < 0.0, -1.0, 1.0)
+        return _Modes(1.0 / np.sqrt(inverse_square), shapes, shapes.T @ structure.mass)
 
     @cached_property
     def _modes(self) -> _Modes:
@@ -193,34 +195,26 @@ class PatchedSteps:
     def _system(self) -> ModalSystem:
         alpha, beta = self._rayleigh
         omega = self._modes.frequency
-        in_modes = self._wing.arrays.motion_basis @ self._modes.shapes
-        ports = {name: self._wing.port_row(name) @ in_modes for name in PORTS}
+        ports = {name: self._wing.port_row(name) @ self._modes.shapes for name in PORTS}
         return ModalSystem(omega, np.diag(alpha + beta * omega**2), ports)
 
     @cached_property
     def _participation(self) -> FloatArray:
         """Modal forces (M, 3) of the patched unit loads."""
-        return np.asarray((self._units @ self._wing.arrays.motion_basis @ self._modes.shapes).T)
+        return np.asarray((self._units @ self._modes.shapes).T)
 
     @cached_property
-    def _motion_static(self) -> FloatArray:
-        """Displacements (r, 3 + J) in the basis of motion under unit loads and unit port forces."""
-        loads = np.vstack((self._units, self._port_rows)) @ self._wing.arrays.motion_basis
-        return np.asarray(np.linalg.solve(self._modes.stiffness, loads.T))
+    def _ports_of_modes(self) -> FloatArray:
+        """Motion (J, M) of the laws' ports by unit modal coordinates."""
+        return self._laws.rows(self._system.ports, len(self._modes.frequency))
 
     @cached_property
-    def _modal_outputs(self) -> FloatArray:
-        """Outputs (G + 2, M) of the modes."""
-        return np.asarray(self._rows @ self._wing.arrays.motion_basis @ self._modes.shapes)
-
-    @cached_property
-    def _correction(self) -> tuple[FloatArray, FloatArray]:
-        """What modes leave out of the outputs: of the change by the patch (G + 2, 3), of port forces (G + 2, J)."""
-        omega = self._modes.frequency[:, np.newaxis]
-        of_loads = self._rows @ self._answers[:, :3] - self._modal_outputs @ (self._participation / omega**2)
-        ports = self._laws.rows(self._system.ports, len(omega))
-        following = self._motion_static[:, 3:] - self._modes.shapes @ (ports / omega.T**2).T
-        return of_loads, self._rows @ self._wing.arrays.motion_basis @ following
+    def _left_out(self) -> FloatArray:
+        """Part (n, 3 + J) of the answers to unit loads and unit port forces that the modes leave out."""
+        forces = np.concatenate((self._participation, self._ports_of_modes.T), axis=1)
+        return np.asarray(
+            self._answers - self._modes.shapes @ (forces / self._modes.frequency[:, np.newaxis] ** 2)
+        )
 
     def released(self, tip_displacement: float, load_factor: float, tip_force: float) -> list[float]:
         """Return the state just after a wing that was held aside at its load point is let go.
@@ -238,23 +232,23 @@ class PatchedSteps:
         SolutionError
             If there is no equilibrium on the way.
         """
-        basis, modes, laws = self._wing.arrays.motion_basis, self._modes, self._laws
+        modes, laws = self._modes, self._laws
         omega2 = modes.frequency**2
         loads = self._acting(load_factor, tip_force)
         resting = self._participation @ loads / omega2
-        holding = self._wing.arrays.load_tip @ basis  # the release point: the holding force acts there
-        flexible = np.linalg.solve(modes.stiffness, holding)
+        holding = self._wing.arrays.load_tip  # the release point: the holding force acts there
+        flexible = self._patched.static(holding)
         compliance = float(holding @ flexible)
         shape = holding @ modes.shapes
-        goal = tip_displacement * compliance / float(self._wing.arrays.tip_row @ basis @ flexible)
-        ports = laws.rows(self._system.ports, len(omega2))
+        goal = tip_displacement * compliance / float(self._wing.arrays.tip_row @ flexible)
+        ports = self._ports_of_modes
         memory, forces = laws.memory(), np.zeros(len(laws))
         if len(laws) and np.any(loads):
             settled = static_solution(laws, (ports @ resting)[np.newaxis], (ports / omega2) @ ports.T)
             forces, memory = settled.forces[0], settled.memory
         q = resting - forces @ (ports / omega2)
         if goal != 0.0:
-            lever = (self._port_rows @ basis) @ flexible / compliance
+            lever = self._port_rows @ flexible / compliance
             # with the point held: x = x_linear - (C - a c^T / a_0) F
             held = ports / omega2 - np.outer(lever, shape / omega2)
             aside = resting + (goal / compliance - lever @ forces) * shape / omega2
@@ -272,13 +266,14 @@ class PatchedSteps:
         state = _Moving(q, np.zeros_like(q), forces, np.array((load_factor, tip_force)), memory)
         return self._packed(self._felt(state))
 
-    def _felt(self, state: _Moving, time: float = 0.0) -> _Moving:
+    def _felt(self, state: _Moving) -> _Moving:
         """Return a state with the forces of the laws at this moment."""
         if not len(self._laws):
             return state
+        constant = self._participation @ self._acting(*state.loads.tolist())
         seen = simulate(
             self._system, self._laws, q=state.q, v=state.v, force=np.zeros(1), interval=1.0,
-            constant=self._participation @ self._acting(*state.loads.tolist()), memory=state.memory, start=time,
+            constant=constant, memory=state.memory,
         )  # fmt: skip
         return state._replace(forces=seen.port_forces[0])
 
@@ -330,32 +325,22 @@ class PatchedSteps:
         values, transverse, shear : (G + 2,) ndarray
             Dimensionless and [m]; the last two are zero for displacements.
         """
-        rows, components = self._rows, self._wing.arrays.strain_rows[1:]
-        basis = self._wing.arrays.motion_basis
         if moving:
             now = self._unpacked(state)
             load_factor, tip_force = now.loads.tolist()
-            forces = now.forces
+            acting = self._acting(load_factor, tip_force)
+            still = np.concatenate((acting, -now.forces))
+            displacement = self._modes.shapes @ now.q + self._left_out @ still
         else:
             load_factor, tip_force = state[:_LOADS]
+            acting = np.array(state[_LOADS : _LOADS + 3])
             forces = np.array(state[_LOADS + 3 : _LOADS + 3 + len(self._laws)])
-        acting = self._acting(load_factor, tip_force)
-        plain = self._plain_answers @ np.array((load_factor, tip_force))
-        # of the reduced model, less the same of the wing for patches: what the patch changes is added
-        values = self._plain_outputs(load_factor, tip_force) - rows @ plain
-        if moving:
-            of_loads, of_forces = self._correction
-            values = values + self._modal_outputs @ now.q + of_loads @ acting - of_forces @ forces
-            omega2 = self._modes.frequency**2
-            following = now.q - self._participation @ acting / omega2
-            in_motion = self._modes.shapes @ following
-            ports = self._laws.rows(self._system.ports, len(omega2))
-            left_out = self._motion_static[:, 3:] - self._modes.shapes @ (ports / omega2).T
-            shown = self._answers[:, :3] @ acting + basis @ (in_motion - left_out @ forces)
-        else:
-            shown = self._answers[:, :3] @ acting - self._answers[:, 3:] @ forces
-            values = values + rows @ shown
-        across, shear = (np.append(part @ shown, (0.0, 0.0)) for part in components)
+            displacement = self._answers @ np.concatenate((acting, -forces))
+        # the reduced model, and what the patch changes of the wing for patches
+        change = displacement - self._plain_answers @ np.array((load_factor, tip_force))
+        values = self._plain_outputs(load_factor, tip_force) + self._rows @ change
+        _, *components = self._wing.arrays.strain_rows
+        across, shear = (np.append(rows @ displacement, (0.0, 0.0)) for rows in components)
         return values, across, shear
 
     def modal_data(self) -> tuple[FloatArray, FloatArray]:
@@ -380,57 +365,42 @@ class PatchedSteps:
         if not moving:
             return list(state) if same else []
         old = before._unpacked(state)
-        deviation = (
-            old.q - before._participation @ before._acting(*old.loads.tolist()) / before._modes.frequency**2
-        )
-        static = before._motion_static[:, :3] @ before._acting(*old.loads.tolist())
-        return self._carried(
-            before._modes.shapes @ deviation + static,
-            before._modes.shapes @ old.v,
-            old.loads,
-            old.memory if same else self._laws.memory(),
-        )
+        memory = old.memory if same else self._laws.memory()
+        return self._carried(before._place(old), before._modes.shapes @ old.v, old.loads, memory)
 
     def take_over_unpatched(self, state: TransientState, before: ModalIntegrator) -> list[float]:
-        """Return the state of a wing without patch in the modes of this one; its modes are matched by rank."""
-        count = len(self._modes.frequency)
-        rest = before.at_rest(*state.load.tolist())
-        deviation = (state.displacement - rest.displacement)[:count]
-        shapes = self._plain_modes.shapes[:, : len(deviation)]
-        loads = (
-            np.stack((self._wing.arrays.load_lift, self._wing.arrays.load_tip))
-            @ self._wing.arrays.motion_basis
-        )
-        static = np.linalg.solve(self._plain_modes.stiffness, loads.T) @ state.load
-        return self._carried(
-            shapes @ deviation + static, shapes @ state.velocity[:count], state.load, self._laws.memory()
-        )
+        """Return the state of a wing without patch in the modes of this one.
+
+        Modes are matched by rank; those of the other wing that have no counterpart here are lost.
+        """
+        modes = self._plain_modes
+        count = len(modes.frequency)
+        deviation = (state.displacement - before.at_rest(*state.load.tolist()).displacement)[:count]
+        place = modes.shapes @ deviation + self._plain_answers @ state.load
+        velocity = modes.shapes @ state.velocity[:count]
+        return self._carried(place, velocity, state.load, self._laws.memory())
 
     def give_back(self, state: Sequence[float], after: ModalIntegrator) -> TransientState:
         """Return a state in the modes of the wing without patch, as `take_over_unpatched` takes it."""
-        now = self._unpacked(state)
-        acting = self._acting(*now.loads.tolist())
-        deviation = now.q - self._participation @ acting / self._modes.frequency**2
-        place = self._modes.shapes @ deviation + self._motion_static[:, :3] @ acting
-        plain = self._plain_modes
-        loads = (
-            np.stack((self._wing.arrays.load_lift, self._wing.arrays.load_tip))
-            @ self._wing.arrays.motion_basis
-        )
+        now, modes = self._unpacked(state), self._plain_modes
         rest = after.at_rest(*now.loads.tolist())
         displacement, velocity = rest.displacement.copy(), rest.velocity.copy()
-        count = min(len(displacement), plain.shapes.shape[1])
-        to_modes = (plain.shapes.T @ plain.mass)[:count]
-        displacement[:count] += to_modes @ (place - np.linalg.solve(plain.stiffness, loads.T) @ now.loads)
-        velocity[:count] = to_modes @ (self._modes.shapes @ now.v)
+        count = min(len(displacement), len(modes.frequency))
+        aside = self._place(now) - self._plain_answers @ now.loads
+        displacement[:count] += (modes.to_modes @ aside)[:count]
+        velocity[:count] = (modes.to_modes @ (self._modes.shapes @ now.v))[:count]
         return TransientState(displacement, velocity, now.loads.copy())
+
+    def _place(self, state: _Moving) -> FloatArray:
+        """Displacement (n,) of a motion, without what port forces add beside the modes."""
+        acting = self._acting(*state.loads.tolist())
+        return np.asarray(self._modes.shapes @ state.q + self._left_out[:, :3] @ acting)
 
     def _carried(
         self, place: FloatArray, velocity: FloatArray, loads: FloatArray, memory: FloatArray
     ) -> list[float]:
-        """Return the state with displacement and velocity (r,) of the basis of motion."""
-        modes = self._modes
-        to_modes = modes.shapes.T @ modes.mass
+        """Return the state with displacement and velocity (n,) of the whole wing."""
+        to_modes = self._modes.to_modes
         state = _Moving(to_modes @ place, to_modes @ velocity, np.zeros(len(self._laws)), loads, memory)
         return self._packed(self._felt(state))
 
@@ -442,3 +412,7 @@ class PatchedSteps:
         sizes = (len(self._modes.frequency),) * 2 + (len(self._laws), _LOADS)
         q, v, forces, loads, rest = np.split(values, np.cumsum(sizes))
         return _Moving(q, v, forces, loads, rest.reshape(memory.shape))
+
+
+def _symmetric(matrix: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (matrix + matrix.T))

@@ -1,7 +1,7 @@
 """Sensors read one sample after the other: `fe.sensors` for a record whose end is not known.
 
-What needs no memory is `apply_sensors` on one row. A high-pass remembers the states of its stages; between two
-samples the signal is linear, as there.
+What needs no memory is `apply_sensors` on one row. A high-pass remembers the states of its stages; between
+two samples the signal is linear, as there.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -118,7 +118,8 @@ class SensorStream:
         InvalidPatchError
             If a primitive cannot be applied.
         """
-        values, after = sample.values, []
+        values = sample.values
+        after: list[float] = []
         pending = [] if memory is None else list(memory)
         rotations = tuple(item for item in self.patch if isinstance(item, SensorRotation))
         if rotations:
@@ -151,7 +152,7 @@ class SensorStream:
         )
         across = (None if part is None else part[np.newaxis] for part in (sample.transverse, sample.shear))
         shown, _ = apply_sensors(ModelPatch(items), record, values[np.newaxis], None, *across)
-        return shown[0]
+        return np.asarray(shown[0])
 
     def _columns(self, item: HighPass) -> list[int]:
         if item.channel != EVERY_CHANNEL:

@@ -57,7 +57,7 @@ _UNIT_OF: Mapping[str, Mapping[str, str | tuple[str, str]]] = {
     "line": {"frequency": "Hz", "cosine": _SHOWN, "sine": _SHOWN},
     "decaying_line": {"frequency": "Hz", "cosine": _SHOWN_PER_RELEASE, "sine": _SHOWN_PER_RELEASE},
 }  # fmt: skip
-"""Units of a primitive's numbers; those that are not here have none. Pairs: of a moving and a turning port."""
+"""Units of a primitive's numbers; others have none. Pairs: of a moving and of a turning port."""
 
 
 @dataclass(frozen=True)

@@ -303,8 +303,8 @@ class Exchange:
         Parameters
         ----------
         parameters : mapping of str to float or sequence of float
-            By the binding's names and in its units; a parameter that the binding does not name goes by its name
-            in the FMU, in the FMU's unit.
+            By the binding's names and in its units; a parameter that the binding does not name goes by its
+            name in the FMU, in the FMU's unit.
 
         Returns
         -------

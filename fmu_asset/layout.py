@@ -54,8 +54,8 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
     label : str
         Place in the binding, for the error.
     causality : {"input", "parameter", "output"}
-        What it must be; everything that is neither input nor parameter can be read, and a tunable parameter can
-        be sent at every step like an input (co-simulation).
+        What it must be; everything that is neither input nor parameter can be read, and a tunable parameter
+        can be sent at every step like an input (co-simulation).
 
     Raises
     ------

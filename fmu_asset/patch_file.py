@@ -34,10 +34,10 @@ QUANTITIES = ("", "strain", "displacement")
 
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _NO_MEANING = {
-    Clock: "inputs and outputs of an FMU belong to the communication points of its master, so there is no second "
-    "clock that could be wrong",
-    RunOffset: "an FMU has no runs between which its zero could have moved; a constant offset is a sensor_drift "
-    "with exponent 0",
+    Clock: "inputs and outputs of an FMU belong to the communication points of its master, so there is no "
+    "second clock that could be wrong",
+    RunOffset: "an FMU has no runs between which its zero could have moved; a constant offset is a "
+    "sensor_drift with exponent 0",
 }
 
 
@@ -100,7 +100,7 @@ class PatchFile:
                     raise PatchFileError(f"{label}, which has no meaning inside an FMU: {reason}.")
             if isinstance(item, HighPass) and item.order not in (1.0, 2.0, 3.0, 4.0):
                 raise PatchFileError(
-                    f"{label} of order {item.order:g}; an FMU can remember stages of whole order only, 1 to 4."
+                    f"{label} of order {item.order:g}; an FMU remembers whole stages only, order 1 to 4."
                 )
             quantity = getattr(item, "quantity", "")
             channel = getattr(item, "channel", EVERY_CHANNEL)
@@ -172,7 +172,8 @@ def _effects(rows: list[dict[str, Any]], where: str) -> tuple[Effect, ...]:
         name = row.get("id")
         if not isinstance(name, str) or not _IDENTIFIER.fullmatch(name):
             raise PatchFileError(
-                f'{where}: the "id" of effect {number} must be letters, digits and underscores, but is {name!r}.'
+                f'{where}: the "id" of effect {number} must be letters, digits and underscores, but is '
+                f"{name!r}."
             )
         try:
             patch = ModelPatch.from_list(row.get("primitives"), f"{where}, effect {name}")

@@ -1,7 +1,8 @@
 """What the wing with missing effects does in one communication step.
 
 While no effect is switched on, everything is `WingBehaviour`, to the last bit. Sensor effects act on what it
-gives; effects of structure and loads have a wing of their own (`fe.patched_steps`), which takes the motion over.
+gives; effects of structure and loads have a wing of their own (`fe.patched_steps`), which takes the motion
+over.
 
 This file is copied into the FMU; what it needs of `fe` is handed to it, as in `behaviour`.
 """
@@ -228,7 +229,7 @@ class PatchedBehaviour(WingBehaviour):
         return self._show(None, parameters, duration, moment)
 
     def _let_go(self, steps: PatchedSteps, parameters: WingParameters) -> tuple[Any, Any]:
-        """Return integrator and state of the wing without effects, after the last of them was switched off."""
+        """Return integrator and state of the wing without effects, once the last one is off."""
         integrator = self._make_integrator(parameters, self._inputs)
         return integrator, steps.give_back(self._motion, integrator)
 

@@ -127,7 +127,7 @@ class WingSlave(_WingSlave):
 
 
 def output_channels(gauge_count: int) -> tuple[tuple[str, str], ...]:
-    """Return names and quantities of the outputs that sensors show, in the order of the behaviour's values."""
+    """Return names and quantities of the outputs that sensors show, in the behaviour's order."""
     strains = tuple((f"strain[{gauge}]", "strain") for gauge in range(1, gauge_count + 1))
     return (*strains, ("tip_displacement", "displacement"), ("load_point_displacement", "displacement"))
 
@@ -175,8 +175,8 @@ def patched_members(
     if needs_structure(patch):
         if arrays is None:
             raise PatchFileError(
-                "The patch changes structure or loads, for which the FMU needs the wing in the basis for patches: "
-                "give `arrays`, as `fe.patch_cache.patch_arrays` returns them."
+                "The patch changes structure or loads, for which the FMU needs the wing in the basis for "
+                "patches: give `arrays`, as `fe.patch_cache.patch_arrays` returns them."
             )
         _check_arrays(model, arrays, patch)
         if not len(patch.of(LocalStiffnessLoss)):
@@ -205,7 +205,7 @@ def _check_arrays(model: ReducedModel, arrays: PatchArrays, patch: ModelPatch) -
 
 
 def without_strips(arrays: PatchArrays) -> PatchArrays:
-    """Return the arrays without the parts that only a local stiffness loss needs; they are most of the bytes."""
+    """Return the arrays without the parts that only a local stiffness loss needs, most of the bytes."""
     return replace(
         arrays,
         strip_stiffness=arrays.strip_stiffness[:0],

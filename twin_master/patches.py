@@ -46,9 +46,9 @@ def check_model_patch(patch: PatchFile, gauge_count: int, where: str = "The patc
             drifts = isinstance(item, SensorDrift) and item.exponent != 0.0
             if drifts or isinstance(item, MicroSlip | BoucWen):
                 raise MissionInputError(
-                    f"the effect {effect.id!r} depends on {'time' if drifts else 'the loads before'}, and the "
-                    "twin predicts the readings of each state and control once for the whole mission: leave it "
-                    "out of `asset.model_patch`."
+                    f"the effect {effect.id!r} depends on {'time' if drifts else 'the loads before'}, and "
+                    "the twin predicts the readings of each state and control once for the whole mission: "
+                    "leave it out of `asset.model_patch`."
                 )
 
 

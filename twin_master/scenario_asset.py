@@ -66,8 +66,8 @@ class AssetSection(Section):
     seeds: tuple[Name, ...] = ()
     """Parameters of the binding that are given a number drawn from the seed of the run."""
     patch: str | None = None
-    """A patch file: missing effects that the FMU packed of the design carries, switched on from the start unless
-    `parameters` says otherwise. The twin does not know of them."""
+    """A patch file: missing effects that the FMU packed of the design carries, switched on from the start
+    unless `parameters` says otherwise. The twin does not know of them."""
     model_patch: str | None = None
     """A patch file: effects that the twin's model of the design carries."""
     component: tuple[ComponentSection, ...] = ()
@@ -124,13 +124,13 @@ class AssetSection(Section):
             )
         if self.patch and (self.kind != "fmu" or self.file or self.script or not self.design):
             raise ValueError(
-                "`patch` goes into the FMU that is packed of `design`, and here another asset is flown: leave out "
-                "`patch`, or `file` and `script`"
+                "`patch` goes into the FMU that is packed of `design`, and here another asset is flown: leave "
+                "out `patch`, or `file` and `script`"
             )
         if self.model_patch and not self.model_of_the_design:
             raise ValueError(
-                "`model_patch` goes into the model of `design`, and the twin believes another one: give `design` "
-                "and leave out `observation_model`, or leave out `model_patch`"
+                "`model_patch` goes into the model of `design`, and the twin believes another one: give "
+                "`design` and leave out `observation_model`, or leave out `model_patch`"
             )
         if self.kind == "strain_library":
             self._check_library()

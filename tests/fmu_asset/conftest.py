@@ -118,7 +118,7 @@ def spring_binding() -> Binding:
 
 
 def chain_arrays(model: ReducedModel, span: float = 1.6) -> PatchArrays:
-    """Return the same chain in the form that carries patches; its basis is the chain itself, so it is exact."""
+    """Return the same chain in the form that carries patches, exact: its basis is the chain itself."""
     stations = span * np.arange(NODES + 1) / NODES
     place = np.vstack((np.zeros(NODES), np.eye(NODES)))
     difference = np.eye(NODES) - np.eye(NODES, k=-1)
@@ -168,7 +168,7 @@ def chain_arrays(model: ReducedModel, span: float = 1.6) -> PatchArrays:
         weight=weight,
         strain_rows=np.stack((gauges, -0.3 * gauges, bending)),
         tip_row=model.static_output[-1],
-        motion_basis=np.eye(NODES),
+        start_shapes=np.linalg.eigh(model.static_stiffness.sum(axis=0))[1][:, :8].copy(),
     )
 
 

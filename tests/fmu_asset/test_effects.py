@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,7 +22,6 @@ from fe.patch import (
     HighPass,
     Line,
     ModelPatch,
-    PowerDamping,
     RunOffset,
     SensorDrift,
     SensorGain,
@@ -36,7 +34,7 @@ from fmu_asset.build import build_fmu
 from fmu_asset.check import check_fmu
 from fmu_asset.effect_variables import active_primitives, effect_rows, numbers_of
 from fmu_asset.errors import FmuCallError, FmuInputError, PatchFileError
-from fmu_asset.patch_file import SCHEMA, PatchFile, load_patch, parse_patch
+from fmu_asset.patch_file import SCHEMA, PatchFile, parse_patch
 from fmu_asset.patched_runtime import output_channels, plain_effects
 from fmu_asset.session import FmiAsset
 
@@ -311,7 +309,7 @@ REFUSED = {
     "an offset of a run": (content({"seat": [RunOffset("A", 1e-3)]}), "no meaning inside an FMU"),
     "a channel that is none": (content({"gain": [SensorGain("g9", 0.1)]}), "'g9', which is no output"),
     "a channel that is no gauge": (content({"hot": [ThermalStrain("tip", 1e-6)]}), "no output of the FMU that it can"),
-    "half a stage": (content({"filter": [HighPass("g3", 1.0, 1.5)]}), "whole order"),
+    "half a stage": (content({"filter": [HighPass("g3", 1.0, 1.5)]}), "whole stages only"),
     "another quantity": (content({"gain": [SensorGain("*", 0.1, "acceleration")]}), "strains and displacements"),
     "another schema": (content(schema="uav-twin patch 9"), "uav-twin patch 9"),
     "no effect": (content({}), "names no effect"),
