@@ -38,7 +38,7 @@ class _Moving(NamedTuple):
 
 
 class _Modes(NamedTuple):
-    """Modes that move: angular frequencies (M,) [rad/s], shapes (n, M), and what takes displacements to them."""
+    """Modes that move: angular frequencies (M,) [rad/s], shapes (n, M), displacements to modes (M, n)."""
 
     frequency: FloatArray
     shapes: FloatArray

@@ -97,12 +97,8 @@ def load_contents(resources):
             np.append,
         )
         channels = tuple((name, quantity) for name, quantity in record["channels"])
-        _contents.append(
-            Contents(
-                table,
-                lambda: PatchedBehaviour(physics, setting["mode_count"], patched, record["effects"], channels),
-            )
-        )
+        given = (physics, setting["mode_count"], patched, record["effects"], channels)
+        _contents.append(Contents(table, lambda: PatchedBehaviour(*given)))
     return _contents[0]
 
 

@@ -124,8 +124,8 @@ class AssetSection(Section):
             )
         if self.patch and (self.kind != "fmu" or self.file or self.script or not self.design):
             raise ValueError(
-                "`patch` goes into the FMU that is packed of `design`, and here another asset is flown: leave "
-                "out `patch`, or `file` and `script`"
+                "`patch` goes into the FMU that is packed of `design`, and here another asset is flown: "
+                "leave out `patch`, or `file` and `script`"
             )
         if self.model_patch and not self.model_of_the_design:
             raise ValueError(

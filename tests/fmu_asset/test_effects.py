@@ -72,7 +72,7 @@ def patched(model: ReducedModel, patch: PatchFile, tmp_path_factory: pytest.Temp
 
 @pytest.fixture(scope="session")
 def everything() -> Binding:
-    """A binding of the wing that observes all outputs, and sends a switch and the temperature at every step."""
+    """A binding of the wing that observes all outputs."""
     record = {
         "binding": {"name": "all", "step_size": 0.05},
         "control": {"load_factor": {"variable": "load_factor", "unit": "1"}},
@@ -308,15 +308,14 @@ REFUSED = {
     "a clock": (content({"clock": [Clock(1e-3, 0.0)]}), "no meaning inside an FMU"),
     "an offset of a run": (content({"seat": [RunOffset("A", 1e-3)]}), "no meaning inside an FMU"),
     "a channel that is none": (content({"gain": [SensorGain("g9", 0.1)]}), "'g9', which is no output"),
-    "a channel that is no gauge": (content({"hot": [ThermalStrain("tip", 1e-6)]}), "no output of the FMU that it can"),
+    "a channel that is no gauge": (content({"hot": [ThermalStrain("tip", 1e-6)]}), "which is no output"),
     "half a stage": (content({"filter": [HighPass("g3", 1.0, 1.5)]}), "whole stages only"),
-    "another quantity": (content({"gain": [SensorGain("*", 0.1, "acceleration")]}), "strains and displacements"),
+    "another quantity": (content({"gain": [SensorGain("*", 0.1, "velocity")]}), "strains and displacements"),
     "another schema": (content(schema="uav-twin patch 9"), "uav-twin patch 9"),
     "no effect": (content({}), "names no effect"),
     "an id that is no name": (content({"a b": [SensorGain("g3", 0.1)]}), "letters, digits and underscores"),
     "nothing to do": (content({"gain": []}), "no primitives"),
-    "a wrong primitive": (b'{"schema": "uav-twin patch 1", "effects": [{"id": "a", "primitives": [{"kind": "b"}]}]}',
-                          "kind 'b'"),
+    "a wrong primitive": (content().replace(b"thermal_strain", b"magic"), "kind 'magic'"),
     "no JSON": (b"{", "is not JSON"),
 }  # fmt: skip
 
