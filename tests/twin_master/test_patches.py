@@ -70,7 +70,7 @@ def write_scenario(folder: Path, lines: str = "", parameters: str = "") -> Path:
 REFUSED = {
     "a patch for a file": ('patch = "p.json"\nfile = "wing.fmu"\n', "`patch` goes into the FMU"),
     "a patch for a script": ('patch = "p.json"\nscript = "gear_pump"\n', "`script` is packed"),
-    "a model that is the asset": ('model_patch = "p.json"\nobservation_model = "asset"\n', "`model_patch` goes"),
+    "the asset as model": ('model_patch = "p.json"\nobservation_model = "asset"\n', "`model_patch` goes"),
 }  # fmt: skip
 
 
