@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from .candidate import Candidate
-from .errors import FitError
+from .errors import FitError, ModelError
 from .problem import Base, Linearisation, Point, Problem
 
 FloatArray = NDArray[np.float64]
@@ -172,11 +172,16 @@ def fit(
             converged = True
             break
         trial_point = _bounded(_plus(state.point, step))
-        proposal = _evaluate(problem, candidate, trial_point, base, derivatives=False)
-        if proposal.objective < state.objective:
-            gain = state.objective - proposal.objective
+        try:
+            proposal = _evaluate(problem, candidate, trial_point, base, derivatives=False)
+            better = proposal.objective < state.objective
+            following = _evaluate(problem, candidate, trial_point, base) if better else state
+        except ModelError:  # outside what the structure can carry: a shorter step
+            better = False
+        if better:
+            gain = state.objective - following.objective
             damping = max(damping * (0.1 if gain > 0.5 * promised else 0.5), 1e-9)
-            state = _evaluate(problem, candidate, trial_point, base)
+            state = following
             if gain < CONVERGED and used < 1e-2:
                 converged = True
                 break

@@ -10,6 +10,7 @@ from scipy.special import logsumexp
 
 from .candidate import Candidate, Term
 from .catalogue.entry import Effect
+from .errors import ModelError
 from .fitting import Fit, fit
 from .gates import absolute_gate
 from .problem import Point, Problem
@@ -130,9 +131,12 @@ class Search:
         """Fit every effect in addition to those of `base` by chord steps; return the best of each."""
         found = []
         for changes in self.screened(base, effects).values():
-            fits = [
-                self.roughly(base, base.candidate.plus(change.term), rescaled(change)) for change in changes
-            ]
+            fits = []
+            for change in changes:
+                try:
+                    fits.append(self.roughly(base, base.candidate.plus(change.term), rescaled(change)))
+                except ModelError:  # the best scale is more than the structure can carry
+                    continue
             for item in fits:
                 self.keep(item, exact=False)
             if fits:
