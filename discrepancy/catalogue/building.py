@@ -111,6 +111,17 @@ def port_scale(setting: Setting, port: str) -> PortScale:
         ) from cause
 
 
+LARGEST_SHARE = 0.9
+"""Largest share of a port's stiffness at rest that an effect takes away; beyond it, it is built as this."""
+
+
+def removed_stiffness(setting: Setting, port: str, share: float) -> float:
+    """Return a share of the port's stiffness at rest [N/m or N m/rad], at most `LARGEST_SHARE` of it."""
+    scale = port_scale(setting, port)
+    at_rest = scale.stiffness if scale.static_stiffness is None else scale.static_stiffness
+    return min(share, LARGEST_SHARE) * at_rest
+
+
 # ---------------------------------------------------------------- places
 
 

@@ -173,6 +173,7 @@ GAUGE_MISALIGNMENT = Effect(
     confusable=("gauge_gain", "local_stiffness_loss"),
 )
 
+# The corner is no magnitude: however low, a filter that had settled takes off the value before a release.
 HIGH_PASS = Effect(
     identifier="high_pass",
     name="high-pass of a piezo gauge or AC coupling",
@@ -188,7 +189,6 @@ HIGH_PASS = Effect(
             "1",
             "corner over the first frequency, 1 / (w_1 tau)",
             Prior("log_normal", 0.005, 1.0),
-            magnitude=True,
         ),
     ),
     build=_high_pass,
