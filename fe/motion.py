@@ -155,7 +155,8 @@ def laws_of(patch: ModelPatch, ports: Collection[str]) -> Laws:
         if item.port not in ports:
             known = f"it has {', '.join(ports)}" if ports else "it has none"
             raise InvalidPatchError(
-                f"The primitive {item.kind!r} acts on the port {item.port!r}, which this model does not have; "
+                f"The primitive {item.kind!r} acts on the port {item.port!r}, which this model "
+                f"does not have; "
                 f"{known}."
             )
         for name, value in positive.items():

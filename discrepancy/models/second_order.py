@@ -195,6 +195,20 @@ class SecondOrderSystem:
         solution = _solve(laws, linear @ rows.T, rows @ flexible)
         return np.asarray(linear - solution.forces @ flexible.T)
 
+    def static_step(
+        self, load: FloatArray, laws: Laws, memory: FloatArray | None, before: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the displacement (n,) under a load (n,) reached from the load `before`, and memory.
+
+        For structures that change between load levels; `memory` None: the laws have never been loaded.
+        """
+        rows = self.port_rows(laws)
+        flexible = self.flexibility(rows.T)
+        linear = self.flexibility(load)
+        start = rows @ self.flexibility(before)
+        solution = _solve(laws, (rows @ linear)[None], rows @ flexible, memory, start)
+        return np.asarray(linear - flexible @ solution.forces[0]), solution.memory
+
     # ------------------------------------------------------------ motion
 
     def ringdown(
@@ -418,8 +432,14 @@ class SecondOrderSystem:
         return Motion(self, times, q, v, acceleration, force, row, port_forces, self.port_rows(laws))
 
 
-def _solve(laws: Laws, linear: FloatArray, compliance: FloatArray) -> StaticSolution:
+def _solve(
+    laws: Laws,
+    linear: FloatArray,
+    compliance: FloatArray,
+    memory: FloatArray | None = None,
+    start: FloatArray | None = None,
+) -> StaticSolution:
     try:
-        return static_solution(laws, linear, compliance, kernel=compiled_kernel())
+        return static_solution(laws, linear, compliance, memory=memory, start=start, kernel=compiled_kernel())
     except SolutionError as cause:
         raise ModelError(str(cause)) from cause
