@@ -291,7 +291,7 @@ def _trial(name: str, kind: TrialKind, time: FloatArray, **given: object) -> Tri
 
 
 def campaign() -> Campaign:
-    """Return a campaign on the cantilever as it is, without noise: all kinds of trial, two runs, two amplitudes.
+    """Return a campaign on the cantilever as it is, without noise: every kind of trial, two runs.
 
     Two ring-downs, one forced trial, three static ones (up, down, warm) and one flight.
     """
