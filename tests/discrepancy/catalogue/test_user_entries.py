@@ -242,5 +242,5 @@ def test_values_that_no_primitive_can_have(write, setting: Setting) -> None:
     text = BUFFER.replace('side = "2 - 1"', 'side = "0.5 * power"')
     buffer = load_catalogue([write(text)], installed=False)[-2]
     assert next(iter(buffer.patch(setting, {"share": 0.05}, "tip"))).side == 1  # type: ignore[attr-defined]
-    with pytest.raises(CatalogueError, match="side must be a number, but is 1.25"):
+    with pytest.raises(CatalogueError, match="side must be a number"):
         buffer.patch(setting, {"share": 0.05, "power": 2.5}, "tip")
