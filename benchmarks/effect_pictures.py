@@ -19,7 +19,7 @@ from fe.patch import ModelPatch
 from reporting.figures import PREDICTION, REFERENCE, new_figure, publication_style, to_png
 
 FloatArray = NDArray[np.float64]
-RESOLUTION = 92.0
+RESOLUTION = 88.0
 
 # Factor and unit of each quantity in a picture.
 UNITS = {Quantity.DISPLACEMENT: (1e3, "mm"), Quantity.STRAIN: (1e6, "microstrain")}

@@ -5,11 +5,12 @@ sent to another process.
 """
 
 from collections.abc import Callable, Mapping
-from functools import partial
+from dataclasses import dataclass
+from functools import lru_cache, partial
 
 import numpy as np
 
-from discrepancy.campaign import Channel, Quantity, Trial, TrialKind
+from discrepancy.campaign import Campaign, Channel, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import PortScale
@@ -63,8 +64,28 @@ def largest_reading(
     setting: Setting, names: tuple[str, ...], kinds: frozenset[TrialKind] = EVERY_TRIAL
 ) -> float:
     """Return the largest magnitude among the used readings of channels [its unit], 1 if all are zero."""
+    return _largest_reading(_Same(setting.campaign), names, kinds)
+
+
+@dataclass(frozen=True, eq=False)
+class _Same:
+    """A campaign, equal to itself only; it holds arrays, so it has no hash of its own."""
+
+    campaign: Campaign
+
+    def __hash__(self) -> int:
+        return id(self.campaign)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.campaign is other.campaign
+
+
+@lru_cache(maxsize=512)  # patches are built at every step of a fit
+def _largest_reading(same: _Same, names: tuple[str, ...], kinds: frozenset[TrialKind]) -> float:
     largest = 0.0
-    for trial in trials(setting, *kinds):
+    for trial in same.campaign.fitted:
+        if trial.kind not in kinds:
+            continue
         for column, name in enumerate(trial.channels):
             if name in names:
                 kept = trial.values[trial.used[:, column], column]
