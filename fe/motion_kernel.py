@@ -29,6 +29,9 @@ half width; micro-slip: stiffness, element count; Bouc-Wen: stiffness, yield dis
 HEAD = 2
 """Columns of a memory before its hysteretic elements: 1 if friction holds the port; its last position."""
 
+FIRST_PARTS = 400
+"""Parts in which the way from a law's last position to the first one of a motion is followed."""
+
 COMPILED = (
     "power", "displacement_force", "displacement_slope", "advance_memory", "damping_kick", "holding_limit",
     "crossing", "integrate", "static_forces", "static_path",
@@ -327,7 +330,7 @@ def integrate(
                 memory[j, 1] = x
         else:
             if codes[j] == MICRO_SLIP or codes[j] == BOUC_WEN:
-                advance_memory(codes[j], laws[j], slips[j], memory[j], x, 1)
+                advance_memory(codes[j], laws[j], slips[j], memory[j], x, FIRST_PARTS)
             current[j] = displacement_force(codes[j], laws[j], memory[j], x)
     for sample in range(count):
         for part in range(substeps if sample > 0 else 0):
@@ -629,6 +632,9 @@ def static_path(
                 found = size <= 1e-12 * scale
             if not found and size <= 1e-9 * scale:
                 found = True  # rounding, or a kink met exactly
+            # A solution that is not stable lies on another branch, beyond a snap.
+            if found and np.linalg.det(np.eye(count) + compliance * slope) <= -1e-9:
+                found = False
             if found:
                 x[:] = guess
                 memory[:] = reached
