@@ -33,6 +33,9 @@ FloatArray = NDArray[np.float64]
 LEAST_PARTICIPATION = 0.03
 """A mode that moves the release point less than this share of the most moving one is scaled by the share."""
 
+LEAST_LEAD = 1e-9
+"""A first sample that is later than the begin by less than this share of the interval is at the begin."""
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -293,7 +296,7 @@ class SecondOrderSystem:
             if lead < 0.0:
                 q, v = self._backwards(q, v, -lead)
                 start, lead, memory = lead, 0.0, None
-            if lead > 0.0:
+            if lead > LEAST_LEAD * interval:
                 first = simulate(
                     self.modal, laws, q=q, v=v, memory=memory, force=np.zeros(2), interval=lead,
                     refinement=refinement, kernel=compiled_kernel(),
@@ -336,7 +339,7 @@ class SecondOrderSystem:
             linear = np.outer(force[:1], shape) / self.angular_frequency**2
             solution = _solve(laws, linear @ rows.T, flexible @ rows.T)
             q, memory = (linear - solution.forces @ flexible)[0], solution.memory
-        if lead > 0.0:
+        if lead > LEAST_LEAD * float(time[-1] - time[0]):
             first = simulate(
                 modal, laws, q=q, v=v, memory=memory, force=np.array([force[0], acting[0]]), interval=lead,
                 shape=shape, start=start, refinement=refinement, kernel=compiled_kernel(),

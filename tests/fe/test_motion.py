@@ -1,5 +1,6 @@
 """Motion with internal forces against closed forms, general integrators and energy; compiled and plain."""
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -101,7 +102,7 @@ def test_a_force_that_is_linear_between_samples_is_exact() -> None:
         load = 0.7 * np.interp(tau, time, force) + 0.3
         return float(load * np.exp(-zeta * w * (time[-1] - tau)) * np.sin(wd * (time[-1] - tau)) / wd)
 
-    duhamel = sum(quad(integrand, a, b, epsabs=1e-13)[0] for a, b in zip(time[:-1], time[1:], strict=True))
+    duhamel = sum(quad(integrand, a, b, epsabs=1e-13)[0] for a, b in itertools.pairwise(time))
     assert moved.q[-1, 0] == pytest.approx(duhamel, abs=1e-12)
 
 
