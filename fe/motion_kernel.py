@@ -112,8 +112,9 @@ def advance_memory(
             z += part
             rest -= part
         if rest != 0.0:  # loading: dz/dx = 1 - |z|^order, by the midpoint rule
-            count = max(int(abs(rest) * order / 0.2) + 1, least)
-            h = abs(rest) / count
+            way = min(abs(rest), 2.0 + 40.0 / order)  # by then it yields to the last bit
+            count = max(int(way * order / 0.2) + 1, least)
+            h = way / count
             size = abs(z)
             for _ in range(count):
                 middle = min(size + 0.5 * h * (1.0 - power(size, order)), 1.0)
@@ -125,7 +126,7 @@ def advance_memory(
 def damping_kick(speed: float, strength: float, exponent: float, duration: float) -> float:
     """Return the speed after s' = -`strength` |s|^`exponent` sgn s alone has acted for `duration`."""
     size = abs(speed)
-    if size == 0.0:
+    if size == 0.0 or (exponent > 1.0 and size < 1e-60):
         return speed
     if exponent == 1.0:
         return float(speed * np.exp(-strength * duration))
