@@ -12,7 +12,7 @@ import numpy as np
 from discrepancy.campaign import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from discrepancy.campaign_file import read_campaign
 from discrepancy.campaign_writer import write_campaign
-from discrepancy.errors import CampaignFileError
+from discrepancy.errors import CampaignFileError, ModelError
 from discrepancy.model_check import prior_mean
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.noise_records import pre_trigger_record
@@ -83,6 +83,56 @@ def wing_plan(gauges: tuple[int, ...] = (0, 4, 8, 12, 17, 21)) -> ExamplePlan:
     tip = Channel("tip", Quantity.DISPLACEMENT, "tip_displacement", NoiseRecord(5e-5, 200.0), 0.0, 1e-4)
     names = tuple(channel.name for channel in channels)
     return ExamplePlan((*channels, tip), flight_channels=names)
+
+
+def plan_for(model: Model, outputs: tuple[str, ...], load_place: str | tuple[float, float]) -> ExamplePlan:
+    """Return a plan for any model: loads that move it by 2 % of its length, noise of 0.1 % of what they show.
+
+    Parameters
+    ----------
+    model : Model
+        Gives its natural scales and the size of its outputs.
+    outputs : tuple of str
+        What is measured, one channel of the same name each.
+    load_place : str or tuple of float
+        Where the force acts.
+
+    Raises
+    ------
+    ModelError
+        If the model lacks an output.
+    """
+    quantities = {output: model.output_quantity(output) for output in outputs}
+    for output, quantity in quantities.items():
+        if quantity is None:
+            raise ModelError(f"{model.name} has no output {output!r}: an example cannot measure it.")
+    scales = model.scales(Campaign("", {}, (), None, {}, ""))
+    channels = tuple(
+        Channel(name, quantity, name, NoiseRecord(1.0, 200.0))
+        for name, quantity in quantities.items()
+        if quantity is not None
+    )
+    period = 2.0 * np.pi / scales.angular_frequency
+    plan = ExamplePlan(
+        channels,
+        force=0.02 * scales.length * scales.tip_stiffness,
+        release=0.02 * scales.length,
+        duration=20.0 * period,
+        interval=period / 50.0,
+        load_place=load_place,
+    )
+    trial = _blank("", TrialKind.STATIC, plan, np.array([plan.force]), start=0.0, run="")
+    bare = Campaign("", {channel.name: channel for channel in channels}, (), None, {}, "")
+    seen = np.abs(observe(model, bare, trial, ModelPatch(), prior_mean(bare, model, trial)).values[0])
+    sized = []
+    for channel, size in zip(channels, seen.tolist(), strict=True):
+        noise = 1e-3 * (size or float(seen.max()) or 1.0)
+        sized.append(
+            replace(
+                channel, noise=NoiseRecord(noise, 200.0), gain_deviation=0.005, offset_deviation=2.0 * noise
+            )
+        )
+    return replace(plan, channels=tuple(sized))
 
 
 def example_campaign(
