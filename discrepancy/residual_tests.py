@@ -159,8 +159,11 @@ def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:
 
 
 def mean_square(residuals: ResidualSet, channels: Sequence[str]) -> tuple[float, float]:
-    """Return the sum of squares of channels over its expectation, and its effective degrees of freedom."""
-    total, parts = 0.0, []
+    """Return the sum of squares of channels over its expectation, and its effective degrees of freedom.
+
+    The trials of the set are all fitted, or all held out.
+    """
+    total, parts, held_out = 0.0, [], residuals.trials[0].trial.held_out
     for item in residuals.trials:
         for name in channels:
             if name not in item.trial.channels:
@@ -170,7 +173,7 @@ def mean_square(residuals: ResidualSet, channels: Sequence[str]) -> tuple[float,
             total += float(np.sum(item.standardised[used, column] ** 2))
             sensitive = None if item.sensitivity is None else item.sensitivity[used, column]
             parts.append((item.expected_variance[used, column], sensitive))
-    mean, freedom = quadratic_moments(parts)
+    mean, freedom = quadratic_moments(parts, held_out=held_out)
     return (total / mean if mean > 0.0 else np.nan), freedom
 
 
