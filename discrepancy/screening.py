@@ -202,8 +202,8 @@ def rescaled(change: Change) -> FloatArray:
         prior = item.prior
         value = prior.value(float(start[number])) * factor
         if prior.shape == "log_normal":
-            value = max(value, prior.value(-0.9 * LARGEST_EFFECT))
-        start[number] = np.clip(prior.normal(value), -0.9 * LARGEST_EFFECT, 0.9 * LARGEST_EFFECT)
+            value = max(value, prior.value(-0.7 * LARGEST_EFFECT))
+        start[number] = np.clip(prior.normal(value), -0.7 * LARGEST_EFFECT, 0.7 * LARGEST_EFFECT)
     return start
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from math import comb, exp, inf, log
+from math import ceil, comb, exp, inf, log
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from .catalogue.entry import Effect
 from .errors import ModelError
 from .fitting import Fit, fit
 from .gates import absolute_gate
-from .problem import Point, Problem
+from .problem import Point, Problem, shortened
 from .screening import Change, Screen, rescaled
 
 FloatArray = NDArray[np.float64]
@@ -31,6 +31,14 @@ EXACT_FITS = 5
 WORTH_ADDING = 1.0
 """Screened gain below which one more effect is not fitted [nat]."""
 PAIRS_FITTED = 10
+FAR = 1.5
+"""Chi-square per sample above which a fit is far from the truth."""
+BEGINNING, LEAST_SAMPLES = 4.0, 60
+"""The beginning of a record: this many periods of the first mode, at least that many samples."""
+SHORT_STEPS, FAR_STEPS = 8, 6
+"""Steps on the beginnings, and then on whole records, before candidates are compared."""
+FAR_FITS = 8
+"""Candidates that go on from the beginnings to whole records."""
 
 Key = tuple[tuple[str, str], ...]
 
@@ -55,7 +63,9 @@ class Search:
     exact : dict of Key to Fit
         Fitted to convergence.
     rough : dict of Key to Fit
-        Fitted by chord steps only; their evidence is approximate.
+        Fitted by few steps only; their evidence is approximate.
+    beginnings : Problem or None
+        The problem with the beginnings of its records, once it was needed.
     """
 
     problem: Problem
@@ -63,6 +73,7 @@ class Search:
     none: Fit
     exact: dict[Key, Fit] = field(default_factory=dict)
     rough: dict[Key, Fit] = field(default_factory=dict)
+    beginnings: Problem | None = None
 
     def __post_init__(self) -> None:
         self.exact[()] = self.none
@@ -128,7 +139,20 @@ class Search:
         return sorted(found, key=_worth)[:STARTS]
 
     def scan(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
-        """Fit every effect in addition to those of `base` by chord steps; return the best of each."""
+        """Fit every effect roughly in addition to those of `base`; return the best of each, best first.
+
+        Close to the truth one linearisation serves all (chord steps). Far from it phases slip over a long record,
+        so that the beginnings of the records are fitted first, and the whole ones from there.
+        """
+        if base.chi_square < FAR * float(self.problem.counts.sum()):
+            found = self._scan_near(base, effects)
+        else:
+            found = self._scan_far(base, tuple(effects))
+        for item in found:
+            self.keep(item, exact=False)
+        return sorted(found, key=lambda item: -self.score(item))
+
+    def _scan_near(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
         found = []
         for changes in self.screened(base, effects).values():
             fits = []
@@ -137,11 +161,53 @@ class Search:
                     fits.append(self.roughly(base, base.candidate.plus(change.term), rescaled(change)))
                 except ModelError:  # the best scale is more than the structure can carry
                     continue
-            for item in fits:
-                self.keep(item, exact=False)
             if fits:
                 found.append(max(fits, key=self.score))
-        return sorted(found, key=lambda item: -self.score(item))
+        return found
+
+    def _scan_far(self, base: Fit, effects: tuple[Effect, ...]) -> list[Fit]:
+        short = self._short()
+        near = fit(short, base.candidate, base.point, evidence=False)
+        screen = Screen(short, near)
+        starts = []
+        for effect in effects:
+            fits = []
+            for change in self._starts(screen, effect):
+                candidate = base.candidate.plus(change.term)
+                start = Point(
+                    near.point.shared, near.point.local, np.concatenate((near.point.effect, rescaled(change)))
+                )
+                try:
+                    fits.append(fit(short, candidate, start, iterations=SHORT_STEPS, evidence=False))
+                except ModelError:
+                    continue
+            if fits:
+                starts.append(min(fits, key=lambda item: item.objective))
+        starts.sort(key=lambda item: item.objective)
+        found: list[Fit] = []
+        least = base.objective
+        for item in starts[:FAR_FITS]:
+            try:
+                whole = fit(self.problem, item.candidate, item.point, iterations=FAR_STEPS, give_up=least)
+            except ModelError:
+                continue
+            least = min(least, whole.objective + CLOSE)
+            found.append(whole)
+        return found
+
+    def _short(self) -> Problem:
+        """Return the problem with the beginnings of its dynamic records only."""
+        if self.beginnings is None:
+            period = 2.0 * np.pi / self.problem.setting.scales.angular_frequency
+            trials = []
+            for data in self.problem.trials:
+                trial = data.trial
+                count = len(trial.time)
+                if trial.is_dynamic:
+                    count = min(count, max(LEAST_SAMPLES, ceil(BEGINNING * period / trial.interval)))
+                trials.append(shortened(trial, count))
+            self.beginnings = self.problem.with_trials(tuple(trials))
+        return self.beginnings
 
     def roughly(self, base: Fit, candidate: Candidate, added: FloatArray) -> Fit:
         """Fit a candidate by chord steps from a base."""
@@ -153,7 +219,10 @@ class Search:
         key = key_of(rough.candidate)
         found = self.exact.get(key)
         if found is None or found.log_evidence < rough.log_evidence - 5.0:
-            found = fit(self.problem, rough.candidate, rough.point)
+            try:
+                found = fit(self.problem, rough.candidate, rough.point)
+            except ModelError:  # chord steps led to where the structure cannot follow
+                found = rough
             self.keep(found, exact=True)
         return self.exact[key]
 
@@ -162,7 +231,9 @@ class Search:
         if not rough:
             return []
         top = self.score(rough[0])
-        chosen = [item for item in rough[:EXACT_FITS] if self.score(item) > max(top - CLOSE, floor)]
+        # far from the truth, chord steps rank only roughly
+        margin = max(CLOSE, 0.5 * (top - floor))
+        chosen = [item for item in rough[:EXACT_FITS] if self.score(item) > max(top - margin, floor)]
         return sorted((self.exactly(item) for item in chosen), key=lambda item: -self.score(item))
 
     # ---------------------------------------------------------------- the search
