@@ -91,7 +91,10 @@ def sample_outliers(values: FloatArray, used: BoolArray | None = None) -> BoolAr
     none = np.zeros(count, dtype=bool)
     if count < 4 * _EDGE + 4 or (used is not None and used.sum() < 0.5 * count):
         return none
-    clean = np.array(values, dtype=np.float64)
+    size = float(np.max(np.abs(values)))
+    if size == 0.0:
+        return none
+    clean = values / size  # squares of readings of any size stay in range
     if used is not None and not used.all():
         rows = np.arange(count)
         clean[~used] = np.interp(rows[~used], rows[used], clean[used])
