@@ -99,7 +99,7 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
             yield _noise_fault(channel, stated, found.standard_deviation, "repeated trials scatter")
             return
     rough = [
-        (roughness(trial.values[:, column]), len(trial.time))
+        roughness(trial.values[:, column]) / trial.noise_factor
         for trial in campaign.trials
         if trial.is_dynamic
         for column, name in enumerate(trial.channels)
@@ -107,7 +107,7 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
     ]
     # Only downwards: a fast mode may well be rougher than the noise, but nothing is smoother than its noise.
     if rough:
-        white = min(rough)[0]
+        white = min(rough)
         if 0.0 < white < stated / _NOISE_FACTOR:
             yield _noise_fault(channel, stated, white, "neighbouring samples scatter")
 

@@ -39,9 +39,10 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     steady (static, flight), and the ratio of amplitudes in records in time, whose phase the model need not
     know. A scale is a slip if it is near 10^3, 10^6, 10^9 (within a factor of 3), 100 (1.7) or 9.81 (1.35) or
     one over them, in most trials of the channel; where all channels of some trials slip alike, the input of
-    those trials does. Negative slopes are reversed signs. Channels of one quantity are swapped if exchanging
-    them leaves each less than half of its misfit and explains 30 units of chi-square (with 2 % of the
-    prediction as a floor of the noise). Signals of unknown scale are left out of all this.
+    those trials does. Negative slopes are reversed signs (of trials at rest, if the channel is in any).
+    Channels of one quantity are swapped if exchanging them leaves each less than half of its misfit and
+    explains 30 units of chi-square (with 2 % of the prediction as a floor of the noise). Signals of unknown
+    scale are left out of all this.
     """
     missing = tuple(_missing_outputs(campaign, model))
     if missing:
@@ -57,7 +58,7 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     # What an exchange explains is no slip and no reversed sign.
     scales = {key: scale for key, scale in scales.items() if key[0] not in exchanged}
     faults += _slips(campaign, scales)
-    faults += _signs(scales)
+    faults += _signs(campaign, scales)
     return (*faults, *(fault for _, fault in swaps))
 
 
@@ -141,7 +142,7 @@ def _scales(campaign: Campaign, predictions: dict[str, FloatArray]) -> dict[tupl
             used = trial.used[:, column]
             data, model = trial.values[used, column], predictions[trial.name][used, column]
             expected = _amplitude(model, trial)
-            noise = 0.0 if channel.noise is None else channel.noise.standard_deviation
+            noise = 0.0 if channel.noise is None else channel.noise.standard_deviation * trial.noise_factor
             if expected <= _VISIBLE * largest[trial.name, channel.quantity] or expected == 0.0:
                 continue
             scale = _slope(data, model) if not trial.is_dynamic else _dynamic_scale(data, model, trial, used)
@@ -206,15 +207,12 @@ def _slips(campaign: Campaign, scales: dict[tuple[str, str], float]) -> Iterator
         for name, factors in by_channel.items()
         if factors[0] is not None and all(item == factors[0] for item in factors)
     }
-    every_channel = set(wrong_channels) == set(by_channel) and len(set(wrong_channels.values())) == 1
-    loaded = all(trial.kind is not TrialKind.RINGDOWN for trial in campaign.trials)
-    if every_channel and len(by_channel) > 1 and loaded:
-        factor = next(iter(wrong_channels.values()))
+    shared = set(wrong_channels.values())
+    if set(wrong_channels) == set(by_channel) and len(by_channel) > 1 and len(shared) == 1:
         yield DataFault(
             FaultKind.INPUT_SLIP,
-            f"All channels of all trials are about {factor:.6g} times what the model says: check the "
-            "unit of the "
-            "forces (N) or load factors (1).",
+            f"All channels of all trials are about {shared.pop():.6g} times what the model says: check the "
+            "units of forces (N), load factors (1) and release displacements.",
         )
         return
     for name, factor in wrong_channels.items():
@@ -264,10 +262,14 @@ def _slip_sentence(campaign: Campaign, name: str, factor: float, where: str = ""
 # ---------------------------------------------------------------- signs
 
 
-def _signs(scales: dict[tuple[str, str], float]) -> Iterator[DataFault]:
+def _signs(campaign: Campaign, scales: dict[tuple[str, str], float]) -> Iterator[DataFault]:
+    dynamic = {trial.name for trial in campaign.trials if trial.is_dynamic}
+    at_rest = {name for name, trial in scales if trial not in dynamic}
     by_channel: dict[str, list[float]] = defaultdict(list)
-    for (name, _), scale in scales.items():
-        by_channel[name].append(scale)
+    for (name, trial), scale in scales.items():
+        # A filter turns the phase of a motion; readings at rest know no phase and go first.
+        if trial not in dynamic or name not in at_rest:
+            by_channel[name].append(scale)
     reversed_channels = [name for name, found in by_channel.items() if max(found) < 0.0]
     if len(reversed_channels) == len(by_channel) > 1:
         yield DataFault(
@@ -311,7 +313,7 @@ def _swaps_of(
         for row, own in enumerate(columns):
             channel = campaign.channels[names[row]]
             used = trial.used[:, own]
-            noise = 0.0 if channel.noise is None else channel.noise.standard_deviation
+            noise = 0.0 if channel.noise is None else channel.noise.standard_deviation * trial.noise_factor
             for place, other in enumerate(columns):
                 misfit[row, place] += _misfit(
                     trial.values[used, own],
@@ -343,14 +345,18 @@ def _misfit(
     """Return chi-square of data about a prediction, with a share of the prediction as the least deviation."""
     if dynamic:
         # Amplitudes only: a small error of frequency would outweigh what the places of two gauges differ by.
-        one = np.array([np.sqrt(np.mean((data - np.mean(data)) ** 2))])
-        other = np.array([np.sqrt(np.mean((model - np.mean(model)) ** 2))])
+        one, other = np.array([np.std(data)]), np.array([np.std(model)])
         sign = 1.0 if float(data[: max(len(data) // 50, 3)].mean() * model[0]) >= 0.0 else -1.0
         deviation = np.hypot(noise / np.sqrt(len(data)), _FLOOR * other)
-        return float(np.sum(((sign * one - other) / np.maximum(deviation, 1e-300)) ** 2))
+        return _chi_square(sign * one - other, deviation)
     rest = data - model
     if offset_deviation > 0.0:
         rest = rest - np.median(rest)
     deviation = np.maximum(np.hypot(noise, _FLOOR * np.abs(model)), 1e-300)
     deviation = np.maximum(deviation, _FLOOR * float(np.max(np.abs(model), initial=0.0)) * 0.2)
-    return float(np.sum((rest / deviation) ** 2))
+    return _chi_square(rest, deviation)
+
+
+def _chi_square(rest: FloatArray, deviation: FloatArray) -> float:
+    # Bounded: readings of any size stay comparable.
+    return float(np.sum(np.minimum(np.abs(rest / np.maximum(deviation, 1e-300)), 1e9) ** 2))

@@ -91,7 +91,10 @@ def sample_outliers(values: FloatArray, used: BoolArray | None = None) -> BoolAr
     none = np.zeros(count, dtype=bool)
     if count < 4 * _EDGE + 4 or (used is not None and used.sum() < 0.5 * count):
         return none
-    clean = np.array(values, dtype=np.float64)
+    size = float(np.max(np.abs(values)))
+    if size == 0.0:
+        return none
+    clean = values / size  # squares of readings of any size stay in range
     if used is not None and not used.all():
         rows = np.arange(count)
         clean[~used] = np.interp(rows[~used], rows[used], clean[used])
@@ -203,7 +206,8 @@ def _repeat_outliers(campaign: Campaign, channel: Channel) -> dict[str, BoolArra
         if channel.offset_deviation > 0.0:
             stack = stack - np.median(stack - np.median(stack, axis=0), axis=1, keepdims=True)
         rest = stack - np.median(stack, axis=0)
-        scale = max(channel.noise.standard_deviation, _NORMAL * float(np.median(np.abs(rest))))
+        noise = channel.noise.standard_deviation * group[0].noise_factor
+        scale = max(noise, _NORMAL * float(np.median(np.abs(rest))))
         far = np.abs(rest) > SIGNIFICANT_ROW * scale
         # A trial that is off in several rows has an offset or a gain of its own; that is no single reading.
         for trial, row in zip(group, far, strict=True):
@@ -219,7 +223,7 @@ def _row_outlier(trial: Trial, values: FloatArray, used: BoolArray, channel: Cha
     if channel.noise is None or len(rows) < 8 or np.ptp(load[rows]) == 0.0:
         return found
     basis = np.vander(load[rows] / np.max(np.abs(load[rows])), 3)
-    noise = channel.noise.standard_deviation
+    noise = channel.noise.standard_deviation * trial.noise_factor
     best, worst = np.inf, -1
     for index in range(len(rows)):
         others = np.arange(len(rows)) != index

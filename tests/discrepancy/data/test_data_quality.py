@@ -140,7 +140,21 @@ def test_input_slips(oscillator, campaign) -> None:
     static = replace(campaign, trials=tuple(kilo(t) for t in campaign.trials if t.kind is TrialKind.STATIC))
     (fault,) = check_against_model(static, oscillator)
     assert fault.kind is FaultKind.INPUT_SLIP
-    assert "check the unit of the forces" in fault.sentence
+    assert "check the units of forces" in fault.sentence
+
+
+def test_slip_of_a_release(oscillator, campaign) -> None:
+    def in_millimetres(trial: Trial) -> Trial:
+        if trial.release is None:
+            return trial
+        return replace(trial, release=replace(trial.release, displacement=1e3 * trial.release.displacement))
+
+    faults = check_against_model(
+        replace(campaign, trials=tuple(map(in_millimetres, campaign.trials))), oscillator
+    )
+    assert {fault.kind for fault in faults} == {FaultKind.INPUT_SLIP}
+    assert {fault.trial for fault in faults} == {f"release {number}" for number in range(1, 5)}
+    assert all("about 0.001 times" in fault.sentence for fault in faults)
 
 
 def test_signs(oscillator, campaign) -> None:
