@@ -10,6 +10,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.special import chdtrc, fdtrc
 
 from discrepancy.residuals import ResidualSet, quadratic_moments
 
@@ -137,8 +138,8 @@ def combine(p_values: Sequence[float]) -> float:
 def variance_p_value(mean_square: float, freedom: float, noise_freedom: float) -> float:
     """Return P(mean square this large) against a noise record: F, or chi^2 if the noise is exact."""
     if np.isinf(noise_freedom):
-        return float(stats.chi2.sf(mean_square * freedom, freedom))
-    return float(stats.f.sf(mean_square, freedom, noise_freedom))
+        return float(chdtrc(freedom, mean_square * freedom))
+    return float(fdtrc(freedom, noise_freedom, mean_square))
 
 
 def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:

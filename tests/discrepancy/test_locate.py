@@ -105,12 +105,12 @@ def test_global_false_alarms_are_one_percent(make_bench, count: int, freedom: fl
     bench = make_bench(count=count, noise_freedom=freedom)
     generator = np.random.default_rng([17, count])
     alarms = 0
-    cases = 400
+    cases = 300
     for _ in range(cases):
         fitted = bench.fit(generator)
         tests = (variance_test(fitted), *serial_tests(fitted, fitted.white(generator)))
         alarms += any(holm([test.p_value for test in tests], 0.01))
-    # At 1 % more than 11 of 400 have a probability of 0.1 %.
+    # At 1 % more than 9 of 300 have a probability of 0.1 %.
     assert alarms <= stats.binom.ppf(0.999, cases, 0.01)
 
 
@@ -198,6 +198,30 @@ def test_hum_is_common_to_all_channels_and_a_line(make_bench) -> None:
     assert line.rejected
     assert line.where.endswith("17 Hz")
     assert found.patterns[0].meaning == "common"
+    told = next(item for item in found.disagreements if item.dependence != "channels")
+    assert told.dependence == "a line at 17 Hz"
+    assert told.share > 0.9
+
+
+def test_a_mode_that_the_model_lacks_is_a_decaying_line(make_bench) -> None:
+    bench = make_bench()
+    shape = np.array([0.2, 0.5, -0.3, 0.1])
+    extra = {n: 40.0 * shape * (np.cos(2 * np.pi * 9.0 * t.time + n) * np.exp(-2.0 * t.time))[:, np.newaxis]
+             for n, t in enumerate(bench.trials[:-1])}  # fmt: skip
+    found = locate(bench.fit(np.random.default_rng(4), extra=extra))
+    told = next(item for item in found.disagreements if item.dependence != "channels")
+    assert told.dependence in ("a decaying line at 9 Hz", "a decaying line at 9.08 Hz")
+    assert told.share > 0.8
+    assert told.sentence.startswith("All channels, a decaying line at 9")
+
+
+def test_outliers_are_remarked_as_errors_of_the_data(make_bench) -> None:
+    bench = make_bench()
+    spikes = np.zeros((300, 4))
+    spikes[[20, 150, 280], [0, 2, 2]] = 30.0
+    found = locate(bench.fit(np.random.default_rng(4), extra={1: spikes}))
+    assert any("g1 (1), g3 (2)" in remark for remark in found.remarks)
+    assert not any("outliers" in r for r in locate(bench.fit(np.random.default_rng(4))).remarks)
 
 
 def test_temperature_is_told(make_bench) -> None:
