@@ -124,6 +124,7 @@ def _common(work: Workbench, joint: Scale, free: Scale, frequencies: FloatArray)
         "dynamic": plan.dynamic_channels,
         "dynamic_range": work.ranges(),
         "noise": {c.name: c.noise for c in channels},
+        "scale": {c.name: c.scale for c in channels},
         "release": max(abs(trial.release) for trial in rings),
         "displacements": tuple(c.name for c in channels if c.quantity == "displacement"),
         "runs": tuple(dict.fromkeys(trial.run for trial in static)),
@@ -298,6 +299,7 @@ def orders(
     trap_count: int,
     seed: int,
     kinds: tuple[str, ...] = KINDS,
+    rigs: tuple[str, ...] = ("wing", "lumped"),
 ) -> list[Order]:
     """Return the cases to make, in an order and with names that tell nothing.
 
@@ -315,6 +317,8 @@ def orders(
         Of everything.
     kinds : tuple of str
         Which of `KINDS`.
+    rigs : tuple of str
+        Which rigs; with one, effects that it cannot hide are left out.
     """
     generator = np.random.default_rng([seed, 77])
     wanted: list[tuple[str, str, tuple[str, ...], str]] = []
@@ -336,7 +340,7 @@ def orders(
         for number in range(trap_count):
             rig = trap.rigs[number % len(trap.rigs)]
             wanted.append(("trap", rig, (), name))
-    wanted = [item for item in wanted if item[0] in kinds]
+    wanted = [item for item in wanted if item[0] in kinds and item[1] in rigs]
     shuffled = [wanted[k] for k in generator.permutation(len(wanted))]
     return [
         Order(f"case-{number:04d}", kind, rig, names, seed * 100003 + number, trap)

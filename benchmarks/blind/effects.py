@@ -53,8 +53,8 @@ class Bench:
         Strain channels, and channels of ring-downs.
     dynamic_range : mapping of str to float
         Largest reading of each of them [unit].
-    noise : mapping of str to float
-        Noise of each channel [unit].
+    noise, scale : mapping of str to float
+        Noise of each channel [unit]; SI value of its unit.
     release : float
         Largest release [m].
     displacements : tuple of str
@@ -84,6 +84,7 @@ class Bench:
     dynamic: tuple[str, ...]
     dynamic_range: Mapping[str, float]
     noise: Mapping[str, float]
+    scale: Mapping[str, float]
     release: float
     displacements: tuple[str, ...]
     runs: tuple[str, ...]
@@ -347,7 +348,7 @@ def gauge_zero_drift(generator: np.random.Generator, bench: Bench) -> Hidden:
     # The rate is what can be told, whatever time the amplitude refers to.
     return _fault(
         "gauge_zero_drift", Fault("drift", (channel,), (value, 1.0)),
-        {"gauge_zero_drift.rate": value / bench.duration}, channel,
+        {"gauge_zero_drift.rate": bench.scale[channel] * value / bench.duration}, channel,
     )  # fmt: skip
 
 
@@ -393,7 +394,7 @@ def mains_hum(generator: np.random.Generator, bench: Bench) -> Hidden:
     return _fault(
         "mains_hum",
         Fault("line", (channel,), (frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))),
-        {"mains_hum.frequency": frequency, "mains_hum.amplitude": amplitude},
+        {"mains_hum.frequency": frequency, "mains_hum.amplitude": amplitude * bench.scale[channel]},
         f"{line:g} Hz, {channel}",
     )
 
@@ -413,7 +414,7 @@ def unmodelled_mode(generator: np.random.Generator, bench: Bench) -> Hidden:
         {
             "unmodelled_mode.frequency": float(frequency),
             "unmodelled_mode.damping_ratio": ratio,
-            "unmodelled_mode.amplitude": amplitude,
+            "unmodelled_mode.amplitude": amplitude * bench.scale[channel],
         },
         channel,
     )
