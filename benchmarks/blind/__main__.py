@@ -76,9 +76,7 @@ def generate(arguments: argparse.Namespace) -> int:
 def score(arguments: argparse.Namespace) -> int:
     cases, missing = load_cases(arguments.out)
     if not cases:
-        print(
-            f"there are no verdicts in {arguments.out / 'verdicts'} for the cases in {arguments.out / 'sealed'}"
-        )
+        print(f"there are no verdicts in {arguments.out / 'verdicts'} for the cases in sealed/")
         return 2
     text = report(cases, missing)
     (arguments.out / "score.md").write_text(text, encoding="utf-8")

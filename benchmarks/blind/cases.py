@@ -75,7 +75,7 @@ class Case:
 class Workbench:
     """A rig with its campaign plan and its scales."""
 
-    def __init__(self, rig: Rig, plan: CampaignPlan, make_bench: Callable[["Workbench"], Bench]) -> None:
+    def __init__(self, rig: Rig, plan: CampaignPlan, make_bench: Callable[[Workbench], Bench]) -> None:
         self.rig, self.plan, self._make_bench = rig, plan, make_bench
 
     @cached_property

@@ -1,9 +1,9 @@
 """How far a hidden effect stands out of the noise when everything else is fitted again.
 
-d^2 is the least sum of squared differences, over noise, between the signals with the effect and those of the
-nominal structure whose calibrated parameters, gains, zeros and release amplitudes may move as their priors let
-them: twice the log likelihood ratio that the data could at best show. Gauss-Newton, with derivatives taken
-once.
+d^2 is the least sum of squared differences, over noise, between the signals with the effect and those of
+the nominal structure whose calibrated parameters, gains, zeros and release amplitudes may move as their
+priors let them: twice the log likelihood ratio that the data could at best show. Gauss-Newton, with
+derivatives taken once.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the instruments of a campaign show: faults that are hidden, then gains, zeros and noise that always are."""
+"""What the instruments of a campaign show: hidden faults, then the gains, zeros and noise of every campaign."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Rig(Protocol):
         place_error: float = 0.0,
         split: int = 1,
     ) -> tuple[FloatArray, FloatArray]:
-        """Outputs of a trial in SI units."""
+        """Return the outputs of a trial in SI units."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def draw_chance(generator: np.random.Generator, plan: CampaignPlan) -> Chance:
 
 
 def true_signals(rig: Rig, plan: CampaignPlan, chance: Chance, changes: Changes) -> Signals:
-    """What ideal channels with the hidden faults show: (rows, channels) by trial, in the channels' units."""
+    """Return what channels without noise show: (rows, channels) by trial, in the channels' units."""
     temperatures = {trial.temperature for trial in plan.trials}
     structures = {t: rig.structure(chance.parameters, changes, t) for t in temperatures}
     filtered = {name for fault in changes.faults if fault.kind == "high_pass" for name in fault.channels}
@@ -162,7 +162,7 @@ class Measured:
 
 
 def coloured(generator: np.random.Generator, count: int, correlation: float) -> FloatArray:
-    """Unit noise (count,), autoregressive of first order with a correlation between samples."""
+    """Return unit noise (count,), autoregressive of first order with a correlation between samples."""
     white = generator.standard_normal(count + 50)
     return np.asarray(lfilter([np.sqrt(1.0 - correlation**2)], [1.0, -correlation], white))[50:]
 
@@ -190,7 +190,7 @@ def measure(
     correlation : float
         Between successive samples of the noise of ring-downs and of the noise record.
     noise_factor : float
-        True noise over the one that is stated where there is no noise record.
+        True noise over the one that the channels are planned with.
     """
     gain = {c.name: 1.0 + c.gain * float(generator.standard_normal()) for c in plan.channels.values()}
     values = {}

@@ -277,7 +277,7 @@ def integrate(state, z, w2, c, rho, b, r, beta, kinds, numbers, slip, stiffness,
             new = _step(state, time, left, *a)
             taken, event = left, False
             if rigid >= 0 and mode[rigid] != 0.0 and events < 8:
-                v0, v1 = _velocity(state, b, rigid) * mode[rigid], _velocity(new, b, rigid) * mode[rigid]
+                v1 = _velocity(new, b, rigid) * mode[rigid]
                 if v1 < 0.0:
                     low, high = 0.0, left
                     for _ in range(45):

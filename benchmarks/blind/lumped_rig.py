@@ -1,4 +1,4 @@
-"""A rig of three masses on a joint: its nominal model for the naming side, and the rig with something hidden."""
+"""A rig of three masses on a joint: its nominal model for whoever names, and the rig with something hidden."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ class LumpedRig:
         place_error: float = 0.0,
         split: int = 1,
     ) -> tuple[FloatArray, FloatArray]:
-        """Outputs (n, C) of a trial, see `WingRig.respond`."""
+        """Return the outputs (n, C) of a trial, see `WingRig.respond`."""
         end = PORTS["end"]
         if trial.kind == "static":
             force = (1.0 + changes.force_gain) * trial.rows + changes.force_tare

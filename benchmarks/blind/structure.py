@@ -25,14 +25,14 @@ from benchmarks.blind.laws import (
 FloatArray = NDArray[np.float64]
 
 STEP = 4e-4
-"""Largest time step [s] of the integration; halving it changes no output by more than 1e-6 of the largest."""
+"""Largest time step [s] of the integration; a quarter of it changes no reading by more than 0.04 noises."""
 LOAD_STEPS = 32
 """Increments between two load levels on the path of a static trial."""
 
 
 @njit(cache=True)
 def _static_path(linear, flexibility, kinds, numbers, slip, stiffness, z, bouc, steps):
-    """Forces (N, P) of elastic and hysteretic laws at each row of the motion `linear` (N, P) without them.
+    """Return the forces (N, P) of elastic laws at each row of the motion `linear` (N, P) without them.
 
     x + G F(x) = x_linear, by Newton's method with differences, in `steps` increments from row to row and
     from rest to the first. `z` (P, E) and `bouc` (P,) are the state of the hysteresis; they are advanced.
@@ -40,7 +40,7 @@ def _static_path(linear, flexibility, kinds, numbers, slip, stiffness, z, bouc, 
     rows, p = linear.shape
     forces = np.zeros((rows, p))
     x, x0, before = np.zeros(p), np.zeros(p), np.zeros(p)
-    force, moved = np.zeros(p), np.zeros(p)
+    force = np.zeros(p)
     matrix = np.zeros((p, p))
     for row in range(rows):
         for step in range(1, steps + 1):
@@ -166,20 +166,18 @@ class Structure:
         return factors
 
     def solve(self, load: FloatArray) -> FloatArray:
-        """Static displacement (r,) or (r, n) under loads."""
+        """Return the static displacement (r,) or (r, n) under loads."""
         return np.asarray(linalg.cho_solve(self._factors, load))
 
     def higher(self, load: FloatArray) -> FloatArray:
-        """Static displacement (r, n) under loads (r, n) that the modes do not hold."""
+        """Return the static displacement (r, n) under loads (r, n) that the modes do not hold."""
         if self.modes >= len(self.mass):
             return np.zeros_like(load)
         w2, shapes = self._modal
         return self.solve(load) - shapes @ ((shapes.T @ load) / w2[:, None])
 
-    def static(
-        self, loads: FloatArray, laws: Sequence[Law] = (), path: FloatArray | None = None
-    ) -> FloatArray:
-        """Outputs (n, C) under loads (r, n), applied one after the other from rest.
+    def static(self, loads: FloatArray, laws: Sequence[Law] = ()) -> FloatArray:
+        """Return the outputs (n, C) under loads (r, n), applied one after the other from rest.
 
         Parameters
         ----------
@@ -188,8 +186,6 @@ class Structure:
         laws : sequence of Law
             Forces inside; those that need motion do nothing here: readings are taken when all is at rest,
             and after a knock on the structure, which frees dry friction.
-        path : ignored
-            For symmetry.
         """
         linear = self.solve(loads)
         elastic = [law for law in laws if law.is_elastic]
@@ -214,7 +210,7 @@ class Structure:
     def _hold(
         self, release: Release, laws: tuple[Law, ...], ports: FloatArray
     ) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-        """Holding force, and forces (P,), Jenkins deflections (P, E) and Bouc-Wen z (P,) of the laws."""
+        """Return the holding force, and the forces (P,) and states (P, E), (P,) of the laws under it."""
         kinds, numbers, slip, stiffness = law_arrays(laws)
         bend = self.solve(release.load)
         unit, target = float(release.measured_at @ bend), release.amplitude
@@ -243,13 +239,13 @@ class Structure:
         return two, forces, z, bouc
 
     def ringdown(self, release: Release, laws: Sequence[Law] = (), refinement: int = 1) -> FloatArray:
-        """Outputs (n, C) after a release, at `release.times`."""
+        """Return the outputs (n, C) after a release, at `release.times`."""
         return self.fine_ringdown(release, laws, 1, refinement)[0]
 
     def fine_ringdown(
         self, release: Release, laws: Sequence[Law], split: int, refinement: int = 1
     ) -> tuple[FloatArray, FloatArray]:
-        """Outputs (split (n - 1) + 1, C) after a release, and their times."""
+        """Return the outputs (split (n - 1) + 1, C) after a release, and their times."""
         inside = tuple(laws)
         w2, shapes = self._modal
         own = np.array([self.ports[law.port] for law in inside]).reshape(len(inside), len(self.mass))
@@ -297,11 +293,10 @@ class Structure:
         return np.asarray(outputs), fine
 
     def free_ringdown(self, release: Release) -> FloatArray:
-        """Outputs (n, C) after a release without forces inside, in closed form."""
+        """Return the outputs (n, C) after a release without forces inside, in closed form."""
         w2, shapes = self._modal
         bend = self.solve(release.load)
         force = release.amplitude / float(release.measured_at @ bend)
-        w = np.sqrt(w2)
         decay = 0.5 * (self.alpha + self.beta * w2)
         damped = np.sqrt((w2 - decay**2).astype(complex))
         t = release.times[:, None]

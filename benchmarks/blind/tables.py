@@ -32,7 +32,7 @@ def _share(hits: int, count: int) -> str:
 
 
 def _shown(case: Scored) -> str:
-    """What the verdict says, in a word or two."""
+    """Return what the verdict says, in a word or two."""
     kind = str(case.verdict["kind"])
     if kind == "named":
         return " + ".join(sorted(case.verdict.get("identifiers") or ()))
@@ -76,9 +76,9 @@ def report(cases: Sequence[Scored], missing: int = 0) -> str:
     lines += ["## Shares, with 95 % intervals", ""]
     lines += _table(["cases", "rig", "number", *(o.value for o in Outcome)], rows)
     lines += [
-        "right: exactly what is hidden (a trap: also an accepted verdict); group: a group or family that holds "
-        "it; open: unexplained, below detectability or data error; missed: 'nothing missing'; part: one of two; "
-        "wrong: anything else.",
+        "right: exactly what is hidden (a trap: also an accepted verdict); group: a group or family that "
+        "holds it; open: unexplained, below detectability or data error; missed: 'nothing missing'; part: one "
+        "of two; wrong: anything else.",
         "",
     ]
     for kind, title in TITLES.items():

@@ -115,7 +115,7 @@ def with_free_phase(
 
 
 def _cancelling(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, ...]:
-    """A mass at the tip lowers f1, a clock that runs slow raises all frequencies by as much."""
+    """Hide a mass and a slow clock: a mass at the tip lowers f1, a clock that runs slow raises all frequencies by as much."""
     ratio = float(generator.uniform(0.006, 0.018))
     mass = ratio * bench.modal_mass
     # f1 falls by half the mass ratio; a sample stamped t is taken later, so that the motion looks faster.
@@ -127,13 +127,14 @@ def _cancelling(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, .
             {"point_mass.mass": mass, "point_mass.station": station},
         ),
         Hidden(
-            "clock_error", Changes(clock_rate=float(rate)), {"clock_error.rate": float(rate), "clock_error.zero": 0.0}
+            "clock_error", Changes(clock_rate=float(rate)),
+            {"clock_error.rate": float(rate), "clock_error.zero": 0.0},
         ),
     )  # fmt: skip
 
 
 def _gain_at_damage(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, ...]:
-    """A gauge beside one of the modelled defects shows too much, as it would after damage there."""
+    """Let a gauge beside a modelled defect show too much, as it would after damage there."""
     channel = str(generator.choice(["g16", "g17", "g18", "g20", "g21", "g22"]))
     gain = float(generator.uniform(0.03, 0.12))
     return (
@@ -147,7 +148,7 @@ def _gain_at_damage(generator: np.random.Generator, bench: Bench) -> tuple[Hidde
 
 
 def _friction_elsewhere(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, ...]:
-    """Dry friction on the moving end, where no joint is."""
+    """Hide dry friction on the moving end, where no joint is."""
     force = log_uniform(generator, 0.004, 0.03) * bench.free.force
     port = bench.free.port
     return (
@@ -220,7 +221,7 @@ def _swapped(
 def _wrong_unit(
     generator: np.random.Generator, plan: CampaignPlan, measured: Measured
 ) -> tuple[CampaignPlan, Measured]:
-    """The file says strain, the numbers are microstrain, in one channel or in all."""
+    """Let the file say strain where the numbers are microstrain, in one channel or in all."""
     strains = [name for name, channel in plan.channels.items() if channel.quantity == "strain"]
     hit = strains if bool(generator.integers(2)) else [str(generator.choice(strains))]
     channels = {

@@ -1,4 +1,4 @@
-"""The full finite element model of the wing, projected once onto a rich basis, so that a hidden wing is cheap.
+"""The full finite element model of the wing, projected once onto a rich basis: a hidden wing is then cheap.
 
 The basis holds static solutions under every load of the campaign and at every place where something may be
 hidden at three values of e, fourteen modes at two of them, again with other masses, and for a
@@ -252,7 +252,7 @@ def _functionals(operators: AffineOperators) -> _Functionals:
 
 
 def _loads(functionals: _Functionals, design: WingDesign) -> FloatArray:
-    """Loads (n, k) whose static solutions are in the basis."""
+    """Return the loads (n, k) whose static solutions are in the basis."""
     f = functionals
     eta = f.lift_stations / design.planform.semi_span
     washed = [(eta**p) @ f.lift for p in (0.0, 1.0, 1.5, 2.0, 3.0)]

@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from benchmarks.blind.changes import Changes
 from benchmarks.blind.laws import DRAG, POWER, Law
@@ -172,7 +171,7 @@ class WingRig:
         place_error: float = 0.0,
         split: int = 1,
     ) -> tuple[FloatArray, FloatArray]:
-        """Outputs (n, C) of a trial in SI units, and the times since its start [s] of dynamic ones.
+        """Return the outputs (n, C) of a trial in SI units, and the rows or times that they belong to.
 
         Parameters
         ----------

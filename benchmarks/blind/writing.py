@@ -21,8 +21,7 @@ def _text(value: str | float | tuple[float, float] | bool) -> str:
         return json.dumps(value)
     if isinstance(value, tuple):
         return "[" + ", ".join(_text(item) for item in value) + "]"
-    text = repr(float(value))
-    return text
+    return repr(float(value))
 
 
 def _table(heading: str, rows: dict[str, str]) -> list[str]:
