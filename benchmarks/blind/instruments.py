@@ -1,4 +1,4 @@
-"""What the instruments of a campaign show: hidden faults, then the gains, zeros and noise of every campaign."""
+"""What the instruments of a campaign show: hidden faults, then gains, zeros and noise as in any campaign."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A rig of three masses on a joint: its nominal model for whoever names, and the rig with something hidden."""
+"""A rig of three masses on a joint: its nominal model for the file, and the rig with something hidden."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ def with_free_phase(
 
 
 def _cancelling(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, ...]:
-    """Hide a mass and a slow clock: a mass at the tip lowers f1, a clock that runs slow raises all frequencies by as much."""
+    """Hide a mass at the tip, which lowers f1, and a slow clock, which raises all frequencies by as much."""
     ratio = float(generator.uniform(0.006, 0.018))
     mass = ratio * bench.modal_mass
     # f1 falls by half the mass ratio; a sample stamped t is taken later, so that the motion looks faster.
