@@ -43,6 +43,8 @@ _DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
 
 ITERATIONS = 3
 """Steps of the subspace iteration for the modes of a patched wing."""
+HELD = 1e-7
+"""Part of a static shape, relative to it, below which a basis of motion holds it already."""
 EMPTY = ModelPatch()
 
 
@@ -122,18 +124,22 @@ def motion_basis(
     Returns
     -------
     (n, r + s) ndarray
-        Orthonormal.
+        Orthonormal; fewer where the modes or other shapes hold a static shape already.
     """
     basis = start
     for _ in range(ITERATIONS):
         basis = np.linalg.qr(static(mass @ basis))[0]
     if solutions is None:
         return np.asarray(basis)
-    # a static shape is held already but for a small part: two passes
-    rest = solutions / np.linalg.norm(solutions, axis=0)
-    rest = rest - basis @ (basis.T @ rest)
-    rest = rest - basis @ (basis.T @ rest)
-    return np.asarray(np.concatenate((basis, np.linalg.qr(rest)[0]), axis=1))
+    for shape in (solutions / np.linalg.norm(solutions, axis=0)).T:
+        # a static shape is held already but for a small part: two passes
+        rest = shape - basis @ (basis.T @ shape)
+        rest = rest - basis @ (basis.T @ rest)
+        size = float(np.linalg.norm(rest))
+        # what is held already, or given twice, would add a direction of rounding
+        if size > HELD:
+            basis = np.concatenate((basis, rest[:, np.newaxis] / size), axis=1)
+    return np.asarray(basis)
 
 
 class _Terms(NamedTuple):
