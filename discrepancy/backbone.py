@@ -220,8 +220,8 @@ def at_amplitude(curves: Sequence[Backbone], amplitude: float, factor: float = 2
     """Return the mean over trials of a mode's frequency and damping ratio at an amplitude.
 
     In each trial a straight line in ln A, weighted by the errors, is laid through the points within `factor`
-    of the amplitude; overlapping windows count as independent. The error is that of the mean over trials by their scatter, or of the line if there is
-    one trial; nan where no trial has two such points.
+    of the amplitude; overlapping windows count as independent. The error is that of the mean over trials by
+    their scatter, or of the line if there is one trial; nan where no trial has two such points.
     """
     values = []
     for curve in curves:

@@ -19,7 +19,7 @@ from discrepancy.residuals import FittedTrial, ResidualSet
 
 FloatArray = NDArray[np.float64]
 
-_HATS = 5  # knots of a dependence on time, amplitude or load
+_HATS = 9  # knots of a dependence on time or amplitude
 _FREE_SHARE = 0.02  # of a direction's square must survive the fit
 
 
@@ -265,6 +265,11 @@ def _bases(
         if np.ptp(within) > 0.0:
             bases["", "time"] = np.column_stack([np.ones_like(within), within - within.mean()])
         return bases | _load_bases(items, joined, stack)
+    drifts = []
+    for item, use in zip(items, rows, strict=True):
+        x = (item.trial.time[use] - item.trial.time[0]) / (item.trial.time[-1] - item.trial.time[0])
+        drifts.append(np.polynomial.legendre.legvander(2.0 * x - 1.0, 4))
+    bases["", "a drift of zero in each trial"] = np.asarray(block_diag(*drifts))
     if all(item.rates is not None for item in items):
         bases["", "x and v"] = stack("x", "v")
         bases["", "higher harmonics"] = stack(
