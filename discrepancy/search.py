@@ -22,8 +22,8 @@ PRIOR_NONE = 0.5
 SET_SHARES = (0.9, 0.09, 0.01)
 """How the rest of the prior is shared among sets of one, two and three effects."""
 LARGEST_SET = len(SET_SHARES)
-STARTS = 2
-"""Starts of the fit of each effect."""
+STARTS, FAR_STARTS = 2, 3
+"""Starts of the fit of each effect, close to the truth and far from it."""
 CHORD_STEPS = 8
 CLOSE = 12.0
 """Candidates within this log evidence of the best are fitted exactly [nat]."""
@@ -35,7 +35,7 @@ FAR = 1.5
 """Chi-square per sample above which a fit is far from the truth."""
 BEGINNING, LEAST_SAMPLES = 4.0, 60
 """The beginning of a record: this many periods of the first mode, at least that many samples."""
-SHORT_STEPS, FAR_STEPS = 8, 6
+SHORT_STEPS, FAR_STEPS = 12, 6
 """Steps on the beginnings, and then on whole records, before candidates are compared."""
 FAR_FITS = 8
 """Candidates that go on from the beginnings to whole records."""
@@ -128,15 +128,15 @@ class Search:
         screen = Screen(self.problem, base)
         return {effect.identifier: self._starts(screen, effect) for effect in effects}
 
-    def _starts(self, screen: Screen, effect: Effect) -> list[Change]:
+    def _starts(self, screen: Screen, effect: Effect, count: int = STARTS) -> list[Change]:
         found: list[Change] = []
         for place in effect.places(self.problem.setting):
             best: list[Change] = []
             for change in screen.changes(Term(effect, place)):
                 if change.size > 0.0:
-                    best = sorted([*best, change], key=_worth)[:STARTS]
+                    best = sorted([*best, change], key=_worth)[:count]
             found.extend(best)
-        return sorted(found, key=_worth)[:STARTS]
+        return sorted(found, key=_worth)[:count]
 
     def scan(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
         """Fit every effect roughly in addition to those of `base`; return the best of each, best first.
@@ -144,13 +144,15 @@ class Search:
         Close to the truth one linearisation serves all (chord steps). Far from it phases slip over a long record,
         so that the beginnings of the records are fitted first, and the whole ones from there.
         """
-        if base.chi_square < FAR * float(self.problem.counts.sum()):
-            found = self._scan_near(base, effects)
-        else:
-            found = self._scan_far(base, tuple(effects))
+        found = (
+            self._scan_far(base, tuple(effects)) if self._far(base) else self._scan_near(base, effects)
+        )
         for item in found:
             self.keep(item, exact=False)
         return sorted(found, key=lambda item: -self.score(item))
+
+    def _far(self, base: Fit) -> bool:
+        return base.chi_square > FAR * float(self.problem.counts.sum())
 
     def _scan_near(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
         found = []
@@ -166,27 +168,43 @@ class Search:
         return found
 
     def _scan_far(self, base: Fit, effects: tuple[Effect, ...]) -> list[Fit]:
-        short = self._short()
-        near = fit(short, base.candidate, base.point, evidence=False)
-        screen = Screen(short, near)
+        near = self._near(base)
+        screen = Screen(self._short(), near)
         starts = []
         for effect in effects:
-            fits = []
-            for change in self._starts(screen, effect):
-                candidate = base.candidate.plus(change.term)
-                start = Point(
-                    near.point.shared, near.point.local, np.concatenate((near.point.effect, rescaled(change)))
-                )
-                try:
-                    fits.append(fit(short, candidate, start, iterations=SHORT_STEPS, evidence=False))
-                except ModelError:
-                    continue
-            if fits:
-                starts.append(min(fits, key=lambda item: item.objective))
-        starts.sort(key=lambda item: item.objective)
+            fits = [
+                self._shortly(near, base.candidate.plus(change.term), rescaled(change))
+                for change in self._starts(screen, effect, FAR_STARTS)
+            ]
+            found = [item for item in fits if item is not None]
+            if found:
+                starts.append(min(found, key=lambda item: item.objective))
+        return self._whole(starts, base.objective)
+
+    def _near(self, base: Fit) -> Fit:
+        """Fit the beginnings with the effects of a base; shared unknowns as expected before the data.
+
+        The nuisances of a wrong model are far off and make a bad start.
+        """
+        expected = Point(
+            np.zeros_like(base.point.shared),
+            tuple(np.zeros_like(u) for u in base.point.local),
+            base.point.effect,
+        )
+        return fit(self._short(), base.candidate, expected, local_only=True, evidence=False)
+
+    def _shortly(self, near: Fit, candidate: Candidate, added: FloatArray) -> Fit | None:
+        """Fit a candidate to the beginnings, or return None where the structure cannot follow."""
+        start = Point(near.point.shared, near.point.local, np.concatenate((near.point.effect, added)))
+        try:
+            return fit(self._short(), candidate, start, iterations=SHORT_STEPS, evidence=False)
+        except ModelError:
+            return None
+
+    def _whole(self, starts: list[Fit], least: float) -> list[Fit]:
+        """Fit the most promising candidates to whole records from where the beginnings led."""
         found: list[Fit] = []
-        least = base.objective
-        for item in starts[:FAR_FITS]:
+        for item in sorted(starts, key=lambda start: start.objective)[:FAR_FITS]:
             try:
                 whole = fit(self.problem, item.candidate, item.point, iterations=FAR_STEPS, give_up=least)
             except ModelError:
@@ -270,18 +288,30 @@ class Search:
 
     def _pairs(self) -> None:
         """Fit the most promising of all pairs of effects, by their changes at the fit without effect."""
-        screen = Screen(self.problem, self.none)
+        far = self._far(self.none)
+        near = self._near(self.none) if far else self.none
+        screen = Screen(self._short() if far else self.problem, near)
         changes = {effect.identifier: self._starts(screen, effect) for effect in self.effects}
         ranked = sorted(_pairs(changes, screen.sign), key=lambda item: item[0])[:PAIRS_FITTED]
-        rough = []
+        rough: list[Fit] = []
         for _, first, second in ranked:
             candidate = Candidate((first.term, second.term))
             if key_of(candidate) in self.exact:
                 continue
             start = np.concatenate((rescaled(first), rescaled(second)))
-            found = self.roughly(self.none, candidate, start)
-            self.keep(found, exact=False)
-            rough.append(found)
+            if far:
+                found = self._shortly(near, candidate, start)
+            else:
+                try:
+                    found = self.roughly(self.none, candidate, start)
+                except ModelError:
+                    found = None
+            if found is not None:
+                rough.append(found)
+        if far:
+            rough = self._whole(rough, self.none.objective)
+        for item in rough:
+            self.keep(item, exact=False)
         rough.sort(key=lambda item: -self.score(item))
         self.refine(rough, self.score(self.best()) - CLOSE)
 
