@@ -144,9 +144,7 @@ class Search:
         Close to the truth one linearisation serves all (chord steps). Far from it phases slip over a long record,
         so that the beginnings of the records are fitted first, and the whole ones from there.
         """
-        found = (
-            self._scan_far(base, tuple(effects)) if self._far(base) else self._scan_near(base, effects)
-        )
+        found = self._scan_far(base, tuple(effects)) if self._far(base) else self._scan_near(base, effects)
         for item in found:
             self.keep(item, exact=False)
         return sorted(found, key=lambda item: -self.score(item))
