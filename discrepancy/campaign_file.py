@@ -168,6 +168,7 @@ def _trial(
         if section.release is None
         else _release(section.release, str(printed["release"]["displacement"])),
         held_out=section.held_out,
+        noise_factor=section.noise_factor,
     )
 
 

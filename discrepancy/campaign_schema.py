@@ -120,6 +120,7 @@ class TrialSection(Section):
     file: Name
     run: str = ""
     held_out: bool = False
+    noise_factor: Positive = 1.0
     start: NotNegative | None = None
     temperature: Number | None = None
     load_place: Name | tuple[Number, Number] = Field(default="tip_load", union_mode="left_to_right")

@@ -206,6 +206,8 @@ def _trial_lines(trial: Trial, file: str, order: list[str]) -> list[str]:
         values["run"] = _quoted(trial.run)
     if trial.held_out:
         values["held_out"] = "true"
+    if trial.noise_factor != 1.0:
+        values["noise_factor"] = _number(trial.noise_factor)
     if trial.start or not trial.is_dynamic:
         values["start"] = _number(trial.start)
     place = trial.load_place

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from .candidate import Candidate
-from .errors import FitError
+from .errors import FitError, ModelError
 from .problem import Base, Linearisation, Point, Problem
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-LARGEST_EFFECT = 4.0
+LARGEST_EFFECT = 8.0
 """Effect parameters stay within this many prior deviations of their median."""
 CONVERGED = 1e-2
 """A step that promises less than this [nat] ends a fit."""
@@ -129,9 +129,10 @@ def fit(
     start: Point,
     *,
     base: Base | None = None,
-    iterations: int = 12,
+    iterations: int = 20,
     evidence: bool = True,
     local_only: bool = False,
+    give_up: float | None = None,
 ) -> Fit:
     """Fit a candidate.
 
@@ -151,6 +152,8 @@ def fit(
         Whether covariance, evidence and spent degrees of freedom are wanted.
     local_only : bool
         Shared unknowns and effects stay: only the trials' own nuisances are fitted (held-out trials).
+    give_up : float, optional
+        A fit whose objective has no prospect of coming below this ends early, not converged.
 
     Raises
     ------
@@ -165,25 +168,42 @@ def fit(
             f"The model gives values that are not finite for {candidate.identifiers or ('no effect',)}; "
             "check the ranges of its parameters."
         )
-    converged = False
+    converged, fresh = False, True
     for _ in range(iterations):
-        step, promised, used = _step(problem, candidate, state, damping, local_only=local_only)
-        if promised < CONVERGED:
+        step, promised = _step(problem, candidate, state, damping, local_only=local_only)
+        if promised < CONVERGED and fresh:
             converged = True
             break
+        if promised < CONVERGED:
+            state, fresh = _evaluate(problem, candidate, state.point, base), True
+            continue
+        following = None
         trial_point = _bounded(_plus(state.point, step))
-        proposal = _evaluate(problem, candidate, trial_point, base, derivatives=False)
-        if proposal.objective < state.objective:
-            gain = state.objective - proposal.objective
+        try:
+            proposal = _evaluate(problem, candidate, trial_point, base, derivatives=False)
+            if proposal.objective < state.objective:
+                following = _evaluate(problem, candidate, trial_point, base, known=state.parts)
+        except ModelError:  # outside what the structure can carry: a shorter step
+            following = None
+        if following is not None:
+            gain = state.objective - following.objective
             damping = max(damping * (0.1 if gain > 0.5 * promised else 0.5), 1e-9)
-            state = _evaluate(problem, candidate, trial_point, base)
-            if gain < CONVERGED and used < 1e-2:
+            state, fresh = following, base is not None
+            if gain < 0.7 * promised and base is None:  # derivatives have grown old
+                state, fresh = _evaluate(problem, candidate, state.point, base), True
+            if give_up is not None and state.objective - 2.0 * promised > give_up:
+                break
+            if gain < CONVERGED and damping < 1e-2 and fresh:
                 converged = True
                 break
+        elif not fresh:
+            state, fresh = _evaluate(problem, candidate, state.point, base), True
         else:
             damping = max(10.0 * damping, 1e-4)
             if damping > 1e6:
                 break
+    if not fresh and evidence:
+        state = _evaluate(problem, candidate, state.point, base)
     return _finished(problem, candidate, state, converged, evidence)
 
 
@@ -203,11 +223,15 @@ def _evaluate(
     point: Point,
     base: Base | None,
     derivatives: bool = True,
+    known: tuple[Linearisation, ...] | None = None,
 ) -> _State:
     parts: list[Linearisation] = []
     residuals, responses = [], []
     for number in range(len(problem.trials)):
-        part = problem.linearise(number, point, candidate, base, derivatives=derivatives)
+        part = problem.linearise(
+            number, point, candidate, base,
+            derivatives=derivatives, known=None if known is None else known[number],
+        )  # fmt: skip
         parts.append(part)
         responses.append(part.response)
         residuals.append(problem.residual(number, point, part.response))
@@ -236,8 +260,8 @@ def _blocks(problem: Problem, candidate: Candidate, state: _State) -> list[Trial
 
 def _step(
     problem: Problem, candidate: Candidate, state: _State, damping: float, *, local_only: bool = False
-) -> tuple[Point, float, float]:
-    """Return the step, the decrease it promises [nat] and the damping that was used."""
+) -> tuple[Point, float]:
+    """Return the step and the decrease it promises [nat]."""
     shared_size = problem.shared.size
     size = shared_size + candidate.size
     prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
@@ -268,11 +292,7 @@ def _step(
         local_step = inner_gradient - inner @ step[block.index]
         promised += 0.5 * float(block.local_gradient @ inner_gradient)
         local_steps.append(local_step)
-    return (
-        Point(step[:shared_size], tuple(local_steps), step[shared_size:]),
-        promised,
-        damping,
-    )
+    return Point(step[:shared_size], tuple(local_steps), step[shared_size:]), promised
 
 
 def _finished(problem: Problem, candidate: Candidate, state: _State, converged: bool, evidence: bool) -> Fit:

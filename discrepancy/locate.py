@@ -37,6 +37,7 @@ MAP_RATE = 0.05
 """False discovery rate of the map."""
 
 _TOO_SMALL = 1e-3  # p-value below which residuals are smaller than the noise record allows
+_FAR_OUT = 6.0  # noise deviations; 2e-9 of Gaussian samples lie beyond
 _WORTH_TELLING = 0.05  # share of the excess variance below which a dependence is not told
 _CLOSE = 0.02  # shares this close are not told apart
 
@@ -149,7 +150,7 @@ def locate(
         patterns=patterns,
         explanations=explained,
         disagreements=_disagreements(fitted, white, explained, patterns, frequencies) if disagrees else (),
-        remarks=(*coloured.values(), *_noise_remarks(fitted)),
+        remarks=(*coloured.values(), *_noise_remarks(fitted), *_outlier_remarks(fitted)),
     )
 
 
@@ -184,6 +185,29 @@ def _noise_remarks(residuals: ResidualSet) -> tuple[str, ...]:
     return tuple(remarks)
 
 
+def _outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
+    """Return a sentence on single samples far out whose neighbours are not: errors of the data."""
+    places: dict[str, int] = {}
+    for item in residuals.trials:
+        if not item.trial.is_dynamic:
+            continue
+        size = np.abs(np.nan_to_num(item.standardised))
+        beside = np.zeros_like(size)
+        beside[1:] = size[:-1]
+        beside[:-1] = np.maximum(beside[:-1], size[1:])
+        alone = (size > _FAR_OUT) & (beside < 0.5 * size)
+        for column, name in enumerate(item.trial.channels):
+            places[name] = places.get(name, 0) + int(alone[:, column].sum())
+    found = {name: count for name, count in places.items() if count}
+    if not found:
+        return ()
+    listed = ", ".join(f"{name} ({count})" for name, count in found.items())
+    return (
+        f"Single samples lie beyond {_FAR_OUT:g} noise deviations while their neighbours do not: {listed}; "
+        "outliers are errors of the data, leave them out.",
+    )
+
+
 def _probability(p: float) -> str:
     return "p < 1e-6" if p < 1e-6 else f"p = {p:.1g}"
 
@@ -203,7 +227,10 @@ def _disagreements(
         if told is None:
             continue
         subject = told.subject or _subject(name, items, [white[n] for n in members], patterns, frequencies)
-        words = _dependence_words(told, rows)
+        line = told.dependence.startswith("a ")
+        if line and subject.startswith("mode"):
+            subject = "all channels"  # a line of its own frequency is no matter of a mode that the model has
+        words = told.dependence if line else f"by {_dependence_words(told, rows)}"
         found.append(
             Disagreement(
                 name,
@@ -211,7 +238,7 @@ def _disagreements(
                 told.dependence,
                 told.share,
                 told.p_value,
-                f"{subject[0].upper()}{subject[1:]}, by {words}, in {name} trials; explains "
+                f"{subject[0].upper()}{subject[1:]}, {words}, in {name} trials; explains "
                 f"{100.0 * told.share:.0f} % of the excess variance ({_probability(told.p_value)}).",
             )
         )

@@ -55,16 +55,18 @@ def pre_trigger_record(samples: FloatArray, interval: float, name: str, source: 
 def repeat_record(channel: Channel, trials: Sequence[Trial]) -> NoiseRecord | None:
     """Return the noise of a channel from repeated static or flight trials, pooled; None without repeats.
 
-    Trials are repeats of each other if kind, run, load place, number of rows and every row's force, load
-    factor, temperature and health agree. Deviations are taken from the mean of each row over the repeats;
-    where the channel's zero is free in each trial (`offset_deviation` above zero), each trial's mean
+    Trials are repeats of each other if kind, run, load place, noise factor, number of rows and every row's
+    force, load factor, temperature and health agree. Deviations are taken from the mean of each row over the
+    repeats; where the channel's zero is free in each trial (`offset_deviation` above zero), each trial's mean
     deviation is removed too. R repeats of N rows then have (R - 1) N or (R - 1) (N - 1) degrees of freedom,
     and sums of squares and degrees of freedom add up over groups of repeats. Fewer than three degrees of
     freedom are no record.
     """
     squares, degrees = 0.0, 0
     for group in repeated(trials, channel.name):
+        # Repeats are weighed alike here, so they have one noise factor (`_repeats`).
         stack = np.stack([trial.values[:, trial.channels.index(channel.name)] for trial in group])
+        stack = stack / group[0].noise_factor
         used = np.all([trial.used[:, trial.channels.index(channel.name)] for trial in group], axis=0)
         stack = stack[:, used]
         rest = stack - stack.mean(axis=0)
@@ -95,8 +97,8 @@ def repeated(trials: Sequence[Trial], channel: str) -> list[list[Trial]]:
 
 
 def _repeats(first: Trial, second: Trial) -> bool:
-    if (first.kind, first.run, first.load_place, len(first.time)) != (
-        second.kind, second.run, second.load_place, len(second.time),
+    if (first.kind, first.run, first.load_place, len(first.time), first.noise_factor) != (
+        second.kind, second.run, second.load_place, len(second.time), second.noise_factor,
     ):  # fmt: skip
         return False
     pairs = (

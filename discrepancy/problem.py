@@ -6,7 +6,7 @@ leaves: -ln L = sum over channels of (n0 + n) / 2 ln(1 + RSS / n0) + constant, R
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 
 import numpy as np
@@ -265,6 +265,7 @@ class Problem:
         base: "Base | None" = None,
         *,
         derivatives: bool = True,
+        known: Linearisation | None = None,
     ) -> Linearisation:
         """Return response and derivatives of a trial.
 
@@ -281,24 +282,28 @@ class Problem:
             added to first order (chord).
         derivatives : bool
             False: the response only.
+        known : Linearisation, optional
+            Derivatives by shared and local unknowns that are near enough.
         """
         data = self.trials[number]
         kind = data.trial.kind
         patch = candidate.patch(self.setting, point.effect) if kind in candidate.acts_on else ModelPatch()
         if base is not None:
             shared, local = base.point.shared, base.point.local[number]
-            known = base.parts[number]
+            there = base.parts[number]
             response, _ = self.response(number, shared, local, patch)
             at_base = response
-            move = (point.shared - shared)[: len(known.parameters)]
-            response = response + np.tensordot(move, known.parameters, 1)
-            response += np.tensordot((point.local[number] - local)[data.unknowns.zeros :], known.local, 1)
-            parameters, by_local = known.parameters, known.local
+            move = (point.shared - shared)[: len(there.parameters)]
+            response = response + np.tensordot(move, there.parameters, 1)
+            response += np.tensordot((point.local[number] - local)[data.unknowns.zeros :], there.local, 1)
+            parameters, by_local = there.parameters, there.local
         else:
             shared, local = point.shared, point.local[number]
             response, rates = self.response(number, shared, local, patch)
             at_base = response
-            if derivatives:
+            if known is not None:
+                parameters, by_local = known.parameters, known.local
+            elif derivatives:
                 parameters = self._by_parameters(number, shared, local, patch, response)
                 by_local = self._by_local(data, number, shared, local, patch, response, rates)
         if not derivatives:
@@ -463,3 +468,9 @@ def _noise(campaign: Campaign, trials: tuple[Trial, ...]) -> dict[str, NoiseMode
         ]
         found[name] = noise_model(channel, 1e-3 * max([*spans, 1e-12]))
     return found
+
+
+def shortened(trial: Trial, count: int) -> Trial:
+    """Return the first rows of a trial."""
+    rows = ("values", "used", "time", "force", "load_factor", "temperature", "health", "health_deviation")
+    return replace(trial, **{name: getattr(trial, name)[:count] for name in rows})

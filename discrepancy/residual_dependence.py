@@ -19,7 +19,7 @@ from discrepancy.residuals import FittedTrial, ResidualSet
 
 FloatArray = NDArray[np.float64]
 
-_HATS = 5  # knots of a dependence on time, amplitude or load
+_HATS = 9  # knots of a dependence on time or amplitude
 _FREE_SHARE = 0.02  # of a direction's square must survive the fit
 
 
@@ -85,8 +85,9 @@ def explanations(
     """Return what single dependences explain of the excess variance, by kind of trial, largest share first.
 
     Every dependence is fitted to each channel by itself with one set of coefficients for all trials of the
-    kind, so that amplitude and time are told apart where releases differ. Modes are split at `frequencies`
-    [Hz]; by default at the peaks of the predictions' spectra.
+    kind, so that amplitude and time are told apart where releases differ; the strongest line has a phase of
+    its own in each trial. Modes are split at `frequencies` [Hz], by default at the peaks of the predictions'
+    spectra.
     """
     found = []
     for name, members in kinds(residuals).items():
@@ -97,6 +98,7 @@ def explanations(
             continue  # no excess to explain
         blocks: dict[tuple[str, str], list[_Block]] = {}
         modes = _modes(items, frequencies)
+        line = dominant_line(items) if items[0].trial.is_dynamic else None
         for column in range(len(items[0].trial.channels)):
             used = [item for item in items if item.used[:, column].any()]
             if not used:
@@ -105,13 +107,18 @@ def explanations(
             sensitive = None
             if all(i.sensitivity is not None for i in used):
                 sensitive = np.vstack([_rows(i, column) for i in used])
-            for key, basis in _bases(used, column, modes).items():
+            bases = _bases(used, column, modes)
+            if line is not None:
+                bases["", line.name] = _line_basis(used, column, line)
+            for key, basis in bases.items():
                 if (block := _block(basis, residual, sensitive)) is not None:
                     blocks.setdefault(key, []).append(block)
         sums = {key: _explained(parts) for key, parts in blocks.items()}
         for (subject, dependence), (explained, count) in sums.items():
             share = float(np.clip((explained - count) / whole, 0.0, 1.0))
             p = float(stats.chi2.sf(explained, count)) if count else 1.0
+            if line is not None and dependence == line.name:
+                p = min(1.0, p * line.choices)
             found.append(Explanation(name, subject, dependence, share, count, p))
         for column, channel in enumerate(items[0].trial.channels):
             if len(items[0].trial.channels) > 1:
@@ -124,6 +131,60 @@ def explanations(
                 share = float(np.clip(own / whole, 0.0, 1.0))
                 found.append(Explanation(name, f"channel {channel}", "whole", share, count, p))
     return tuple(sorted(found, key=lambda item: -item.share))
+
+
+class SpectralLine(NamedTuple):
+    """The strongest line of residuals: frequency [Hz], decay rate [1/s], how many it was chosen from."""
+
+    frequency: float
+    decay: float
+    choices: int
+
+    @property
+    def name(self) -> str:
+        """Such as "a line at 50 Hz" or "a decaying line at 9.1 Hz"."""
+        return f"a {'decaying ' if self.decay else ''}line at {self.frequency:.3g} Hz"
+
+
+def dominant_line(items: Sequence[FittedTrial]) -> SpectralLine | None:
+    """Return the line that explains most of the residuals of dynamic trials, over all channels and trials.
+
+    Frequencies are those of a spectrum padded four times, from one period of the record upwards; decays are
+    none, and 1, 3, 10 and 30 e-folds within a record. None for records of fewer than eight samples.
+    """
+    best, choices = (0.0, 0.0, 0.0), 0
+    length = max(len(item.trial.time) for item in items)
+    interval = items[0].trial.interval
+    if length < 8:
+        return None
+    alike = [item for item in items if abs(item.trial.interval / interval - 1.0) < 1e-6]
+    at = np.fft.rfftfreq(4 * length, interval)
+    for folds in (0.0, 1.0, 3.0, 10.0, 30.0):
+        decay = folds / (length * interval)
+        power = np.zeros(at.size)
+        for item in alike:
+            weight = np.exp(-decay * interval * np.arange(len(item.trial.time)))
+            values = np.nan_to_num(item.standardised) * weight[:, np.newaxis]
+            # A cosine and a sine under this weight have about half the weight's square each.
+            power += (
+                2.0 * np.sum(np.abs(np.fft.rfft(values, 4 * length, axis=0)) ** 2, axis=1) / (weight @ weight)
+            )
+        power[:4] = 0.0
+        place = int(np.argmax(power))
+        choices += length // 2
+        # A decay must explain visibly more than the same line without it.
+        if power[place] > 1.05 * best[0]:
+            best = (float(power[place]), float(at[place]), decay)
+    return SpectralLine(best[1], best[2], choices) if best[0] > 0.0 else None
+
+
+def _line_basis(items: Sequence[FittedTrial], column: int, line: SpectralLine) -> FloatArray:
+    waves = []
+    for item in items:
+        time = item.trial.time[item.used[:, column]] - item.trial.time[0]
+        wave = np.exp((-line.decay + 2j * np.pi * line.frequency) * time)
+        waves.append(np.column_stack([wave.real, wave.imag]))
+    return np.asarray(block_diag(*waves))
 
 
 class _Block(NamedTuple):
@@ -204,6 +265,11 @@ def _bases(
         if np.ptp(within) > 0.0:
             bases["", "time"] = np.column_stack([np.ones_like(within), within - within.mean()])
         return bases | _load_bases(items, joined, stack)
+    drifts = []
+    for item, use in zip(items, rows, strict=True):
+        x = (item.trial.time[use] - item.trial.time[0]) / (item.trial.time[-1] - item.trial.time[0])
+        drifts.append(np.polynomial.legendre.legvander(2.0 * x - 1.0, 4))
+    bases["", "a drift of zero in each trial"] = np.asarray(block_diag(*drifts))
     if all(item.rates is not None for item in items):
         bases["", "x and v"] = stack("x", "v")
         bases["", "higher harmonics"] = stack(

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import ndtr, stdtr
 
 from discrepancy.campaign import Trial
 from discrepancy.residual_tests import benjamini_yekutieli, periodogram, variance_p_value
@@ -227,8 +227,8 @@ def _projected(item: FittedTrial, column: int, table: FloatArray) -> tuple[Float
 
 def _tail(z: float, freedom: float) -> float:
     if freedom <= 0.0 or np.isinf(freedom):
-        return float(stats.norm.sf(z))
-    return float(stats.t.sf(z, freedom))
+        return float(ndtr(-z))
+    return float(stdtr(freedom, -z))
 
 
 def _size(

@@ -4,12 +4,13 @@ Each yields one p-value for the whole set; Holm's rule over them keeps the rate 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.special import chdtrc, fdtrc
 
 from discrepancy.residuals import ResidualSet, quadratic_moments
 
@@ -137,8 +138,8 @@ def combine(p_values: Sequence[float]) -> float:
 def variance_p_value(mean_square: float, freedom: float, noise_freedom: float) -> float:
     """Return P(mean square this large) against a noise record: F, or chi^2 if the noise is exact."""
     if np.isinf(noise_freedom):
-        return float(stats.chi2.sf(mean_square * freedom, freedom))
-    return float(stats.f.sf(mean_square, freedom, noise_freedom))
+        return float(chdtrc(freedom, mean_square * freedom))
+    return float(fdtrc(freedom, noise_freedom, mean_square))
 
 
 def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:
@@ -159,8 +160,11 @@ def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:
 
 
 def mean_square(residuals: ResidualSet, channels: Sequence[str]) -> tuple[float, float]:
-    """Return the sum of squares of channels over its expectation, and its effective degrees of freedom."""
-    total, parts = 0.0, []
+    """Return the sum of squares of channels over its expectation, and its effective degrees of freedom.
+
+    The trials of the set are all fitted, or all held out.
+    """
+    total, parts, held_out = 0.0, [], residuals.trials[0].trial.held_out
     for item in residuals.trials:
         for name in channels:
             if name not in item.trial.channels:
@@ -170,33 +174,56 @@ def mean_square(residuals: ResidualSet, channels: Sequence[str]) -> tuple[float,
             total += float(np.sum(item.standardised[used, column] ** 2))
             sensitive = None if item.sensitivity is None else item.sensitivity[used, column]
             parts.append((item.expected_variance[used, column], sensitive))
-    mean, freedom = quadratic_moments(parts)
+    mean, freedom = quadratic_moments(parts, held_out=held_out)
     return (total / mean if mean > 0.0 else np.nan), freedom
 
 
 def variance_test(residuals: ResidualSet) -> OmnibusTest:
-    """Return the test of the mean squares against the noise records; nan without any record."""
-    groups = noise_groups(residuals)
-    of_groups, of_channels, worst = [], [], ("", 2.0)
+    """Return the test of the mean squares against the noise records; nan without any record.
+
+    Each noise record gives one p-value, Bonferroni's over all its trials and each kind of trial (few static
+    readings would drown in thousands of samples of ring-downs); these are combined. Each channel in each
+    trial gives one more, for a gap in one place only.
+    """
+    parts = [residuals, *_by_kind(residuals)]
+    of_groups, of_places, worst = [], [], ("", 2.0)
     total, weight = 0.0, 0.0
-    for names in groups.values():
-        square, freedom = mean_square(residuals, names)
-        if freedom < 0.5:
-            continue
+    for names in noise_groups(residuals).values():
         noise_freedom = residuals.degrees_of_freedom(names[0])
-        of_groups.append(variance_p_value(square, freedom, noise_freedom))
-        total, weight = total + square * freedom, weight + freedom
-        for name in names:
-            own, own_freedom = mean_square(residuals, (name,))
-            if own_freedom >= 0.5:
-                of_channels.append(variance_p_value(own, own_freedom, noise_freedom))
-                worst = min(worst, (name, of_channels[-1]), key=lambda pair: pair[1])
+        found = []
+        for part in parts:
+            square, freedom = mean_square(part, names)
+            if freedom >= 0.5:
+                found.append(variance_p_value(square, freedom, noise_freedom))
+                if part is residuals:
+                    total, weight = total + square * freedom, weight + freedom
+        if found:
+            of_groups.append(min(1.0, len(found) * min(found)))
+        for item in residuals.trials:
+            single = replace(residuals, trials=(item,))
+            for name in names:
+                square, freedom = mean_square(single, (name,))
+                if freedom < 0.5:
+                    continue
+                of_places.append(variance_p_value(square, freedom, noise_freedom))
+                worst = min(worst, (f"{item.trial.name}, {name}", of_places[-1]), key=lambda pair: pair[1])
     if not of_groups:
         return OmnibusTest("variance", np.nan, np.nan, "")
     p = combine(of_groups)
-    if len(of_channels) > 1:
-        p = min(1.0, 2.0 * min(p, len(of_channels) * min(of_channels)))
+    if len(of_places) > 1:
+        p = min(1.0, 2.0 * min(p, len(of_places) * min(of_places)))
     return OmnibusTest("variance", p, total / weight, worst[0])
+
+
+def _by_kind(residuals: ResidualSet) -> tuple[ResidualSet, ...]:
+    """Return the set split by the kind of its trials; nothing if there is one kind only."""
+    kinds = list(dict.fromkeys(item.trial.kind for item in residuals.trials))
+    if len(kinds) < 2:
+        return ()
+    return tuple(
+        replace(residuals, trials=tuple(i for i in residuals.trials if i.trial.kind is kind))
+        for kind in kinds
+    )
 
 
 def serial_tests(

@@ -66,8 +66,9 @@ class FittedTrial:
     rates : (N, C) ndarray or None
         Time derivatives of the prediction, dynamic trials [channel's unit / s].
     sensitivity : (N, C, P) ndarray or None
-        S of the module's text, one column for each parameter of the whole fit, alike in all its trials. With
-        it tests allow exactly for what the fit has absorbed; without it for the leverage only.
+        S of the module's text, one column for each parameter of the whole fit, alike in all its trials
+        (held-out trials: without what was fitted to themselves). With it tests allow exactly for what the fit
+        has absorbed; without it for the leverage only.
 
     Raises
     ------
@@ -193,31 +194,52 @@ class ResidualSet:
 
         A residual at a draw of the posterior is distributed as the noise itself (Johnson 2007, Bayesian
         Analysis 2(4), 719-734): r + S z with z standard normal, one z for all trials, restores exactly what
-        the fit has absorbed. Without sensitivities residuals are divided by their expected deviation. Samples
-        that are not used are drawn from the noise, so that series keep their even spacing.
+        the fit has absorbed; held-out trials lose the error of the parameters alike. Without sensitivities
+        residuals are divided by their expected deviation. Samples that are not used are drawn from the noise,
+        so that series keep their even spacing.
         """
         draw = generator.standard_normal(self.parameter_count)
+        outside = self._held_out_draw(draw)
         white = []
         for item in self.trials:
             filler = generator.standard_normal(item.residual.shape)
             residual = np.nan_to_num(item.standardised)
-            if item.sensitivity is not None and not item.trial.held_out:
-                residual = residual + item.sensitivity @ draw
-            else:
+            if item.sensitivity is None:
                 residual = residual / np.sqrt(np.clip(item.expected_variance, 1e-12, None))
+            elif item.trial.held_out:
+                residual = residual - item.sensitivity @ outside
+            else:
+                residual = residual + item.sensitivity @ draw
             white.append(np.where(item.used, residual, filler))
         return tuple(white)
 
+    def _held_out_draw(self, draw: FloatArray) -> FloatArray:
+        """Return a draw of the parameters' error given the held-out trials.
+
+        There r = e + S z: given r, z is Gaussian with the precision I + S^T S, and r less S times a draw of
+        it is distributed as e.
+        """
+        precision, along = np.eye(draw.size), np.zeros(draw.size)
+        for item in self.trials:
+            if item.trial.held_out and item.sensitivity is not None:
+                part = item.sensitivity[item.used]
+                precision += part.T @ part
+                along += part.T @ item.standardised[item.used]
+        root = np.linalg.cholesky(precision)
+        return np.asarray(np.linalg.solve(precision, along) + np.linalg.solve(root.T, draw))
+
 
 def quadratic_moments(
-    items: Iterable[tuple[FloatArray, FloatArray | None]],
+    items: Iterable[tuple[FloatArray, FloatArray | None]], *, held_out: bool = False
 ) -> tuple[float, float]:
-    """Return mean and effective degrees of freedom of a sum of squares of fitted residuals.
+    """Return mean and effective degrees of freedom of a sum of squares of residuals.
 
     Parameters
     ----------
     items : iterable of ((n,) ndarray, (n, P) ndarray or None)
         Expected variance of the residuals and their sensitivities, by trial and channel.
+    held_out : bool
+        Whether they are of held-out trials, where A = I + S S^T.
 
     Returns
     -------
@@ -233,7 +255,7 @@ def quadratic_moments(
             square += float(expected.sum())
             continue
         leverage = np.einsum("np,np->n", sensitive, sensitive)
-        square += float(np.sum(1.0 - 2.0 * leverage))
+        square += float(np.sum(1.0 + (2.0 if held_out else -2.0) * leverage))
         count += expected.size
         part = sensitive.T @ sensitive
         cross = part if cross is None else cross + part

@@ -20,6 +20,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from .candidate import Candidate, Term
 from .catalogue.entry import EffectParameter
+from .errors import ModelError
 from .fitting import LARGEST_EFFECT, Fit, trial_block
 from .problem import Problem
 
@@ -157,9 +158,12 @@ class Screen:
         return np.concatenate((np.ones(samples), -np.ones(rest)))
 
     def changes(self, term: Term) -> Iterator[Change]:
-        """Yield the changes of a term over the grid of its parameters."""
+        """Yield the changes of a term over the grid of its parameters, where the model can follow."""
         for start in grid(term):
-            yield self.change(term, start)
+            try:
+                yield self.change(term, start)
+            except ModelError:  # such as a spring softer than what is taken from it
+                continue
 
 
 def grid(term: Term) -> Iterator[FloatArray]:
@@ -198,8 +202,8 @@ def rescaled(change: Change) -> FloatArray:
         prior = item.prior
         value = prior.value(float(start[number])) * factor
         if prior.shape == "log_normal":
-            value = max(value, prior.value(-0.9 * LARGEST_EFFECT))
-        start[number] = np.clip(prior.normal(value), -0.9 * LARGEST_EFFECT, 0.9 * LARGEST_EFFECT)
+            value = max(value, prior.value(-0.7 * LARGEST_EFFECT))
+        start[number] = np.clip(prior.normal(value), -0.7 * LARGEST_EFFECT, 0.7 * LARGEST_EFFECT)
     return start
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from math import comb, exp, inf, log
+from math import ceil, comb, exp, inf, log
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,10 @@ from scipy.special import logsumexp
 
 from .candidate import Candidate, Term
 from .catalogue.entry import Effect
+from .errors import ModelError
 from .fitting import Fit, fit
 from .gates import absolute_gate
-from .problem import Point, Problem
+from .problem import Point, Problem, shortened
 from .screening import Change, Screen, rescaled
 
 FloatArray = NDArray[np.float64]
@@ -21,8 +22,8 @@ PRIOR_NONE = 0.5
 SET_SHARES = (0.9, 0.09, 0.01)
 """How the rest of the prior is shared among sets of one, two and three effects."""
 LARGEST_SET = len(SET_SHARES)
-STARTS = 2
-"""Starts of the fit of each effect."""
+STARTS, FAR_STARTS = 2, 3
+"""Starts of the fit of each effect, close to the truth and far from it."""
 CHORD_STEPS = 8
 CLOSE = 12.0
 """Candidates within this log evidence of the best are fitted exactly [nat]."""
@@ -30,6 +31,14 @@ EXACT_FITS = 5
 WORTH_ADDING = 1.0
 """Screened gain below which one more effect is not fitted [nat]."""
 PAIRS_FITTED = 10
+FAR = 1.5
+"""Chi-square per sample above which a fit is far from the truth."""
+BEGINNING, LEAST_SAMPLES = 4.0, 60
+"""The beginning of a record: this many periods of the first mode, at least that many samples."""
+SHORT_STEPS, FAR_STEPS = 12, 6
+"""Steps on the beginnings, and then on whole records, before candidates are compared."""
+FAR_FITS = 8
+"""Candidates that go on from the beginnings to whole records."""
 
 Key = tuple[tuple[str, str], ...]
 
@@ -54,7 +63,9 @@ class Search:
     exact : dict of Key to Fit
         Fitted to convergence.
     rough : dict of Key to Fit
-        Fitted by chord steps only; their evidence is approximate.
+        Fitted by few steps only; their evidence is approximate.
+    beginnings : Problem or None
+        The problem with the beginnings of its records, once it was needed.
     """
 
     problem: Problem
@@ -62,6 +73,7 @@ class Search:
     none: Fit
     exact: dict[Key, Fit] = field(default_factory=dict)
     rough: dict[Key, Fit] = field(default_factory=dict)
+    beginnings: Problem | None = None
 
     def __post_init__(self) -> None:
         self.exact[()] = self.none
@@ -116,28 +128,102 @@ class Search:
         screen = Screen(self.problem, base)
         return {effect.identifier: self._starts(screen, effect) for effect in effects}
 
-    def _starts(self, screen: Screen, effect: Effect) -> list[Change]:
+    def _starts(self, screen: Screen, effect: Effect, count: int = STARTS) -> list[Change]:
         found: list[Change] = []
         for place in effect.places(self.problem.setting):
             best: list[Change] = []
             for change in screen.changes(Term(effect, place)):
                 if change.size > 0.0:
-                    best = sorted([*best, change], key=_worth)[:STARTS]
+                    best = sorted([*best, change], key=_worth)[:count]
             found.extend(best)
-        return sorted(found, key=_worth)[:STARTS]
+        return sorted(found, key=_worth)[:count]
 
     def scan(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
-        """Fit every effect in addition to those of `base` by chord steps; return the best of each."""
+        """Fit every effect roughly in addition to those of `base`; return the best of each, best first.
+
+        Close to the truth one linearisation serves all (chord steps). Far from it phases slip over a long record,
+        so that the beginnings of the records are fitted first, and the whole ones from there.
+        """
+        found = self._scan_far(base, tuple(effects)) if self._far(base) else self._scan_near(base, effects)
+        for item in found:
+            self.keep(item, exact=False)
+        return sorted(found, key=lambda item: -self.score(item))
+
+    def _far(self, base: Fit) -> bool:
+        return base.chi_square > FAR * float(self.problem.counts.sum())
+
+    def _scan_near(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
         found = []
         for changes in self.screened(base, effects).values():
-            fits = [
-                self.roughly(base, base.candidate.plus(change.term), rescaled(change)) for change in changes
-            ]
-            for item in fits:
-                self.keep(item, exact=False)
+            fits = []
+            for change in changes:
+                try:
+                    fits.append(self.roughly(base, base.candidate.plus(change.term), rescaled(change)))
+                except ModelError:  # the best scale is more than the structure can carry
+                    continue
             if fits:
                 found.append(max(fits, key=self.score))
-        return sorted(found, key=lambda item: -self.score(item))
+        return found
+
+    def _scan_far(self, base: Fit, effects: tuple[Effect, ...]) -> list[Fit]:
+        near = self._near(base)
+        screen = Screen(self._short(), near)
+        starts = []
+        for effect in effects:
+            fits = [
+                self._shortly(near, base.candidate.plus(change.term), rescaled(change))
+                for change in self._starts(screen, effect, FAR_STARTS)
+            ]
+            found = [item for item in fits if item is not None]
+            if found:
+                starts.append(min(found, key=lambda item: item.objective))
+        return self._whole(starts, base.objective)
+
+    def _near(self, base: Fit) -> Fit:
+        """Fit the beginnings with the effects of a base; shared unknowns as expected before the data.
+
+        The nuisances of a wrong model are far off and make a bad start.
+        """
+        expected = Point(
+            np.zeros_like(base.point.shared),
+            tuple(np.zeros_like(u) for u in base.point.local),
+            base.point.effect,
+        )
+        return fit(self._short(), base.candidate, expected, local_only=True, evidence=False)
+
+    def _shortly(self, near: Fit, candidate: Candidate, added: FloatArray) -> Fit | None:
+        """Fit a candidate to the beginnings, or return None where the structure cannot follow."""
+        start = Point(near.point.shared, near.point.local, np.concatenate((near.point.effect, added)))
+        try:
+            return fit(self._short(), candidate, start, iterations=SHORT_STEPS, evidence=False)
+        except ModelError:
+            return None
+
+    def _whole(self, starts: list[Fit], least: float) -> list[Fit]:
+        """Fit the most promising candidates to whole records from where the beginnings led."""
+        found: list[Fit] = []
+        for item in sorted(starts, key=lambda start: start.objective)[:FAR_FITS]:
+            try:
+                whole = fit(self.problem, item.candidate, item.point, iterations=FAR_STEPS, give_up=least)
+            except ModelError:
+                continue
+            least = min(least, whole.objective + CLOSE)
+            found.append(whole)
+        return found
+
+    def _short(self) -> Problem:
+        """Return the problem with the beginnings of its dynamic records only."""
+        if self.beginnings is None:
+            period = 2.0 * np.pi / self.problem.setting.scales.angular_frequency
+            trials = []
+            for data in self.problem.trials:
+                trial = data.trial
+                count = len(trial.time)
+                if trial.is_dynamic:
+                    count = min(count, max(LEAST_SAMPLES, ceil(BEGINNING * period / trial.interval)))
+                trials.append(shortened(trial, count))
+            self.beginnings = self.problem.with_trials(tuple(trials))
+        return self.beginnings
 
     def roughly(self, base: Fit, candidate: Candidate, added: FloatArray) -> Fit:
         """Fit a candidate by chord steps from a base."""
@@ -149,7 +235,10 @@ class Search:
         key = key_of(rough.candidate)
         found = self.exact.get(key)
         if found is None or found.log_evidence < rough.log_evidence - 5.0:
-            found = fit(self.problem, rough.candidate, rough.point)
+            try:
+                found = fit(self.problem, rough.candidate, rough.point)
+            except ModelError:  # chord steps led to where the structure cannot follow
+                found = rough
             self.keep(found, exact=True)
         return self.exact[key]
 
@@ -158,7 +247,9 @@ class Search:
         if not rough:
             return []
         top = self.score(rough[0])
-        chosen = [item for item in rough[:EXACT_FITS] if self.score(item) > max(top - CLOSE, floor)]
+        # far from the truth, chord steps rank only roughly
+        margin = max(CLOSE, 0.5 * (top - floor))
+        chosen = [item for item in rough[:EXACT_FITS] if self.score(item) > max(top - margin, floor)]
         return sorted((self.exactly(item) for item in chosen), key=lambda item: -self.score(item))
 
     # ---------------------------------------------------------------- the search
@@ -195,18 +286,30 @@ class Search:
 
     def _pairs(self) -> None:
         """Fit the most promising of all pairs of effects, by their changes at the fit without effect."""
-        screen = Screen(self.problem, self.none)
+        far = self._far(self.none)
+        near = self._near(self.none) if far else self.none
+        screen = Screen(self._short() if far else self.problem, near)
         changes = {effect.identifier: self._starts(screen, effect) for effect in self.effects}
         ranked = sorted(_pairs(changes, screen.sign), key=lambda item: item[0])[:PAIRS_FITTED]
-        rough = []
+        rough: list[Fit] = []
         for _, first, second in ranked:
             candidate = Candidate((first.term, second.term))
             if key_of(candidate) in self.exact:
                 continue
             start = np.concatenate((rescaled(first), rescaled(second)))
-            found = self.roughly(self.none, candidate, start)
-            self.keep(found, exact=False)
-            rough.append(found)
+            if far:
+                found = self._shortly(near, candidate, start)
+            else:
+                try:
+                    found = self.roughly(self.none, candidate, start)
+                except ModelError:
+                    found = None
+            if found is not None:
+                rough.append(found)
+        if far:
+            rough = self._whole(rough, self.none.objective)
+        for item in rough:
+            self.keep(item, exact=False)
         rough.sort(key=lambda item: -self.score(item))
         self.refine(rough, self.score(self.best()) - CLOSE)
 

@@ -345,13 +345,14 @@ def high_pass(
         return np.array(signal, dtype=np.float64)
     step, spectrum, length = _kernel(count, interval / time_constant, float(order))
     shape = signal.shape
-    columns = np.asarray(signal, dtype=np.float64).reshape(count, -1)
-    increments = np.diff(columns, axis=0, prepend=columns[:1])
-    transformed = np.fft.rfft(increments, length, axis=0) * spectrum[:, np.newaxis]
-    output = np.fft.irfft(transformed, length, axis=0)[:count]
+    rows = np.ascontiguousarray(np.asarray(signal, dtype=np.float64).reshape(count, -1).T)
+    increments = np.zeros((len(rows), count))
+    np.subtract(rows[:, 1:], rows[:, :-1], out=increments[:, 1:])
+    output = np.fft.irfft(np.fft.rfft(increments, length) * spectrum, length)[:, :count].T
     if held is not None:
-        jump = columns[0] - np.broadcast_to(held, shape[1:]).reshape(-1)
-        output += step[:, np.newaxis] * jump
+        jump = rows[:, 0] - np.broadcast_to(held, shape[1:]).reshape(-1)
+        if np.any(jump):
+            output = output + step[:, np.newaxis] * jump
     return output.reshape(shape)
 
 

@@ -5,11 +5,12 @@ sent to another process.
 """
 
 from collections.abc import Callable, Mapping
-from functools import partial
+from dataclasses import dataclass
+from functools import lru_cache, partial
 
 import numpy as np
 
-from discrepancy.campaign import Channel, Quantity, Trial, TrialKind
+from discrepancy.campaign import Campaign, Channel, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import PortScale
@@ -63,8 +64,28 @@ def largest_reading(
     setting: Setting, names: tuple[str, ...], kinds: frozenset[TrialKind] = EVERY_TRIAL
 ) -> float:
     """Return the largest magnitude among the used readings of channels [its unit], 1 if all are zero."""
+    return _largest_reading(_Same(setting.campaign), names, kinds)
+
+
+@dataclass(frozen=True, eq=False)
+class _Same:
+    """A campaign, equal to itself only; it holds arrays, so it has no hash of its own."""
+
+    campaign: Campaign
+
+    def __hash__(self) -> int:
+        return id(self.campaign)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.campaign is other.campaign
+
+
+@lru_cache(maxsize=512)  # patches are built at every step of a fit
+def _largest_reading(same: _Same, names: tuple[str, ...], kinds: frozenset[TrialKind]) -> float:
     largest = 0.0
-    for trial in trials(setting, *kinds):
+    for trial in same.campaign.fitted:
+        if trial.kind not in kinds:
+            continue
         for column, name in enumerate(trial.channels):
             if name in names:
                 kept = trial.values[trial.used[:, column], column]
@@ -109,6 +130,17 @@ def port_scale(setting: Setting, port: str) -> PortScale:
             f"The model {setting.model.name!r} has no port {port!r}; "
             f"it has {', '.join(setting.scales.ports) or 'none'}."
         ) from cause
+
+
+LARGEST_SHARE = 0.9
+"""Largest share of a port's stiffness at rest that an effect takes away; beyond it, it is built as this."""
+
+
+def removed_stiffness(setting: Setting, port: str, share: float) -> float:
+    """Return a share of the port's stiffness at rest [N/m or N m/rad], at most `LARGEST_SHARE` of it."""
+    scale = port_scale(setting, port)
+    at_rest = scale.stiffness if scale.static_stiffness is None else scale.static_stiffness
+    return min(share, LARGEST_SHARE) * at_rest
 
 
 # ---------------------------------------------------------------- places

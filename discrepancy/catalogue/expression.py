@@ -8,7 +8,7 @@ from math import cos, exp, isfinite, log, sin, sqrt, tan
 
 from discrepancy.errors import CatalogueError
 
-LONGEST = 500
+LONGEST = 300
 """Longest expression [characters]."""
 
 _BINARY: dict[type[ast.operator], Callable[[float, float], float]] = {

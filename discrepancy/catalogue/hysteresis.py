@@ -2,17 +2,24 @@
 
 from collections.abc import Mapping
 
-from discrepancy.catalogue.building import EVERY_TRIAL, at_ports, carried, has_port, needs, port_scale
+from discrepancy.catalogue.building import (
+    EVERY_TRIAL,
+    at_ports,
+    carried,
+    has_port,
+    needs,
+    port_scale,
+    removed_stiffness,
+)
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting, ShapeParameter
 from fe.patch import BoucWen, MicroSlip, ModelPatch
 
 FAMILY = "rate-independent hysteresis"
-LARGEST_SHARE = 0.9
 
 
 def _micro_slip(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
     scale = port_scale(setting, place)
-    stiffness = min(values["stiffness_share"], LARGEST_SHARE) * scale.stiffness
+    stiffness = removed_stiffness(setting, place, values["stiffness_share"])
     if stiffness == 0.0:
         return ModelPatch()  # a joint without stiffness of its own carries nothing that could slip
     slip_force = values["slip_ratio"] * stiffness * scale.displacement
@@ -21,7 +28,7 @@ def _micro_slip(setting: Setting, values: Mapping[str, float], place: str) -> Mo
 
 def _bouc_wen(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
     scale = port_scale(setting, place)
-    stiffness = min(values["stiffness_share"], LARGEST_SHARE) * scale.stiffness
+    stiffness = removed_stiffness(setting, place, values["stiffness_share"])
     return ModelPatch(
         (BoucWen(place, stiffness, values["yield_ratio"] * scale.displacement, values["order"]),)
     )
@@ -31,7 +38,7 @@ JOINT_MICRO_SLIP = Effect(
     identifier="joint_micro_slip",
     name="joint micro-slip (Iwan)",
     family=FAMILY,
-    equation="F = sum of Jenkins elements - K_T x, K_T = s k, F_S = r K_T A, slip displacements ~ d^chi",
+    equation="F = sum of Jenkins elements - K_T x, K_T = s k_0, F_S = r K_T A, slip displacements ~ d^chi",
     signature="Frequency falls and damping rises with amplitude; loss per cycle ~ A^(3 + chi).",
     reference="Iwan 1966, J. Appl. Mech. 33 (4), 893-900; Segalman 2005, J. Appl. Mech. 72 (5), 752-760",
     acts_on=EVERY_TRIAL,
@@ -40,8 +47,8 @@ JOINT_MICRO_SLIP = Effect(
             "stiffness_share",
             "s",
             "1",
-            "joint's share of the port's stiffness, K_T / k (built up to 0.9)",
-            Prior("log_normal", 0.02, 0.40),
+            "joint's share of the port's stiffness at rest, K_T / k_0 (built up to 0.9)",
+            Prior("log_normal", 0.03, 0.70),
             magnitude=True,
         ),
         EffectParameter(
@@ -73,7 +80,7 @@ BOUC_WEN_HYSTERESIS = Effect(
     identifier="bouc_wen_hysteresis",
     name="Bouc-Wen hysteresis",
     family=FAMILY,
-    equation="F = s k (z - x), z' = v (1 - (1 + sgn(v z)) / 2 |z / z_y|^n), z_y = r A",
+    equation="F = s k_0 (z - x), z' = v (1 - (1 + sgn(v z)) / 2 |z / z_y|^n), z_y = r A",
     signature="Smooth loops of load against motion at any speed; softer and more damped with amplitude.",
     reference="Bouc 1967, 4th Conf. Nonlinear Oscillation, Prague; Wen 1976, J. Eng. Mech. Div. 102, 249-263",
     acts_on=EVERY_TRIAL,
@@ -82,8 +89,8 @@ BOUC_WEN_HYSTERESIS = Effect(
             "stiffness_share",
             "s",
             "1",
-            "hysteretic share of the port's stiffness, 1 - alpha (built up to 0.9)",
-            Prior("log_normal", 0.02, 0.40),
+            "hysteretic share of the port's stiffness at rest, 1 - alpha (built up to 0.9)",
+            Prior("log_normal", 0.03, 0.70),
             magnitude=True,
         ),
         EffectParameter(

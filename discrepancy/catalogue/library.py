@@ -91,8 +91,8 @@ def _check_one(effect: Effect) -> None:
     for name, count in names.items():
         if count > 1:
             raise CatalogueError(f"{where} has {count} parameters with the name {name!r}.")
-    if not any(parameter.magnitude for parameter in effect.parameters):
-        raise CatalogueError(f"{where} has no parameter with which it vanishes (magnitude = true).")
+    if not effect.parameters:
+        raise CatalogueError(f"{where} has no parameters.")
     free: tuple[EffectParameter | ShapeParameter, ...] = (*effect.parameters, *effect.shape)
     for parameter in free:
         _check_prior(parameter.prior, f"{where}, parameter {parameter.name!r}")

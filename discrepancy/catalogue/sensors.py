@@ -1,7 +1,10 @@
 """Effects of sensors: thermal strain, zero drift, gain, misalignment of a gauge, AC coupling."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from math import isinf, pi
+
+import numpy as np
 
 from discrepancy.catalogue.building import (
     DYNAMIC,
@@ -16,9 +19,12 @@ from discrepancy.catalogue.building import (
     somewhere,
     temperature_varies,
     trial_of,
+    trials,
     with_all,
 )
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting, ShapeParameter
+from discrepancy.errors import ModelError
+from discrepancy.models.interface import Conditions, Response
 from fe.patch import HighPass, ModelPatch, SensorDrift, SensorGain, SensorRotation, ThermalStrain
 
 _NO_STRAIN = "The campaign has no strain channel."
@@ -58,6 +64,24 @@ def _gauge_gain(setting: Setting, values: Mapping[str, float], place: str) -> Mo
 
 def _misalignment(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
     return ModelPatch((SensorRotation(place, values["angle"]),))
+
+
+def _strain_components(setting: Setting) -> str | None:
+    """Return why a turned gauge cannot be computed, None if the model gives strain across and in shear."""
+    model, campaign = setting.model, setting.campaign
+    names = at_strain_channels(setting)
+    trial = next(trial for trial in trials(setting) if any(name in names for name in trial.channels))
+    channel = campaign.channels[next(name for name in trial.channels if name in names)]
+    means = [campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in model.parameters]
+    conditions = Conditions(np.array(means), health=trial.health)
+    given: Response | None = None
+    with suppress(ModelError):
+        given = model.respond(
+            trial, ((channel.output, channel.quantity),), ModelPatch(), conditions, components=True
+        )
+    if given is None or given.transverse is None or given.shear is None:
+        return f"The model {model.name!r} gives no transverse and shear strain, which a turned gauge sees."
+    return None
 
 
 def _dynamic_channels(setting: Setting) -> tuple[str, ...]:
@@ -169,10 +193,11 @@ GAUGE_MISALIGNMENT = Effect(
     ),
     build=_misalignment,
     places=at_strain_channels,
-    unavailable=needs(somewhere(at_strain_channels, _NO_STRAIN)),
+    unavailable=needs(somewhere(at_strain_channels, _NO_STRAIN), _strain_components),
     confusable=("gauge_gain", "local_stiffness_loss"),
 )
 
+# The corner is no magnitude: however low, a filter that had settled takes off the value before a release.
 HIGH_PASS = Effect(
     identifier="high_pass",
     name="high-pass of a piezo gauge or AC coupling",
@@ -188,7 +213,6 @@ HIGH_PASS = Effect(
             "1",
             "corner over the first frequency, 1 / (w_1 tau)",
             Prior("log_normal", 0.005, 1.0),
-            magnitude=True,
         ),
     ),
     build=_high_pass,

@@ -14,6 +14,7 @@ from discrepancy.catalogue.building import (
     has_port,
     needs,
     port_scale,
+    removed_stiffness,
     somewhere,
     trial_of,
     trials,
@@ -22,7 +23,6 @@ from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting,
 from fe.patch import FreePlay, ModelPatch, PowerStiffness, RunOffset, StiffnessDrift
 
 FAMILY = "stiffness |x|^n, one- or two-sided"
-LARGEST_LOSS = 0.9
 SKINS = {"lower skin": 1, "upper skin": -1}
 """Skin that is cracked, and the sign of x that opens it: upward bending stretches the lower skin."""
 
@@ -48,13 +48,13 @@ def _skins(setting: Setting) -> tuple[str, ...]:
 def _breathing_crack(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
     port, _, skin = place.rpartition(", ")
     scale = port_scale(setting, port)
-    force = -min(values["stiffness_loss"], LARGEST_LOSS) * scale.stiffness * scale.displacement
+    force = -removed_stiffness(setting, port, values["stiffness_loss"]) * scale.displacement
     return ModelPatch((PowerStiffness(port, force, values["exponent"], SKINS[skin], scale.displacement),))
 
 
 def _free_play(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
     scale = port_scale(setting, place)
-    stiffness = min(values["stiffness_share"], LARGEST_LOSS) * scale.stiffness
+    stiffness = removed_stiffness(setting, place, values["stiffness_share"])
     return ModelPatch((FreePlay(place, stiffness, values["gap_ratio"] * scale.displacement),))
 
 
@@ -116,7 +116,7 @@ BREATHING_CRACK = Effect(
     identifier="breathing_crack",
     name="breathing crack (bilinear stiffness)",
     family=FAMILY,
-    equation="F = -d k x where the crack is open (one sign of x), 0 where it is closed",
+    equation="F = -d k_0 x where the crack is open (one sign of x), 0 where it is closed",
     signature="Second harmonic and a shift of the mean, as the amplitude; frequencies constant.",
     reference="Chu and Shen 1992, AIAA Journal 30 (10), 2512-2519",
     acts_on=EVERY_TRIAL,
@@ -125,8 +125,8 @@ BREATHING_CRACK = Effect(
             "stiffness_loss",
             "d",
             "1",
-            "share of the port's stiffness lost while open (built up to 0.9)",
-            Prior("log_normal", 0.02, 0.40),
+            "share of the port's stiffness at rest lost while open (built up to 0.9)",
+            Prior("log_normal", 0.03, 0.60),
             magnitude=True,
         ),
     ),
@@ -141,7 +141,7 @@ FREE_PLAY = Effect(
     identifier="free_play",
     name="free play (dead zone)",
     family="dead zone",
-    equation="F = -s k clip(x, -delta, delta), delta = r A",
+    equation="F = -s k_0 clip(x, -delta, delta), delta = r A",
     signature="The frequency falls as the amplitude nears the gap; a load line with a jump at zero load.",
     reference="Conner, Tang, Dowell and Virgin 1997, J. Fluids Struct. 11 (1), 89-109",
     acts_on=EVERY_TRIAL,
@@ -158,7 +158,7 @@ FREE_PLAY = Effect(
             "stiffness_share",
             "s",
             "1",
-            "share of the port's stiffness that the gap removes (built up to 0.9)",
+            "share of the port's stiffness at rest that the gap removes (built up to 0.9)",
             Prior("log_normal", 0.10, 0.80),
         ),
     ),

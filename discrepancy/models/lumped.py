@@ -387,4 +387,4 @@ class LumpedModel:
         still = 1.0 / float(vector @ system.flexibility(vector))
         # A port that the first mode does not move has its static stiffness.
         stiffness = first**2 / moved**2 if moved**2 / first**2 * still > 1e-6 else still
-        return PortScale(largest or 1.0, stiffness, first)
+        return PortScale(largest or 1.0, stiffness, first, still)

@@ -34,8 +34,9 @@ def test_moments_of_a_sum_of_squares_are_those_of_the_projection() -> None:
     assert quadratic_moments([(expected, None)]) == pytest.approx((np.trace(A), np.trace(A)))
 
 
-def test_restored_residuals_are_white_with_unit_variance(make_bench) -> None:
-    bench = make_bench(count=40, noise_freedom=np.inf)
+@pytest.mark.parametrize("held_out", [False, True])
+def test_restored_residuals_are_white_with_unit_variance(make_bench, held_out: bool) -> None:
+    bench = make_bench(count=40, noise_freedom=np.inf, held_out=(False, held_out))
     generator = np.random.default_rng(11)
     draws = np.array([
         np.concatenate([part.ravel() for part in bench.fit(generator).white(generator)]) for _ in range(3000)

@@ -186,6 +186,7 @@ def campaigns(draw: st.DrawFn) -> Campaign:
                 st.integers(0, 5), positive)) if kind is TrialKind.RINGDOWN
                 else None,
                 held_out=draw(st.booleans()),
+                noise_factor=draw(st.just(1.0) | positive),
             )
         )  # fmt: skip
     text = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=20)
