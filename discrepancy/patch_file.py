@@ -48,7 +48,7 @@ class PrimitiveInterval:
 
 @dataclass(frozen=True)
 class StoredPatch:
-    """Content of patch.json: effects, intervals of their primitives by effect, origin, FMU outputs by channel."""
+    """Content of patch.json: effects, intervals of their primitives, origin, FMU outputs by channel."""
 
     effects: tuple[NamedEffect, ...]
     intervals: tuple[tuple[PrimitiveInterval, ...], ...]
@@ -113,8 +113,8 @@ def write_patch(
     draws : sequence of sequence of ModelPatch, optional
         For each effect, in order: its patch at draws of the posterior. Without, intervals are null.
     channels : mapping of str to str, optional
-        Outputs of the wing FMU by the names of channels, as `fmu_outputs` returns them: by it the FMU knows what
-        the patch's sensors are.
+        Outputs of the wing FMU by the names of channels, as `fmu_outputs` returns them: by it the FMU knows
+        what the patch's sensors are.
 
     Raises
     ------
