@@ -231,6 +231,7 @@ class WingModel:
         ]
         duration = max(ends) - min(begins) if ends else 0.0
         by_first = self._port_rows @ shape
+        flexibility = np.einsum("pn,np->p", self._port_rows, static.solve(self._port_rows.T))
         return Scales(
             length=self.wing.span,
             tip_stiffness=1.0 / float(tip @ static.solve(tip)),
@@ -243,8 +244,8 @@ class WingModel:
             duration=max((float(t.time[-1] - t.time[0]) for t in dynamic), default=1.0),
             campaign_time=duration if duration > 0.0 else 1.0,
             ports={
-                port: PortScale(float(size) or 1.0, first**2 / float(by) ** 2, first)
-                for port, size, by in zip(PORTS, largest, by_first, strict=True)
+                port: PortScale(float(size) or 1.0, first**2 / float(by) ** 2, first, 1.0 / float(own))
+                for port, size, by, own in zip(PORTS, largest, by_first, flexibility, strict=True)
             },
         )
 
