@@ -25,6 +25,11 @@ SIGNAL, TIP = "spanwise", "tip"
 """Names of the channels: the strain signal of the ring-downs, the displacement of the loading runs."""
 ROOT_GAUGE = "strain[16]"
 """Where the model's strain is read for the signal; its place only sets the scale, which is unknown."""
+READING_ERROR = 33e-6 / 3.0**0.5
+"""Deviation of a value read off the plot: evenly within +-33 microvolt (a pixel is 66). The five plots show the same
+motion on the same grid of pixels, so that its error is common to the trials, and no average makes it less [V]."""
+TREND = 67
+"""Columns of the moving average that is the slow zero: 0.54 s, three periods of the first mode."""
 PARAMETERS = {
     "young_modulus_factor": (1.0080, 0.0103),
     "servo_mass": (0.1680, 0.0140),
@@ -47,20 +52,27 @@ class RecordPlan:
     columns : int
         Columns of the plot that are averaged into one sample. Four (32 ms) have a zero of their frequency
         response at 30.8 Hz, where the second bending mode rings.
+    detrended : bool
+        Whether the slow zero of the signal is taken off: its average over three periods (Hann weights). It moves
+        by a third of a millivolt in all five trials alike and is no motion of the wing.
     release : float
         Nominal displacement of the tip at the window's begin [m]; the unknown scale of the signal makes any value
         as good.
     mode_count : int
         Modes whose state at the begin is free.
+    loading_runs : bool
+        Whether the loading runs are used too, where they are.
     held_out : tuple of int
         Trials kept for proof, counted from 1.
     """
 
-    begin: float = 0.4
+    begin: float = 0.8
     end: float = inf
     columns: int = 4
-    release: float = 0.010
-    mode_count: int = 1
+    detrended: bool = True
+    release: float = 0.05
+    mode_count: int = 2
+    loading_runs: bool = True
     held_out: tuple[int, ...] = (3, 5)
 
 
@@ -90,7 +102,7 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
     data, plan = Path(data), plan or RecordPlan()
     try:
         records = read_records(data)
-        pairs = read_measurements(data) if _has_pairs(data) else None
+        pairs = read_measurements(data) if plan.loading_runs and _has_pairs(data) else None
     except CalibrationError as cause:
         raise CampaignFileError(f"The measurements of the wing cannot be read: {cause}") from cause
     if any(len(record.time) != len(records[0].time) for record in records) or len(records) < 2:
@@ -98,7 +110,8 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
             f"{data} must hold two or more ring-down records of one length; it holds {len(records)}."
         )
     windows = [_windowed(record, plan) for record in records]
-    noise = trial_scatter(windows)
+    scatter = trial_scatter(windows)
+    noise = replace(scatter, standard_deviation=float(np.hypot(scatter.standard_deviation, READING_ERROR)))
     channels = {
         SIGNAL: Channel(SIGNAL, Quantity.SIGNAL, ROOT_GAUGE, noise, inf, inf),
     }
@@ -128,7 +141,8 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
         (
             f"Ring-downs: {records[0].source} to {records[-1].source}, from {plan.begin:g} s after the release; "
             f"{plan.columns} columns of the plot averaged into a sample of {1e3 * _interval(windows):.3g} ms.",
-            f"Noise of the signal: scatter between the trials, {1e6 * noise.standard_deviation:.3g} microvolt.",
+            f"Noise of the signal: scatter between the trials, {1e6 * scatter.standard_deviation:.3g} microvolt, and "
+            f"the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
         ),
     )
 
@@ -170,15 +184,21 @@ def trial_scatter(windows: list[tuple[FloatArray, FloatArray]], duration: float 
 def _windowed(record: RingDownRecord, plan: RecordPlan) -> tuple[FloatArray, FloatArray]:
     """Return times since the first and samples of a record in the plan's window."""
     inside = np.flatnonzero((record.time >= plan.begin) & (record.time <= plan.end))
+    time, signal = record.time, record.signal
+    if plan.detrended:
+        inside = inside[(inside >= TREND // 2) & (inside < record.count - TREND // 2)]
+        weights = np.hanning(TREND + 2)[1:-1]
+        slow = np.convolve(signal, weights / weights.sum(), "same")
+        signal = signal - slow
     count = len(inside) // plan.columns
     if count < 60:
         raise CampaignDataError(
             f"{record.source}: {count} samples are left between {plan.begin:g} and {plan.end:g} s; 60 are needed."
         )
     kept = inside[: count * plan.columns].reshape(count, plan.columns)
-    time = record.time[kept].mean(axis=1)
+    time = time[kept].mean(axis=1)
     interval = float(time[-1] - time[0]) / (count - 1)
-    return interval * np.arange(count), record.signal[kept].mean(axis=1)
+    return interval * np.arange(count), signal[kept].mean(axis=1)
 
 
 def _interval(windows: list[tuple[FloatArray, FloatArray]]) -> float:
