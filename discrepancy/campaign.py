@@ -161,6 +161,9 @@ class Trial:
         Ring-downs only.
     held_out : bool
         True: not used to find or fit anything, only for proof.
+    noise_factor : float
+        Standard deviation of the noise in this trial over that of the channels' noise records, as known from the
+        acquisition (averaging, another range) [1].
     """
 
     name: str
@@ -179,6 +182,7 @@ class Trial:
     health_deviation: FloatArray
     release: Release | None = None
     held_out: bool = False
+    noise_factor: float = 1.0
 
     @property
     def is_dynamic(self) -> bool:

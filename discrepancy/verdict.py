@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from math import nan
 
 from fe.patch import ModelPatch
 
@@ -111,6 +112,15 @@ class Scores:
         Share of samples within the central predictive intervals.
     whiteness : float
         p-value of the Ljung-Box test, the least over dynamic channels (Holm); nan without dynamic trials.
+    sample_count : int
+        Used samples.
+    chi_square_deviation : float
+        Standard deviation of `chi_square_per_dof` if the model is right, from its degrees of freedom and
+        those of the noise records; nan without a noise record.
+    pit : tuple of float
+        Shares of the probability integral transforms in ten equal bins; 0.1 each if predictions are right.
+    pit_p_value : float
+        Of their uniformity, with the effective number of samples; nan with fewer than ten.
     """
 
     rms: Mapping[str, float]
@@ -119,6 +129,10 @@ class Scores:
     coverage_50: float
     coverage_90: float
     whiteness: float
+    sample_count: int = 0
+    chi_square_deviation: float = nan
+    pit: tuple[float, ...] = ()
+    pit_p_value: float = nan
 
 
 @dataclass(frozen=True)
@@ -126,7 +140,8 @@ class Proof:
     """What the effect does to data not used: before and after, on held-out and on fitted trials.
 
     `gap_closed` = 1 - (chi2_after - 1) / (chi2_before - 1) per degree of freedom on held-out trials;
-    `log_score_gain` per sample with its standard error.
+    nan with the reason in `gap_reason` where there is no held-out trial or no gap to close.
+    `log_score_gain` per sample with its standard error, trials taken as units.
     """
 
     held_out_before: Scores | None
@@ -137,6 +152,7 @@ class Proof:
     log_score_gain: float
     log_score_gain_error: float
     remaining: str = ""
+    gap_reason: str = ""
 
 
 @dataclass(frozen=True)

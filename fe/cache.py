@@ -187,7 +187,7 @@ def _build(
 ) -> WingFields:
     """Build and keep an entry; of several builders of one entry, one builds and the others wait for it."""
     entry = _entry(design, settings)
-    with _locked(entry.model.with_suffix(".lock")):
+    with locked(entry.model.with_suffix(".lock")):
         try:
             return _checked_fields(entry, design)  # another process may have been faster
         except (OSError, ReducedModelFileError):
@@ -244,7 +244,7 @@ def build(
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Iterator[None]:
     """Hold a lock file while building; without a writable folder there is nothing to guard."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -396,9 +396,7 @@ class ModelPatch:
             If a kind is unknown, a value is missing, superfluous, of the wrong type or not finite.
         """
         if not isinstance(rows, list):
-            raise InvalidPatchError(
-                f"{where} must be a list of primitives, but is a {type(rows).__name__}."
-            )
+            raise InvalidPatchError(f"{where} must be a list of primitives, but is a {type(rows).__name__}.")
         return cls(tuple(_primitive(row, f"{where}, primitive {n}") for n, row in enumerate(rows, start=1)))
 
     def to_json(self) -> str:

@@ -6,7 +6,7 @@ is handed to it, so that the same code runs on the project's modules and on the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
     from fe.reduced import ReducedModel
     from fe.transient import ModalIntegrator, TransientState
+
+
+class UnacceptableEffectError(ValueError):
+    """The values of missing effects are none that the wing can have; one sentence with its full stop."""
 
 
 class Physics(NamedTuple):
@@ -49,6 +53,22 @@ class Response(NamedTuple):
     tip_displacement: float
 
 
+class Moment(NamedTuple):
+    """What a step of an FMU with missing effects depends on beside inputs and duration.
+
+    Attributes
+    ----------
+    time, start : float
+        Time at the end of the step, and at the start of the simulation [s].
+    values : mapping of str to float
+        Variables of the effects by name.
+    """
+
+    time: float
+    start: float
+    values: Mapping[str, float]
+
+
 class WingBehaviour:
     """The wing in time: what it remembers, and how a step changes it.
 
@@ -72,7 +92,9 @@ class WingBehaviour:
         self._transient: TransientState | None = None
         self._bound: float | None = None
 
-    def start(self, parameters: WingParameters, inputs: Sequence[float]) -> Response:
+    def start(
+        self, parameters: WingParameters, inputs: Sequence[float], moment: Moment | None = None
+    ) -> Response:
         """Find the initial state: equilibrium, and for the transient the tip displaced and just let go.
 
         Parameters
@@ -81,6 +103,8 @@ class WingBehaviour:
             The parameters, within the validity box.
         inputs : sequence of float
             The inputs at the start.
+        moment : Moment, optional
+            Nothing here depends on it.
 
         Returns
         -------
@@ -99,7 +123,7 @@ class WingBehaviour:
         self._parameters, self._inputs = parameters, tuple(inputs)
         return response
 
-    def advance(self, inputs: Sequence[float], duration: float) -> Response:
+    def advance(self, inputs: Sequence[float], duration: float, moment: Moment | None = None) -> Response:
         """Advance by one step with the inputs held.
 
         Parameters
@@ -108,6 +132,8 @@ class WingBehaviour:
             The inputs of this step, within the validity box.
         duration : float
             Step size [s].
+        moment : Moment, optional
+            Nothing here depends on it.
 
         Returns
         -------

@@ -20,14 +20,18 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
+from fe.patch_arrays import PatchArrays
 from fe.reduced import RUNTIME_FILES, ReducedModel
 from fe.state import STIFFNESS_LOSS_NAMES, DigitalState
 from reporting.files import atomic_write_bytes
 
 from .compiled.package import DATA_FILE, binary_of, compiled_members
 from .description import documentation_page, model_description
-from .errors import FmuBuildError
-from .variables import FmuVariable, variable_table
+from .effect_variables import effect_rows, switch_of, units_of
+from .errors import FmuBuildError, PatchFileError
+from .patch_file import PatchFile
+from .patched_runtime import output_channels, patched_members, plain_effects
+from .variables import UNITS, FmuVariable, variable_table
 
 FmuKind = Literal["python", "compiled", "source"]
 """Run by Python, compiled for this machine, or the sources of the compiled one alone."""
@@ -142,6 +146,9 @@ def build_fmu(
     kind: FmuKind = "python",
     note: str = "",
     resources: Mapping[str, bytes] | None = None,
+    patch: PatchFile | None = None,
+    activate: bool = False,
+    arrays: PatchArrays | None = None,
     replace: bool = False,
 ) -> FmuInfo:
     """Pack a reduced model as an FMU; equal input gives equal bytes.
@@ -161,6 +168,13 @@ def build_fmu(
         characters.
     resources : mapping of str to bytes, optional
         Further files of the archive's folder `resources`, by name.
+    patch : PatchFile, optional
+        Missing effects that the FMU is to carry as tunable parameters.
+    activate : bool
+        Whether these are switched on from the start.
+    arrays : PatchArrays, optional
+        The wing in the basis for patches (`fe.patch_cache.patch_arrays`); needed where an effect changes
+        structure or loads, or turns a gauge.
     replace : bool
         Whether an existing file may be replaced.
 
@@ -175,13 +189,17 @@ def build_fmu(
         If the file exists, the suffix is wrong, a start value lies outside the model's validity box, a
         resource would take the place of another file, the wrong pythonfmu is installed, or there is no C
         compiler for a compiled one.
+    PatchFileError
+        If the FMU cannot carry an effect of the patch.
     """
     target = Path(path)
     if target.suffix != ".fmu":
         raise FmuBuildError(f"An FMU must have the suffix .fmu, but {target} was given.")
     if target.exists() and not replace:
         raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
-    content, content_hash = fmu_bytes(model, state, kind, note=note, resources=resources)
+    content, content_hash = fmu_bytes(
+        model, state, kind, note=note, resources=resources, patch=patch, activate=activate, arrays=arrays
+    )
     atomic_write_bytes(target, content)
     return _info(model, target, content, content_hash)
 
@@ -204,6 +222,9 @@ def fmu_bytes(
     *,
     note: str = "",
     resources: Mapping[str, bytes] | None = None,
+    patch: PatchFile | None = None,
+    activate: bool = False,
+    arrays: PatchArrays | None = None,
 ) -> tuple[bytes, str]:
     """Return the archive and its content hash; see `build_fmu`."""
     start = start_values(state or DigitalState())
@@ -212,9 +233,20 @@ def fmu_bytes(
         gauge_count=model.gauge_count, mode_count=mode_count, validity=model.validity, start=start
     )
     _check_start(table)
+    effects = []
+    if patch is not None:
+        if kind != "python":
+            raise PatchFileError(
+                f"The {kind} FMU cannot carry missing effects: build the kind `python` with this patch."
+            )
+        effects = plain_effects(patch.for_outputs(output_channels(model.gauge_count)))
+        start |= {switch_of(effect): float(activate) for effect in effects}
+        table += effect_rows(effects, len(table), start)
     description = f"{DESCRIPTION} {note}".strip()
     if kind == "python":
         template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start}, description)
+        if effects:
+            template |= patched_members(f"resources/uav_wing_{_PLACEHOLDER}_runtime", model, effects, arrays)
     else:
         template = compiled_members(
             model,
@@ -320,6 +352,7 @@ def _members(
             description=description,
             version=version("uav-twin"),
             generation_tool=f"uav-twin with PythonFMU {installed}",
+            units=UNITS + units_of(table),
         ),
         f"binaries/linux64/{module}.so": (
             wrapper / "resources/binaries/linux64/libpythonfmu-export.so"

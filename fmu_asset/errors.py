@@ -29,6 +29,10 @@ class FmuBuildError(FmuError, ValueError):
     """An FMU cannot be made from what was given."""
 
 
+class PatchFileError(FmuBuildError):
+    """A patch file cannot be read, or holds an effect that the FMU cannot carry."""
+
+
 class FmuFileError(FmuError, ValueError):
     """An FMU file is missing, damaged or unsafe to extract."""
 

@@ -193,6 +193,19 @@ class Exchange:
                 f"parameter.{name}", parameter, place.variable, positions
             )
 
+    def _own_slot(self, name: str) -> Slot:
+        """Return the slot of a parameter by its name in the FMU, which the binding does not name."""
+        variable = self._description.variable(name)
+        bound = {slot.variable.name for slot in self._parameter_slots.values()}
+        if variable is None or variable.causality != "parameter" or name in bound:
+            raise BindingError(
+                f"The binding {self._binding.name} has no parameter {name!r}; "
+                f"it has {', '.join(self._parameter_slots) or 'none'}."
+            )
+        place = self._find(name, f"parameter.{name}", "parameter")
+        own = Input(variable=name, unit=variable.unit or "1")
+        return self._slot(f"parameter.{name}", own, variable, [*range(place.size)])
+
     def _table(self, role: str) -> Mapping[str, Input]:
         table: Mapping[str, Input] = getattr(self._binding, role)
         return table
@@ -290,7 +303,8 @@ class Exchange:
         Parameters
         ----------
         parameters : mapping of str to float or sequence of float
-            By the binding's names and in its units.
+            By the binding's names and in its units; a parameter that the binding does not name goes by its
+            name in the FMU, in the FMU's unit.
 
         Returns
         -------
@@ -304,13 +318,9 @@ class Exchange:
         FmuInputError
             If a value is not finite or outside its range.
         """
-        slots = self._parameter_slots
-        for name in parameters:
-            if name not in slots:
-                raise BindingError(
-                    f"The binding {self._binding.name} has no parameter {name!r}; "
-                    f"it has {', '.join(slots) or 'none'}."
-                )
+        slots = self._parameter_slots | {
+            name: self._own_slot(name) for name in parameters if name not in self._parameter_slots
+        }
         fixed = {
             name: parameter.value
             for name, parameter in self._binding.parameter.items()

@@ -54,7 +54,8 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
     label : str
         Place in the binding, for the error.
     causality : {"input", "parameter", "output"}
-        What it must be; everything that is neither input nor parameter can be read.
+        What it must be; everything that is neither input nor parameter can be read, and a tunable parameter
+        can be sent at every step like an input (co-simulation).
 
     Raises
     ------
@@ -68,7 +69,12 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
         near = difflib.get_close_matches(name, [v.name for v in description.variables], 1, 0.6)
         hint = f"; did you mean {near[0]!r}?" if near else "."
         raise BindingError(f"{label} names {name!r}, which is not a variable of {description.path}{hint}")
-    if variable.causality not in _CAUSALITY[causality]:
+    sent = (
+        causality == "input"
+        and (variable.causality, variable.variability) == ("parameter", "tunable")
+        and description.interface == "co-simulation"
+    )
+    if variable.causality not in _CAUSALITY[causality] and not sent:
         raise BindingError(
             f"{label} must be of causality {causality}, but {name!r} is declared as {variable.causality} in "
             f"{description.path}."

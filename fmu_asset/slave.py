@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from .behaviour import Response, WingBehaviour, WingParameters
+from .behaviour import Moment, Response, UnacceptableEffectError, WingBehaviour, WingParameters
 from .variables import (
     INPUTS,
     STATUS_BAD_CALL,
@@ -106,9 +106,13 @@ class WingSlave:
         self._status = self._reference["status"]
         self._load_point = self._reference["load_point_displacement"]
         self._modal = self._load_point + 1
+        # Rows of missing effects, at the end of the table: they can be set between steps.
+        names = [row.name for row in self._table if row.variability == "tunable"]
+        self._first_effect = self._reference[names[0]] if names else len(self._table)
+        self._effects = {row.name: row.reference for row in self._table[self._first_effect :]}
         self._reading = _reading((), 0)
         self._phase = INSTANTIATED
-        self._time = 0.0
+        self._time = self._start_time = 0.0
         # Outputs that are computed when somebody reads them, since most masters do not.
         self._stale_response = True
         self._stale_bound = True
@@ -119,7 +123,7 @@ class WingSlave:
     def setup_experiment(self, start_time: float = 0.0, *_: object) -> None:
         """Take the start time."""
         if math.isfinite(start_time):
-            self._time = float(start_time)
+            self._time = self._start_time = float(start_time)
         else:
             self._refuse(STATUS_NOT_FINITE, f"the start time is {start_time!r}; it must be finite")
 
@@ -169,25 +173,44 @@ class WingSlave:
                 STATUS_BAD_STEP,
                 f"the step from t = {current_time!r} s was refused: the FMU stands at t = {self._time!r} s",
             )
-        if not self._in_range(0, self._input_count, "the step was refused and the state is as it was"):
+        consequence = "the step was refused and the state is as it was"
+        if not self._in_range(0, self._input_count, consequence):
             return False
-        response = self._behaviour.advance(self._values[: self._input_count], step_size)
+        moment = None
+        if self._effects:
+            if not self._in_range(self._first_effect, len(self._values), consequence):
+                return False
+            moment = self._moment(current_time + step_size)
+        try:
+            response = self._behaviour.advance(self._values[: self._input_count], step_size, moment)
+        except UnacceptableEffectError as error:
+            return self._refuse(STATUS_OUTSIDE_RANGE, f"{error} {consequence[:1].upper()}{consequence[1:]}")
         self._time = current_time + step_size
         self._accept(response)
         return True
 
     def _initialise(self) -> bool:
-        if not self._in_range(0, self._first_output, "the initialisation was refused"):
+        consequence = "the initialisation was refused"
+        if not self._in_range(0, self._first_output, consequence) or not self._in_range(
+            self._first_effect, len(self._values), consequence
+        ):
             return False
         try:
-            response = self._behaviour.start(self._parameters(), self._values[: self._input_count])
+            moment = self._moment(self._time) if self._effects else None
+            response = self._behaviour.start(self._parameters(), self._values[: self._input_count], moment)
+        except UnacceptableEffectError as error:
+            return self._refuse(STATUS_OUTSIDE_RANGE, f"{error} {consequence[:1].upper()}{consequence[1:]}")
         except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
             return self._refuse(STATUS_INTERNAL, f"the initialisation failed: {error!r}")
         self._accept(response)
         return True
 
+    def _moment(self, time: float) -> Moment:
+        values = {name: self._values[reference] for name, reference in self._effects.items()}
+        return Moment(time, self._start_time, values)
+
     def _parameters(self) -> WingParameters:
-        value = {row.name: self._values[row.reference] for row in self._table if row.causality == "parameter"}
+        value = {row.name: self._values[row.reference] for row in self._table if row.variability == "fixed"}
         return WingParameters(
             young_modulus_factor=value["young_modulus_factor"],
             damping_alpha=value["damping.alpha"],
@@ -211,7 +234,7 @@ class WingSlave:
     # ------------------------------------------------------------------ values
 
     def set_real(self, vrs: Sequence[int], values: Sequence[float]) -> None:
-        """Set inputs at any time and parameters before the end of initialisation."""
+        """Set inputs and tunable parameters at any time, others before the end of initialisation."""
         store = self._values
         free = self._input_count
         if vrs == self._input_references:  # all inputs in their order, as most masters send them
@@ -225,7 +248,7 @@ class WingSlave:
         self._stale_response = True
 
     def set_integer(self, vrs: Sequence[int], values: Sequence[int]) -> None:
-        """Set the enumeration `response` before the end of initialisation."""
+        """Set the enumeration `response` before the end of initialisation, whole tunable ones at any time."""
         for vr, value in zip(vrs, values, strict=True):
             self._set_parameter(vr, value)
         self._stale_response = True
@@ -235,7 +258,7 @@ class WingSlave:
         if row is None or row.causality == "output":
             name = "an unknown variable" if row is None else row.name
             self._refuse(STATUS_BAD_CALL, f"{name} (value reference {vr}) cannot be set")
-        elif self._phase in (READY, TERMINATED):
+        elif vr < self._first_effect and self._phase in (READY, TERMINATED):
             self._refuse(
                 STATUS_BAD_CALL, f"{row.name} is a fixed parameter and can be set only before the first step"
             )
@@ -273,7 +296,7 @@ class WingSlave:
             self._values[self._load_point] = self._behaviour.load_point_displacement()
         if self._stale_modal and highest >= self._modal:
             frequency, damping_ratio = self._behaviour.modal_data()
-            self._values[self._modal :] = [*frequency, *damping_ratio]
+            self._values[self._modal : self._first_effect] = [*frequency, *damping_ratio]
             self._stale_modal = False
 
     def set_boolean(self, vrs: Sequence[int], values: Sequence[bool]) -> None:
@@ -303,6 +326,7 @@ class WingSlave:
         body = [
             float(self._phase),
             self._time,
+            self._start_time,
             float(self._stale_response),
             float(self._stale_bound),
             float(self._stale_modal),
@@ -317,14 +341,14 @@ class WingSlave:
         try:
             body = self._unpack(state)
             count = len(self._values)
-            self._behaviour.restore(self._parameters_of(body[5 : 5 + count]), body[5 + count :])
+            self._behaviour.restore(self._parameters_of(body[6 : 6 + count]), body[6 + count :])
         except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
             self._refuse(STATUS_BAD_STATE, f"the FMU state was not restored: {error}")
             return
         self._phase = int(body[0])
-        self._time = body[1]
-        self._stale_response, self._stale_bound, self._stale_modal = (flag != 0.0 for flag in body[2:5])
-        self._values[:] = body[5 : 5 + count]
+        self._time, self._start_time = body[1:3]
+        self._stale_response, self._stale_bound, self._stale_modal = (flag != 0.0 for flag in body[3:6])
+        self._values[:] = body[6 : 6 + count]
 
     def _parameters_of(self, values: Sequence[float]) -> WingParameters:
         kept = self._values

@@ -12,7 +12,7 @@ from typing import Literal
 
 Kind = Literal["Real", "Integer", "Boolean", "Enumeration"]
 Causality = Literal["input", "parameter", "output"]
-Variability = Literal["continuous", "discrete", "fixed"]
+Variability = Literal["continuous", "discrete", "fixed", "tunable"]
 
 QUASI_STATIC = 1
 """Value of `response`: the steady turn, inertia and damping left out."""

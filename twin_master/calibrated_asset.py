@@ -12,8 +12,10 @@ from scipy.stats import gaussian_kde
 
 from calibration.result import QUANTITIES, STATE, CalibrationResult, Quantity
 from calibration.result_file import result_bytes
+from fe.patch_arrays import PatchArrays
 from fe.reduced import ReducedModel
 from fmu_asset.build import FmuInfo, FmuKind, build_fmu
+from fmu_asset.patch_file import PatchFile
 from reporting.provenance import hash_bytes
 from twin_master.run_folder import to_json
 
@@ -31,6 +33,9 @@ def pack_calibrated_wing(
     path: str | os.PathLike[str],
     *,
     kind: FmuKind = "python",
+    patch: PatchFile | None = None,
+    activate: bool = False,
+    arrays: PatchArrays | None = None,
     replace: bool = False,
 ) -> FmuInfo:
     """Pack the tailored model as an FMU that starts at the posterior mean; equal input gives equal bytes.
@@ -46,7 +51,7 @@ def pack_calibrated_wing(
         The wing.
     path : path-like
         Where to write, with the suffix .fmu.
-    kind : {"python", "compiled", "source"}
+    kind, patch, activate, arrays
         See `fmu_asset.build.build_fmu`.
     replace : bool
         Whether an existing file may be replaced.
@@ -64,6 +69,9 @@ def pack_calibrated_wing(
         note=description(calibration),
         resources={RESOURCE_NAME: record},
         kind=kind,
+        patch=patch,
+        activate=activate,
+        arrays=arrays,
         replace=replace,
     )
 

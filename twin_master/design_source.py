@@ -13,21 +13,23 @@ from fe.cache import reduced_model, wing_fields
 from fe.design import WingDesign, load_design
 from fe.fields import write_wing_vtu
 from fe.reduced import ReducedModel
+from fmu_asset.patch_file import load_patch
 from reporting.files import atomic_write_bytes, write_error
 from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.asset_source import (
     CALIBRATION_COPY,
     DESIGN_COPY,
+    MODEL_PATCH_COPY,
     Origin,
     check_wing_scenario,
     wing_asset,
-    wing_observation_table,
 )
 from twin_master.assets import Asset
 from twin_master.errors import MissionInputError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws, draw_parameter
+from twin_master.patches import check_model_patch, model_observation_table
 from twin_master.scenario import Scenario
 
 Float = NDArray[np.float64]
@@ -48,7 +50,13 @@ class DesignSource:
 
     def __init__(self, scenario: Scenario, design: Path | None, calibration: Path | None = None) -> None:
         self._scenario = scenario
-        self._given = {DESIGN_COPY: design, CALIBRATION_COPY: calibration}
+        model_patch = None if scenario.asset.model_patch is None else Path(scenario.asset.model_patch)
+        self._given = {
+            DESIGN_COPY: design,
+            CALIBRATION_COPY: calibration,
+            MODEL_PATCH_COPY: model_patch,
+        }
+        self._patch: Path | None = None
         self._design: WingDesign | None = None
         self._wing: ReducedModel | None = None
         self._mean = 1.0
@@ -58,6 +66,8 @@ class DesignSource:
     def origin(self) -> Origin:
         """The reduced model, twice; it has the name of its design once prepared."""
         model = f"reduced model of the design {self._name}".rstrip()
+        if self._given[MODEL_PATCH_COPY] is not None:
+            model = f"{model}, with effects"
         return Origin(model, model)
 
     @property
@@ -83,7 +93,11 @@ class DesignSource:
         design = read_design(self._given[DESIGN_COPY], calibration, tailored=self._given[DESIGN_COPY] is None)
         if design is None:
             raise MissionInputError("there is neither a wing design nor a calibration file.")
-        check_wing_scenario(self._scenario, len(design.gauges.positions))
+        gauges = len(design.gauges.positions)
+        check_wing_scenario(self._scenario, gauges)
+        patch = self._given[MODEL_PATCH_COPY]
+        if patch is not None:
+            check_model_patch(load_patch(patch), gauges, str(patch))
 
     def files(self) -> dict[str, bytes]:
         """Return design and calibration as they are given.
@@ -108,6 +122,9 @@ class DesignSource:
             if not copy.exists():
                 atomic_write_bytes(copy, self.files()[name])
         hashes = {}
+        if MODEL_PATCH_COPY in copies:
+            self._patch = copies[MODEL_PATCH_COPY]
+            hashes["model_patch"] = hash_file(self._patch)
         if CALIBRATION_COPY in copies:
             hashes["calibration"] = hash_file(copies[CALIBRATION_COPY])
         calibration = read_calibration(copies.get(CALIBRATION_COPY), self._scenario)
@@ -126,7 +143,7 @@ class DesignSource:
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Return the strains (E, S, U, G)."""
-        return wing_observation_table(self._model, self._scenario, draws, model)
+        return model_observation_table(self._model, self._scenario, draws, model, self._patch, self._design)
 
     def open(self) -> Asset:
         """Return the model as an asset."""

@@ -17,19 +17,21 @@ from fe.reduced import ReducedModel
 from fmu_asset.binding import Binding, load_binding
 from fmu_asset.build import build_fmu
 from fmu_asset.coupling.asset import CoupledAsset
+from fmu_asset.patch_file import load_patch
 from fmu_asset.script import script_fmu
 from fmu_asset.session import FmiAsset
 from reporting.files import atomic_write_bytes
-from reporting.progress import Progress
+from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_file
 from twin_master.asset_source import (
     BINDING_COPY,
     CALIBRATION_COPY,
     DESIGN_COPY,
     FMU_COPY,
+    MODEL_PATCH_COPY,
+    PATCH_COPY,
     Origin,
     check_wing_scenario,
-    wing_observation_table,
 )
 from twin_master.assets import Asset, AssetReading, InnerTruth
 from twin_master.calibrated_asset import pack_calibrated_wing
@@ -37,6 +39,7 @@ from twin_master.design_source import read_calibration, read_content, read_desig
 from twin_master.errors import MissionInputError
 from twin_master.graphical_model import GraphicalModel
 from twin_master.parameter import ParameterDraws, draw_parameter
+from twin_master.patches import arrays_of, check_model_patch, effect_names, model_observation_table
 from twin_master.scenario import Scenario
 from twin_master.seeds import generator
 
@@ -178,6 +181,8 @@ class FmuSource:
             DESIGN_COPY: design,
             FMU_COPY: fmu,
             CALIBRATION_COPY: calibration,
+            PATCH_COPY: _optional(scenario.asset.patch),
+            MODEL_PATCH_COPY: _optional(scenario.asset.model_patch),
         }
         self._folder: Path | None = None
         self._design: WingDesign | None = None
@@ -194,7 +199,13 @@ class FmuSource:
         model = f"reduced model of the design {self._design_name}".rstrip()
         if not self._scenario.asset.model_of_the_design:
             return Origin("FMU", "FMU")
-        return Origin("FMU" if self._given[FMU_COPY] else f"FMU of the {model}", model)
+        asset = "FMU" if self._given[FMU_COPY] else f"FMU of the {model}"
+        patched, believed = (self._given[name] is not None for name in (PATCH_COPY, MODEL_PATCH_COPY))
+        return Origin(
+            f"{asset}, with hidden effects" if patched else asset,
+            f"{model}, with effects" if believed else model,
+            differ=patched or believed,
+        )
 
     @property
     def wing(self) -> ReducedModel | None:
@@ -231,7 +242,11 @@ class FmuSource:
         design = read_design(self._given[DESIGN_COPY], calibration, tailored=self._tailored)
         fmu = self._given[FMU_COPY]
         binding = load_binding(self._binding)
-        self._check_names(binding)
+        gauges = 0 if design is None else len(design.gauges.positions)
+        self._check_names(binding, effect_names(self._given[PATCH_COPY], gauges))
+        model_patch = self._given[MODEL_PATCH_COPY]
+        if model_patch is not None:
+            check_model_patch(load_patch(model_patch), gauges, str(model_patch))
         if design is not None and self._scenario.asset.model_of_the_design:
             check_wing_scenario(self._scenario, len(design.gauges.positions))
         # Only with the FMU it is known how many values an array has.
@@ -260,14 +275,16 @@ class FmuSource:
             contents[FMU_COPY] = script_fmu(self._script)[0]
         return contents
 
-    def _check_names(self, binding: Binding) -> None:
+    def _check_names(self, binding: Binding, effects: tuple[str, ...] = ()) -> None:
+        """Check the scenario's names against the binding; `effects` are parameters by the FMU's own names."""
         scenario = self._scenario
         for what, names, known in (
             ("control input", scenario.control[0].values, binding.control),
             ("state", () if scenario.truth.kind == "asset" else scenario.state_names, binding.health),
             ("load", scenario.asset.load, binding.load),
-            ("parameter", (*scenario.asset.parameters, *scenario.asset.seeds), binding.parameter),
-        ):
+            ("parameter", (*scenario.asset.parameters, *scenario.asset.seeds),
+             [*binding.parameter, *effects]),
+        ):  # fmt: skip
             unknown = sorted({*names} - {*known})
             if unknown:
                 raise MissionInputError(
@@ -293,13 +310,17 @@ class FmuSource:
         hashes |= self._prepare_model(progress)
         if self._wing is not None and self._given[FMU_COPY] is None:
             with progress.stage("Packing the FMU"):
-                self._pack(self._wing, self._path(FMU_COPY), tailored=self._tailored)
+                self._pack(self._wing, self._path(FMU_COPY), tailored=self._tailored, progress=progress)
         hashes["fmu"] = hash_file(self._path(FMU_COPY))
         return hashes
 
     def _prepare_model(self, progress: Progress) -> dict[str, str]:
         """Read the calibration and reduce the design that the twin believes; return the hashes."""
-        hashes = {}
+        hashes = {
+            Path(name).stem: hash_file(self._path(name))
+            for name in (PATCH_COPY, MODEL_PATCH_COPY)
+            if self._given[name] is not None
+        }
         if self._given[CALIBRATION_COPY] is not None:
             self._calibration = read_calibration(self._path(CALIBRATION_COPY), self._scenario)
             hashes["calibration"] = hash_file(self._path(CALIBRATION_COPY))
@@ -311,12 +332,18 @@ class FmuSource:
             hashes["design"] = self._wing.design_hash
         return hashes
 
-    def _pack(self, wing: ReducedModel, target: Path, *, tailored: bool) -> None:
+    def _pack(
+        self, wing: ReducedModel, target: Path, *, tailored: bool, progress: Progress | None = None
+    ) -> None:
         """Pack an FMU to fly; where the scenario names no parameter, the start value is flown."""
+        patch = None if self._given[PATCH_COPY] is None else load_patch(self._path(PATCH_COPY))
+        arrays = arrays_of(self._design, patch, progress or SilentProgress())
         if tailored and self._calibration is not None:
-            pack_calibrated_wing(wing, self._calibration, target, replace=True)
+            pack_calibrated_wing(
+                wing, self._calibration, target, patch=patch, activate=True, arrays=arrays, replace=True
+            )
         else:
-            build_fmu(wing, target, replace=True)
+            build_fmu(wing, target, patch=patch, activate=True, arrays=arrays, replace=True)
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the calibrated parameter."""
@@ -326,7 +353,8 @@ class FmuSource:
         """Return the predicted observations (E, S, U, G), from the design's model or from the FMU itself."""
         if self._scenario.asset.observation_model == "asset" or self._wing is None:
             return self._tabulate(draws, model)
-        return wing_observation_table(self._wing, self._scenario, draws, model)
+        patch = None if self._given[MODEL_PATCH_COPY] is None else self._path(MODEL_PATCH_COPY)
+        return model_observation_table(self._wing, self._scenario, draws, model, patch, self._design)
 
     def _tabulate(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Ask the FMU for its observation at every draw, state and control: for assets without memory."""
@@ -428,6 +456,10 @@ class FmuSource:
         start = 1.0 if self._calibration is None else self._calibration.mean("young_modulus_factor")
         e = self._scenario.asset.parameters.get("young_modulus_factor", start)
         return write_design_field(path, self._scenario, self._design, e, state, control)
+
+
+def _optional(path: str | None) -> Path | None:
+    return None if path is None else Path(path)
 
 
 def _plain_name(name: str, taken: set[str]) -> str:

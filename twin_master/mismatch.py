@@ -164,7 +164,7 @@ class Misfit:
 def find_misfit(
     scenario: Scenario, model: GraphicalModel, sensor_model: GaussianSensorModel, asset: Asset
 ) -> Misfit:
-    """Ask an asset without memory for every state and control, and compare; NaN where it refuses the step.
+    """Ask an asset for every state and control from where it stands, and compare; NaN where it refuses.
 
     Parameters
     ----------
@@ -179,9 +179,11 @@ def find_misfit(
     """
     names = scenario.state_names
     observation = np.full(sensor_model.mean.shape, np.nan)
+    start = asset.save_state()
     for state, levels in enumerate(model.states.coordinates):
         health = dict(zip(names, levels.tolist(), strict=True))
         for index, control in enumerate(scenario.control):
+            asset.restore_state(start)  # an asset with hidden effects may remember
             with suppress(FmuCallError):
                 observation[state, index] = asset.step(control.values, health).values
     return Misfit(sensor_model.mean - observation, observation, _gain(model, sensor_model))

@@ -15,7 +15,9 @@ from twin_master.asset_source import (
     DESIGN_COPY,
     FMU_COPY,
     LIBRARY_COPY,
+    MODEL_PATCH_COPY,
     OBSERVATIONS_COPY,
+    PATCH_COPY,
     SHIPPED_DESIGN_NAME,
     SSP_COPY,
     AssetSource,
@@ -116,8 +118,9 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
         asset["file"] = str(folder / asset["file"])
     if asset["script"] and asset["script"] not in asset_scripts():
         asset["script"] = str(folder / asset["script"])
-    if asset["library"]:
-        asset["library"] = str(folder / asset["library"])
+    for key in ("library", "patch", "model_patch"):
+        if asset[key]:
+            asset[key] = str(folder / asset[key])
     if asset["binding"] and asset["binding"] not in binding_files():
         asset["binding"] = str(folder / asset["binding"])
     for component, section in zip(asset["component"], loaded.scenario.asset.component, strict=True):
@@ -141,7 +144,7 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
         if asset["kind"] != "strain_library":
             asset |= {"kind": "strain_library", "design": None, "binding": None, "observation_model": None}
             asset |= {"parameters": {}, "component": [], "connection": [], "seeds": []}  # those of FMUs
-            asset |= {"script": None, "library": None}
+            asset |= {"script": None, "library": None, "patch": None, "model_patch": None}
         asset["file"] = str(_library_file(overrides.strain_library))
     if overrides.library:
         asset |= {"observation_model": "library", "library": str(overrides.library.resolve())}
@@ -160,6 +163,7 @@ def portable_scenario(scenario: Scenario) -> Scenario:
     """Return a resolved scenario that names the copies in the run folder, so that it holds on any machine."""
     file = {"strain_library": LIBRARY_COPY, "coupled": SSP_COPY}.get(scenario.asset.kind, FMU_COPY)
     copies = {"file": file, "design": DESIGN_COPY, "binding": BINDING_COPY, "library": OBSERVATIONS_COPY}
+    copies |= {"patch": PATCH_COPY, "model_patch": MODEL_PATCH_COPY}
     portable = _with_asset(
         scenario,
         {key: copies[key] for key in _given_paths(scenario)}
@@ -186,6 +190,7 @@ def _given_paths(scenario: Scenario) -> dict[str, str]:
     """Return the files that the asset names, without what is shipped."""
     asset = scenario.asset
     given = {"file": asset.file or asset.script, "library": asset.library}
+    given |= {"patch": asset.patch, "model_patch": asset.model_patch}
     shipped = {SHIPPED_DESIGN_NAME, CALIBRATED_DESIGN_NAME, *binding_files()}
     for key, path in (("design", asset.design), ("binding", asset.binding)):
         given[key] = None if path in shipped else path

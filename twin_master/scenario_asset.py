@@ -65,6 +65,11 @@ class AssetSection(Section):
     """An observation library, as `uav-twin library sample` writes it."""
     seeds: tuple[Name, ...] = ()
     """Parameters of the binding that are given a number drawn from the seed of the run."""
+    patch: str | None = None
+    """A patch file: missing effects that the FMU packed of the design carries, switched on from the start
+    unless `parameters` says otherwise. The twin does not know of them."""
+    model_patch: str | None = None
+    """A patch file: effects that the twin's model of the design carries."""
     component: tuple[ComponentSection, ...] = ()
     connection: tuple[ConnectionSection, ...] = ()
     algorithm: Literal["gauss_seidel", "jacobi"] = "gauss_seidel"
@@ -79,7 +84,11 @@ class AssetSection(Section):
     @property
     def another_model(self) -> bool:
         """Whether what is flown is known to be another model than the one that the twin believes."""
-        return self.kind == "strain_library" and self.model_of_the_design
+        return (
+            (self.kind == "strain_library" and self.model_of_the_design)
+            or self.patch is not None
+            or self.model_patch is not None
+        )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -112,6 +121,16 @@ class AssetSection(Section):
         if self.observation_model == "design" and self.design is None:
             raise ValueError(
                 '`observation_model = "design"` needs `design`, the wing whose model the twin believes'
+            )
+        if self.patch and (self.kind != "fmu" or self.file or self.script or not self.design):
+            raise ValueError(
+                "`patch` goes into the FMU that is packed of `design`, and here another asset is flown: "
+                "leave out `patch`, or `file` and `script`"
+            )
+        if self.model_patch and not self.model_of_the_design:
+            raise ValueError(
+                "`model_patch` goes into the model of `design`, and the twin believes another one: give "
+                "`design` and leave out `observation_model`, or leave out `model_patch`"
             )
         if self.kind == "strain_library":
             self._check_library()

@@ -30,36 +30,59 @@ def build(
         str | None,
         typer.Option(help="Pack this model script instead of a wing: gear_pump, or a file."),
     ] = None,
+    patch: Annotated[
+        Path | None,
+        typer.Option(help="A patch file: missing effects that the FMU carries as tunable parameters."),
+    ] = None,
+    activate: Annotated[
+        bool, typer.Option("--activate", help="Switch the effects of --patch on from the start.")
+    ] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Pack the wing (or a model script) as an FMI 2.0 co-simulation FMU; equal input gives equal bytes."""
     from fe.cache import reduced_model
     from fe.design import load_design
+    from fe.patch_cache import patch_arrays
     from fmu_asset.build import build_fmu
     from fmu_asset.compiled.compiler import find_compiler
     from fmu_asset.errors import FmuBuildError
+    from fmu_asset.patch_file import load_patch
     from reporting.progress import RichProgress
 
     if calibration is not None and design is not None:
         raise typer.BadParameter("the calibration holds its design: give either it or --design.")
     if out.exists() and not replace:
         raise FmuBuildError(f"{out} exists: choose another --out or give --replace.")
+    if activate and patch is None:
+        raise typer.BadParameter("there is no --patch whose effects could be switched on.")
     if script is not None:
-        for_the_wing = design is not None or calibration is not None or kind != "python"
+        for_the_wing = design is not None or calibration is not None or kind != "python" or patch is not None
         _build_script(script, out, replace=replace, other=for_the_wing)
         return
+    effects = None if patch is None else load_patch(patch)
     if kind == "compiled":
         find_compiler()  # before the wing is modelled, which can take a minute
     if calibration is None:
-        model = reduced_model(load_design(design), progress=RichProgress())
-        info = build_fmu(model, out, kind=kind, replace=replace)
+        shape = load_design(design)
+        model = reduced_model(shape, progress=RichProgress())
+        arrays = patch_arrays(shape, RichProgress()) if effects is not None and effects.needs_arrays else None
+        info = build_fmu(
+            model, out, kind=kind, patch=effects, activate=activate, arrays=arrays, replace=replace
+        )
     else:
         from calibration.result import CalibrationResult
         from twin_master.calibrated_asset import pack_calibrated_wing
 
         wing = CalibrationResult.load(calibration)
         model = reduced_model(wing.design, progress=RichProgress())
-        info = pack_calibrated_wing(model, wing, out, kind=kind, replace=replace)
+        arrays = (
+            patch_arrays(wing.design, RichProgress())
+            if effects is not None and effects.needs_arrays
+            else None
+        )
+        info = pack_calibrated_wing(
+            model, wing, out, kind=kind, patch=effects, activate=activate, arrays=arrays, replace=replace
+        )
         typer.echo(f"Calibrated for {wing.asset}.")
     typer.echo(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
 
@@ -71,7 +94,7 @@ def _build_script(script: str, out: Path, *, replace: bool, other: bool) -> None
 
     if other:
         raise typer.BadParameter(
-            "--design, --calibration and --kind are for the wing.", param_hint="--script"
+            "--design, --calibration, --patch and --kind are for the wing.", param_hint="--script"
         )
     info = build_script_fmu(asset_scripts().get(script, Path(script)), out, replace=replace)
     typer.echo(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}")

@@ -38,7 +38,7 @@ class WingRig:
         self.store = store
         self.design = store.design
         self.outputs = (
-            *(f"strain[{k}]" for k in range(len(self.design.gauges.positions))),
+            *(f"strain[{k + 1}]" for k in range(len(self.design.gauges.positions))),
             "load_point_displacement",
             "tip_displacement",
             "displacement[0.914, 0.3]",

@@ -49,11 +49,15 @@ class PortScale:
         k, the stiffness of the first bending mode seen at the port, w1^2 / phi1(port)^2 [N/m or N m/rad].
     angular_frequency : float
         w1 [rad/s].
+    static_stiffness : float or None
+        1 / (p . K^-1 p), the stiffness at rest seen at the port [N/m or N m/rad]. At a stiff joint it is a
+        small part of `stiffness`, and no effect can take away more. None: not known, taken as `stiffness`.
     """
 
     displacement: float
     stiffness: float
     angular_frequency: float
+    static_stiffness: float | None = None
 
 
 @dataclass(frozen=True)

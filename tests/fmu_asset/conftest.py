@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fe.patch_arrays import PatchArrays
 from fe.reduced import ReducedModel
 from fmu_asset.binding import Binding, load_binding, parse_binding
 from fmu_asset.build import build_fmu
@@ -114,3 +115,63 @@ def spring_mass(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def spring_binding() -> Binding:
     return parse_binding(SPRING_MASS)
+
+
+def chain_arrays(model: ReducedModel, span: float = 1.6) -> PatchArrays:
+    """Return the same chain in the form that carries patches, exact: its basis is the chain itself."""
+    stations = span * np.arange(NODES + 1) / NODES
+    place = np.vstack((np.zeros(NODES), np.eye(NODES)))
+    difference = np.eye(NODES) - np.eye(NODES, k=-1)
+    spring = float(model.static_stiffness[3, -1, -1]) / 0.05
+    region = np.zeros(NODES, dtype=int)
+    region[3:6], region[9:12] = 1, 2
+    parts, strip_of, term_of = [], [], []
+    for strip in range(4):
+        for term in range(3):
+            inside = (np.arange(NODES) // 4 == strip) & (region == term)
+            if inside.any():
+                matrix = difference.T @ np.diag(spring * inside) @ difference
+                parts.append(matrix[np.tril_indices(NODES)])
+                strip_of.append(strip)
+                term_of.append(term)
+    gauges = model.static_output[:-1]
+    bending = np.diff(gauges, axis=1, append=0.0)
+    zero = np.zeros_like(place)
+    weight = -9.81 * model.modal_mass[0].diagonal()
+    shares = np.arange(NODES + 1, 0.0, -1.0)
+    return PatchArrays(
+        design_hash=model.design_hash,
+        validity_box=model.validity_box,
+        largest_loss=0.7,
+        largest_compliance=1e-3,
+        largest_mass=0.5,
+        stiffness=model.static_stiffness,
+        mass=model.modal_mass,
+        strip_lines=np.linspace(0.0, span, 5),
+        strip_stiffness=np.array(parts, dtype=np.float32),
+        strip_of=np.array(strip_of),
+        term_of=np.array(term_of),
+        flap_row=np.eye(NODES)[0],
+        flap_spring=0.05 * spring,
+        semi_span=span,
+        root_chord=0.4,
+        tip_chord=0.3,
+        straight_chord_line=0.25,
+        load_place=float(stations[-2]),
+        stations=stations,
+        line_chord=np.array([0.25, 0.6]),
+        line_rows=np.stack((zero, zero, place, 0.9 * place)),
+        station_weights=shares / shares.sum(),
+        load_tip=model.static_load[1],
+        load_lift=model.static_load[0],
+        lift_rows=place * (model.static_load[0] - weight),
+        weight=weight,
+        strain_rows=np.stack((gauges, -0.3 * gauges, bending)),
+        tip_row=model.static_output[-1],
+        start_shapes=np.linalg.eigh(model.static_stiffness.sum(axis=0))[1][:, :8].copy(),
+    )
+
+
+@pytest.fixture(scope="session")
+def arrays(model: ReducedModel) -> PatchArrays:
+    return chain_arrays(model)

@@ -1,0 +1,132 @@
+"""Name what is hidden in blind campaigns: `python -m benchmarks.blind_naming DIR [--jobs 2]`.
+
+DIR is what `python -m benchmarks.blind generate --out DIR` wrote. Only DIR/campaigns and DIR/leave_out.json are
+read; a verdict for each campaign goes to DIR/verdicts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from discrepancy.campaign_file import read_campaign
+from discrepancy.catalogue.library import library
+from discrepancy.errors import DiscrepancyError
+from discrepancy.models.interface import Model
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.wing import WingModel
+from discrepancy.patch_file import primitive_intervals
+from discrepancy.verdict import VerdictKind
+from discrepancy.workflow import Investigation, investigate, patch_draws
+
+NAMING = (VerdictKind.NAMED, VerdictKind.FAMILY)
+_models: dict[str, Model] = {}
+
+
+def model_of(folder: Path) -> Model:
+    """Return the model of a campaign: the lumped one beside it, else the shipped wing."""
+    file = folder / "model.toml"
+    key = file.read_text(encoding="utf-8") if file.exists() else "wing"
+    if key not in _models:
+        _models[key] = LumpedModel.load(file) if file.exists() else WingModel.shipped()
+    return _models[key]
+
+
+def name_case(folder: Path, left_out: dict[str, list[str]]) -> dict[str, Any]:
+    """Return the verdict on one campaign as the scoring wants it."""
+    started = time.perf_counter()
+    effects = [item for item in library() if item.identifier not in left_out.get(folder.name, [])]
+    try:
+        found = investigate(read_campaign(folder), model_of(folder), effects, thorough=False)
+    except DiscrepancyError as error:
+        return {"kind": "data error", "sentence": str(error), "seconds": time.perf_counter() - started}
+    row = verdict_row(found)
+    row["seconds"] = time.perf_counter() - started
+    return row
+
+
+def verdict_row(found: Investigation) -> dict[str, Any]:
+    """Return a verdict as plain data."""
+    verdict, proof = found.verdict, found.proof
+    row: dict[str, Any] = {
+        "kind": verdict.kind.value,
+        "sentence": verdict.sentence,
+        "identifiers": sorted(item.identifier for item in verdict.effects) if verdict.kind in NAMING else [],
+        "places": {item.identifier: item.place for item in verdict.effects},
+        "group": list(verdict.group),
+        "family": verdict.family,
+        "probability": _finite(verdict.probability),
+        "log_bayes_factor": _finite(verdict.log_bayes_factor),
+        "gates": [[gate.name, gate.passed, _finite(gate.statistic), gate.reason] for gate in verdict.gates],
+        "stages": found.seconds,
+        "hypotheses": [
+            [list(item.identifiers), round(item.log_evidence, 2), round(item.probability, 5)]
+            for item in verdict.hypotheses[:5]
+        ],
+        "estimates": {},
+        "parameters": {},
+    }
+    if proof is not None and proof.held_out_after is not None:
+        row["held_out_chi_square_per_dof_after"] = _finite(proof.held_out_after.chi_square_per_dof)
+        row["gap_closed"] = _finite(proof.gap_closed)
+    if verdict.kind in NAMING and found.problem is not None and found.fit is not None:
+        draws = patch_draws(found.problem, found.fit, seed=1)
+        for effect, patches in zip(verdict.effects, draws, strict=True):
+            row["parameters"][effect.identifier] = {
+                item.name: [item.low, item.value, item.high] for item in effect.parameters
+            }
+            for item in primitive_intervals(effect.patch, patches):
+                if math.isfinite(item.low) and item.low < item.high:
+                    row["estimates"][f"{effect.identifier}.{item.parameter}"] = [
+                        item.low,
+                        item.value,
+                        item.high,
+                    ]
+    return row
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _one(out: Path, left_out: dict[str, list[str]], folder: Path) -> str:
+    row = name_case(folder, left_out)
+    (out / f"{folder.name}.json").write_text(json.dumps(row, indent=1) + "\n", encoding="utf-8")
+    return folder.name
+
+
+def main() -> None:
+    """Name all campaigns that have no verdict yet."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--again", action="store_true", help="also those that have a verdict")
+    arguments = parser.parse_args()
+    out = arguments.folder / "verdicts"
+    out.mkdir(exist_ok=True)
+    file = arguments.folder / "leave_out.json"
+    left_out = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    folders = [
+        folder
+        for folder in sorted((arguments.folder / "campaigns").iterdir())
+        if arguments.again or not (out / f"{folder.name}.json").exists()
+    ]
+    WingModel.shipped()  # built once, before the processes start
+    with ProcessPoolExecutor(arguments.jobs) as pool:
+        named = pool.map(partial(_one, out, left_out), folders, chunksize=1)
+        for _ in track(named, description="verdicts", total=len(folders), console=Console()):
+            pass
+
+
+if __name__ == "__main__":
+    main()

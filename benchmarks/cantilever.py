@@ -1,0 +1,317 @@
+"""A uniform cantilever as a `Model`: quick, for the pictures of docs/effects and the catalogue's tests.
+
+Euler-Bernoulli elements on a root that turns in a spring; shear strain of the skin follows the torque of a
+load behind the elastic line. About the size of the wing that this project flies.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign import (
+    Campaign,
+    Channel,
+    NoiseRecord,
+    Quantity,
+    Release,
+    Trial,
+    TrialKind,
+)
+from discrepancy.errors import ModelError
+from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.second_order import SecondOrderSystem
+from discrepancy.sensing import observe
+from fe.motion import laws_of
+from fe.patch import (
+    INTERNAL_FORCES,
+    InertiaRelief,
+    LoadGain,
+    LoadPlace,
+    LocalStiffnessLoss,
+    ModelPatch,
+    ModulusTemperature,
+    PointMass,
+    Primitive,
+    RootCompliance,
+    Washout,
+)
+
+FloatArray = NDArray[np.float64]
+
+LENGTH, ELEMENTS = 1.8, 18  # m
+BENDING_STIFFNESS = 1350.0  # N m^2
+MASS_PER_LENGTH = 1.25  # kg/m
+ROOT_STIFFNESS = 12000.0  # N m/rad
+TORSIONAL_STIFFNESS = 900.0  # N m^2
+SKIN = 0.018  # m from the elastic line
+POISSON = 0.3
+GRAVITY = 9.80665
+LOAD_STATION = 1.65  # m, of the place "tip_load"
+DAMPING_RATIO = 0.006
+GAUGES = {"strain[0]": 0.25, "strain[1]": 0.85, "strain[2]": 1.35}  # m
+STEP = LENGTH / ELEMENTS
+SIZE = 2 * ELEMENTS + 1  # root rotation, then displacement and rotation of each node
+
+
+def _degrees(element: int) -> list[int | None]:
+    """Return the unknowns of an element's ends: displacement, rotation; the root does not move."""
+    first: list[int | None] = [None, 0] if element == 0 else [2 * element - 1, 2 * element]
+    return [*first, 2 * element + 1, 2 * element + 2]
+
+
+def displacement_row(station: float) -> FloatArray:
+    """Return the row (n,) of the upward displacement at a station [m]."""
+    element = min(int(station / STEP), ELEMENTS - 1)
+    s = station / STEP - element
+    shape = (1 - 3 * s**2 + 2 * s**3, STEP * (s - 2 * s**2 + s**3), 3 * s**2 - 2 * s**3, STEP * (s**3 - s**2))
+    row = np.zeros(SIZE)
+    for degree, value in zip(_degrees(element), shape, strict=True):
+        if degree is not None:
+            row[degree] = value
+    return row
+
+
+def curvature_row(station: float) -> FloatArray:
+    """Return the row (n,) of w'' at a station [1/m]."""
+    element = min(int(station / STEP), ELEMENTS - 1)
+    s = station / STEP - element
+    shape = ((12 * s - 6) / STEP**2, (6 * s - 4) / STEP, (6 - 12 * s) / STEP**2, (6 * s - 2) / STEP)
+    row = np.zeros(SIZE)
+    for degree, value in zip(_degrees(element), shape, strict=True):
+        if degree is not None:
+            row[degree] = value
+    return row
+
+
+POINTS = (np.arange(10 * ELEMENTS) + 0.5) * LENGTH / (10 * ELEMENTS)
+SHARES = np.array([displacement_row(y) for y in POINTS])  # (P, n)
+SPAN = SHARES.mean(axis=0)
+ROOT = np.eye(SIZE)[0]
+TIP = displacement_row(LENGTH)
+PORTS = {"root": ROOT, "tip": TIP, "span": SPAN}
+
+
+@cache
+def _system(modulus: float, structural: ModelPatch) -> SecondOrderSystem:
+    """Return the structure with its modulus scaled and masses, root and losses of a patch."""
+    loss = np.zeros(ELEMENTS)
+    mass, extra, compliance = np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE)), 1.0 / ROOT_STIFFNESS
+    ends = np.arange(ELEMENTS) * STEP
+    for item in structural:
+        if isinstance(item, LocalStiffnessLoss):
+            inner = np.clip(
+                np.minimum(ends + STEP, item.start + item.length) - np.maximum(ends, item.start), 0, None
+            )
+            loss += item.loss * inner / STEP
+        elif isinstance(item, PointMass):
+            row = displacement_row(item.station)
+            extra += item.mass * np.outer(row, row)
+        elif isinstance(item, RootCompliance):
+            compliance += item.compliance
+    stiffness = np.zeros((SIZE, SIZE))
+    h = STEP
+    k = np.array(
+        [[12, 6 * h, -12, 6 * h], [6 * h, 4 * h**2, -6 * h, 2 * h**2],
+         [-12, -6 * h, 12, -6 * h], [6 * h, 2 * h**2, -6 * h, 4 * h**2]]
+    ) / h**3  # fmt: skip
+    m = np.array(
+        [[156, 22 * h, 54, -13 * h], [22 * h, 4 * h**2, 13 * h, -3 * h**2],
+         [54, 13 * h, 156, -22 * h], [-13 * h, -3 * h**2, -22 * h, 4 * h**2]]
+    ) * h / 420  # fmt: skip
+    for element in range(ELEMENTS):
+        pairs = [(i, d) for i, d in enumerate(_degrees(element)) if d is not None]
+        for i, a in pairs:
+            for j, b in pairs:
+                stiffness[a, b] += modulus * BENDING_STIFFNESS * (1.0 - loss[element]) * k[i, j]
+                mass[a, b] += MASS_PER_LENGTH * m[i, j]
+    stiffness[0, 0] += 1.0 / compliance
+    mass += extra
+    damping = (
+        2.0 * DAMPING_RATIO / 30.0 * stiffness
+    )  # ratio as stated at 30 rad/s, in proportion to frequency
+    return SecondOrderSystem(mass, damping, stiffness, PORTS, 5)
+
+
+class Cantilever:
+    """The cantilever; outputs "tip_displacement" and "strain[0]" to "strain[2]", ports root, tip and span."""
+
+    name = "cantilever"
+    parameters = (ModelParameter("young_modulus_factor", 1.0, 0.01, "1", 0.5, 2.0),)
+
+    def output_quantity(self, output: str) -> Quantity | None:
+        """Return what an output is."""
+        if output in GAUGES:
+            return Quantity.STRAIN
+        return Quantity.DISPLACEMENT if output == "tip_displacement" else None
+
+    def supports(self, primitive: type[Primitive]) -> bool:
+        """Whether the cantilever can carry a primitive: it can carry all."""
+        return True
+
+    def ports(self) -> tuple[str, ...]:
+        """Names of the ports."""
+        return tuple(PORTS)
+
+    def stations(self) -> tuple[float, float]:
+        """Root and tip [m]."""
+        return 0.0, LENGTH
+
+    def scales(self, campaign: Campaign) -> Scales:
+        """Return the natural scales under a campaign."""
+        system = _system(1.0, ModelPatch())
+        w = float(system.angular_frequency[0])
+        ports = {}
+        for name, row in PORTS.items():
+            largest = 0.0
+            for trial in campaign.fitted:
+                values = _motion(trial, row[None], ModelPatch(), Conditions(np.ones(1)))[0]
+                largest = max(largest, float(np.max(np.abs(values))))
+            ports[name] = PortScale(
+                largest,
+                float(w**2 / (row @ system.shapes[:, 0]) ** 2),
+                w,
+                float(1.0 / (row @ system.flexibility(row))),
+            )
+        dynamic = [trial for trial in campaign.fitted if trial.is_dynamic]
+        return Scales(
+            length=LENGTH,
+            tip_stiffness=float(1.0 / (TIP @ system.flexibility(TIP))),
+            modal_mass=float(1.0 / (TIP @ system.shapes[:, 0]) ** 2),
+            angular_frequency=w,
+            force=max(float(np.max(np.abs(trial.force))) for trial in campaign.fitted),
+            load_factor=max(float(np.max(np.abs(trial.load_factor))) for trial in campaign.fitted),
+            duration=max((float(trial.time[-1]) for trial in dynamic), default=1.0),
+            campaign_time=max(
+                float(trial.time[-1]) + (trial.start if trial.is_dynamic else 0.0)
+                for trial in campaign.fitted
+            ),
+            ports=ports,
+        )
+
+    def respond(
+        self,
+        trial: Trial,
+        outputs: tuple[tuple[str, Quantity], ...],
+        patch: ModelPatch,
+        conditions: Conditions,
+        *,
+        components: bool = False,
+        refinement: int = 1,
+    ) -> Response:
+        """Return the response of a trial."""
+        rows = np.array(
+            [SKIN * curvature_row(GAUGES[name]) if name in GAUGES else TIP for name, _ in outputs]
+        )
+        values, rates, torque = _motion(trial, rows, patch, conditions, refinement)
+        if not components:
+            return Response(values, rates)
+        gauge = np.array([name in GAUGES for name, _ in outputs])
+        shear = np.outer(torque, gauge) * 2.0 * SKIN / TORSIONAL_STIFFNESS
+        return Response(values, rates, -POISSON * values * gauge, shear)
+
+
+def _motion(
+    trial: Trial, rows: FloatArray, patch: ModelPatch, conditions: Conditions, refinement: int = 1
+) -> tuple[FloatArray, FloatArray | None, FloatArray]:
+    """Return values and rates (N, C) of rows (C, n), and the torque (N,) of the load."""
+    structural = patch.of(PointMass, RootCompliance, LocalStiffnessLoss)
+    softening = sum(item.coefficient for item in patch if isinstance(item, ModulusTemperature))
+    modulus = float(conditions.parameters[0]) * (1.0 - softening * trial.temperature)
+    place = LOAD_STATION if isinstance(trial.load_place, str) else trial.load_place[0]
+    gain, tare, behind, washout, relief = 1.0, 0.0, 0.05, np.zeros(len(POINTS)), 0.0
+    for item in patch:
+        if isinstance(item, LoadPlace):
+            place, behind = place + item.along_span, behind + item.along_chord
+        elif isinstance(item, LoadGain):
+            gain, tare = gain * (1.0 + item.gain), tare + item.tare
+        elif isinstance(item, Washout):
+            washout = washout + item.coefficient * (POINTS / LENGTH) ** item.exponent
+        elif isinstance(item, InertiaRelief):
+            relief += item.fraction
+    row = displacement_row(min(place, LENGTH))
+    force = np.where(trial.force != 0.0, gain * trial.force + tare, 0.0)
+    laws = laws_of(patch.of(*INTERNAL_FORCES), PORTS)
+    if trial.is_dynamic:
+        system = _system(float(modulus[0]), structural)
+        if trial.kind is TrialKind.RINGDOWN:
+            if trial.release is None:
+                raise ModelError(f"The ring-down {trial.name!r} has no release.")
+            motion = system.ringdown(
+                TIP,
+                trial.release,
+                conditions.initial,
+                trial.time,
+                laws,
+                clock=conditions.clock,
+                refinement=refinement,
+            )
+        else:
+            motion = system.forced(
+                row, force, trial.time, laws, clock=conditions.clock, refinement=refinement
+            )
+        response = motion.response(rows, [Quantity.DISPLACEMENT] * len(rows))
+        return response.values, response.rates, behind * force
+    loads = np.outer(force, row)
+    for n in range(len(force)):
+        factor = trial.load_factor[n]
+        lift = 20.0 * factor * (1.0 - washout * factor)  # N/m: about the aircraft's weight
+        loads[n] += ((lift - relief * factor * MASS_PER_LENGTH * GRAVITY)[:, None] * SHARES).sum(axis=0) * (
+            LENGTH / len(POINTS)
+        )
+    values = np.empty((len(force), len(rows)))
+    for level in np.unique(modulus):
+        chosen = modulus == level
+        values[chosen] = (_system(float(level), structural).static(loads, laws) @ rows.T)[chosen]
+    return values, None, behind * force
+
+
+def channel_list() -> dict[str, Channel]:
+    """Return four channels: the tip's displacement and three gauges."""
+    noise = {Quantity.DISPLACEMENT: 2e-4, Quantity.STRAIN: 2e-6}
+    rows = [("tip", Quantity.DISPLACEMENT, "tip_displacement")]
+    rows += [(f"g{n}", Quantity.STRAIN, name) for n, name in enumerate(GAUGES)]
+    return {
+        name: Channel(name, quantity, output, NoiseRecord(noise[quantity], 200.0), 0.005, noise[quantity])
+        for name, quantity, output in rows
+    }
+
+
+def _trial(name: str, kind: TrialKind, time: FloatArray, **given: object) -> Trial:
+    count, names = len(time), tuple(channel_list())
+    zero = np.zeros(count)
+    base = {
+        "values": np.zeros((count, len(names))), "used": np.ones((count, len(names)), dtype=bool),
+        "force": zero, "load_factor": zero, "load_place": "tip_load", "temperature": zero, "start": 0.0,
+        "run": "A", "health": np.zeros((count, 2)), "health_deviation": np.zeros((count, 2)),
+    }  # fmt: skip
+    return Trial(name=name, kind=kind, channels=names, time=time, **{**base, **given})  # type: ignore[arg-type]
+
+
+def campaign() -> Campaign:
+    """Return a campaign on the cantilever as it is, without noise: every kind of trial, two runs.
+
+    Two ring-downs, one forced trial, three static ones (up, down, warm) and one flight.
+    """
+    levels = np.array([5.0, 10.0, 20.0, 30.0, 20.0, 10.0, 5.0])
+    minutes = 60.0 * np.arange(1, 8)
+    samples = np.arange(2000) / 250.0
+    trials = (
+        _trial("up", TrialKind.STATIC, minutes, force=levels),
+        _trial("down", TrialKind.STATIC, 600.0 + minutes, force=-levels, run="B"),
+        _trial("warm", TrialKind.STATIC, 1200.0 + minutes, force=levels, run="B",
+               temperature=np.full(7, 15.0)),
+        _trial("release", TrialKind.RINGDOWN, samples, start=2000.0, release=Release(0.08)),
+        _trial("half", TrialKind.RINGDOWN, samples, start=2100.0, release=Release(0.04)),
+        _trial("pushed", TrialKind.FORCED, samples[:1000], start=2200.0,
+               force=8.0 * np.sin(2.0 * np.pi * (2.0 + samples[:1000]) * samples[:1000])),
+        _trial("flight", TrialKind.FLIGHT, 3000.0 + minutes, load_factor=np.linspace(1.0, 3.0, 7)),
+    )  # fmt: skip
+    bare = Campaign("Cantilever", channel_list(), trials, 20.0, {}, "")
+    model = Cantilever()
+    for trial in trials:
+        conditions = Conditions(np.ones(1))
+        trial.values[:] = observe(model, bare, trial, ModelPatch(), conditions).values
+    return bare

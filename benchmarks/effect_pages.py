@@ -1,0 +1,167 @@
+"""The pages of docs/effects: from the catalogue's records, the paragraphs beside them, and the pictures.
+
+``python -m benchmarks.effect_pages`` writes them all; ``--no-pictures`` leaves the pictures as they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks.effect_pictures import PICTURES, draw, picture_patch, picture_setting
+from discrepancy.catalogue.building import KIND_NAMES
+from discrepancy.catalogue.entry import Effect, Prior, Setting
+from discrepancy.catalogue.library import library
+from reporting.files import atomic_write_bytes, atomic_write_text
+
+FOLDER = Path(__file__).parents[1] / "docs" / "effects"
+
+LETTERS = {"static": "S", "ring-down": "R", "forced": "O", "flight": "F"}
+
+
+def paragraphs() -> dict[str, Any]:
+    """Return the hand-written parts by effect, and the "overview" with @names@ of what is put in."""
+    return tomllib.loads((FOLDER / "paragraphs.toml").read_text(encoding="utf-8"))
+
+
+def cell(text: str) -> str:
+    """Return a text for a cell of a table."""
+    return text.replace("|", "\\|")
+
+
+def range_of(prior: Prior) -> str:
+    """Return a prior in a few words."""
+    name = prior.shape.replace("_", "-")
+    return f"{name}, {prior.low:.3g} to {prior.high:.3g}"
+
+
+def rounded(value: Any) -> Any:
+    """Return a value with four digits, so that a page does not depend on the last bits of a computer."""
+    return float(f"{value:.4g}") if isinstance(value, float) else value
+
+
+def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
+    """Return the page of an effect."""
+    names = {other.identifier: other.name for other in library()}
+    kinds = [name for kind, name in KIND_NAMES.items() if kind in effect.acts_on]
+    places = effect.places(setting)
+    patch, place = picture_patch(effect, setting)
+    values = PICTURES[effect.identifier].values
+    rows = [
+        f"| {cell(p.symbol)} | `{p.name}` | {cell(p.description)} | {p.unit} | {range_of(p.prior)} |"
+        for p in effect.parameters
+    ]
+    lines = [
+        f"# {effect.name[0].upper()}{effect.name[1:]}",
+        "",
+        f"`{effect.identifier}`, family: {effect.family}.",
+        "",
+        text["what"].strip(),
+        "",
+        "```",
+        effect.equation,
+        "```",
+        "",
+        "## Parameters",
+        "| symbol | name | meaning | unit | prior |",
+        "| --- | --- | --- | --- | --- |",
+        *rows,
+        "",
+        text["unit"].strip(),
+        "",
+    ]
+    if effect.shape:
+        lines += [
+            "Its family frees:",
+            "",
+            "| symbol | name | meaning | in the named effect | prior in the family |",
+            "| --- | --- | --- | --- | --- |",
+            *(
+                f"| {cell(s.symbol)} | `{s.name}` | {cell(s.description)} | {s.canonical:g} "
+                f"| {range_of(s.prior)} |"
+                for s in effect.shape
+            ),
+            "",
+        ]
+    lines += ["## Where it acts", f"Trials: {', '.join(kinds)}."]
+    if places != ("",):
+        lines.append(
+            f"Places, on the cantilever of the picture: {', '.join(f'`{name}`' for name in places)}."
+        )
+    shown = ", ".join(f"{name} = {value:g}" for name, value in values.items())
+    lines += [
+        "",
+        "## Signature",
+        effect.signature,
+        "",
+        f"![{effect.name} on a cantilever](images/{effect.identifier}.png)",
+        "",
+        f"A uniform cantilever with {shown}" + (f", place `{place}`." if place else "."),
+        "",
+        "## Easily confused with",
+        *(f"- [{names[other]}]({other}.md): {text['tell'][other]}" for other in effect.confusable),
+        "",
+        "## Patch",
+        "That of the picture, rounded:",
+        "",
+        "```json",
+        *(json.dumps({k: rounded(v) for k, v in row.items()}) for row in patch.to_list()),
+        "```",
+        "",
+        "## References",
+        *(f"- {reference}" for reference in text["references"]),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def readme() -> str:
+    """Return the table of all effects."""
+    rows = []
+    for effect in library():
+        letters = "".join(LETTERS[name] for kind, name in KIND_NAMES.items() if kind in effect.acts_on)
+        parameters = ", ".join(
+            f"{p.symbol} ({p.prior.low:.3g} to {p.prior.high:.3g})" for p in effect.parameters
+        )
+        shape = ", ".join(f"{s.symbol} = {s.canonical:g}" for s in effect.shape) or "-"
+        rows.append(
+            f"| [{effect.name}]({effect.identifier}.md) | {letters} | {cell(parameters)} | {cell(shape)} "
+            f"| {cell(effect.signature)} |"
+        )
+    families = len({effect.family for effect in library()})
+    numbers = {"count": len(library()), "families": families, "rows": "\n".join(rows)}
+    text: str = paragraphs()["overview"]
+    for name, value in numbers.items():
+        text = text.replace(f"@{name}@", str(value))
+    return text
+
+
+def pages() -> dict[str, str]:
+    """Return every page by its file name."""
+    texts, setting = paragraphs(), picture_setting()
+    made = {
+        f"{effect.identifier}.md": page(effect, texts[effect.identifier], setting) for effect in library()
+    }
+    return {"README.md": readme(), **made}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--no-pictures", action="store_true", help="leave the pictures as they are")
+    arguments = parser.parse_args()
+    for name, text in pages().items():
+        atomic_write_text(FOLDER / name, text)
+    if not arguments.no_pictures:
+        setting = picture_setting()
+        for effect in library():
+            data = draw(effect, setting)
+            atomic_write_bytes(FOLDER / "images" / f"{effect.identifier}.png", data)
+            print(f"{effect.identifier:32s}{len(data) / 1024:6.1f} kB")
+
+
+if __name__ == "__main__":
+    main()

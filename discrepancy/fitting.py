@@ -1,0 +1,354 @@
+"""Fit of a candidate: maximum of the posterior by Levenberg-Marquardt, and its Laplace evidence.
+
+Local unknowns are eliminated trial by trial (Schur complement). The derivatives by what all hypotheses share
+change little with an effect; away from the end they may be those of the fit without effect (chord steps).
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from .candidate import Candidate
+from .errors import FitError, ModelError
+from .problem import Base, Linearisation, Point, Problem
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+LARGEST_EFFECT = 8.0
+"""Effect parameters stay within this many prior deviations of their median."""
+CONVERGED = 1e-2
+"""A step that promises less than this [nat] ends a fit."""
+
+
+@dataclass(frozen=True)
+class TrialBlock:
+    """Normal equations of one trial."""
+
+    local: FloatArray  # (L, L) with prior
+    cross: FloatArray  # (L, K)
+    shared: FloatArray  # (K, K)
+    local_gradient: FloatArray  # (L,)
+    shared_gradient: FloatArray  # (K,)
+    index: IntArray  # (K,)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted candidate.
+
+    Attributes
+    ----------
+    candidate : Candidate
+        What was fitted.
+    point : Point
+        Maximum of the posterior.
+    objective : float
+        -ln posterior there, up to a constant shared by all candidates [nat].
+    log_evidence : float
+        Laplace, up to the same constant [nat].
+    covariance : (Q + E, Q + E) ndarray
+        Of global unknowns and effect parameters (scaled), local ones marginalised.
+    residuals : tuple of (N, C) ndarray
+        Standardised.
+    responses : tuple of (N, C) ndarray
+        Without gain and zero.
+    sums : (channels,) ndarray
+        Sum of squared residuals by channel.
+    spent : (channels,) ndarray
+        Degrees of freedom that the unknowns took from each channel.
+    linearisations : tuple of Linearisation
+        At the point (or older, after chord steps).
+    converged : bool
+        Whether the last step was short enough.
+    """
+
+    candidate: Candidate
+    point: Point
+    objective: float
+    log_evidence: float
+    covariance: FloatArray
+    residuals: tuple[FloatArray, ...]
+    responses: tuple[FloatArray, ...]
+    sums: FloatArray
+    spent: FloatArray
+    linearisations: tuple[Linearisation, ...] = field(repr=False)
+    converged: bool = True
+
+    @property
+    def effect_covariance(self) -> FloatArray:
+        """Covariance (E, E) of the scaled effect parameters."""
+        count = self.candidate.size
+        return self.covariance[len(self.covariance) - count :, len(self.covariance) - count :]
+
+    @property
+    def base(self) -> Base:
+        """What chord steps of other candidates need of this fit."""
+        return Base(self.point, self.linearisations)
+
+    @property
+    def chi_square(self) -> float:
+        """Sum of squared standardised residuals."""
+        return float(self.sums.sum())
+
+
+def trial_block(
+    problem: Problem,
+    number: int,
+    point: Point,
+    parts: Linearisation,
+    candidate: Candidate,
+    residual: FloatArray,
+    precision: FloatArray,
+) -> tuple[TrialBlock, FloatArray, FloatArray]:
+    """Return the normal equations of a trial, and the weighted derivatives they are made of."""
+    data = problem.trials[number]
+    local, shared, index = problem.jacobian(number, point, parts, candidate)
+    root = np.sqrt(precision[data.groups])
+    weights = np.broadcast_to(root, residual.shape).ravel()
+    local, shared = local * weights, shared * weights
+    weighted = residual.ravel() * weights
+    u = point.local[number]
+    prior = data.unknowns.precision
+    block = TrialBlock(
+        local=local @ local.T + np.diag(prior + 1e-12),
+        cross=local @ shared.T,
+        shared=shared @ shared.T,
+        local_gradient=local @ weighted - prior * u,
+        shared_gradient=shared @ weighted,
+        index=index,
+    )
+    return block, local, shared
+
+
+def fit(
+    problem: Problem,
+    candidate: Candidate,
+    start: Point,
+    *,
+    base: Base | None = None,
+    iterations: int = 20,
+    evidence: bool = True,
+    local_only: bool = False,
+    give_up: float | None = None,
+) -> Fit:
+    """Fit a candidate.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    candidate : Candidate
+        What may act.
+    start : Point
+        Where to begin.
+    base : Base, optional
+        Chord steps: the model is evaluated at the base's shared and local unknowns only.
+    iterations : int
+        Largest number of steps.
+    evidence : bool
+        Whether covariance, evidence and spent degrees of freedom are wanted.
+    local_only : bool
+        Shared unknowns and effects stay: only the trials' own nuisances are fitted (held-out trials).
+    give_up : float, optional
+        A fit whose objective has no prospect of coming below this ends early, not converged.
+
+    Raises
+    ------
+    FitError
+        If the model gives numbers that are not finite at the start.
+    """
+    point = _bounded(start)
+    damping = 1e-3
+    state = _evaluate(problem, candidate, point, base)
+    if not np.isfinite(state.objective):
+        raise FitError(
+            f"The model gives values that are not finite for {candidate.identifiers or ('no effect',)}; "
+            "check the ranges of its parameters."
+        )
+    converged, fresh = False, True
+    for _ in range(iterations):
+        step, promised = _step(problem, candidate, state, damping, local_only=local_only)
+        if promised < CONVERGED and fresh:
+            converged = True
+            break
+        if promised < CONVERGED:
+            state, fresh = _evaluate(problem, candidate, state.point, base), True
+            continue
+        following = None
+        trial_point = _bounded(_plus(state.point, step))
+        try:
+            proposal = _evaluate(problem, candidate, trial_point, base, derivatives=False)
+            if proposal.objective < state.objective:
+                following = _evaluate(problem, candidate, trial_point, base, known=state.parts)
+        except ModelError:  # outside what the structure can carry: a shorter step
+            following = None
+        if following is not None:
+            gain = state.objective - following.objective
+            damping = max(damping * (0.1 if gain > 0.5 * promised else 0.5), 1e-9)
+            state, fresh = following, base is not None
+            if gain < 0.7 * promised and base is None:  # derivatives have grown old
+                state, fresh = _evaluate(problem, candidate, state.point, base), True
+            if give_up is not None and state.objective - 2.0 * promised > give_up:
+                break
+            if gain < CONVERGED and damping < 1e-2 and fresh:
+                converged = True
+                break
+        elif not fresh:
+            state, fresh = _evaluate(problem, candidate, state.point, base), True
+        else:
+            damping = max(10.0 * damping, 1e-4)
+            if damping > 1e6:
+                break
+    if not fresh and evidence:
+        state = _evaluate(problem, candidate, state.point, base)
+    return _finished(problem, candidate, state, converged, evidence)
+
+
+@dataclass(frozen=True)
+class _State:
+    point: Point
+    objective: float
+    residuals: tuple[FloatArray, ...]
+    responses: tuple[FloatArray, ...]
+    sums: FloatArray
+    parts: tuple[Linearisation, ...]
+
+
+def _evaluate(
+    problem: Problem,
+    candidate: Candidate,
+    point: Point,
+    base: Base | None,
+    derivatives: bool = True,
+    known: tuple[Linearisation, ...] | None = None,
+) -> _State:
+    parts: list[Linearisation] = []
+    residuals, responses = [], []
+    for number in range(len(problem.trials)):
+        part = problem.linearise(
+            number, point, candidate, base,
+            derivatives=derivatives, known=None if known is None else known[number],
+        )  # fmt: skip
+        parts.append(part)
+        responses.append(part.response)
+        residuals.append(problem.residual(number, point, part.response))
+    sums = problem.group_sums(residuals)
+    prior = 0.5 * float(problem.shared.precision @ point.shared**2) + 0.5 * float(point.effect @ point.effect)
+    for data, u in zip(problem.trials, point.local, strict=True):
+        prior += 0.5 * float(data.unknowns.precision @ u**2)
+    objective = problem.misfit(sums) + prior
+    return _State(
+        point,
+        objective if np.isfinite(objective) else np.inf,
+        tuple(residuals),
+        tuple(responses),
+        sums,
+        tuple(parts),
+    )
+
+
+def _blocks(problem: Problem, candidate: Candidate, state: _State) -> list[TrialBlock]:
+    precision = problem.precisions(state.sums)
+    return [
+        trial_block(problem, n, state.point, state.parts[n], candidate, state.residuals[n], precision)[0]
+        for n in range(len(problem.trials))
+    ]
+
+
+def _step(
+    problem: Problem, candidate: Candidate, state: _State, damping: float, *, local_only: bool = False
+) -> tuple[Point, float]:
+    """Return the step and the decrease it promises [nat]."""
+    shared_size = problem.shared.size
+    size = shared_size + candidate.size
+    prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
+    position = np.concatenate((state.point.shared, state.point.effect))
+    matrix = np.diag(prior + 1e-12)
+    gradient = -prior * position
+    blocks = _blocks(problem, candidate, state)
+    damped_diagonal = np.zeros(size)
+    eliminated = []
+    for block in blocks:
+        local = block.local + damping * np.diag(np.diag(block.local))
+        factor = cho_factor(local)
+        solved = cho_solve(factor, np.column_stack((block.cross, block.local_gradient)))
+        inner, inner_gradient = solved[:, :-1], solved[:, -1]
+        matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
+        np.add.at(damped_diagonal, block.index, np.diag(block.shared))
+        gradient_part = block.shared_gradient - block.cross.T @ inner_gradient
+        np.add.at(gradient, block.index, gradient_part)
+        eliminated.append((inner, inner_gradient))
+    matrix += damping * np.diag(damped_diagonal + prior)
+    try:
+        step = np.zeros(size) if local_only else cho_solve(cho_factor(matrix), gradient)
+    except LinAlgError as cause:
+        raise FitError("The normal equations of a fit are singular; a parameter has no influence.") from cause
+    promised = 0.5 * float(gradient @ step)
+    local_steps = []
+    for block, (inner, inner_gradient) in zip(blocks, eliminated, strict=True):
+        local_step = inner_gradient - inner @ step[block.index]
+        promised += 0.5 * float(block.local_gradient @ inner_gradient)
+        local_steps.append(local_step)
+    return Point(step[:shared_size], tuple(local_steps), step[shared_size:]), promised
+
+
+def _finished(problem: Problem, candidate: Candidate, state: _State, converged: bool, evidence: bool) -> Fit:
+    size = problem.shared.size + candidate.size
+    covariance, log_evidence = np.zeros((size, size)), -state.objective
+    spent = np.zeros(len(problem.channel_names))
+    if evidence:
+        precision = problem.precisions(state.sums)
+        prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
+        matrix = np.diag(prior + 1e-12)
+        pieces = []
+        log_determinant = 0.0
+        for n in range(len(problem.trials)):
+            block, local, shared = trial_block(
+                problem, n, state.point, state.parts[n], candidate, state.residuals[n], precision
+            )
+            factor = cho_factor(block.local)
+            inner = cho_solve(factor, block.cross)
+            matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
+            log_determinant += 2.0 * float(np.log(np.diag(factor[0])).sum())
+            pieces.append((block, factor, inner, local, shared))
+        factor = cho_factor(matrix)
+        log_determinant += 2.0 * float(np.log(np.diag(factor[0])).sum())
+        covariance = cho_solve(factor, np.eye(size))
+        log_evidence -= 0.5 * log_determinant
+        for n, (block, local_factor, inner, local, shared) in enumerate(pieces):
+            # leverage of each sample: trace of J Cov J^T by column
+            projected = shared - inner.T @ local
+            leverage = np.einsum(
+                "kn,kn->n", projected, covariance[np.ix_(block.index, block.index)] @ projected
+            )
+            leverage += np.einsum("ln,ln->n", local, cho_solve(local_factor, local))
+            data = problem.trials[n]
+            np.add.at(spent, data.groups, leverage.reshape(state.residuals[n].shape).sum(axis=0))
+    return Fit(
+        candidate,
+        state.point,
+        state.objective,
+        log_evidence,
+        covariance,
+        state.residuals,
+        state.responses,
+        state.sums,
+        spent,
+        state.parts,
+        converged,
+    )
+
+
+def _plus(point: Point, step: Point) -> Point:
+    return Point(
+        point.shared + step.shared,
+        tuple(u + du for u, du in zip(point.local, step.local, strict=True)),
+        point.effect + step.effect,
+    )
+
+
+def _bounded(point: Point) -> Point:
+    return Point(point.shared, point.local, np.clip(point.effect, -LARGEST_EFFECT, LARGEST_EFFECT))

@@ -1,0 +1,117 @@
+"""The two gates that a name must pass: absolute fit against the noise record, and shape against its family."""
+
+from math import isinf
+
+import numpy as np
+from scipy.stats import chi2, f, norm
+
+from .fitting import Fit
+from .noise import ljung_box
+from .problem import Problem
+from .verdict import Gate
+
+ABSOLUTE_LEVEL = 1e-3
+"""Level of the absolute gate; a true name fails it this often."""
+SHAPE_GAIN = 2.0
+"""Log evidence that the free-shape family may gain before the name gives way to it [nat]."""
+LAGS = 20
+
+
+def absolute_gate(problem: Problem, fit: Fit) -> Gate:
+    """Judge whether what is left is what the noise records say, and white.
+
+    Tests, by Holm together at `ABSOLUTE_LEVEL`: the sum over all channels, F of each channel against its record,
+    Ljung-Box of each channel over its dynamic records.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    fit : Fit
+        What is judged.
+
+    Returns
+    -------
+    Gate
+        `passed` is None where no channel has a noise record; whiteness is judged all the same and can fail.
+    """
+    tests = absolute_tests(problem, fit)
+    known = any(not name.startswith("whiteness") for name, _ in tests)
+    if not tests:
+        return Gate(
+            "absolute fit", None, np.nan, ABSOLUTE_LEVEL, "No noise record: the fit cannot be judged."
+        )
+    name, least = min(tests, key=lambda test: test[1])
+    statistic = min(1.0, least * len(tests))
+    if statistic < ABSOLUTE_LEVEL:
+        return Gate(
+            "absolute fit", False, statistic, ABSOLUTE_LEVEL, f"What is left is more than noise: {name}."
+        )
+    if not known:
+        return Gate(
+            "absolute fit", None, statistic, ABSOLUTE_LEVEL,
+            "No noise record: only the whiteness of what is left could be judged, and it is white.",
+        )  # fmt: skip
+    return Gate(
+        "absolute fit", True, statistic, ABSOLUTE_LEVEL, "What is left agrees with the noise records."
+    )
+
+
+def absolute_tests(problem: Problem, fit: Fit) -> list[tuple[str, float]]:
+    """Return name and p-value of each test of the absolute gate."""
+    tests: list[tuple[str, float]] = []
+    total, expected, variance = 0.0, 0.0, 0.0
+    for number, name in enumerate(problem.channel_names):
+        n0 = problem.freedom[number]
+        freedom = problem.counts[number] - fit.spent[number]
+        if n0 <= 0.0 or freedom < 1.0:
+            continue
+        sums = fit.sums[number]
+        if isinf(n0):
+            tests.append((f"variance of {name}", float(chi2.sf(sums, freedom))))
+            variance += 2.0 * freedom
+        else:
+            tests.append((f"variance of {name}", float(f.sf(sums / freedom, freedom, n0))))
+            variance += 2.0 * freedom * (1.0 + freedom / n0)
+        total += sums
+        expected += freedom
+    if variance > 0.0:
+        tests.append(("variance of all channels", float(norm.sf((total - expected) / np.sqrt(variance)))))
+    return [*tests, *whiteness_tests(problem, fit)]
+
+
+def whiteness_tests(problem: Problem, fit: Fit) -> list[tuple[str, float]]:
+    """Return name and p-value of the Ljung-Box test of each channel, its dynamic records pooled."""
+    statistics: dict[str, list[float]] = {}
+    for data, residual in zip(problem.trials, fit.residuals, strict=True):
+        if not data.trial.is_dynamic or len(residual) < 5 * LAGS:
+            continue
+        for column, name in enumerate(data.trial.channels):
+            p = ljung_box(residual[:, column], LAGS)
+            statistics.setdefault(name, []).append(float(chi2.isf(max(p, 1e-300), LAGS)))
+    return [
+        (f"whiteness of {name}", float(chi2.sf(sum(values), LAGS * len(values))))
+        for name, values in statistics.items()
+    ]
+
+
+def shape_gate(named: Fit, family: Fit | None) -> Gate:
+    """Judge whether the free-shape family explains more than the named effect.
+
+    Parameters
+    ----------
+    named, family : Fit
+        With canonical and with free shape; None where the effect has no shape to free.
+    """
+    if family is None:
+        return Gate("shape", True, 0.0, SHAPE_GAIN, "The effect has no shape that could be free.")
+    gain = family.log_evidence - named.log_evidence
+    if gain > SHAPE_GAIN:
+        return Gate(
+            "shape",
+            False,
+            gain,
+            SHAPE_GAIN,
+            f"Its family with a free shape gains {gain:.1f} nats over the name.",
+        )
+    return Gate("shape", True, gain, SHAPE_GAIN, "A free shape explains no more than the named one.")

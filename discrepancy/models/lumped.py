@@ -1,0 +1,390 @@
+"""A lumped linear structure as a model: masses, springs, dampers with named inputs, outputs and ports."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign import Campaign, Quantity, Trial, TrialKind
+from discrepancy.errors import ModelError
+from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.lumped_file import LumpedDescription, load_lumped, matrix_of
+from discrepancy.models.second_order import SecondOrderSystem
+from fe.errors import InvalidPatchError
+from fe.motion import NO_LAWS, laws_of
+from fe.patch import (
+    INTERNAL_FORCES,
+    SENSORS,
+    LoadGain,
+    LoadPlace,
+    ModelPatch,
+    ModulusTemperature,
+    PointMass,
+    Primitive,
+    RootCompliance,
+    StiffnessDrift,
+)
+
+FloatArray = NDArray[np.float64]
+
+DEFAULT_PLACE = "tip_load"
+"""What a campaign says when it does not say where the force acts; a model with one input takes that one."""
+KEPT_SYSTEMS = 128
+"""Structures whose modes are remembered."""
+LEAST_STIFFNESS = 0.05
+"""A temperature that leaves less than this share of the stiffness is refused."""
+
+
+class LumpedModel:
+    """A lumped model (`discrepancy.models.interface.Model`).
+
+    Parameters
+    ----------
+    description : LumpedDescription
+        Content of its file.
+
+    Notes
+    -----
+    Damping that is given as modal ratios stays at these ratios when the structure changes. Health (z1, z2)
+    has no meaning here and is passed over.
+    """
+
+    def __init__(self, description: LumpedDescription) -> None:
+        self.description = description
+        self._mass = matrix_of(description.mass)
+        self._stiffness = matrix_of(description.stiffness)
+        self._inputs = {item.name: item for item in description.input}
+        self._outputs = {item.name: np.array(item.vector) for item in description.output}
+        self._quantities = {item.name: Quantity(item.quantity) for item in description.output}
+        self._ports = {item.name: np.array(item.vector) for item in description.port}
+        places = sorted(description.place, key=lambda place: place.station)
+        self._stations = np.array([place.station for place in places])
+        self._place_rows = np.array([place.vector for place in places])
+        self._parameters = tuple(
+            ModelParameter(item.name, item.mean, item.deviation, item.unit, item.low, item.high)
+            for item in description.parameter
+        )
+        self._systems: OrderedDict[tuple[object, ...], SecondOrderSystem] = OrderedDict()
+
+    @classmethod
+    def load(cls, path: Path | str) -> "LumpedModel":
+        """Return the model of a TOML file, or a shipped one by name; raises `ModelError`."""
+        return cls(load_lumped(path))
+
+    # ------------------------------------------------------------ what it is
+
+    @property
+    def name(self) -> str:
+        """Name for people."""
+        return self.description.name
+
+    @property
+    def parameters(self) -> tuple[ModelParameter, ...]:
+        """Calibrated parameters."""
+        return self._parameters
+
+    def output_quantity(self, output: str) -> Quantity | None:
+        """Return what an output is, or None if the model has no such output."""
+        return self._quantities.get(output)
+
+    def supports(self, primitive: type[Primitive]) -> bool:
+        """Whether the model can carry a primitive."""
+        if primitive in SENSORS or primitive in (ModulusTemperature, LoadGain, StiffnessDrift):
+            return True
+        if primitive is PointMass:
+            return len(self._stations) > 0
+        if primitive is RootCompliance:
+            return self.description.root is not None
+        if primitive is LoadPlace:
+            return any(item.station_derivative is not None for item in self.description.input)
+        return primitive in INTERNAL_FORCES and bool(self._ports)
+
+    def ports(self) -> tuple[str, ...]:
+        """Names of the ports."""
+        return tuple(self._ports)
+
+    def stations(self) -> tuple[float, float] | None:
+        """Return the least and largest station [m] of the places, None without places."""
+        if not len(self._stations):
+            return None
+        return float(self._stations[0]), float(self._stations[-1])
+
+    def scales(self, campaign: Campaign) -> Scales:
+        """Return the natural scales under a campaign."""
+        values = [campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in self._parameters]
+        conditions = Conditions(np.array(values))
+        system = self._system(conditions.parameters, (), 0.0)
+        loaded = [trial.load_place for trial in campaign.trials if trial.kind is not TrialKind.FLIGHT]
+        row = self._input_row(loaded[0]) if loaded else np.array(self.description.input[0].vector)
+        first = system.angular_frequency[0]
+        participation = float(row @ system.shapes[:, 0]) ** 2
+        flexible = float(row @ system.flexibility(row))
+        largest = dict.fromkeys(self._ports, 0.0)
+        port_rows = np.array(list(self._ports.values())).reshape(len(self._ports), self.description.size)
+        for trial in campaign.trials if self._ports else ():
+            if trial.kind is TrialKind.FLIGHT:
+                continue
+            motion = self._still_or_moving(trial, system, conditions)
+            for name, size in zip(self._ports, np.max(np.abs(motion @ port_rows.T), axis=0), strict=True):
+                largest[name] = max(largest[name], float(size))
+        dynamic = [trial for trial in campaign.trials if trial.is_dynamic]
+        moments = [
+            trial.start + (trial.time if trial.is_dynamic else trial.time - trial.start)
+            for trial in campaign.trials
+        ]
+        span = float(max(map(np.max, moments)) - min(map(np.min, moments))) if moments else 0.0
+        ends = self.stations()
+        return Scales(
+            length=self.description.characteristic_length or (max(map(abs, ends)) if ends else 0.0) or 1.0,
+            tip_stiffness=1.0 / flexible,
+            modal_mass=1.0 / participation if participation else float(np.trace(self._mass)),
+            angular_frequency=float(first),
+            force=max((float(np.max(np.abs(trial.force))) for trial in campaign.trials), default=0.0),
+            load_factor=max((float(np.max(np.abs(t.load_factor))) for t in campaign.trials), default=0.0),
+            duration=max((float(trial.time[-1] - trial.time[0]) for trial in dynamic), default=1.0),
+            campaign_time=span if span > 0.0 else 1.0,
+            ports={
+                name: self._port_scale(system, vector, largest[name]) for name, vector in self._ports.items()
+            },
+        )
+
+    # ------------------------------------------------------------ response
+
+    def respond(
+        self,
+        trial: Trial,
+        outputs: tuple[tuple[str, Quantity], ...],
+        patch: ModelPatch,
+        conditions: Conditions,
+        *,
+        components: bool = False,
+        refinement: int = 1,
+    ) -> Response:
+        """Return the response of a trial, see `Model.respond`; `transverse` and `shear` are never known.
+
+        The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
+        """
+        if trial.kind is TrialKind.FLIGHT:
+            raise ModelError(
+                f"The trial {trial.name!r} is a flight, but the lumped model {self.name!r} has no "
+                f"lift; leave it out."
+            )
+        rows = self._rows(outputs)
+        quantities = [quantity for _, quantity in outputs]
+        structure, forces, gain, tare, along_span, along_chord = self._sorted(patch)
+        try:
+            laws = laws_of(forces, self._ports) if len(forces) else NO_LAWS
+        except InvalidPatchError as cause:
+            raise ModelError(str(cause)) from cause
+        acting = trial.force * (1.0 + gain) + tare * (trial.force != 0.0) if gain or tare else trial.force
+        row = self._input_row(trial.load_place)
+        if trial.kind is TrialKind.STATIC:
+            if any(quantity in (Quantity.VELOCITY, Quantity.ACCELERATION) for quantity in quantities):
+                raise ModelError(
+                    f"The trial {trial.name!r} is static, but a channel measures velocity or acceleration."
+                )
+            row = self._moved_row(trial.load_place, row, along_span, along_chord)
+            if len(laws) and len(np.unique(trial.temperature)) > 1 and self._coefficient(structure):
+                return Response(
+                    self._static_by_level(trial, acting, row, rows, structure, conditions, forces)
+                )
+            values = np.empty((len(acting), len(rows)))
+            for temperature in np.unique(trial.temperature) if self._coefficient(structure) else (0.0,):
+                at = trial.temperature == temperature if self._coefficient(structure) else slice(None)
+                system = self._system(conditions.parameters, structure, float(temperature))
+                values[at] = system.static(np.outer(acting[at], row), laws) @ rows.T
+            return Response(values)
+        system = self._system(conditions.parameters, structure, float(trial.temperature[0]))
+        if trial.kind is TrialKind.RINGDOWN:
+            if trial.release is None:
+                raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
+            motion = system.ringdown(
+                row, trial.release, conditions.initial, trial.time, laws,
+                clock=conditions.clock, refinement=refinement,
+            )  # fmt: skip
+        else:
+            row = self._moved_row(trial.load_place, row, along_span, along_chord)
+            motion = system.forced(
+                row, acting, trial.time, laws, clock=conditions.clock, refinement=refinement
+            )  # fmt: skip
+        return motion.response(rows, quantities)
+
+    # ------------------------------------------------------------ parts
+
+    def _rows(self, outputs: Sequence[tuple[str, Quantity]]) -> FloatArray:
+        rows = []
+        for output, quantity in outputs:
+            own = self._quantities.get(output)
+            if own is None:
+                raise ModelError(
+                    f"The lumped model {self.name!r} has no output {output!r}; it has "
+                    f"{', '.join(self._outputs)}."
+                )
+            derived = own is Quantity.DISPLACEMENT and quantity in (Quantity.VELOCITY, Quantity.ACCELERATION)
+            if quantity not in (own, Quantity.SIGNAL) and not derived:
+                raise ModelError(
+                    f"The output {output!r} of {self.name!r} is a {own.value}, but a channel measures "
+                    f"{quantity.value}."
+                )
+            rows.append(self._outputs[output])
+        return np.array(rows).reshape(len(rows), self.description.size)
+
+    def _input_row(self, place: str | tuple[float, float]) -> FloatArray:
+        if place == DEFAULT_PLACE and place not in self._inputs and len(self._inputs) == 1:
+            place = next(iter(self._inputs))
+        if not isinstance(place, str) or place not in self._inputs:
+            raise ModelError(
+                f"The load place {place!r} is not an input of the lumped model {self.name!r}; it has "
+                f"{', '.join(self._inputs)}."
+            )
+        return np.array(self._inputs[place].vector)
+
+    def _moved_row(
+        self, place: str | tuple[float, float], row: FloatArray, along_span: float, along_chord: float
+    ) -> FloatArray:
+        if along_span == 0.0 and along_chord == 0.0:
+            return row
+        item = self._inputs.get(str(place), self.description.input[0])
+        if item.station_derivative is None:
+            raise ModelError(
+                f"The input {item.name!r} of {self.name!r} declares no station_derivative, so its "
+                f"place cannot move."
+            )
+        row = row + along_span * np.array(item.station_derivative)
+        return row if item.chord_derivative is None else row + along_chord * np.array(item.chord_derivative)
+
+    def _sorted(
+        self, patch: ModelPatch
+    ) -> tuple[tuple[Primitive, ...], ModelPatch, float, float, float, float]:
+        """Return structure, internal forces, gain and tare of loads, and how far their place moves."""
+        structure, forces = [], []
+        gain, tare, along_span, along_chord = 0.0, 0.0, 0.0, 0.0
+        for item in patch:
+            if isinstance(item, SENSORS):
+                continue
+            if isinstance(item, INTERNAL_FORCES):
+                forces.append(item)
+            elif not self.supports(type(item)):
+                raise ModelError(f"The lumped model {self.name!r} cannot carry the primitive {item.kind!r}.")
+            elif isinstance(item, LoadGain):
+                gain, tare = (1.0 + gain) * (1.0 + item.gain) - 1.0, tare + item.tare
+            elif isinstance(item, LoadPlace):
+                along_span, along_chord = along_span + item.along_span, along_chord + item.along_chord
+            else:
+                structure.append(item)
+        return tuple(structure), ModelPatch(tuple(forces)), gain, tare, along_span, along_chord
+
+    @staticmethod
+    def _coefficient(structure: Sequence[Primitive]) -> float:
+        return sum(item.coefficient for item in structure if isinstance(item, ModulusTemperature))
+
+    def _system(
+        self, parameters: FloatArray, structure: tuple[Primitive, ...], temperature: float
+    ) -> SecondOrderSystem:
+        """Return the structure at values of the parameters and a temperature above the reference [K]."""
+        softening = self._coefficient(structure) * temperature
+        key = (parameters.tobytes(), structure, softening)
+        found = self._systems.get(key)
+        if found is not None:
+            self._systems.move_to_end(key)
+            return found
+        system = self._made(parameters, structure, softening)
+        self._systems[key] = system
+        if len(self._systems) > KEPT_SYSTEMS:
+            self._systems.popitem(last=False)
+        return system
+
+    def _made(
+        self, parameters: FloatArray, structure: tuple[Primitive, ...], softening: float
+    ) -> SecondOrderSystem:
+        description = self.description
+        if parameters.shape != (len(self._parameters),):
+            raise ModelError(
+                f"The lumped model {self.name!r} has {len(self._parameters)} parameters, but "
+                f"{parameters.size} came."
+            )
+        factors: dict[str, float] = {}
+        for item, value in zip(description.parameter, parameters, strict=True):
+            for term in item.scaled:
+                factors[term] = factors.get(term, 1.0) * float(value)
+        mass, stiffness = self._mass.copy(), self._stiffness.copy()
+        for part in description.mass_part:
+            mass += factors.get(part.name, 1.0) * matrix_of(part.matrix)
+        for part in description.stiffness_part:
+            stiffness += factors.get(part.name, 1.0) * matrix_of(part.matrix)
+        mass *= factors.get("mass", 1.0)
+        if 1.0 - softening < LEAST_STIFFNESS:
+            raise ModelError(
+                f"The temperature leaves {1.0 - softening:.2g} of the stiffness, which no structure has."
+            )
+        stiffness *= factors.get("stiffness", 1.0) * (1.0 - softening)
+        for change in structure:
+            if isinstance(change, PointMass):
+                row = self._place_row(change.station)
+                mass += change.mass * np.outer(row, row)
+            elif isinstance(change, RootCompliance) and description.root is not None:
+                # in series: K^-1 + c l l^T, by Sherman and Morrison
+                pull = stiffness @ np.array(description.root.lever)
+                stiff = float(pull @ np.array(description.root.lever))
+                stiffness -= np.outer(pull, pull) * change.compliance / (1.0 + change.compliance * stiff)
+        system = SecondOrderSystem(mass, np.zeros_like(mass), stiffness, self._ports)
+        damping = description.damping
+        if damping.matrix is not None:
+            matrix = matrix_of(damping.matrix)
+        elif damping.ratios is not None:
+            whole = replace(system, mode_count=len(mass))
+            weighted = mass @ whole.shapes
+            matrix = (weighted * (2.0 * np.array(damping.ratios) * whole.angular_frequency)) @ weighted.T
+        else:
+            matrix = (damping.alpha or 0.0) * mass + (damping.beta or 0.0) * stiffness
+        return replace(system, damping=factors.get("damping", 1.0) * matrix)
+
+    def _place_row(self, station: float) -> FloatArray:
+        """Return the row at a station, linear between the places."""
+        rows = self._place_rows
+        return np.array([np.interp(station, self._stations, rows[:, k]) for k in range(rows.shape[1])])
+
+    def _static_by_level(
+        self,
+        trial: Trial,
+        acting: FloatArray,
+        row: FloatArray,
+        rows: FloatArray,
+        structure: tuple[Primitive, ...],
+        conditions: Conditions,
+        forces: ModelPatch,
+    ) -> FloatArray:
+        """Return static values (N, C) where stiffness changes along the load path of laws with a memory."""
+        laws = laws_of(forces, self._ports)
+        values = np.empty((len(acting), len(rows)))
+        memory: FloatArray | None = None
+        before = np.zeros(self.description.size)
+        for level, (force, temperature) in enumerate(zip(acting, trial.temperature, strict=True)):
+            system = self._system(conditions.parameters, structure, float(temperature))
+            u, memory = system.static_step(force * row, laws, memory, before)
+            before = force * row
+            values[level] = rows @ u
+        return values
+
+    def _still_or_moving(self, trial: Trial, system: SecondOrderSystem, conditions: Conditions) -> FloatArray:
+        """Return displacements (N, n) of a trial by the unpatched model."""
+        row = self._input_row(trial.load_place)
+        if trial.kind is TrialKind.STATIC:
+            return system.static(np.outer(trial.force, row), NO_LAWS)
+        if trial.kind is TrialKind.FORCED:
+            return system.forced(row, trial.force, trial.time, NO_LAWS).q @ system.shapes.T
+        size = trial.release.displacement if trial.release is not None else 0.0
+        shape = system.flexibility(row)
+        return (size / float(row @ shape) * shape)[None]
+
+    @staticmethod
+    def _port_scale(system: SecondOrderSystem, vector: FloatArray, largest: float) -> PortScale:
+        first = float(system.angular_frequency[0])
+        moved = float(vector @ system.shapes[:, 0])
+        still = 1.0 / float(vector @ system.flexibility(vector))
+        # A port that the first mode does not move has its static stiffness.
+        stiffness = first**2 / moved**2 if moved**2 / first**2 * still > 1e-6 else still
+        return PortScale(largest or 1.0, stiffness, first, still)

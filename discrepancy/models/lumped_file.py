@@ -1,0 +1,282 @@
+"""A lumped model as a TOML file: matrices, named vectors and calibrated parameters, checked strictly."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from discrepancy.errors import ModelError
+
+FloatArray = NDArray[np.float64]
+
+SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"
+"""Models that come with the package, by file name without the ending."""
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0)]
+Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0)]
+Name = Annotated[str, Field(min_length=1, max_length=100)]
+Vector = tuple[Number, ...]
+Matrix = tuple[Vector, ...]
+
+
+class Section(BaseModel):
+    """A table of the file; unknown keys are refused, and numbers and words are not turned into each other."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Damping(Section):
+    """`[damping]`: exactly one of modal ratios, a matrix, or Rayleigh coefficients alpha M + beta K."""
+
+    ratios: tuple[NotNegative, ...] | None = None
+    matrix: Matrix | None = None
+    alpha: NotNegative | None = None
+    beta: NotNegative | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        rayleigh = self.alpha is not None or self.beta is not None
+        if sum((self.ratios is not None, self.matrix is not None, rayleigh)) != 1:
+            raise ValueError("give exactly one of ratios, matrix, or alpha and beta")
+        return self
+
+
+class Part(Section):
+    """`[[mass_part]]`, `[[stiffness_part]]`: a part that a parameter can scale, added to the base matrix."""
+
+    name: Name
+    matrix: Matrix
+
+
+class Input(Section):
+    """`[[input]]`: where a force acts, and how the vector changes when its place moves [1/m]."""
+
+    name: Name
+    vector: Vector
+    station_derivative: Vector | None = None
+    chord_derivative: Vector | None = None
+
+
+class Output(Section):
+    """`[[output]]`: what can be measured; velocity and acceleration come from a displacement."""
+
+    name: Name
+    vector: Vector
+    quantity: Literal["displacement", "strain", "signal"] = "displacement"
+
+
+class Port(Section):
+    """`[[port]]`: where an internal force can act, between the structure and the ground or within it."""
+
+    name: Name
+    vector: Vector
+
+
+class Place(Section):
+    """`[[place]]`: where a mass can sit; places with a station [m] make a line along the structure."""
+
+    name: Name
+    vector: Vector
+    station: Number
+
+
+class Root(Section):
+    """`[root]`: motion of the unknowns when the root turns by one radian as a rigid body [m/rad]."""
+
+    lever: Vector
+
+
+class Parameter(Section):
+    """`[[parameter]]`: a factor of the terms named."""
+
+    name: Name
+    terms: Name | tuple[Name, ...]
+    mean: Number = 1.0
+    deviation: NotNegative
+    low: Number
+    high: Number
+    unit: str = "1"
+
+    @property
+    def scaled(self) -> tuple[str, ...]:
+        """Names of the terms."""
+        return (self.terms,) if isinstance(self.terms, str) else self.terms
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Self:
+        if not 0.0 < self.low <= self.mean <= self.high:
+            raise ValueError("a factor needs 0 < low <= mean <= high")
+        return self
+
+
+class LumpedDescription(Section):
+    """Content of a lumped model's file; vectors have as many entries as the mass matrix has rows, n.
+
+    Attributes
+    ----------
+    format : int
+        1.
+    name : str
+        For people.
+    mass, stiffness : (n, n) matrix, or (n,) vector of a diagonal
+        SI.
+    damping : Damping
+        See there.
+    characteristic_length : float, optional
+        L [m]; by default the largest station, or 1.
+    """
+
+    format: Literal[1]
+    name: Name
+    mass: Matrix | Vector
+    stiffness: Matrix | Vector
+    damping: Damping
+    characteristic_length: Positive | None = None
+    mass_part: tuple[Part, ...] = ()
+    stiffness_part: tuple[Part, ...] = ()
+    input: tuple[Input, ...] = Field(min_length=1)
+    output: tuple[Output, ...] = Field(min_length=1)
+    port: tuple[Port, ...] = ()
+    place: tuple[Place, ...] = ()
+    root: Root | None = None
+    parameter: tuple[Parameter, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Unknowns n."""
+        return len(self.mass)
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        n = self.size
+        matrices = [("mass", self.mass), ("stiffness", self.stiffness)]
+        matrices += [(f"mass_part {part.name!r}", part.matrix) for part in self.mass_part]
+        matrices += [(f"stiffness_part {part.name!r}", part.matrix) for part in self.stiffness_part]
+        if self.damping.matrix is not None:
+            matrices.append(("damping.matrix", self.damping.matrix))
+        for where, content in matrices:
+            rows = [row if isinstance(row, tuple) else None for row in content]
+            lengths = {len(row) for row in rows if row is not None}
+            if len(content) != n or (lengths and lengths != {n}):
+                raise ValueError(
+                    f"{where} must be a {n} x {n} matrix (or {n} diagonal values), as mass has {n} rows"
+                )
+            full = matrix_of(content)
+            if np.max(np.abs(full - full.T)) > 1e-9 * max(float(np.max(np.abs(full))), 1e-300):
+                raise ValueError(f"{where} must be symmetric")
+            if where.startswith("damping") and np.min(np.linalg.eigvalsh(full)) < -1e-9 * np.max(
+                np.abs(full)
+            ):
+                raise ValueError(f"{where} must not feed energy: it has a negative eigenvalue")
+        for kind, items in (
+            ("input", self.input),
+            ("output", self.output),
+            ("port", self.port),
+            ("place", self.place),
+        ):
+            for item in items:
+                for key in ("vector", "station_derivative", "chord_derivative"):
+                    vector = getattr(item, key, None)
+                    if vector is not None and len(vector) != n:
+                        raise ValueError(
+                            f"{key} of {kind} {item.name!r} has {len(vector)} entries, but the model has {n} "
+                            f"unknowns"
+                        )
+                if not any(item.vector):
+                    raise ValueError(f"vector of {kind} {item.name!r} is zero")
+            _unique(kind, [item.name for item in items])
+        if self.root is not None and (len(self.root.lever) != n or not any(self.root.lever)):
+            raise ValueError(f"lever of root must have {n} entries that are not all zero")
+        if self.damping.ratios is not None and len(self.damping.ratios) != n:
+            raise ValueError(f"damping.ratios needs one value for each of the {n} modes")
+        _unique("place station", [f"{place.station:g}" for place in self.place])
+        parts = [part.name for part in (*self.mass_part, *self.stiffness_part)]
+        _unique("part", [*parts, "mass", "stiffness", "damping"])
+        _unique("parameter", [item.name for item in self.parameter])
+        for parameter in self.parameter:
+            for term in parameter.scaled:
+                if term not in ("mass", "stiffness", "damping", *parts):
+                    raise ValueError(
+                        f"parameter {parameter.name!r} scales {term!r}, but there are mass, stiffness, "
+                        f"damping" + "".join(f", {part}" for part in parts)
+                    )
+        for where, base, added in (
+            ("mass", self.mass, self.mass_part),
+            ("stiffness", self.stiffness, self.stiffness_part),
+        ):
+            whole = matrix_of(base) + sum((matrix_of(part.matrix) for part in added), np.zeros((n, n)))
+            if np.min(np.linalg.eigvalsh(whole)) <= 0.0:
+                raise ValueError(
+                    f"{where} (with its parts) must be positive definite; a structure that can float "
+                    f"away has no "
+                    "static response"
+                    if where == "stiffness"
+                    else f"{where} (with its parts) must be positive definite"
+                )
+        return self
+
+
+def matrix_of(content: Matrix | Vector) -> FloatArray:
+    """Return a matrix from rows or from its diagonal."""
+    array = np.array(content, dtype=np.float64)
+    return np.diag(array) if array.ndim == 1 else array
+
+
+def _unique(kind: str, names: list[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"there are two of {kind} {name!r}")
+
+
+def parse_lumped(content: dict[str, Any], source: str = "the lumped model") -> LumpedDescription:
+    """Check the content of a lumped model's file.
+
+    Raises
+    ------
+    ModelError
+        One sentence that names `source`, the place, what came and what was expected.
+    """
+    try:
+        return LumpedDescription.model_validate(content)
+    except ValidationError as error:
+        details = error.errors()
+        # Of a matrix that may also be a diagonal both readings are reported; the other one says too little.
+        first = next((detail for detail in details if detail["type"] != "tuple_type"), details[0])
+        place = ".".join(str(part) for part in first["loc"] if "tuple[" not in str(part))
+        if first["type"] == "extra_forbidden":
+            sentence = (
+                f"{source}: {place!r} is not a key of a lumped model; remove it or correct its spelling"
+            )
+        elif first["type"] == "missing":
+            sentence = f"{source}: {place!r} is missing"
+        else:
+            message = first["msg"].removeprefix("Value error, ")
+            sentence = f"{source}: {place + ': ' if place else ''}{message[0].lower() + message[1:]}"
+        raise ModelError(f"{sentence}.") from None
+
+
+def load_lumped(path: Path | str) -> LumpedDescription:
+    """Read a lumped model from a TOML file, or one of those shipped by its name (`single_mass_rig`).
+
+    Raises
+    ------
+    ModelError
+        If there is no such file, it is not TOML, or its content is no lumped model.
+    """
+    file = Path(path)
+    if not file.suffix and not file.exists():
+        file = SHIPPED_MODELS / f"{path}.toml"
+        if not file.exists():
+            known = ", ".join(sorted(item.stem for item in SHIPPED_MODELS.glob("*.toml")))
+            raise ModelError(f"There is no lumped model {str(path)!r}; shipped are {known}, or give a file.")
+    try:
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ModelError(f"The lumped model {file} cannot be read: {error.strerror}.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ModelError(f"The lumped model {file} is not valid TOML: {error}.") from None
+    return parse_lumped(content, str(file))

@@ -1,0 +1,440 @@
+"""Response of M u'' + D u' + K u = forces, with internal forces at ports: static, ring-down, forced.
+
+What the wing and a lumped model have in common. A model makes a `SecondOrderSystem` from its parameters and
+the structural part of a patch, keeps it, and asks it for a `Motion`; rows of its outputs then give a
+`Response`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, eigh
+
+from discrepancy.campaign import Quantity, Release
+from discrepancy.compiled_motion import compiled_kernel
+from discrepancy.errors import ModelError
+from discrepancy.models.interface import Response
+from fe.errors import SolutionError
+from fe.motion import (
+    Laws,
+    ModalSystem,
+    StaticSolution,
+    linear_step,
+    simulate,
+    static_solution,
+)
+
+FloatArray = NDArray[np.float64]
+
+LEAST_PARTICIPATION = 0.03
+"""A mode that moves the release point less than this share of the most moving one is scaled by the share."""
+
+LEAST_LEAD = 1e-9
+"""A first sample that is later than the begin by less than this share of the interval is at the begin."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion at the samples of a trial.
+
+    Attributes
+    ----------
+    system : SecondOrderSystem
+        What moved.
+    time : (N,) ndarray
+        Times of the motion since the release or the begin of the force [s].
+    q, velocity : (N, M) ndarray
+        Modal coordinates and their rates (mass-normalised).
+    force : (N,) ndarray
+        Applied force [N].
+    input_row : (n,) ndarray
+        Where it acts.
+    port_forces : (N, J) ndarray
+        Internal forces.
+    laws : Laws
+        Their laws.
+    held : int
+        First samples that lie before the release, where the shape is held.
+    """
+
+    system: "SecondOrderSystem"
+    time: FloatArray
+    q: FloatArray
+    velocity: FloatArray
+    force: FloatArray
+    input_row: FloatArray
+    port_forces: FloatArray
+    laws: Laws
+    held: int = 0
+
+    @cached_property
+    def acceleration(self) -> FloatArray:
+        """Second derivatives (N, M) of the modal coordinates, from the equation of motion."""
+        square = self.system.angular_frequency**2
+        modal = self.system.modal
+        acceleration = -self.q * square - self.velocity @ modal.damping.T
+        if self.laws.rate != 0.0:
+            acceleration -= self.laws.rate * self.time[:, None] * self.q * square
+        if len(self.laws):
+            acceleration -= self.port_forces @ self.laws.rows(modal.ports, self.q.shape[1])
+        if np.any(self.force):
+            acceleration += np.outer(self.force, self.input_row @ self.system.shapes)
+        acceleration[: self.held] = 0.0
+        return np.asarray(acceleration)
+
+    def values(self, rows: FloatArray) -> FloatArray:
+        """Return row . u (N, C) of rows (C, n); omitted modes follow the forces without delay."""
+        values = self.q @ (rows @ self.system.shapes).T
+        if self.system.truncated:
+            if np.any(self.force):
+                values += np.outer(self.force, rows @ self.system.residual(self.input_row))
+            if len(self.laws):
+                port_rows = self.system.port_rows(self.laws)
+                values -= self.port_forces @ (rows @ self.system.residual(port_rows.T)).T
+        return np.asarray(values)
+
+    def response(self, rows: FloatArray, quantities: Sequence[Quantity]) -> Response:
+        """Return what sensors at rows (C, n) show, and the rates.
+
+        Velocity and acceleration are derivatives of row . u, the other quantities row . u itself. Omitted
+        modes are part of values that are not derivatives only.
+        """
+        modal = rows @ self.system.shapes
+        values, rates = np.empty((2, len(self.q), len(rows)))
+        jerk: FloatArray | None = None
+        still = self.values(rows)
+        for column, quantity in enumerate(quantities):
+            if quantity is Quantity.VELOCITY:
+                values[:, column] = self.velocity @ modal[column]
+                rates[:, column] = self.acceleration @ modal[column]
+            elif quantity is Quantity.ACCELERATION:
+                if jerk is None:
+                    jerk = _slope(self.acceleration, self.time)
+                values[:, column] = self.acceleration @ modal[column]
+                rates[:, column] = jerk @ modal[column]
+            else:
+                values[:, column] = still[:, column]
+                rates[:, column] = self.velocity @ modal[column]
+        return Response(values, rates)
+
+
+def _slope(values: FloatArray, time: FloatArray) -> FloatArray:
+    return np.asarray(np.gradient(values, time, axis=0)) if len(time) > 1 else np.zeros_like(values)
+
+
+@dataclass(frozen=True, eq=False)
+class SecondOrderSystem:
+    """A linear structure of few unknowns, and its first modes.
+
+    Attributes
+    ----------
+    mass, damping, stiffness : (n, n) ndarray
+        Symmetric; mass and stiffness positive definite.
+    ports : mapping of str to (n,) ndarray
+        Rows of the ports where internal forces act: displacement [m] or rotation [rad] is row . u.
+    mode_count : int
+        Modes that move; the others follow without delay.
+    """
+
+    mass: FloatArray
+    damping: FloatArray
+    stiffness: FloatArray
+    ports: Mapping[str, FloatArray]
+    mode_count: int = 8
+
+    @cached_property
+    def _modes(self) -> tuple[FloatArray, FloatArray]:
+        count = min(self.mode_count, len(self.mass))
+        try:
+            square, shapes = eigh(self.stiffness, self.mass, subset_by_index=[0, count - 1])
+        except np.linalg.LinAlgError as cause:
+            raise ModelError(f"The mass matrix must be positive definite ({cause}).") from cause
+        if square[0] <= 0.0:
+            raise ModelError(
+                f"The stiffness matrix must be positive definite, but an eigenvalue is {square[0]:g} 1/s^2."
+            )
+        return np.sqrt(square), np.ascontiguousarray(shapes)
+
+    @property
+    def angular_frequency(self) -> FloatArray:
+        """Angular frequencies (M,) [rad/s], rising."""
+        return self._modes[0]
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Mass-normalised mode shapes (n, M)."""
+        return self._modes[1]
+
+    @property
+    def truncated(self) -> bool:
+        """Whether modes are left out."""
+        return len(self.angular_frequency) < len(self.mass)
+
+    @cached_property
+    def modal(self) -> ModalSystem:
+        """The modes with damping and ports; damping that couples modes by rounding only is made diagonal."""
+        damping = self.shapes.T @ self.damping @ self.shapes
+        diagonal = np.diag(np.diag(damping))
+        if np.max(np.abs(damping - diagonal)) <= 1e-10 * np.max(np.abs(diagonal), initial=1e-300):
+            damping = diagonal
+        return ModalSystem(
+            self.angular_frequency,
+            damping,
+            {name: np.asarray(row @ self.shapes) for name, row in self.ports.items()},
+        )
+
+    @cached_property
+    def _factor(self) -> tuple[FloatArray, bool]:
+        factor: tuple[FloatArray, bool] = cho_factor(self.stiffness)
+        return factor
+
+    def flexibility(self, loads: FloatArray) -> FloatArray:
+        """Return K^-1 loads, for loads (n,) or (n, k)."""
+        return np.asarray(cho_solve(self._factor, loads))
+
+    def residual(self, loads: FloatArray) -> FloatArray:
+        """Return the part of K^-1 loads, (n,) or (n, k), that the modes leave out."""
+        modal = (self.shapes.T @ loads).T / self.angular_frequency**2
+        return self.flexibility(loads) - self.shapes @ modal.T
+
+    def port_rows(self, laws: Laws) -> FloatArray:
+        """Return the rows (J, n) of the laws' ports."""
+        return laws.rows(self.ports, len(self.mass))
+
+    # ------------------------------------------------------------ static
+
+    def static(self, loads: FloatArray, laws: Laws) -> FloatArray:
+        """Return the displacements (L, n) under loads (L, n) that follow one another from zero."""
+        linear = self.flexibility(loads.T).T
+        if not len(laws):
+            return linear
+        rows = self.port_rows(laws)
+        flexible = self.flexibility(rows.T)
+        solution = _solve(laws, linear @ rows.T, rows @ flexible)
+        return np.asarray(linear - solution.forces @ flexible.T)
+
+    def static_step(
+        self, load: FloatArray, laws: Laws, memory: FloatArray | None, before: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the displacement (n,) under a load (n,) reached from the load `before`, and memory.
+
+        For structures that change between load levels; `memory` None: the laws have never been loaded.
+        """
+        rows = self.port_rows(laws)
+        flexible = self.flexibility(rows.T)
+        linear = self.flexibility(load)
+        start = rows @ self.flexibility(before)
+        solution = _solve(laws, (rows @ linear)[None], rows @ flexible, memory, start)
+        return np.asarray(linear - flexible @ solution.forces[0]), solution.memory
+
+    # ------------------------------------------------------------ motion
+
+    def ringdown(
+        self,
+        release_row: FloatArray,
+        release: Release,
+        initial: FloatArray,
+        time: FloatArray,
+        laws: Laws,
+        *,
+        clock: tuple[float, float] = (0.0, 0.0),
+        refinement: int = 1,
+    ) -> Motion:
+        """Return the motion after a release.
+
+        Parameters
+        ----------
+        release_row : (n,) ndarray
+            The release point: row . u is its displacement, and the holding force acts along it.
+        release : Release
+            How it began.
+        initial : (R, 2) ndarray
+            As in `Conditions`; rows beyond the modes are passed over.
+        time : (N,) ndarray
+            Stamps of the samples [s], evenly spaced.
+        laws : Laws
+            Internal forces.
+        clock : tuple of float
+            Rate and zero: a sample stamped t shows the motion at (1 + rate) t + zero.
+        refinement : int
+            Steps are this many times smaller.
+
+        Returns
+        -------
+        Motion
+            Before a release from rest the shape is held. A record that does not begin at rest is continued
+            backwards without internal forces where its clock asks for times before zero.
+
+        Raises
+        ------
+        ModelError
+            If the release point cannot be moved, or the static state has no solution.
+        """
+        times = (1.0 + clock[0]) * time + clock[1]
+        q, v, memory = self._released(release_row, release, initial, laws)
+        held = 0
+        if release.at_rest:
+            held = int(np.searchsorted(times, 0.0))  # samples before the release
+        nothing = np.zeros(len(times))
+        if laws.linear and not self.modal.coupled:
+            all_q, all_v = self._free(q, v, times)
+            if held:
+                all_q[:held], all_v[:held] = q, 0.0
+            none = np.zeros((len(times), 0))
+            return Motion(self, times, all_q, all_v, nothing, release_row, none, laws, held)
+        count = len(times)
+        all_q, all_v = np.tile(q, (count, 1)), np.tile(v, (count, 1))
+        forces = np.zeros((count, len(laws)))
+        if held < count:
+            lead = float(times[held])
+            interval = float(times[-1] - times[0]) / (count - 1) if count > 1 else 0.0
+            start = 0.0
+            if lead < 0.0:
+                q, v = self._backwards(q, v, -lead)
+                start, lead, memory = lead, 0.0, None
+            if lead > LEAST_LEAD * interval:
+                first = simulate(
+                    self.modal, laws, q=q, v=v, memory=memory, force=np.zeros(2), interval=lead,
+                    refinement=refinement, kernel=compiled_kernel(),
+                )  # fmt: skip
+                q, v, memory, start = first.q[-1], first.v[-1], first.memory, lead
+            moved = simulate(
+                self.modal, laws, q=q, v=v, memory=memory, force=nothing[held:], interval=interval or 1.0,
+                start=start, refinement=refinement, kernel=compiled_kernel(),
+            )  # fmt: skip
+            all_q[held:], all_v[held:], forces[held:] = moved.q, moved.v, moved.port_forces
+            forces[:held] = forces[held]
+        return Motion(self, times, all_q, all_v, nothing, release_row, forces, laws, held)
+
+    def forced(
+        self,
+        input_row: FloatArray,
+        force: FloatArray,
+        time: FloatArray,
+        laws: Laws,
+        *,
+        clock: tuple[float, float] = (0.0, 0.0),
+        refinement: int = 1,
+    ) -> Motion:
+        """Return the motion from rest under a force [N] that is known at `time` and linear in between.
+
+        The record of the force is taken as right; with a clock error the samples of the motion are taken at
+        (1 + rate) t + zero, and the force is read there from its record. Parameters as in `ringdown`.
+        """
+        times = (1.0 + clock[0]) * time + clock[1]
+        acting = force if clock == (0.0, 0.0) else np.interp(times, time, force)
+        modes = len(self.angular_frequency)
+        modal = self.modal
+        shape = np.asarray(input_row @ self.shapes)
+        q, v, memory = np.zeros(modes), np.zeros(modes), laws.memory()
+        start, lead = float(time[0]), float(times[0] - time[0])
+        # At rest before the record: under its first force where that is not zero.
+        if force[0] != 0.0:
+            rows = laws.rows(modal.ports, modes)
+            flexible = rows / self.angular_frequency**2
+            linear = np.outer(force[:1], shape) / self.angular_frequency**2
+            solution = _solve(laws, linear @ rows.T, flexible @ rows.T)
+            q, memory = (linear - solution.forces @ flexible)[0], solution.memory
+        if lead > LEAST_LEAD * float(time[-1] - time[0]):
+            first = simulate(
+                modal, laws, q=q, v=v, memory=memory, force=np.array([force[0], acting[0]]), interval=lead,
+                shape=shape, start=start, refinement=refinement, kernel=compiled_kernel(),
+            )  # fmt: skip
+            q, v, memory, start = first.q[-1], first.v[-1], first.memory, start + lead
+        moved = simulate(
+            modal, laws, q=q, v=v, memory=memory, force=acting, shape=shape, start=start,
+            interval=float(times[-1] - times[0]) / (len(times) - 1), refinement=refinement,
+            kernel=compiled_kernel(),
+        )  # fmt: skip
+        return Motion(self, times, moved.q, moved.v, acting, input_row, moved.port_forces, laws)
+
+    # ------------------------------------------------------------ parts
+
+    def _released(
+        self, row: FloatArray, release: Release, initial: FloatArray, laws: Laws
+    ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        """Return modal displacement, velocity and the laws' memory at the beginning of a ring-down."""
+        modes = len(self.angular_frequency)
+        shape = np.asarray(row @ self.shapes)
+        largest = float(np.max(np.abs(shape)))
+        if largest == 0.0:
+            raise ModelError("The release point of a ring-down does not move in any mode of the model.")
+        safe = np.where(
+            np.abs(shape) >= LEAST_PARTICIPATION * largest,
+            shape,
+            np.where(shape < 0.0, -1.0, 1.0) * LEAST_PARTICIPATION * largest,
+        )
+        given = np.zeros((modes, 2))
+        given[: min(modes, len(initial))] = initial[:modes]
+        size = release.displacement
+        if not release.at_rest:
+            return given[:, 0] * size / safe, given[:, 1] * size * self.angular_frequency / safe, None
+        goal = size * (1.0 + given[0, 0])
+        compliance = float(row @ self.flexibility(row))  # release point, all modes
+        q = goal / compliance * shape / self.angular_frequency**2
+        memory: FloatArray | None = None
+        if len(laws):
+            # With the release point held at its displacement: x = x_linear - (C - a c^T / a_0) F.
+            rows = laws.rows(self.modal.ports, modes)
+            flexible = rows / self.angular_frequency**2  # (J, M): modal displacement by unit port forces
+            lever = self.port_rows(laws) @ self.flexibility(row) / compliance  # holding force by port forces
+            held = flexible - np.outer(lever, shape / self.angular_frequency**2)
+            solution = _solve(laws, (rows @ q)[None], rows @ held.T)
+            q = q - solution.forces[0] @ held
+            memory = solution.memory
+        deviation = given[:, 0] * size / safe
+        deviation[0] = 0.0
+        return q + deviation, np.zeros(modes), memory
+
+    def _free(self, q: FloatArray, v: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return free motion (N, M), displacement and velocity, of uncoupled modes in closed form.
+
+        `times` are evenly spaced.
+        """
+        half = 0.5 * np.diag(self.modal.damping)
+        w = self.angular_frequency
+        root = np.sqrt((half**2 - w**2).astype(complex))
+        root = np.where(np.abs(root) < 1e-6 * w, 1e-6 * w, root)  # critical: beside it, by 1e-12 of w^2
+        fast, slow = -half - root, -half + root
+        first = (v - fast * q) / (2.0 * root)  # q = first e^(slow t) + second e^(fast t)
+        if np.all(root.imag != 0.0):  # the two are conjugate
+            wave = 2.0 * first * _exponentials(slow, times)
+            return np.ascontiguousarray(wave.real), np.ascontiguousarray((slow * wave).real)
+        one, two = first * _exponentials(slow, times), (q - first) * _exponentials(fast, times)
+        return np.ascontiguousarray((one + two).real), np.ascontiguousarray((slow * one + fast * two).real)
+
+    def _backwards(self, q: FloatArray, v: FloatArray, duration: float) -> tuple[FloatArray, FloatArray]:
+        """Return the state a duration [s] earlier, without internal forces."""
+        modes = len(q)
+        step = linear_step(self.modal, np.zeros(modes), np.zeros(modes), duration).transition
+        state = np.linalg.solve(step, np.concatenate((q, v)))
+        return np.asarray(state[:modes]), np.asarray(state[modes:])
+
+
+def _solve(
+    laws: Laws,
+    linear: FloatArray,
+    compliance: FloatArray,
+    memory: FloatArray | None = None,
+    start: FloatArray | None = None,
+) -> StaticSolution:
+    try:
+        return static_solution(laws, linear, compliance, memory=memory, start=start, kernel=compiled_kernel())
+    except SolutionError as cause:
+        raise ModelError(str(cause)) from cause
+
+
+def _exponentials(rates: NDArray[Any], times: FloatArray) -> NDArray[np.complex128]:
+    """Return e^(rate t) (N, M) at evenly spaced times, as products of few exponentials."""
+    count, block = len(times), 32
+    if count <= 2 * block:
+        return np.asarray(np.exp(np.outer(times, rates)))
+    interval = (times[-1] - times[0]) / (count - 1)
+    blocks = -(-count // block)
+    coarse = np.exp(np.outer(times[0] + interval * block * np.arange(blocks), rates))
+    fine = np.exp(np.outer(interval * np.arange(block), rates))
+    return np.asarray((coarse[:, None, :] * fine).reshape(blocks * block, -1)[:count])

@@ -1,0 +1,494 @@
+"""The wing as a model: its reduced structure under patches, in static tests, flights and ring-downs."""
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from calibration.errors import CalibrationError
+from calibration.result import STATE, CalibrationResult
+from discrepancy.campaign import Campaign, Quantity, Trial, TrialKind
+from discrepancy.compiled_motion import compiled_kernel
+from discrepancy.errors import ModelError
+from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.second_order import SecondOrderSystem
+from fe.design import load_design
+from fe.errors import FiniteElementError, InvalidPatchError, SolutionError
+from fe.motion import NO_LAWS, Laws, laws_of, static_solution
+from fe.patch import (
+    INTERNAL_FORCES,
+    LOADS,
+    PRIMITIVES,
+    STRUCTURE,
+    LoadGain,
+    LocalStiffnessLoss,
+    ModelPatch,
+    ModulusTemperature,
+    PointMass,
+    Primitive,
+    RootCompliance,
+)
+from fe.patch_arrays import PatchArrays
+from fe.patch_cache import patch_arrays
+from fe.patched_wing import LOAD_PLACE, PORTS, PatchedWing, Place, motion_basis
+from fe.reduced_arrays import PARAMETER_NAMES
+from fe.reduction import Progress
+
+FloatArray = NDArray[np.float64]
+Outputs = tuple[tuple[str, Quantity], ...]
+Key = Hashable
+
+SHIPPED_PRIOR = {
+    "young_modulus_factor": (1.0073, 0.0103),
+    "servo_mass": (0.1688, 0.0041),
+    "pitot_mass": (0.1344, 0.0082),
+    "damping_alpha": (1.0300, 0.15),
+    "damping_beta": (7.658e-4, 1.5e-4),
+}
+"""Mean and standard deviation of the calibrated state of the shipped wing (docs/calibration.md)."""
+DAMPING_LIMITS = {"damping_alpha": (0.0, 20.0), "damping_beta": (0.0, 1e-2)}
+MODE_COUNT = 6
+"""Modes that move in ring-downs and under forces; those of the FMU."""
+KEPT = 256
+"""Structures, and results of each kind, that are remembered."""
+
+_Value = TypeVar("_Value")
+
+
+class _Memory:
+    """Results by key, the least recently used forgotten."""
+
+    def __init__(self, size: int = KEPT) -> None:
+        self._size = size
+        self._values: OrderedDict[Key, Any] = OrderedDict()
+
+    def get(self, key: Key, make: Callable[[], _Value]) -> _Value:
+        """Return what `make` returned for `key`, calling it if need be."""
+        try:
+            value = self._values[key]
+        except KeyError:
+            value = self._values[key] = make()
+            if len(self._values) > self._size:
+                self._values.popitem(last=False)
+            return value
+        self._values.move_to_end(key)
+        return value  # type: ignore[no-any-return]
+
+
+class _Stiffness:
+    """Factorised stiffness of the wing in one state, and what it answered so far."""
+
+    def __init__(self, matrix: FloatArray) -> None:
+        self.matrix = matrix
+        try:
+            self._factor = cho_factor(matrix, lower=True, check_finite=False)
+        except np.linalg.LinAlgError as cause:
+            raise ModelError(
+                f"The patched wing has no stiffness left in some direction ({cause})."
+            ) from cause
+
+    def solve(self, loads: FloatArray) -> FloatArray:
+        """Return K^-1 loads, (n,) or (n, k)."""
+        return np.asarray(cho_solve(self._factor, loads, check_finite=False))
+
+
+class _Moved(NamedTuple):
+    """The wing in a basis (n, k) of its first modes and some static shapes."""
+
+    basis: FloatArray
+    system: SecondOrderSystem
+
+
+class WingModel:
+    """The wing (`discrepancy.models.interface.Model`).
+
+    Parameters
+    ----------
+    arrays : PatchArrays
+        The wing for patches.
+    name : str
+        For people.
+    prior : mapping of str to (float, float)
+        Mean and standard deviation of the calibrated parameters, by the names of `calibration.result.STATE`.
+
+    Notes
+    -----
+    Load places are "tip_load" or (y [m], chord fraction). Outputs are strain[k], tip_displacement,
+    load_point_displacement and displacement[y, x].
+    """
+
+    def __init__(
+        self, arrays: PatchArrays, name: str = "wing", prior: dict[str, tuple[float, float]] | None = None
+    ) -> None:
+        self.wing = PatchedWing(arrays)
+        self._name = name
+        prior = prior or SHIPPED_PRIOR
+        box = dict(zip(PARAMETER_NAMES, arrays.validity_box.tolist(), strict=True))
+        limits = {key: (low, high) for key, (low, high) in box.items()} | DAMPING_LIMITS
+        self._parameters = tuple(
+            ModelParameter(item.name, *prior[item.name], item.unit, *limits[item.name]) for item in STATE
+        )
+        self._ports = {port: self.wing.port_row(port) for port in PORTS}
+        self._port_rows = np.stack([self._ports[port] for port in PORTS])
+        self._stiffnesses, self._systems = _Memory(), _Memory()
+        self._rows, self._statics = _Memory(), _Memory(2048)
+
+    @classmethod
+    def shipped(cls, progress: Progress | None = None) -> "WingModel":
+        """Return the shipped wing with the calibration that the documentation states."""
+        return cls.of_design(None, progress)
+
+    @classmethod
+    def of_design(cls, path: Path | str | None, progress: Progress | None = None) -> "WingModel":
+        """Return the wing of a design file, calibrated as the shipped wing is.
+
+        Raises
+        ------
+        ModelError
+            If it cannot be read, modelled or reduced.
+        """
+        try:
+            design = load_design(path)
+            return cls(patch_arrays(design, progress), design.name)
+        except FiniteElementError as cause:
+            raise ModelError(str(cause)) from cause
+
+    @classmethod
+    def of_calibration(cls, path: Path | str, progress: Progress | None = None) -> "WingModel":
+        """Return the wing of a calibration, its posterior as prior.
+
+        Raises
+        ------
+        ModelError
+            If the calibration cannot be read, or its wing not be modelled.
+        """
+        try:
+            result = CalibrationResult.load(Path(path))
+            prior = {
+                item.name: (float(np.mean(column)), float(np.std(column)))
+                for item, column in zip(STATE, result.samples.T, strict=True)
+            }
+            return cls(patch_arrays(result.design, progress), result.asset, prior)
+        except (FiniteElementError, CalibrationError, OSError) as cause:
+            raise ModelError(f"The calibration {path} cannot be used: {cause}") from cause
+
+    # ------------------------------------------------------------ what it is
+
+    @property
+    def name(self) -> str:
+        """Name for people."""
+        return self._name
+
+    @property
+    def parameters(self) -> tuple[ModelParameter, ...]:
+        """Calibrated parameters."""
+        return self._parameters
+
+    def output_quantity(self, output: str) -> Quantity | None:
+        """Return what an output is, or None if the model has no such output."""
+        if self.wing.output_row(output) is None:
+            return None
+        return Quantity.STRAIN if output.startswith("strain") else Quantity.DISPLACEMENT
+
+    def supports(self, primitive: type[Primitive]) -> bool:
+        """Whether the model can carry a primitive; it can carry all."""
+        return primitive in PRIMITIVES.values()
+
+    def ports(self) -> tuple[str, ...]:
+        """Names of the ports where internal forces can act."""
+        return PORTS
+
+    def stations(self) -> tuple[float, float] | None:
+        """Return the least and largest station [m]."""
+        return 0.0, self.wing.span
+
+    def scales(self, campaign: Campaign) -> Scales:
+        """Return the natural scales under a campaign, by the unpatched wing."""
+        values = np.array([campaign.parameters.get(p.name, (p.mean, 0.0))[0] for p in self._parameters])
+        empty = ModelPatch()
+        static = self._stiffness(values, (0.0, 0.0), empty, 0.0)
+        moved = self._moved(values, (0.0, 0.0), empty, 0.0, LOAD_PLACE)
+        tip = self.wing.arrays.load_tip
+        first, shape = float(moved.system.angular_frequency[0]), moved.basis @ moved.system.shapes[:, 0]
+        largest = np.zeros(len(PORTS))
+        for trial in campaign.trials:
+            motion = self._port_motion(trial, static, moved)
+            largest = np.maximum(largest, np.abs(motion).max(axis=0, initial=0.0))
+        dynamic = [trial for trial in campaign.trials if trial.is_dynamic]
+        begins = [
+            trial.start if trial.is_dynamic else float(trial.time.min())
+            for trial in campaign.trials
+            if len(trial.time)
+        ]
+        ends = [
+            trial.start + float(trial.time[-1]) if trial.is_dynamic else float(trial.time.max())
+            for trial in campaign.trials
+            if len(trial.time)
+        ]
+        duration = max(ends) - min(begins) if ends else 0.0
+        by_first = self._port_rows @ shape
+        return Scales(
+            length=self.wing.span,
+            tip_stiffness=1.0 / float(tip @ static.solve(tip)),
+            modal_mass=1.0 / float(tip @ shape) ** 2,
+            angular_frequency=first,
+            force=max((float(np.abs(t.force).max(initial=0.0)) for t in campaign.trials), default=0.0),
+            load_factor=max(
+                (float(np.abs(t.load_factor).max(initial=0.0)) for t in campaign.trials), default=0.0
+            ),
+            duration=max((float(t.time[-1] - t.time[0]) for t in dynamic), default=1.0),
+            campaign_time=duration if duration > 0.0 else 1.0,
+            ports={
+                port: PortScale(float(size) or 1.0, first**2 / float(by) ** 2, first)
+                for port, size, by in zip(PORTS, largest, by_first, strict=True)
+            },
+        )
+
+    # ------------------------------------------------------------ response
+
+    def respond(
+        self,
+        trial: Trial,
+        outputs: Outputs,
+        patch: ModelPatch,
+        conditions: Conditions,
+        *,
+        components: bool = False,
+        refinement: int = 1,
+    ) -> Response:
+        """Return the response of a trial, see `Model.respond`.
+
+        The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero. In a
+        dynamic trial the structure is that at its first temperature.
+        """
+        if len(conditions.parameters) != len(self._parameters):
+            raise ModelError(
+                f"The wing has {len(self._parameters)} parameters, but {len(conditions.parameters)} came."
+            )
+        rows = self._output_rows(outputs, 0)
+        quantities = [quantity for _, quantity in outputs]
+        try:
+            forces = patch.of(*INTERNAL_FORCES)
+            laws = laws_of(forces, PORTS) if len(forces) else NO_LAWS
+            if not trial.is_dynamic:
+                return self._at_rest(trial, outputs, rows, patch, conditions, laws, components)
+            return self._moving(
+                trial, outputs, rows, quantities, patch, conditions, laws, components, refinement
+            )
+        except (InvalidPatchError, SolutionError) as cause:
+            raise ModelError(str(cause)) from cause
+
+    def _at_rest(
+        self,
+        trial: Trial,
+        outputs: Outputs,
+        rows: FloatArray,
+        patch: ModelPatch,
+        conditions: Conditions,
+        laws: Laws,
+        components: bool,
+    ) -> Response:
+        if any(quantity in (Quantity.VELOCITY, Quantity.ACCELERATION) for _, quantity in outputs):
+            raise ModelError(
+                f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
+            )
+        structure = patch.of(*STRUCTURE)
+        loads = patch.of(*LOADS)
+        size = len(trial.time)
+        health = np.broadcast_to(conditions.health, (size, 2))
+        depends = any(isinstance(item, ModulusTemperature) for item in structure)
+        temperature = trial.temperature if depends else np.zeros(size)
+        acting = np.column_stack((health, temperature))
+        amounts = _amounts(trial, loads)
+        blocks = [rows]
+        if components:
+            blocks += [self._output_rows(outputs, 1), self._output_rows(outputs, 2)]
+        values = np.empty((size, len(blocks) * len(outputs)))
+        place = None if trial.kind is TrialKind.FLIGHT else trial.load_place
+        memory: FloatArray | None = None
+        before = np.zeros(len(laws))
+        start = 0
+        # rows of one structure that follow one another are solved together, in the order of the load path
+        changes = np.flatnonzero(np.any(np.diff(acting, axis=0) != 0.0, axis=1)) + 1
+        for end in (*changes.tolist(), size):
+            z1, z2, warmer = acting[start]
+            key = self._stiffness_key(conditions.parameters, (z1, z2), structure, warmer)
+            stiffness = self._stiffness(conditions.parameters, (z1, z2), structure, warmer)
+            shown, at_ports, flexible, port_flexibility = self._statics.get(
+                (key, place, loads.primitives, outputs, components),
+                lambda stiffness=stiffness: self._static_units(stiffness, place, loads, blocks),  # type: ignore[misc]
+            )
+            part = amounts[start:end] @ shown
+            if len(laws):
+                index = [PORTS.index(port) for port in laws.ports]
+                linear = amounts[start:end] @ at_ports[:, index]
+                solution = static_solution(
+                    laws,
+                    linear,
+                    port_flexibility[np.ix_(index, index)],
+                    memory=memory,
+                    start=before @ at_ports[:, index] if start else None,
+                    kernel=compiled_kernel(),
+                )
+                memory = solution.memory
+                part = part - solution.forces @ flexible[index]
+            values[start:end] = part
+            before, start = amounts[end - 1], end
+        count = len(outputs)
+        if not components:
+            return Response(values)
+        return Response(values[:, :count], None, values[:, count : 2 * count], values[:, 2 * count :])
+
+    def _static_units(
+        self, stiffness: _Stiffness, place: Place | None, loads: ModelPatch, blocks: list[FloatArray]
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return outputs (k, C) and port motions (k, 3) of unit loads, and the same of unit port forces."""
+        units = self.wing.load_parts(loads) if place is None else self.wing.force_row(place, loads)[None]
+        answer = stiffness.solve(np.concatenate((units, self._port_rows)).T)
+        shown = np.concatenate([rows @ answer for rows in blocks]).T
+        moved = (self._port_rows @ answer).T
+        count = len(units)
+        return shown[:count], moved[:count], shown[count:], moved[count:]
+
+    def _moving(
+        self,
+        trial: Trial,
+        outputs: Outputs,
+        rows: FloatArray,
+        quantities: list[Quantity],
+        patch: ModelPatch,
+        conditions: Conditions,
+        laws: Laws,
+        components: bool,
+        refinement: int,
+    ) -> Response:
+        structure = patch.of(*STRUCTURE)
+        z1, z2 = conditions.health[0]
+        loads = patch.of(*LOADS)
+        basis, system = self._moved(
+            conditions.parameters, (z1, z2), structure, float(trial.temperature[0]), trial.load_place
+        )
+        if trial.kind is TrialKind.RINGDOWN:
+            if trial.release is None:
+                raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
+            motion = system.ringdown(
+                self.wing.force_row(trial.load_place) @ basis, trial.release, conditions.initial, trial.time,
+                laws, clock=conditions.clock, refinement=refinement,
+            )  # fmt: skip
+        else:
+            motion = system.forced(
+                self.wing.force_row(trial.load_place, loads) @ basis, _amounts(trial, loads)[:, 0],
+                trial.time, laws, clock=conditions.clock, refinement=refinement,
+            )  # fmt: skip
+        response = motion.response(rows @ basis, quantities)
+        if not components:
+            return response
+        across, shear = (motion.values(self._output_rows(outputs, number) @ basis) for number in (1, 2))
+        return Response(response.values, response.rates, across, shear)
+
+    # ------------------------------------------------------------ parts
+
+    def _output_rows(self, outputs: Outputs, component: int) -> FloatArray:
+        return self._rows.get((outputs, component), lambda: self._made_rows(outputs, component))
+
+    def _made_rows(self, outputs: Outputs, component: int) -> FloatArray:
+        rows = []
+        for output, quantity in outputs:
+            own = self.output_quantity(output)
+            row = self.wing.output_row(output, component)
+            if own is None or row is None:
+                raise ModelError(
+                    f"The wing has no output {output!r}; it has strain[1] to "
+                    f"strain[{self.wing.gauge_count}], tip_displacement, load_point_displacement and "
+                    f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction."
+                )
+            moving = own is Quantity.DISPLACEMENT and quantity in (Quantity.VELOCITY, Quantity.ACCELERATION)
+            if quantity not in (own, Quantity.SIGNAL) and not moving:
+                raise ModelError(
+                    f"The output {output!r} of the wing is a {own.value}, but a channel measures "
+                    f"{quantity.value}."
+                )
+            rows.append(row)
+        return np.array(rows).reshape(len(rows), self.wing.size)
+
+    @staticmethod
+    def _stiffness_key(
+        parameters: FloatArray, health: tuple[float, float], structure: ModelPatch, temperature: float
+    ) -> Key:
+        kept = structure.of(RootCompliance, LocalStiffnessLoss, ModulusTemperature)
+        if not any(isinstance(item, ModulusTemperature) for item in kept):
+            temperature = 0.0
+        return float(parameters[0]), float(health[0]), float(health[1]), kept.primitives, float(temperature)
+
+    def _stiffness(
+        self,
+        parameters: FloatArray,
+        health: tuple[float, float],
+        structure: ModelPatch,
+        temperature: float,
+    ) -> _Stiffness:
+        key = self._stiffness_key(parameters, health, structure, temperature)
+        return self._stiffnesses.get(
+            key,
+            lambda: _Stiffness(
+                self.wing.structure(float(parameters[0]), health, 0.0, 0.0, structure, temperature).stiffness
+            ),
+        )
+
+    def _moved(
+        self,
+        parameters: FloatArray,
+        health: tuple[float, float],
+        structure: ModelPatch,
+        temperature: float,
+        place: Place,
+    ) -> "_Moved":
+        """Return the wing as it moves when released from, or pushed at, a place."""
+        key = self._stiffness_key(parameters, health, structure, temperature)
+        masses = structure.of(PointMass)
+
+        def make() -> _Moved:
+            e, servo, pitot, alpha, beta = (float(value) for value in parameters)
+            stiffness = self._stiffness(parameters, health, structure, temperature)
+            mass = self.wing.structure(e, health, servo, pitot, masses).mass
+            still = stiffness.solve(np.vstack((self.wing.force_row(place), self._port_rows)).T)
+            basis = motion_basis(stiffness.solve, mass, self.wing.arrays.start_shapes, still)
+            small_mass, small = basis.T @ mass @ basis, basis.T @ stiffness.matrix @ basis
+            small_mass, small = 0.5 * (small_mass + small_mass.T), 0.5 * (small + small.T)
+            ports = {port: row @ basis for port, row in self._ports.items()}
+            return _Moved(
+                basis,
+                SecondOrderSystem(small_mass, alpha * small_mass + beta * small, small, ports, MODE_COUNT),
+            )
+
+        return self._systems.get((key, masses.primitives, parameters[1:].tobytes(), place), make)
+
+    def _port_motion(self, trial: Trial, static: _Stiffness, moved: _Moved) -> FloatArray:
+        """Motion (N, 3) of the ports in a trial by the unpatched wing."""
+        empty = ModelPatch()
+        if not trial.is_dynamic:
+            place = None if trial.kind is TrialKind.FLIGHT else trial.load_place
+            units = self._static_units(static, place, empty, [self._port_rows])[1]
+            return np.asarray(_amounts(trial, empty) @ units)
+        row = self.wing.force_row(trial.load_place)
+        if trial.kind is TrialKind.FORCED:
+            motion = moved.system.forced(row @ moved.basis, trial.force, trial.time, NO_LAWS)
+            return motion.values(self._port_rows @ moved.basis)
+        shape = static.solve(row)
+        size = trial.release.displacement if trial.release is not None else 0.0
+        return np.asarray(size / float(row @ shape) * (self._port_rows @ shape))[None]
+
+
+def _amounts(trial: Trial, loads: ModelPatch) -> FloatArray:
+    """Return the factors (N, k) of the unit loads of a trial."""
+    if trial.kind is TrialKind.FLIGHT:
+        return np.column_stack((trial.load_factor, trial.load_factor**2))
+    force = trial.force
+    for item in loads:
+        if isinstance(item, LoadGain):
+            force = (1.0 + item.gain) * force + item.tare * (trial.force != 0.0)
+    return np.asarray(force)[:, None]

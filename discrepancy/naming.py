@@ -1,0 +1,262 @@
+"""From fitted candidates to a verdict: named, a family, a group, unexplained, or nothing missing."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .candidate import Candidate, Term
+from .catalogue.entry import NINETY, Effect
+from .fitting import Fit, fit
+from .gates import SHAPE_GAIN, absolute_gate, shape_gate
+from .problem import Point, Problem
+from .search import Search, search
+from .verdict import Estimate, Gate, Hypothesis, NamedEffect, Verdict, VerdictKind
+
+SURE = 0.95
+"""Probability that a name needs."""
+BAYES_FACTOR = 3.0
+"""ln Bayes factor against 'none' that a name needs [nat]."""
+LARGEST_GROUP = 6
+
+
+def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, Fit]:
+    """Name what is missing.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    effects : sequence of Effect
+        The catalogue.
+
+    Returns
+    -------
+    Verdict
+        Without next experiments and data faults, which others add.
+    Search
+        All candidates.
+    Fit
+        The one that stands for the verdict: of the named set, of the family, of the most probable member of a
+        group, or the one without effect.
+    """
+    found = search(problem, effects)
+    probabilities = found.set_probabilities()
+    best = found.best()
+    bayes = _single_evidence(found, best) - found.none.log_evidence
+    hypotheses = _hypotheses(problem, found, probabilities)
+    inclusion = {
+        effect.identifier: sum(p for names, p in probabilities.items() if effect.identifier in names)
+        for effect in found.effects
+    }
+
+    def verdict(kind: VerdictKind, sentence: str, probability: float, **more: object) -> Verdict:
+        return Verdict(
+            kind=kind,
+            sentence=sentence,
+            probability=probability,
+            log_bayes_factor=bayes,
+            hypotheses=hypotheses,
+            inclusion=inclusion,
+            **more,  # type: ignore[arg-type]
+        )
+
+    none_gate = absolute_gate(problem, found.none)
+    p_none = probabilities.get((), 0.0)
+    top, p_top = next(iter(probabilities.items()))
+    if not top or (bayes < BAYES_FACTOR and none_gate.passed is not False):
+        if none_gate.passed is False:
+            return (
+                verdict(
+                    VerdictKind.UNEXPLAINED,
+                    f"There is a gap ({none_gate.reason}) that no effect of the catalogue explains.",
+                    p_none, gates=(none_gate,),
+                ),
+                found, found.none,
+            )  # fmt: skip
+        return (
+            verdict(
+                VerdictKind.NOTHING_MISSING,
+                "The model explains the data within their noise.",
+                p_none, gates=(none_gate,),
+            ),
+            found, found.none,
+        )  # fmt: skip
+
+    gate = absolute_gate(problem, best)
+    if p_top >= SURE and bayes >= BAYES_FACTOR:
+        shape, family = _shape(found, best)
+        if gate.passed is not False and shape.passed:
+            named = named_effects(problem, best)
+            return (
+                verdict(VerdictKind.NAMED, _named_sentence(named, p_top), p_top, effects=named, gates=(gate, shape)),
+                found, best,
+            )  # fmt: skip
+        if family is not None and not shape.passed:
+            family_gate = absolute_gate(problem, family)
+            if family_gate.passed is not False:
+                named = named_effects(problem, family)
+                text = ", ".join(sorted({effect.family for effect in named}))
+                return (
+                    verdict(
+                        VerdictKind.FAMILY,
+                        f"An effect of the family {text} is missing, with a shape of its own.",
+                        p_top, effects=named, family=text, gates=(family_gate, shape),
+                    ),
+                    found, family,
+                )  # fmt: skip
+            gate = family_gate
+        return (
+            verdict(
+                VerdictKind.UNEXPLAINED,
+                f"There is a gap that no effect of the catalogue fits; the nearest is "
+                f"{' with '.join(top)}, but {gate.reason[0].lower()}{gate.reason[1:]}",
+                p_top, gates=(gate, shape), resembles=top,
+            ),
+            found, found.none,
+        )  # fmt: skip
+
+    return (*_open(problem, found, probabilities, verdict, gate), best)
+
+
+def _open(problem, found, probabilities, verdict, gate):  # type: ignore[no-untyped-def]
+    """Return the verdict where no set reaches the probability that a name needs, and the search."""
+    members: list[tuple[str, ...]] = []
+    total = 0.0
+    for names, p in probabilities.items():
+        members.append(names)
+        total += p
+        if total >= SURE:
+            break
+    fits = [_best_of(found, names) for names in members]
+    if () in members:
+        hints = sorted({name for names in members for name in names})
+        return (
+            verdict(
+                VerdictKind.BELOW_LIMIT,
+                "Something may be missing, but too small for these data to tell from noise"
+                + (f"; the nearest are {', '.join(hints[:4])}." if hints else "."),
+                total, group=tuple(hints), gates=(gate,),
+            ),
+            found,
+        )  # fmt: skip
+    gates = [absolute_gate(problem, item) for item in fits]
+    fitting = [
+        (names, item)
+        for names, item, each in zip(members, fits, gates, strict=True)
+        if each.passed is not False
+    ]
+    if not fitting or len(fitting) > LARGEST_GROUP:
+        return (
+            verdict(
+                VerdictKind.UNEXPLAINED,
+                "There is a gap that no effect of the catalogue fits."
+                if not fitting
+                else f"There is a gap, and {len(fitting)} explanations fit it alike.",
+                total, gates=(gates[0],), resembles=members[0],
+            ),
+            found,
+        )  # fmt: skip
+    group = tuple(dict.fromkeys(" + ".join(names) for names, _ in fitting))
+    effects = tuple(effect for _, item in fitting for effect in named_effects(problem, item))
+    return (
+        verdict(
+            VerdictKind.GROUP,
+            f"One of {', '.join(group)} is missing; these data cannot tell which.",
+            total, effects=effects, group=group, gates=(gates[0],),
+        ),
+        found,
+    )  # fmt: skip
+
+
+def _best_of(found: Search, identifiers: tuple[str, ...]) -> Fit:
+    options = [item for item in found.all().values() if item.candidate.identifiers == identifiers]
+    best = max(options, key=found.score)
+    return found.exactly(best)
+
+
+def _single_evidence(found: Search, best: Fit) -> float:
+    """Log evidence of the best set, averaged over its places."""
+    places = 0.0
+    for term in best.candidate.terms:
+        places += np.log(len(term.effect.places(found.problem.setting)))
+    return best.log_evidence - places
+
+
+def _shape(found: Search, best: Fit) -> tuple[Gate, Fit | None]:
+    """Free the shape of each effect of the best set in turn; return the outcome that matters most."""
+    outcome, kept = shape_gate(best, None), None
+    for index, term in enumerate(best.candidate.terms):
+        if not term.effect.shape:
+            continue
+        terms = list(best.candidate.terms)
+        terms[index] = Term(term.effect, term.place, free_shape=True)
+        parts = list(best.candidate.parts(best.point.effect))
+        shape = [item.prior.normal(item.canonical) for item in term.effect.shape]
+        parts[index] = np.concatenate((parts[index], shape))
+        start = Point(best.point.shared, best.point.local, np.concatenate(parts))
+        freed = Candidate(tuple(terms))
+        rough = fit(found.problem, freed, start, base=best.base, evidence=False)
+        family = fit(found.problem, freed, rough.point)
+        gate = shape_gate(best, family)
+        if kept is None or gate.statistic > outcome.statistic:
+            outcome, kept = gate, family
+    return outcome, kept if kept is not None and outcome.statistic > SHAPE_GAIN else None
+
+
+def named_effects(problem: Problem, found: Fit) -> tuple[NamedEffect, ...]:
+    """Return the effects of a fit with medians and 90 % intervals of their parameters (Laplace)."""
+    named = []
+    deviation = np.sqrt(np.diag(found.effect_covariance))
+    at = 0
+    for term, part in zip(found.candidate.terms, found.candidate.parts(found.point.effect), strict=True):
+        estimates = []
+        for item, u, spread in zip(term.parameters, part, deviation[at : at + len(part)], strict=True):
+            ends = [item.prior.value(float(u + side * NINETY * spread)) for side in (-1.0, 1.0)]
+            estimates.append(
+                Estimate(
+                    item.name,
+                    item.prior.value(float(u)),
+                    min(ends),
+                    max(ends),
+                    getattr(item, "unit", "1"),
+                    item.description,
+                )
+            )
+        count = len(term.effect.parameters)
+        named.append(
+            NamedEffect(
+                term.effect.identifier,
+                term.effect.name,
+                term.place,
+                term.effect.family,
+                tuple(estimates[:count]),
+                tuple(estimates[count:]),
+                Candidate((term,)).patch(problem.setting, part),
+            )
+        )
+        at += len(part)
+    return tuple(named)
+
+
+def _hypotheses(
+    problem: Problem, found: Search, probabilities: dict[tuple[str, ...], float]
+) -> tuple[Hypothesis, ...]:
+    rows = []
+    for identifiers, probability in probabilities.items():
+        options = [item for item in found.all().values() if item.candidate.identifiers == identifiers]
+        best = max(options, key=found.score)
+        rows.append(
+            Hypothesis(
+                named_effects(problem, best),
+                best.log_evidence,
+                probability,
+                best.chi_square,
+                float(problem.counts.sum() - best.spent.sum()),
+            )
+        )
+    return tuple(rows)
+
+
+def _named_sentence(named: tuple[NamedEffect, ...], probability: float) -> str:
+    what = " and ".join(f"{effect.name}{f' at {effect.place}' if effect.place else ''}" for effect in named)
+    return f"The model lacks {what} (probability {probability:.3f})."

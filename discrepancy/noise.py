@@ -1,0 +1,177 @@
+"""What the noise record of a channel says: its variance, lines of the mains in it, its correlation in time.
+
+Coloured noise is whitened by an autoregression fitted to the record, so that samples that repeat each other are
+not counted as evidence. Lines of the mains are taken out first: they are an effect, not noise.
+"""
+
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_toeplitz
+from scipy.signal import lfilter
+from scipy.stats import chi2
+
+from .campaign import Channel
+
+FloatArray = NDArray[np.float64]
+
+MAINS = (50.0, 60.0, 400.0)
+"""Frequencies at which mains lines are looked for [Hz]."""
+LARGEST_ORDER = 12
+WHITE_LEVEL = 1e-3
+"""Noise is taken as white unless the Ljung-Box test of the record rejects it at this level."""
+LINE_LEVEL = 1e-4
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Noise of one channel.
+
+    Attributes
+    ----------
+    standard_deviation : float
+        s0 of the white innovation for dynamic trials, after whitening [channel's unit].
+    static_deviation : float
+        s0 of a single reading [channel's unit].
+    degrees_of_freedom : float
+        n0; infinite where s0 is exact, zero where nothing is known.
+    autoregression : (p,) ndarray
+        Coefficients a of e_t = x_t - sum_k a_k x_(t-k); empty for white noise.
+    interval : float or None
+        Sampling interval to which the autoregression belongs [s].
+    lines : tuple of float
+        Mains frequencies found in the record [Hz].
+    """
+
+    standard_deviation: float
+    static_deviation: float
+    degrees_of_freedom: float
+    autoregression: FloatArray
+    interval: float | None
+    lines: tuple[float, ...]
+
+    @property
+    def is_known(self) -> bool:
+        """Whether an absolute statement about the fit is possible."""
+        return self.degrees_of_freedom > 0.0
+
+    def whiten(self, columns: FloatArray, interval: float) -> FloatArray:
+        """Return the columns (..., N) of a dynamic record filtered so that this noise becomes white.
+
+        Parameters
+        ----------
+        columns : (..., N) ndarray
+            Residuals or derivatives, along the last axis.
+        interval : float
+            Their sampling interval [s]; the filter applies only at the record's own interval.
+        """
+        if not self.applies(interval):
+            return columns
+        return np.asarray(lfilter(np.r_[1.0, -self.autoregression], [1.0], columns, axis=-1))
+
+    def applies(self, interval: float) -> bool:
+        """Whether the autoregression belongs to this sampling interval."""
+        return bool(
+            self.autoregression.size
+            and self.interval is not None
+            and abs(interval - self.interval) <= 1e-3 * self.interval
+        )
+
+
+def aliased(frequency: float, interval: float) -> float:
+    """Return the frequency [Hz] at which a line shows when sampled at `interval` [s]."""
+    rate = 1.0 / interval
+    return abs(frequency - rate * round(frequency / rate))
+
+
+def noise_model(channel: Channel, fallback: float) -> NoiseModel:
+    """Return the noise of a channel from its record.
+
+    Parameters
+    ----------
+    channel : Channel
+        With its noise record, or none.
+    fallback : float
+        Scale that stands in for an unknown deviation [channel's unit]; only ratios to it matter then.
+    """
+    record = channel.noise
+    if record is None:
+        return NoiseModel(fallback, fallback, 0.0, np.empty(0), None, ())
+    samples, interval = record.samples, record.interval
+    deviation, freedom = record.standard_deviation, record.degrees_of_freedom
+    white = NoiseModel(deviation, deviation, freedom, np.empty(0), interval, ())
+    if samples is None or interval is None or len(samples) < 50:
+        return white
+    rest, lines = without_lines(samples - samples.mean(), interval)
+    freedom = len(rest) - 1.0 - 2.0 * len(lines)
+    deviation = float(np.sqrt(rest @ rest / freedom))
+    if ljung_box(rest, 20) > WHITE_LEVEL:
+        return NoiseModel(deviation, deviation, freedom, np.empty(0), interval, lines)
+    coefficients, innovation = autoregression(rest)
+    return NoiseModel(
+        float(np.sqrt(innovation)), deviation, freedom - len(coefficients), coefficients, interval, lines
+    )
+
+
+def without_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tuple[float, ...]]:
+    """Return the record without the mains lines that stand out of it, and their frequencies [Hz]."""
+    found: list[float] = []
+    rest = samples
+    time = interval * np.arange(len(samples))
+    for frequency in MAINS:
+        shown = aliased(frequency, interval)
+        resolution = 1.0 / (len(samples) * interval)
+        if shown < 2.0 * resolution or shown > 0.5 / interval - 2.0 * resolution:
+            continue
+        waves = np.stack((np.cos(2.0 * np.pi * shown * time), np.sin(2.0 * np.pi * shown * time)), axis=1)
+        amplitude, *_ = np.linalg.lstsq(waves, rest, rcond=None)
+        line = waves @ amplitude
+        left = rest - line
+        # against the neighbourhood of the line, so that coloured noise is not taken for one
+        spectrum = np.abs(np.fft.rfft(left)) ** 2
+        index = round(shown / resolution)
+        near = np.r_[spectrum[max(1, index - 12) : max(1, index - 2)], spectrum[index + 3 : index + 13]]
+        level = near.mean() * 2.0 / len(samples)  # mean power that a line of noise alone takes from the sum
+        if level > 0.0 and line @ line > 0.5 * chi2.isf(LINE_LEVEL, 2) * level:
+            found.append(frequency)
+            rest = left
+    return rest, tuple(found)
+
+
+def ljung_box(series: FloatArray, lags: int, fitted: int = 0) -> float:
+    """Return the p-value of the Ljung-Box test that a series is white.
+
+    Parameters
+    ----------
+    series : (N,) ndarray
+        Residuals.
+    lags : int
+        Number of autocorrelations.
+    fitted : int
+        Coefficients of a time series model fitted to it, which cost degrees of freedom.
+    """
+    size = len(series)
+    centred = series - series.mean()
+    power = centred @ centred
+    if power == 0.0:
+        return 1.0
+    lags = min(lags, size // 4)
+    correlation = np.array([centred[lag:] @ centred[:-lag] for lag in range(1, lags + 1)]) / power
+    statistic = size * (size + 2.0) * np.sum(correlation**2 / (size - np.arange(1, lags + 1)))
+    return float(chi2.sf(statistic, max(lags - fitted, 1)))
+
+
+def autoregression(series: FloatArray) -> tuple[FloatArray, float]:
+    """Return coefficients (p,) and innovation variance of the autoregression with the least BIC."""
+    size = len(series)
+    covariance = np.array([series[: size - lag] @ series[lag:] / size for lag in range(LARGEST_ORDER + 1)])
+    best, least = (np.empty(0), float(covariance[0])), inf
+    for order in range(LARGEST_ORDER + 1):
+        coefficients = solve_toeplitz(covariance[:order], covariance[1 : order + 1]) if order else np.empty(0)
+        innovation = float(covariance[0] - coefficients @ covariance[1 : order + 1])
+        score = size * np.log(innovation) + order * np.log(size)
+        if score < least:
+            best, least = (coefficients, innovation * size / (size - order - 1.0)), score
+    return best

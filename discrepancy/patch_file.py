@@ -1,0 +1,148 @@
+"""`patch.json`: the change of a model that an effect stands for, with posterior intervals and units."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import nan
+from pathlib import Path
+
+import numpy as np
+
+from discrepancy.document_file import (
+    Origin,
+    effects_of,
+    number,
+    origin_of,
+    origin_rows,
+    plain,
+    read_document,
+    write_document,
+)
+from discrepancy.errors import VerdictFileError
+from discrepancy.file_models import PATCH_SCHEMA, PRIMITIVE_UNITS, PatchDocument
+from discrepancy.verdict import NamedEffect
+from fe.patch import ModelPatch
+
+PATCH_NAME = "patch.json"
+
+_INTERVAL = (0.05, 0.95)
+
+
+@dataclass(frozen=True)
+class PrimitiveInterval:
+    """90 % posterior interval of a parameter of the primitive `primitive` (index in the effect's patch).
+
+    `low`, `high` are nan where the posterior was not drawn from; `unit` is that of the parameter.
+    """
+
+    primitive: int
+    parameter: str
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class StoredPatch:
+    """Content of patch.json: effects, the intervals of their primitives by effect, and the origin."""
+
+    effects: tuple[NamedEffect, ...]
+    intervals: tuple[tuple[PrimitiveInterval, ...], ...]
+    origin: Origin
+
+    @property
+    def patch(self) -> ModelPatch:
+        """The whole patch: that of all effects, in order."""
+        return sum((effect.patch for effect in self.effects), ModelPatch())
+
+
+def primitive_intervals(patch: ModelPatch, draws: Sequence[ModelPatch] = ()) -> tuple[PrimitiveInterval, ...]:
+    """Return the interval of each real parameter of a patch.
+
+    Parameters
+    ----------
+    patch : ModelPatch
+        At the posterior's centre.
+    draws : sequence of ModelPatch
+        Patches of the same effect at draws of its posterior; their quantiles 0.05 and 0.95 are taken.
+
+    Raises
+    ------
+    VerdictFileError
+        If a draw has other primitives than the patch.
+    """
+    kinds = [item.kind for item in patch]
+    for count, draw in enumerate(draws, start=1):
+        if [item.kind for item in draw] != kinds:
+            raise VerdictFileError(
+                f"Draw {count} of the posterior has the primitives "
+                f"{', '.join(item.kind for item in draw) or 'none'}, but the patch has "
+                f"{', '.join(kinds) or 'none'}."
+            )
+    found = []
+    for place, primitive in enumerate(patch):
+        for name, unit in PRIMITIVE_UNITS[primitive.kind].items():
+            values = [float(getattr(draw.primitives[place], name)) for draw in draws]
+            low, high = np.quantile(values, _INTERVAL).tolist() if values else (nan, nan)
+            found.append(PrimitiveInterval(place, name, float(getattr(primitive, name)), low, high, unit))
+    return tuple(found)
+
+
+def write_patch(
+    path: Path,
+    effects: Sequence[NamedEffect],
+    origin: Origin,
+    draws: Sequence[Sequence[ModelPatch]] = (),
+) -> Path:
+    """Write patch.json, whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        Destination.
+    effects : sequence of NamedEffect
+        What the patch stands for.
+    origin : Origin
+        What it was found from.
+    draws : sequence of sequence of ModelPatch, optional
+        For each effect, in order: its patch at draws of the posterior. Without, intervals are null.
+
+    Raises
+    ------
+    VerdictFileError, reporting.errors.FileNotWrittenError
+        As `write_verdict` and `primitive_intervals`.
+    """
+    if draws and len(draws) != len(effects):
+        raise VerdictFileError(
+            f"Draws are needed for each of {len(effects)} effects, or none, but came for {len(draws)}."
+        )
+    rows = []
+    for place, effect in enumerate(effects):
+        intervals = primitive_intervals(effect.patch, draws[place] if draws else ())
+        rows.append(plain(effect) | {"intervals": [plain(item) for item in intervals]})
+    return write_document(
+        path, {"schema": PATCH_SCHEMA, **origin_rows(origin), "effects": rows}, PatchDocument
+    )
+
+
+def read_patch(path: Path) -> StoredPatch:
+    """Read the patch.json that `write_patch` wrote; the patch is identical to the last bit.
+
+    Raises
+    ------
+    VerdictFileError
+        As `read_verdict`.
+    """
+    content = read_document(path, PatchDocument, PATCH_SCHEMA)
+    effects = effects_of(content["effects"], path)
+    intervals = tuple(
+        tuple(
+            PrimitiveInterval(
+                i["primitive"], i["parameter"], number(i["value"]), number(i["low"]), number(i["high"]),
+                i["unit"],
+            )
+            for i in row["intervals"]
+        )
+        for row in content["effects"]
+    )  # fmt: skip
+    return StoredPatch(effects, intervals, origin_of(content))

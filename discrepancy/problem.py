@@ -1,0 +1,476 @@
+"""Campaign and model brought together: standardised residuals of every trial and their derivatives.
+
+A residual is (measured - (1 + gain) model - zero) / s0, whitened in time where the noise record is coloured. The
+variance of each channel's noise is marginalised under the inverse gamma distribution that its noise record
+leaves: -ln L = sum over channels of (n0 + n) / 2 ln(1 + RSS / n0) + constant, RSS in units of s0^2.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fe.patch import ModelPatch
+
+from .campaign import Campaign, Trial
+from .candidate import Candidate
+from .catalogue.entry import Setting
+from .errors import CampaignDataError
+from .models.interface import Model
+from .models.memo import MemoModel
+from .noise import NoiseModel, noise_model
+from .sensing import observe
+from .unknowns import GlobalUnknowns, LocalUnknowns, global_unknowns, local_unknowns
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+PARAMETER_STEP = 1e-2
+"""Step of the forward differences in scaled variables."""
+
+
+@dataclass(frozen=True)
+class TrialData:
+    """One trial, ready to be compared.
+
+    Attributes
+    ----------
+    trial : Trial
+        As measured.
+    deviation : (C,) ndarray
+        s0 of each column, of the whitened samples in dynamic trials [channel's unit].
+    groups : (C,) ndarray of int
+        Noise group (channel number) of each column.
+    unknowns : LocalUnknowns
+        Of this trial.
+    weight : (N, C) ndarray
+        1 where a sample counts, else 0.
+    """
+
+    trial: Trial
+    deviation: FloatArray
+    groups: IntArray
+    unknowns: LocalUnknowns
+    weight: FloatArray
+    noise: tuple[NoiseModel, ...]
+
+    def standardised(self, columns: FloatArray) -> FloatArray:
+        """Return columns (..., N, C) over s0, whitened in time, zero where a sample does not count."""
+        scaled = columns / self.deviation
+        if self.trial.is_dynamic:
+            interval = self.trial.interval
+            for number, noise in enumerate(self.noise):
+                if noise.applies(interval):
+                    scaled[..., number] = noise.whiten(scaled[..., number], interval)
+        return np.asarray(scaled * self.weight)
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Prediction of one trial and its derivatives, before gain and zero.
+
+    Attributes
+    ----------
+    response : (N, C) ndarray
+        Prediction without gain and zero.
+    parameters : (P, N, C) ndarray
+        Its derivatives by the scaled calibrated parameters.
+    local : (I, N, C) ndarray
+        By the scaled initial state, time zero and health.
+    effect : (E, N, C) ndarray
+        By the scaled effect parameters; empty without effect.
+    """
+
+    response: FloatArray
+    parameters: FloatArray
+    local: FloatArray
+    effect: FloatArray
+
+
+@dataclass(frozen=True)
+class Point:
+    """Values of all scaled variables.
+
+    Attributes
+    ----------
+    shared : (Q,) ndarray
+        Global unknowns.
+    local : tuple of (L_t,) ndarray
+        Of each trial.
+    effect : (E,) ndarray
+        Of the candidate.
+    """
+
+    shared: FloatArray
+    local: tuple[FloatArray, ...]
+    effect: FloatArray
+
+
+@dataclass(frozen=True)
+class Base:
+    """Where the derivatives by shared and local unknowns were taken, for chord steps."""
+
+    point: Point
+    parts: tuple[Linearisation, ...]
+
+
+_NOTHING = np.empty((0, 0, 0))
+
+
+class Problem:
+    """A campaign and a model, with everything that does not depend on the hypothesis.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        With its noise records.
+    model : Model
+        The model as it is.
+    setting : Setting
+        Scales for the catalogue.
+    trials : tuple of Trial, optional
+        Those to compare; the fitted ones if left out.
+    like : Problem, optional
+        Noise models and global unknowns are taken from it (for held-out trials).
+    """
+
+    def __init__(
+        self,
+        campaign: Campaign,
+        model: Model,
+        setting: Setting,
+        trials: tuple[Trial, ...] | None = None,
+        like: "Problem | None" = None,
+    ) -> None:
+        self.campaign, self.setting = campaign, setting
+        self.model = model if isinstance(model, MemoModel) else MemoModel(model)
+        chosen = campaign.fitted if trials is None else trials
+        if not chosen:
+            raise CampaignDataError(
+                f"The campaign {campaign.name!r} has no trial to fit: all are held out; mark fewer."
+            )
+        self.channel_names = tuple(campaign.channels)
+        self.noise = like.noise if like is not None else _noise(campaign, chosen)
+        self.trials = tuple(self._trial_data(trial) for trial in chosen)
+        counts = np.zeros(len(self.channel_names))
+        for data in self.trials:
+            np.add.at(counts, data.groups, data.weight.sum(axis=0))
+        self.counts = counts
+        self.freedom = np.array([self.noise[name].degrees_of_freedom for name in self.channel_names])
+        self._responses: dict[object, tuple[FloatArray, FloatArray | None]] = {}
+        if like is not None:
+            self.shared = like.shared
+        else:
+            self.shared = global_unknowns(campaign, model, chosen, {})
+            ratios = self._unit_responses()
+            if ratios:
+                self.shared = global_unknowns(campaign, model, chosen, ratios)
+
+    def _trial_data(self, trial: Trial) -> TrialData:
+        noise = tuple(self.noise[name] for name in trial.channels)
+        interval = trial.interval if trial.is_dynamic else None
+        deviation = trial.noise_factor * np.array(
+            [
+                item.standard_deviation
+                if interval is not None and item.applies(interval)
+                else item.static_deviation
+                for item in noise
+            ]
+        )
+        groups = np.array([self.channel_names.index(name) for name in trial.channels])
+        weight = trial.used.astype(np.float64)
+        if interval is not None:  # the filter smears what is left out over its order
+            for number, item in enumerate(noise):
+                if item.applies(interval):
+                    for row in np.flatnonzero(~trial.used[:, number]):
+                        weight[row : row + len(item.autoregression) + 1, number] = 0.0
+        return TrialData(
+            trial, deviation, groups, local_unknowns(self.campaign, trial, deviation), weight, noise
+        )
+
+    def _unit_responses(self) -> dict[str, float]:
+        """Estimate data over model for signals of unknown scale."""
+        found: dict[str, float] = {}
+        point = self.start(Candidate())
+        for number, data in enumerate(self.trials):
+            for column, name in enumerate(data.trial.channels):
+                channel = self.campaign.channels[name]
+                if channel.gain_deviation != inf or name in found:
+                    continue
+                measured = data.trial.values[:, column] - np.median(data.trial.values[:, column])
+                if data.trial.release is not None and not data.trial.release.at_rest:
+                    unit = np.zeros_like(point.local[number])
+                    unit[data.unknowns.zeros] = 1.0 / data.unknowns.initial_scale
+                    response, _ = self.response(number, point.shared, unit, ModelPatch())
+                else:
+                    response, _ = self.response(number, point.shared, point.local[number], ModelPatch())
+                size = float(np.abs(response[:, column]).max())
+                if size > 0.0:
+                    same = data.trial.release is not None or measured @ response[:, column] > 0.0
+                    found[name] = float(np.abs(measured).max()) / size * (1.0 if same else -1.0)
+        return found
+
+    # -------------------------------------------------------------------------- values
+
+    def start(self, candidate: Candidate) -> Point:
+        """Return the prior means, and the start of the candidate."""
+        return Point(
+            np.zeros(self.shared.size),
+            tuple(np.zeros(data.unknowns.size) for data in self.trials),
+            candidate.start(),
+        )
+
+    def response(
+        self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch, refinement: int = 1
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Return the response (N, C) of a trial without gain and zero, and its rates; kept while it is used."""
+        data = self.trials[number]
+        conditions = data.unknowns.conditions(data.trial, self.shared.parameters(shared), local)
+        key = (
+            number, refinement, patch.primitives, conditions.parameters.tobytes(), conditions.initial.tobytes(),
+            conditions.clock, conditions.health.tobytes(),
+        )  # fmt: skip
+        kept = self._responses.get(key)
+        if kept is None:
+            observed = observe(
+                self.model, self.campaign, data.trial, patch, conditions, refinement=refinement
+            )
+            kept = (observed.values, observed.rates)
+            if len(self._responses) > 2000:
+                self._responses.clear()
+            self._responses[key] = kept
+        return kept
+
+    def prediction(self, number: int, point: Point, response: FloatArray) -> FloatArray:
+        """Return the prediction (N, C) with gains and zeros."""
+        data = self.trials[number]
+        gains = self.shared.gains(point.shared, data.trial.channels)
+        zero = data.unknowns.zero(point.local[number], len(data.trial.channels))
+        return np.asarray((1.0 + gains) * response + zero)
+
+    def residual(self, number: int, point: Point, response: FloatArray) -> FloatArray:
+        """Return the standardised residuals (N, C) of a trial."""
+        data = self.trials[number]
+        return data.standardised(data.trial.values - self.prediction(number, point, response))
+
+    # -------------------------------------------------------------------------- derivatives
+
+    def linearise(
+        self,
+        number: int,
+        point: Point,
+        candidate: Candidate,
+        base: "Base | None" = None,
+        *,
+        derivatives: bool = True,
+        known: Linearisation | None = None,
+    ) -> Linearisation:
+        """Return response and derivatives of a trial.
+
+        Parameters
+        ----------
+        number : int
+            Of the trial.
+        point : Point
+            Where.
+        candidate : Candidate
+            Effects that act.
+        base : Base, optional
+            With it, only the effect is evaluated, at the base's shared and local unknowns; their own steps are
+            added to first order (chord).
+        derivatives : bool
+            False: the response only.
+        known : Linearisation, optional
+            Derivatives by shared and local unknowns that are near enough.
+        """
+        data = self.trials[number]
+        kind = data.trial.kind
+        patch = candidate.patch(self.setting, point.effect) if kind in candidate.acts_on else ModelPatch()
+        if base is not None:
+            shared, local = base.point.shared, base.point.local[number]
+            there = base.parts[number]
+            response, _ = self.response(number, shared, local, patch)
+            at_base = response
+            move = (point.shared - shared)[: len(there.parameters)]
+            response = response + np.tensordot(move, there.parameters, 1)
+            response += np.tensordot((point.local[number] - local)[data.unknowns.zeros :], there.local, 1)
+            parameters, by_local = there.parameters, there.local
+        else:
+            shared, local = point.shared, point.local[number]
+            response, rates = self.response(number, shared, local, patch)
+            at_base = response
+            if known is not None:
+                parameters, by_local = known.parameters, known.local
+            elif derivatives:
+                parameters = self._by_parameters(number, shared, local, patch, response)
+                by_local = self._by_local(data, number, shared, local, patch, response, rates)
+        if not derivatives:
+            return Linearisation(response, _NOTHING, _NOTHING, _NOTHING)
+        effect = np.zeros((candidate.size, *response.shape))
+        for k in range(candidate.size):
+            if kind in candidate.acting(k):
+                moved = candidate.patch(self.setting, _moved(point.effect, k))
+                effect[k] = (self.response(number, shared, local, moved)[0] - at_base) / PARAMETER_STEP
+        return Linearisation(response, parameters, by_local, effect)
+
+    def _by_parameters(
+        self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch, response: FloatArray
+    ) -> FloatArray:
+        columns = [
+            (self.response(number, _moved(shared, k), local, patch)[0] - response) / PARAMETER_STEP
+            for k in range(len(self.shared.parameter_mean))
+        ]
+        return np.stack(columns) if columns else np.zeros((0, *response.shape))
+
+    def _by_local(
+        self,
+        data: TrialData,
+        number: int,
+        shared: FloatArray,
+        local: FloatArray,
+        patch: ModelPatch,
+        response: FloatArray,
+        rates: FloatArray | None,
+    ) -> FloatArray:
+        unknowns = data.unknowns
+        first = unknowns.zeros
+        columns = [
+            (self.response(number, shared, _moved(local, first + k), patch)[0] - response) / PARAMETER_STEP
+            for k in range(unknowns.initials)
+        ]
+        if unknowns.time_zero_scale > 0.0:
+            if rates is None:
+                at = first + unknowns.initials
+                rates = (self.response(number, shared, _moved(local, at), patch)[0] - response) / (
+                    PARAMETER_STEP * unknowns.time_zero_scale
+                )
+            columns.append(rates * unknowns.time_zero_scale)
+        if len(unknowns.health_rows):
+            at = unknowns.size - len(unknowns.health_rows)
+            for region in range(2):
+                entries = np.flatnonzero(unknowns.health_columns == region)
+                if not len(entries):
+                    continue
+                moved = local.copy()
+                # away from the limits of the loss; rows do not act on each other
+                sign = np.where(moved[at + entries] > 0.0, -1.0, 1.0)
+                moved[at + entries] += sign * PARAMETER_STEP
+                change = (self.response(number, shared, moved, patch)[0] - response) / PARAMETER_STEP
+                for entry, direction in zip(entries, sign, strict=True):
+                    row = unknowns.health_rows[entry]
+                    column = np.zeros_like(response)
+                    if data.trial.is_dynamic:
+                        column[:] = direction * change
+                    else:
+                        column[row] = direction * change[row]
+                    columns.append(column)
+        return np.stack(columns) if columns else np.zeros((0, *response.shape))
+
+    def jacobian(
+        self, number: int, point: Point, parts: Linearisation, candidate: Candidate
+    ) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Return standardised derivatives of the prediction of a trial.
+
+        Returns
+        -------
+        local : (L, N C) ndarray
+            By the local unknowns.
+        shared : (K, N C) ndarray
+            By those shared unknowns and effect parameters that touch the trial.
+        index : (K,) ndarray of int
+            Which these are: global unknowns first, then effect parameters.
+        """
+        data = self.trials[number]
+        channels = data.trial.channels
+        gains = 1.0 + self.shared.gains(point.shared, channels)
+        shape = parts.response.shape
+        zeros = np.zeros((data.unknowns.zeros, *shape))
+        for row, (column, scale) in enumerate(
+            zip(data.unknowns.zero_columns, data.unknowns.zero_scale, strict=True)
+        ):
+            zeros[row, :, column] = scale
+        local = np.concatenate((zeros, parts.local * gains))
+        count = len(self.shared.parameter_mean)
+        by_gain, gain_index = [], []
+        for position, name in enumerate(self.shared.gain_channels):
+            if name in channels:
+                column = np.zeros(shape)
+                at = channels.index(name)
+                column[:, at] = self.shared.gain_scale[position] * parts.response[:, at]
+                by_gain.append(column)
+                gain_index.append(count + position)
+        acting = [k for k in range(candidate.size) if data.trial.kind in candidate.acting(k)]
+        blocks = [parts.parameters * gains]
+        if by_gain:
+            blocks.append(np.stack(by_gain))
+        if acting:
+            blocks.append(parts.effect[acting] * gains)
+        shared = np.concatenate(blocks)
+        index = np.array(
+            [*range(count), *gain_index, *(self.shared.size + k for k in acting)], dtype=np.int64
+        )
+        size = shape[0] * shape[1]
+        return (
+            data.standardised(local).reshape(len(local), size),
+            data.standardised(shared).reshape(len(shared), size),
+            index,
+        )
+
+    # -------------------------------------------------------------------------- likelihood
+
+    def group_sums(self, residuals: Sequence[FloatArray]) -> FloatArray:
+        """Return the sum of squared standardised residuals of each channel."""
+        sums = np.zeros(len(self.channel_names))
+        for data, residual in zip(self.trials, residuals, strict=True):
+            np.add.at(sums, data.groups, np.einsum("nc,nc->c", residual, residual))
+        return sums
+
+    def misfit(self, sums: FloatArray) -> float:
+        """Return -ln L with the noise variances marginalised, up to a constant."""
+        n0, n = self.freedom, self.counts
+        with np.errstate(divide="ignore", invalid="ignore"):
+            known = 0.5 * (n0 + n) * np.log1p(sums / n0)
+            terms = np.where(
+                np.isinf(n0),
+                0.5 * sums,
+                np.where(n0 > 0.0, known, 0.5 * n * np.log(np.maximum(sums, 1e-300))),
+            )
+        return float(terms[n > 0].sum())
+
+    def precisions(self, sums: FloatArray) -> FloatArray:
+        """Return the expected precision of each channel's noise over 1 / s0^2, given the residuals."""
+        n0, n = self.freedom, self.counts
+        with np.errstate(divide="ignore", invalid="ignore"):
+            weights = np.where(np.isinf(n0), 1.0, (n0 + n) / (n0 + sums))
+        return np.where(n > 0, weights, 1.0)
+
+    def with_trials(self, trials: tuple[Trial, ...]) -> "Problem":
+        """Return the same problem on other trials, with the same noise and global unknowns."""
+        return Problem(self.campaign, self.model, self.setting, trials, like=self)
+
+
+def _moved(values: FloatArray, index: int) -> FloatArray:
+    moved = values.copy()
+    moved[index] += PARAMETER_STEP
+    return moved
+
+
+def _noise(campaign: Campaign, trials: tuple[Trial, ...]) -> dict[str, NoiseModel]:
+    """Noise models of all channels; where nothing is known, a thousandth of the channel's range stands in."""
+    found = {}
+    for name, channel in campaign.channels.items():
+        spans = [
+            float(np.ptp(trial.values[:, trial.channels.index(name)]))
+            for trial in campaign.trials
+            if name in trial.channels
+        ]
+        found[name] = noise_model(channel, 1e-3 * max([*spans, 1e-12]))
+    return found
+
+
+def shortened(trial: Trial, count: int) -> Trial:
+    """Return the first rows of a trial."""
+    rows = ("values", "used", "time", "force", "load_factor", "temperature", "health", "health_deviation")
+    return replace(trial, **{name: getattr(trial, name)[:count] for name in rows})

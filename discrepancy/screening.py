@@ -1,0 +1,222 @@
+"""Screening: what an effect could explain, before any fit, to first order in the nuisances.
+
+With d the standardised change that an effect makes to the prediction at the fitted nuisances, J their derivatives
+and H the Hessian of the fit, the misfit after the nuisances have adapted is
+
+    F(d) = F(0) - b(d) + G(d, d) / 2,   G(c, d) = c.d - (J c)' H^-1 (J d),   b(d) = r.d - g' H^-1 (J d).
+
+Changes of several effects add, so pairs and scales cost inner products only. G is also what separates two effects
+before data are looked at.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from .candidate import Candidate, Term
+from .catalogue.entry import EffectParameter
+from .errors import ModelError
+from .fitting import LARGEST_EFFECT, Fit, trial_block
+from .problem import Problem
+
+FloatArray = NDArray[np.float64]
+
+LEVELS = {1: (-1.5, -0.5, 0.5, 1.5), 2: (-1.3, 0.0, 1.3), 3: (-1.2, 0.0, 1.2)}
+"""Grid of the scaled parameters that are not a mere scale, by their number; two levels from four on."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """What an effect at given values does to the prediction, adapted nuisances taken off.
+
+    Attributes
+    ----------
+    term : Term
+        The effect at a place.
+    start : (E,) ndarray
+        Scaled parameters.
+    vector : (D,) ndarray
+        Change and its projections, such that G(c, d) = c.sign.d.
+    fits : float
+        b(d): its overlap with the residual [nat].
+    size : float
+        G(d, d): squared distance from the model without it [sigma^2].
+    """
+
+    term: Term
+    start: FloatArray
+    vector: FloatArray
+    fits: float
+    size: float
+
+    @property
+    def scale(self) -> float:
+        """Factor on the change that explains most."""
+        return self.fits / self.size if self.size > 0.0 else 0.0
+
+    @property
+    def gain(self) -> float:
+        """Decrease of the misfit at the best scale [nat]."""
+        return 0.5 * self.fits * self.scale
+
+
+class Screen:
+    """Inner products of changes at a fit.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    fit : Fit
+        Where the nuisances stand; its own effects stay as they are.
+    record_noise : bool
+        Whether residuals count by the noise record (else by what the fit left).
+    """
+
+    def __init__(self, problem: Problem, fit: Fit, *, record_noise: bool = True) -> None:
+        self.problem, self.fit = problem, fit
+        known = problem.freedom > 0.0
+        left = problem.precisions(fit.sums)
+        precision = np.where(known, 1.0, left) if record_noise else left
+        candidate = Candidate()
+        size = problem.shared.size
+        matrix = np.diag(problem.shared.precision + 1e-12)
+        gradient = -problem.shared.precision * fit.point.shared
+        self._pieces = []
+        for number in range(len(problem.trials)):
+            block, local, shared = trial_block(
+                problem, number, fit.point, fit.linearisations[number], candidate,
+                fit.residuals[number], precision,
+            )  # fmt: skip
+            factor = cho_factor(block.local, lower=True)
+            inner = cho_solve(factor, block.cross)
+            matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
+            np.add.at(gradient, block.index, block.shared_gradient - inner.T @ block.local_gradient)
+            root = np.broadcast_to(
+                np.sqrt(precision[problem.trials[number].groups]), fit.residuals[number].shape
+            ).ravel()
+            lower = np.tril(factor[0])
+            self._pieces.append(
+                (
+                    local,
+                    shared,
+                    inner,
+                    lower,
+                    block.index,
+                    root,
+                    fit.residuals[number].ravel() * root,
+                    solve_triangular(lower, block.local_gradient, lower=True),
+                )
+            )
+        self._lower = np.tril(cho_factor(matrix, lower=True)[0])
+        self._gradient = solve_triangular(self._lower, gradient, lower=True)
+        self._size = size
+
+    def change(self, term: Term, start: FloatArray) -> Change:
+        """Return what a term does at scaled parameters, besides the effects of the fit."""
+        problem, fit = self.problem, self.fit
+        candidate = fit.candidate.plus(term)
+        acting = term.effect.acts_on
+        effect = np.concatenate((fit.point.effect, start))
+        total = np.zeros(self._size)
+        parts, fits, square = [], 0.0, 0.0
+        tail = []
+        for number, (data, piece) in enumerate(zip(problem.trials, self._pieces, strict=True)):
+            local, shared, inner, lower, index, root, residual, local_gradient = piece
+            if data.trial.kind not in acting:
+                parts.append(np.zeros(len(root)))
+                tail.append(np.zeros(len(lower)))
+                continue
+            patch = candidate.patch(problem.setting, effect)
+            response, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch)
+            gains = 1.0 + problem.shared.gains(fit.point.shared, data.trial.channels)
+            moved = gains * (response - fit.responses[number])
+            d = data.standardised(moved).ravel() * root
+            z = local @ d
+            np.add.at(total, index, shared @ d - inner.T @ z)
+            z = solve_triangular(lower, z, lower=True)
+            fits += float(residual @ d) - float(local_gradient @ z)
+            square += float(d @ d) - float(z @ z)
+            parts.append(d)
+            tail.append(z)
+        y = solve_triangular(self._lower, total, lower=True)
+        fits -= float(self._gradient @ y)
+        square -= float(y @ y)
+        vector = np.concatenate((*parts, *tail, y))
+        return Change(term, start, vector, fits, max(square, 0.0))
+
+    @property
+    def sign(self) -> FloatArray:
+        """Signs (D,) of the inner product: changes count, their projections are taken off."""
+        samples = sum(len(piece[5]) for piece in self._pieces)
+        rest = sum(len(piece[3]) for piece in self._pieces) + self._size
+        return np.concatenate((np.ones(samples), -np.ones(rest)))
+
+    def changes(self, term: Term) -> Iterator[Change]:
+        """Yield the changes of a term over the grid of its parameters, where the model can follow."""
+        for start in grid(term):
+            try:
+                yield self.change(term, start)
+            except ModelError:  # such as a spring softer than what is taken from it
+                continue
+
+
+def grid(term: Term) -> Iterator[FloatArray]:
+    """Yield scaled parameters to try: magnitudes at one value, since changes scale with them."""
+    axes: list[tuple[float, ...]] = []
+    scaled = False
+    count = sum(1 for item in term.parameters if not _is_magnitude(item))
+    levels = LEVELS.get(count, (-1.0, 1.0))
+    for item in term.parameters:
+        if _is_magnitude(item):
+            signed = item.prior.value(0.0) == 0.0
+            if scaled:
+                axes.append((-1.0, 0.0, 1.0) if signed else (0.0,))
+            else:
+                axes.append((1.0,) if signed else (0.0,))
+                scaled = True
+        elif item in term.effect.shape:
+            axes.append((item.prior.normal(item.canonical),))  # type: ignore[union-attr]
+        else:
+            axes.append(levels)
+    for values in product(*axes):
+        yield np.array(values)
+
+
+def _is_magnitude(item: object) -> bool:
+    return isinstance(item, EffectParameter) and item.magnitude
+
+
+def rescaled(change: Change) -> FloatArray:
+    """Return the scaled parameters at which the magnitude is that of the best scale."""
+    start = change.start.copy()
+    factor = change.scale
+    for number, item in enumerate(change.term.parameters):
+        if not _is_magnitude(item):
+            continue
+        prior = item.prior
+        value = prior.value(float(start[number])) * factor
+        if prior.shape == "log_normal":
+            value = max(value, prior.value(-0.7 * LARGEST_EFFECT))
+        start[number] = np.clip(prior.normal(value), -0.7 * LARGEST_EFFECT, 0.7 * LARGEST_EFFECT)
+    return start
+
+
+def separation(first: Change, second: Change, sign: FloatArray) -> float:
+    """Return d^2, the squared distance of `first` from the nearest multiple of `second` [sigma^2]."""
+    if second.size <= 0.0:
+        return first.size
+    overlap = float(first.vector * sign @ second.vector)
+    return max(first.size - overlap**2 / second.size, 0.0)
+
+
+def cosine(first: Change, second: Change, sign: FloatArray) -> float:
+    """Return the cosine of the angle between two changes, nuisances projected out."""
+    if first.size <= 0.0 or second.size <= 0.0:
+        return 0.0
+    return float(first.vector * sign @ second.vector) / sqrt(first.size * second.size)

@@ -1,0 +1,382 @@
+"""The search for the set of effects that explains a campaign: screen, fit, add one, take one away, try pairs."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from math import ceil, comb, exp, inf, log
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from .candidate import Candidate, Term
+from .catalogue.entry import Effect
+from .errors import ModelError
+from .fitting import Fit, fit
+from .gates import absolute_gate
+from .problem import Point, Problem, shortened
+from .screening import Change, Screen, rescaled
+
+FloatArray = NDArray[np.float64]
+
+PRIOR_NONE = 0.5
+SET_SHARES = (0.9, 0.09, 0.01)
+"""How the rest of the prior is shared among sets of one, two and three effects."""
+LARGEST_SET = len(SET_SHARES)
+STARTS, FAR_STARTS = 2, 3
+"""Starts of the fit of each effect, close to the truth and far from it."""
+CHORD_STEPS = 8
+CLOSE = 12.0
+"""Candidates within this log evidence of the best are fitted exactly [nat]."""
+EXACT_FITS = 5
+WORTH_ADDING = 1.0
+"""Screened gain below which one more effect is not fitted [nat]."""
+PAIRS_FITTED = 10
+FAR = 1.5
+"""Chi-square per sample above which a fit is far from the truth."""
+BEGINNING, LEAST_SAMPLES = 4.0, 60
+"""The beginning of a record: this many periods of the first mode, at least that many samples."""
+SHORT_STEPS, FAR_STEPS = 12, 6
+"""Steps on the beginnings, and then on whole records, before candidates are compared."""
+FAR_FITS = 8
+"""Candidates that go on from the beginnings to whole records."""
+
+Key = tuple[tuple[str, str], ...]
+
+
+def key_of(candidate: Candidate) -> Key:
+    """Return what tells candidates apart: sorted (identifier, place)."""
+    return tuple(sorted((term.effect.identifier, term.place) for term in candidate.terms))
+
+
+@dataclass
+class Search:
+    """All candidates fitted so far.
+
+    Attributes
+    ----------
+    problem : Problem
+        Campaign and model.
+    effects : tuple of Effect
+        Those that can act here.
+    none : Fit
+        Without effect.
+    exact : dict of Key to Fit
+        Fitted to convergence.
+    rough : dict of Key to Fit
+        Fitted by few steps only; their evidence is approximate.
+    beginnings : Problem or None
+        The problem with the beginnings of its records, once it was needed.
+    """
+
+    problem: Problem
+    effects: tuple[Effect, ...]
+    none: Fit
+    exact: dict[Key, Fit] = field(default_factory=dict)
+    rough: dict[Key, Fit] = field(default_factory=dict)
+    beginnings: Problem | None = None
+
+    def __post_init__(self) -> None:
+        self.exact[()] = self.none
+
+    # ---------------------------------------------------------------- probabilities
+
+    def log_prior(self, candidate: Candidate) -> float:
+        """Return ln of the prior probability of a candidate at its places."""
+        count = len(candidate.terms)
+        if count == 0:
+            return log(PRIOR_NONE)
+        sets = comb(len(self.effects), count)
+        places = sum(log(self._places(term.effect)) for term in candidate.terms)
+        return log((1.0 - PRIOR_NONE) * SET_SHARES[count - 1] / sets) - places
+
+    def _places(self, effect: Effect) -> int:
+        return len(effect.places(self.problem.setting))
+
+    def score(self, found: Fit) -> float:
+        """Return ln (evidence times prior), up to a constant."""
+        return found.log_evidence + self.log_prior(found.candidate)
+
+    def all(self) -> dict[Key, Fit]:
+        """Return every candidate, the exact fit where there is one."""
+        return {**self.rough, **self.exact}
+
+    def best(self) -> Fit:
+        """Return the most probable candidate."""
+        return max(self.exact.values(), key=self.score)
+
+    def set_probabilities(self) -> dict[tuple[str, ...], float]:
+        """Return the probability of each set of identifiers, places summed, most probable first."""
+        scores: dict[tuple[str, ...], list[float]] = {}
+        for found in self.all().values():
+            scores.setdefault(found.candidate.identifiers, []).append(self.score(found))
+        sums = {identifiers: float(logsumexp(values)) for identifiers, values in scores.items()}
+        total = float(logsumexp(list(sums.values())))
+        ordered = sorted(sums.items(), key=lambda item: -item[1])
+        return {identifiers: exp(value - total) for identifiers, value in ordered}
+
+    # ---------------------------------------------------------------- fits
+
+    def keep(self, found: Fit, *, exact: bool) -> None:
+        """Keep a fit if it is better than what is known of the same candidate."""
+        kept = self.exact if exact else self.rough
+        key = key_of(found.candidate)
+        if key not in kept or kept[key].log_evidence < found.log_evidence:
+            kept[key] = found
+
+    def screened(self, base: Fit, effects: Iterable[Effect]) -> dict[str, list[Change]]:
+        """Return for each effect its most promising changes, best first, at different places or values."""
+        screen = Screen(self.problem, base)
+        return {effect.identifier: self._starts(screen, effect) for effect in effects}
+
+    def _starts(self, screen: Screen, effect: Effect, count: int = STARTS) -> list[Change]:
+        found: list[Change] = []
+        for place in effect.places(self.problem.setting):
+            best: list[Change] = []
+            for change in screen.changes(Term(effect, place)):
+                if change.size > 0.0:
+                    best = sorted([*best, change], key=_worth)[:count]
+            found.extend(best)
+        return sorted(found, key=_worth)[:count]
+
+    def scan(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
+        """Fit every effect roughly in addition to those of `base`; return the best of each, best first.
+
+        Close to the truth one linearisation serves all (chord steps). Far from it phases slip over a long record,
+        so that the beginnings of the records are fitted first, and the whole ones from there.
+        """
+        found = self._scan_far(base, tuple(effects)) if self._far(base) else self._scan_near(base, effects)
+        for item in found:
+            self.keep(item, exact=False)
+        return sorted(found, key=lambda item: -self.score(item))
+
+    def _far(self, base: Fit) -> bool:
+        return base.chi_square > FAR * float(self.problem.counts.sum())
+
+    def _scan_near(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
+        found = []
+        for changes in self.screened(base, effects).values():
+            fits = []
+            for change in changes:
+                try:
+                    fits.append(self.roughly(base, base.candidate.plus(change.term), rescaled(change)))
+                except ModelError:  # the best scale is more than the structure can carry
+                    continue
+            if fits:
+                found.append(max(fits, key=self.score))
+        return found
+
+    def _scan_far(self, base: Fit, effects: tuple[Effect, ...]) -> list[Fit]:
+        near = self._near(base)
+        screen = Screen(self._short(), near)
+        starts = []
+        for effect in effects:
+            fits = [
+                self._shortly(near, base.candidate.plus(change.term), rescaled(change))
+                for change in self._starts(screen, effect, FAR_STARTS)
+            ]
+            found = [item for item in fits if item is not None]
+            if found:
+                starts.append(min(found, key=lambda item: item.objective))
+        return self._whole(starts, base.objective)
+
+    def _near(self, base: Fit) -> Fit:
+        """Fit the beginnings with the effects of a base; shared unknowns as expected before the data.
+
+        The nuisances of a wrong model are far off and make a bad start.
+        """
+        expected = Point(
+            np.zeros_like(base.point.shared),
+            tuple(np.zeros_like(u) for u in base.point.local),
+            base.point.effect,
+        )
+        return fit(self._short(), base.candidate, expected, local_only=True, evidence=False)
+
+    def _shortly(self, near: Fit, candidate: Candidate, added: FloatArray) -> Fit | None:
+        """Fit a candidate to the beginnings, or return None where the structure cannot follow."""
+        start = Point(near.point.shared, near.point.local, np.concatenate((near.point.effect, added)))
+        try:
+            return fit(self._short(), candidate, start, iterations=SHORT_STEPS, evidence=False)
+        except ModelError:
+            return None
+
+    def _whole(self, starts: list[Fit], least: float) -> list[Fit]:
+        """Fit the most promising candidates to whole records from where the beginnings led."""
+        found: list[Fit] = []
+        for item in sorted(starts, key=lambda start: start.objective)[:FAR_FITS]:
+            try:
+                whole = fit(self.problem, item.candidate, item.point, iterations=FAR_STEPS, give_up=least)
+            except ModelError:
+                continue
+            least = min(least, whole.objective + CLOSE)
+            found.append(whole)
+        return found
+
+    def _short(self) -> Problem:
+        """Return the problem with the beginnings of its dynamic records only."""
+        if self.beginnings is None:
+            period = 2.0 * np.pi / self.problem.setting.scales.angular_frequency
+            trials = []
+            for data in self.problem.trials:
+                trial = data.trial
+                count = len(trial.time)
+                if trial.is_dynamic:
+                    count = min(count, max(LEAST_SAMPLES, ceil(BEGINNING * period / trial.interval)))
+                trials.append(shortened(trial, count))
+            self.beginnings = self.problem.with_trials(tuple(trials))
+        return self.beginnings
+
+    def roughly(self, base: Fit, candidate: Candidate, added: FloatArray) -> Fit:
+        """Fit a candidate by chord steps from a base."""
+        start = Point(base.point.shared, base.point.local, np.concatenate((base.point.effect, added)))
+        return fit(self.problem, candidate, start, base=base.base, iterations=CHORD_STEPS)
+
+    def exactly(self, rough: Fit) -> Fit:
+        """Fit a candidate to convergence from a rough fit, and keep it."""
+        key = key_of(rough.candidate)
+        found = self.exact.get(key)
+        if found is None or found.log_evidence < rough.log_evidence - 5.0:
+            try:
+                found = fit(self.problem, rough.candidate, rough.point)
+            except ModelError:  # chord steps led to where the structure cannot follow
+                found = rough
+            self.keep(found, exact=True)
+        return self.exact[key]
+
+    def refine(self, rough: Sequence[Fit], floor: float) -> list[Fit]:
+        """Fit exactly those that are close to the best of them and above a floor of the score."""
+        if not rough:
+            return []
+        top = self.score(rough[0])
+        # far from the truth, chord steps rank only roughly
+        margin = max(CLOSE, 0.5 * (top - floor))
+        chosen = [item for item in rough[:EXACT_FITS] if self.score(item) > max(top - margin, floor)]
+        return sorted((self.exactly(item) for item in chosen), key=lambda item: -self.score(item))
+
+    # ---------------------------------------------------------------- the search
+
+    def run(self) -> None:
+        """Search: singles, one more at a time, all pairs where a single one does not do, deletion."""
+        floor = self.score(self.none) - 6.0
+        self.refine(self.scan(self.none, self.effects), floor)
+        current = self.best()
+        while current.candidate.terms and len(current.candidate.terms) < LARGEST_SET:
+            longer = self._extended(current)
+            if longer is None:
+                break
+            current = longer
+        if not absolute_gate(self.problem, self.best()).passed and len(self.effects) > 1:
+            self._pairs()
+            self._extended(self.best())
+        self._deletions()
+
+    def _extended(self, current: Fit) -> Fit | None:
+        """Return a better set with one more effect, or None."""
+        if len(current.candidate.terms) >= LARGEST_SET:
+            return None
+        before = self.score(current)
+        there = {term.effect.identifier for term in current.candidate.terms}
+        others = [effect for effect in self.effects if effect.identifier not in there]
+        promising = [
+            effect
+            for effect, changes in zip(others, self.screened(current, others).values(), strict=True)
+            if changes and changes[0].gain > WORTH_ADDING
+        ]
+        fitted = self.refine(self.scan(current, promising), before - 2.0)
+        return fitted[0] if fitted and self.score(fitted[0]) > before else None
+
+    def _pairs(self) -> None:
+        """Fit the most promising of all pairs of effects, by their changes at the fit without effect."""
+        far = self._far(self.none)
+        near = self._near(self.none) if far else self.none
+        screen = Screen(self._short() if far else self.problem, near)
+        changes = {effect.identifier: self._starts(screen, effect) for effect in self.effects}
+        ranked = sorted(_pairs(changes, screen.sign), key=lambda item: item[0])[:PAIRS_FITTED]
+        rough: list[Fit] = []
+        for _, first, second in ranked:
+            candidate = Candidate((first.term, second.term))
+            if key_of(candidate) in self.exact:
+                continue
+            start = np.concatenate((rescaled(first), rescaled(second)))
+            if far:
+                found = self._shortly(near, candidate, start)
+            else:
+                try:
+                    found = self.roughly(self.none, candidate, start)
+                except ModelError:
+                    found = None
+            if found is not None:
+                rough.append(found)
+        if far:
+            rough = self._whole(rough, self.none.objective)
+        for item in rough:
+            self.keep(item, exact=False)
+        rough.sort(key=lambda item: -self.score(item))
+        self.refine(rough, self.score(self.best()) - CLOSE)
+
+    def _deletions(self) -> None:
+        """Fit the best set less one effect, for each."""
+        best = self.best()
+        if len(best.candidate.terms) < 2:
+            return
+        for index in range(len(best.candidate.terms)):
+            less = best.candidate.without(index)
+            if key_of(less) not in self.exact:
+                parts = best.candidate.parts(best.point.effect)
+                effect = np.concatenate(parts[:index] + parts[index + 1 :])
+                self.keep(
+                    fit(self.problem, less, Point(best.point.shared, best.point.local, effect)), exact=True
+                )
+
+
+def _worth(change: Change) -> float:
+    """Order of changes: misfit gained, less what the scale costs in the prior."""
+    scaled = rescaled(change)
+    return -change.gain + 0.5 * float(scaled @ scaled)
+
+
+def _pairs(changes: dict[str, list[Change]], sign: FloatArray) -> Iterator[tuple[float, Change, Change]]:
+    """Yield misfit and changes, scaled together, of all pairs of effects."""
+    names = list(changes)
+    for i, one in enumerate(names):
+        for other in names[i + 1 :]:
+            best: tuple[float, Change, Change] | None = None
+            for first in changes[one]:
+                for second in changes[other]:
+                    overlap = float(first.vector * sign @ second.vector)
+                    gram = np.array([[first.size, overlap], [overlap, second.size]])
+                    fits = np.array([first.fits, second.fits])
+                    if np.linalg.cond(gram) > 1e8:
+                        continue
+                    scale = np.linalg.solve(gram, fits)
+                    misfit = -0.5 * float(fits @ scale)
+                    if best is None or misfit < best[0]:
+                        best = (misfit, _scaled(first, scale[0]), _scaled(second, scale[1]))
+            if best is not None and best[0] > -inf:
+                yield best
+
+
+def _scaled(change: Change, scale: float) -> Change:
+    """Return the change whose best scale alone is the given one."""
+    return Change(change.term, change.start, change.vector, scale * change.size, change.size)
+
+
+def search(problem: Problem, effects: Sequence[Effect]) -> Search:
+    """Fit the model without effect, then search the catalogue.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    effects : sequence of Effect
+        The catalogue; what is unavailable here is left out.
+
+    Returns
+    -------
+    Search
+        All candidates with their evidence.
+    """
+    none = fit(problem, Candidate(), problem.start(Candidate()))
+    usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
+    found = Search(problem, usable, none)
+    found.run()
+    return found

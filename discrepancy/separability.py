@@ -1,0 +1,231 @@
+"""What a campaign can decide, before its data are looked at: detectable sizes and confusion groups.
+
+Every effect is put on the model at its prior median; the change it makes, with all nuisances projected out, is
+compared with the noise (can it be seen?) and with what every other effect can do (can it be told apart?).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import inf, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .campaign import Campaign, Trial
+from .candidate import Candidate, Term
+from .catalogue.entry import Effect, EffectParameter, Setting
+from .errors import DiscrepancyError
+from .fitting import fit
+from .models.interface import Model
+from .problem import PARAMETER_STEP, Problem
+from .screening import Change, Screen
+
+FloatArray = NDArray[np.float64]
+
+CONFUSED = 9.0
+"""Squared distance [sigma^2] below which two effects form a confusion group."""
+DETECTED = 25.0
+"""Squared distance from the model [sigma^2] at which an effect is found: 3 nats of Bayes factor, the cost of its
+parameters and of its place in the catalogue."""
+
+
+@dataclass(frozen=True)
+class Detectability:
+    """How well a campaign sees one effect.
+
+    Attributes
+    ----------
+    effect : Effect
+        Which.
+    reason : str
+        Why it cannot be tested here; empty if it can.
+    place : str
+        Where it shows best.
+    distance : float
+        d^2 from the model without it at the prior median [sigma^2].
+    parameter : str
+        The parameter that scales it.
+    detectable : float
+        Value of that parameter from which on it is found [unit of the parameter]; infinite if never.
+    unit : str
+        Of it.
+    typical : float
+        Its prior median (for a signed parameter one prior deviation).
+    """
+
+    effect: Effect
+    reason: str
+    place: str = ""
+    distance: float = 0.0
+    parameter: str = ""
+    detectable: float = inf
+    unit: str = "1"
+    typical: float = 0.0
+
+
+@dataclass(frozen=True)
+class Separability:
+    """What a campaign can and cannot decide.
+
+    Attributes
+    ----------
+    detectability : tuple of Detectability
+        In the order of the catalogue.
+    identifiers : tuple of str
+        Of the effects that can be tested, rows and columns of `distance`.
+    distance : (E, E) ndarray
+        d^2 of the row's effect (at its median) from the nearest that the column's effect can do [sigma^2].
+    groups : tuple of tuple of str
+        Confusion groups of two or more.
+    """
+
+    detectability: tuple[Detectability, ...]
+    identifiers: tuple[str, ...]
+    distance: FloatArray
+    groups: tuple[tuple[str, ...], ...]
+
+    def group_of(self, identifier: str) -> tuple[str, ...]:
+        """Return the confusion group of an effect, itself alone if it has none."""
+        for group in self.groups:
+            if identifier in group:
+                return group
+        return (identifier,)
+
+
+def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
+    """Return the campaign with what the model predicts in the place of the data."""
+    problem = Problem(campaign, model, setting)
+    point = problem.start(Candidate())
+    trials: list[Trial] = []
+    predicted = {}
+    for number, data in enumerate(problem.trials):
+        response, _ = problem.response(
+            number, point.shared, point.local[number], Candidate().patch(setting, point.effect)
+        )
+        predicted[data.trial.name] = problem.prediction(number, point, response)
+    for trial in campaign.trials:
+        values = predicted.get(trial.name)
+        trials.append(trial if values is None else replace(trial, values=values))
+    return replace(campaign, trials=tuple(trials))
+
+
+def separability(
+    campaign: Campaign, model: Model, setting: Setting, effects: Sequence[Effect]
+) -> Separability:
+    """Return what a campaign can decide.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Inputs, channels and noise count; the measured values do not.
+    model : Model
+        The model as it is.
+    setting : Setting
+        Scales.
+    effects : sequence of Effect
+        The catalogue.
+    """
+    ideal = as_predicted(campaign, model, setting)
+    problem = Problem(ideal, model, setting)
+    none = fit(problem, Candidate(), problem.start(Candidate()), iterations=1)
+    screen = Screen(problem, none)
+    rows: list[Detectability] = []
+    changes: dict[str, list[Change]] = {}
+    for effect in effects:
+        reason = effect.unavailable(setting)
+        if reason is not None:
+            rows.append(Detectability(effect, reason))
+            continue
+        options = [
+            change for place in effect.places(setting) for change in screen.changes(Term(effect, place))
+        ]
+        central = [_reference(screen, effect, place) for place in effect.places(setting)]
+        best = max(central, key=lambda change: change.size)
+        rows.append(_detectability(effect, best))
+        if best.size > 1e-6:
+            changes[effect.identifier] = [best, *options]
+    names = tuple(changes)
+    distance = np.array(
+        [[_distance(screen, changes[i][0], changes[j]) if i != j else 0.0 for j in names] for i in names]
+    )
+    return Separability(tuple(rows), names, distance, _groups(names, distance))
+
+
+def _reference(screen: Screen, effect: Effect, place: str) -> Change:
+    """Return the change of an effect at its prior median (signed magnitudes: at one prior deviation)."""
+    term = Term(effect, place)
+    start = term.start()
+    for number, item in enumerate(term.parameters):
+        if isinstance(item, EffectParameter) and item.magnitude and item.prior.value(0.0) == 0.0:
+            start[number] = 1.0
+    return screen.change(term, start)
+
+
+def _detectability(effect: Effect, change: Change) -> Detectability:
+    for number, item in enumerate(change.term.parameters):
+        if isinstance(item, EffectParameter) and item.magnitude:
+            typical = abs(item.prior.value(float(change.start[number])))
+            detectable = typical * sqrt(DETECTED / change.size) if change.size > 0.0 else inf
+            return Detectability(
+                effect, "", change.term.place, change.size, item.name, detectable, item.unit, typical
+            )
+    return Detectability(effect, "", change.term.place, change.size)
+
+
+def _distance(screen: Screen, target: Change, options: list[Change]) -> float:
+    """Return d^2 of a change from what an effect can do: its nearest grid point, moved along its parameters."""
+    sign = screen.sign
+    if target.size <= 0.0:
+        return 0.0
+
+    def overlap(option: Change) -> float:
+        return (
+            abs(float(target.vector * sign @ option.vector)) / sqrt(option.size) if option.size > 0.0 else 0.0
+        )
+
+    nearest = max(options, key=overlap)
+    if nearest.size <= 0.0:
+        return target.size
+    columns = [nearest.vector]
+    for number in range(len(nearest.start)):
+        moved = nearest.start.copy()
+        moved[number] += 10.0 * PARAMETER_STEP
+        columns.append(screen.change(nearest.term, moved).vector - nearest.vector)
+    span = np.stack(columns)
+    gram = (span * sign) @ span.T
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    gram = gram / np.outer(scale, scale) + 1e-6 * np.eye(len(gram))
+    right = (span * sign) @ target.vector / scale
+    return max(target.size - float(right @ np.linalg.solve(gram, right)), 0.0)
+
+
+def _groups(names: tuple[str, ...], distance: FloatArray) -> tuple[tuple[str, ...], ...]:
+    """Return connected sets of effects that are closer than `CONFUSED` in either direction."""
+    near = np.minimum(distance, distance.T) < CONFUSED
+    left, groups = set(range(len(names))), []
+    while left:
+        found, edge = set(), {min(left)}
+        while edge:
+            found |= edge
+            edge = {j for i in edge for j in left if near[i, j]} - found
+        left -= found
+        if len(found) > 1:
+            groups.append(tuple(names[i] for i in sorted(found)))
+    return tuple(groups)
+
+
+def usable(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
+    """Return the effects that can be tested here.
+
+    Raises
+    ------
+    DiscrepancyError
+        If there is none.
+    """
+    found = tuple(effect for effect in effects if effect.unavailable(setting) is None)
+    if not found:
+        raise DiscrepancyError(
+            "No effect of the catalogue can be tested with this campaign and model: the campaign needs static, "
+            "ring-down, forced or flight trials whose channels are outputs of the model."
+        )
+    return found

@@ -1,0 +1,234 @@
+"""The whole way from a campaign to a verdict: check, locate, name, prove, propose the next experiment."""
+
+import time
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from fe.patch import ModelPatch
+
+from .campaign import Campaign
+from .candidate import Candidate
+from .catalogue.entry import Effect, Setting
+from .catalogue.library import load_catalogue
+from .data_fault import DataFault
+from .data_quality import check_against_model, check_data, mark_outliers
+from .fitting import Fit
+from .held_out import choose_held_out
+from .locate import Location, locate
+from .models.interface import Model
+from .naming import name
+from .next_experiment import next_experiments
+from .predictive import residual_set
+from .problem import Problem
+from .proof import prove
+from .residuals import ResidualSet
+from .search import Search
+from .verdict import Proof, Verdict, VerdictKind
+
+SOLVER_SHARE = 0.1
+"""Largest share of the noise that the time steps may cost (rms over a channel of a trial)."""
+DRAWS = 400
+OPEN_KINDS = (VerdictKind.GROUP, VerdictKind.UNEXPLAINED, VerdictKind.FAMILY, VerdictKind.BELOW_LIMIT)
+
+
+class Progress(Protocol):
+    """Where the work reports how far it is; `reporting.progress` has implementations."""
+
+    def stage(
+        self, description: str, total: int | None = None, unit: str = ""
+    ) -> AbstractContextManager[object]:
+        """Open a stretch of work."""
+
+
+@dataclass(frozen=True)
+class Investigation:
+    """All that came out.
+
+    Attributes
+    ----------
+    campaign : Campaign
+        As used: outliers marked, held-out trials chosen.
+    model : Model
+        The model as it was.
+    faults : tuple of DataFault
+        What is wrong with the data.
+    verdict : Verdict
+        The conclusion.
+    location : Location or None
+        Where model and data disagree, before anything is added.
+    proof : Proof or None
+        Where an effect was named, or is the most probable one.
+    before, after : ResidualSet or None
+        Residuals without and with it; None where faults of the data stopped the work.
+    problem, search, fit : Problem, Search, Fit or None
+        What the naming side worked with; `fit` stands for the verdict.
+    seconds : dict of str to float
+        Wall time by stage.
+    """
+
+    campaign: Campaign
+    model: Model
+    faults: tuple[DataFault, ...]
+    verdict: Verdict
+    location: Location | None = None
+    proof: Proof | None = None
+    before: ResidualSet | None = None
+    after: ResidualSet | None = None
+    problem: Problem | None = None
+    search: Search | None = None
+    fit: Fit | None = None
+    seconds: dict[str, float] | None = None
+
+
+def investigate(
+    campaign: Campaign,
+    model: Model,
+    effects: Sequence[Effect] | None = None,
+    *,
+    seed: int = 0,
+    thorough: bool = True,
+    progress: Progress | None = None,
+) -> Investigation:
+    """Find out what a model lacks.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Measured data.
+    model : Model
+        The model that is to explain them.
+    effects : sequence of Effect, optional
+        The catalogue; the shipped one with the user's installed entries if left out.
+    seed : int
+        Of all draws.
+    thorough : bool
+        False: no map of residuals and no next experiment, for studies over many campaigns.
+    progress : Progress, optional
+        Where to report.
+
+    Returns
+    -------
+    Investigation
+        Verdict, evidence, proof.
+
+    Raises
+    ------
+    DiscrepancyError
+        If the campaign cannot be compared with the model at all.
+    """
+    seconds: dict[str, float] = {}
+
+    def stage(description: str, key: str) -> "_Timed":
+        return _Timed(progress, description, key, seconds)
+
+    with stage("Checking the data", "check"):
+        campaign, faults = checked(campaign, model)
+    fatal = [fault for fault in faults if fault.fatal]
+    if fatal:
+        verdict = Verdict(
+            VerdictKind.DATA_ERROR,
+            fatal[0].sentence,
+            float("nan"),
+            float("nan"),
+            remarks=tuple(fault.sentence for fault in faults),
+        )
+        return Investigation(campaign, model, faults, verdict, seconds=seconds)
+    setting = Setting(campaign, model, model.scales(campaign))
+    with stage("Fitting what is known, and searching the catalogue", "name"):
+        problem = Problem(campaign, model, setting)
+        verdict, search, fit = name(problem, load_catalogue() if effects is None else effects)
+    remarks = [fault.sentence for fault in faults] + list(campaign.remarks)
+    with stage("Checking the time steps", "steps"):
+        share = solver_share(problem, fit)
+        if share > SOLVER_SHARE:
+            remarks.append(
+                f"The time steps cost up to {share:.2g} of the noise (rms), more than the {SOLVER_SHARE:g} that is "
+                "wanted: probabilities may be too sharp."
+            )
+    with stage("Residuals", "residuals"):
+        before = residual_set(problem, search.none, sensitivities=thorough)
+        after = residual_set(problem, fit, sensitivities=False) if fit is not search.none else before
+    location = None
+    if thorough:
+        with stage("Locating the gap", "locate"):
+            location = locate(before, seed=seed)
+            remarks += [text for text in location.remarks if text not in remarks]
+    proof = None
+    if fit.candidate.terms:
+        with stage("Proving on held-out trials", "prove"):
+            proof = prove(before, after, seed=seed)
+    experiments: tuple = ()
+    if thorough and verdict.kind in OPEN_KINDS:
+        with stage("Looking for the next experiment", "next"):
+            experiments = next_experiments(problem, open_hypotheses(search))
+    verdict = replace(verdict, remarks=tuple(remarks), next_experiments=experiments)
+    return Investigation(
+        campaign, model, faults, verdict, location, proof, before, after, problem, search, fit, seconds
+    )
+
+
+def checked(campaign: Campaign, model: Model) -> tuple[Campaign, tuple[DataFault, ...]]:
+    """Return the campaign with outliers marked and trials held out, and what is wrong with it."""
+    faults = check_data(campaign)
+    campaign = mark_outliers(campaign)
+    faults = (*faults, *check_against_model(campaign, model))
+    return choose_held_out(campaign), faults
+
+
+def solver_share(problem: Problem, fit: Fit) -> float:
+    """Return the largest rms change of a channel when the time steps are halved, over its noise."""
+    largest = 0.0
+    for number, data in enumerate(problem.trials):
+        if not data.trial.is_dynamic:
+            continue
+        candidate = fit.candidate if data.trial.kind in fit.candidate.acts_on else Candidate()
+        patch = candidate.patch(problem.setting, fit.point.effect) if candidate.terms else ModelPatch()
+        finer, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch, refinement=2)
+        change = (finer - fit.responses[number]) / data.deviation
+        largest = max(largest, float(np.sqrt((change**2).mean(axis=0)).max()))
+    return largest
+
+
+def open_hypotheses(search: Search, count: int = 5) -> list[tuple[Fit, float]]:
+    """Return the most probable hypotheses with their probabilities, different sets of effects."""
+    found = []
+    for identifiers, probability in list(search.set_probabilities().items())[:count]:
+        options = [item for item in search.all().values() if item.candidate.identifiers == identifiers]
+        found.append((max(options, key=search.score), probability))
+    return found
+
+
+def patch_draws(problem: Problem, fit: Fit, seed: int, count: int = DRAWS) -> list[list[ModelPatch]]:
+    """Return for each effect of a fit its patch at draws of the posterior (Laplace)."""
+    generator = np.random.default_rng(seed)
+    size = fit.candidate.size
+    root = np.linalg.cholesky(fit.effect_covariance + 1e-15 * np.eye(size))
+    draws = fit.point.effect + generator.standard_normal((count, size)) @ root.T
+    patches: list[list[ModelPatch]] = []
+    at = 0
+    for term in fit.candidate.terms:
+        width = len(term.parameters)
+        alone = Candidate((term,))
+        patches.append([alone.patch(problem.setting, draw[at : at + width]) for draw in draws])
+        at += width
+    return patches
+
+
+class _Timed:
+    def __init__(
+        self, progress: Progress | None, description: str, key: str, seconds: dict[str, float]
+    ) -> None:
+        self._stage = nullcontext() if progress is None else progress.stage(description)
+        self._key, self._seconds = key, seconds
+
+    def __enter__(self) -> None:
+        self._began = time.perf_counter()
+        self._stage.__enter__()
+
+    def __exit__(self, *error: object) -> None:
+        self._stage.__exit__(*error)  # type: ignore[arg-type]
+        self._seconds[self._key] = time.perf_counter() - self._began

@@ -1,0 +1,463 @@
+"""The wing with changes, online: what the primitives of `fe.patch` do to its structure, loads and outputs.
+
+NumPy and relative imports only: this file is copied into the FMU. The arrays are those of `fe.patch_arrays`;
+the equations are in `docs/patches.md`.
+"""
+
+import re
+from collections.abc import Callable
+from functools import cached_property
+from math import isfinite
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from .errors import InvalidPatchError
+from .patch import (
+    InertiaRelief,
+    LoadGain,
+    LoadPlace,
+    LocalStiffnessLoss,
+    ModelPatch,
+    ModulusTemperature,
+    PointMass,
+    RootCompliance,
+    Washout,
+)
+from .patch_arrays import PatchArrays
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+Place = str | tuple[float, float]
+
+LOAD_PLACE = "tip_load"
+"""Name of the place of the static test."""
+OVERHANG = 0.15
+"""How far beyond the tip a place may lie, as a share of the semi-span."""
+PORTS = ("root", "tip", "span")
+"""Ports where internal forces act."""
+_STRAIN = re.compile(r"strain\[(\d+)\]")
+_NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
+_DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
+
+ITERATIONS = 3
+"""Steps of the subspace iteration for the modes of a patched wing."""
+HELD = 1e-7
+"""Part of a static shape, relative to it, below which a basis of motion holds it already."""
+EMPTY = ModelPatch()
+
+
+class PatchedStructure:
+    """Stiffness and mass of the wing at one state and under one set of changes.
+
+    Attributes
+    ----------
+    stiffness, mass : (n, n) ndarray
+        In the basis of the arrays.
+    """
+
+    def __init__(self, wing: "PatchedWing", terms: "_Terms") -> None:
+        self._wing, self._terms = wing, terms
+
+    @cached_property
+    def stiffness(self) -> FloatArray:
+        """Stiffness (n, n)."""
+        return self._wing.sum_of_stiffness(self._terms)
+
+    @cached_property
+    def mass(self) -> FloatArray:
+        """Mass (n, n)."""
+        return self._wing.sum_of_mass(self._terms)
+
+    @cached_property
+    def _inverse(self) -> FloatArray:
+        return np.asarray(np.linalg.inv(self.stiffness))
+
+    def static(self, loads: FloatArray) -> FloatArray:
+        """Return the displacements K^-1 f of loads (n,) or (n, k)."""
+        return np.asarray(self._inverse @ loads)
+
+    def modes(self, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return the first undamped modes, Kapteyn et al. 2021, eq. (16).
+
+        Parameters
+        ----------
+        count : int
+            How many.
+
+        Returns
+        -------
+        angular_frequency : (count,) ndarray
+            Rising [rad/s].
+        shapes : (n, count) ndarray
+            Mass-normalised.
+        """
+        basis = motion_basis(self.static, self.mass, self._wing.arrays.start_shapes)
+        # M x = K x / w^2: the low modes are the largest eigenvalues, which keep all their digits
+        to_standard = np.linalg.inv(np.linalg.cholesky(basis.T @ self.stiffness @ basis))
+        inverse_square, vectors = np.linalg.eigh(to_standard @ (basis.T @ self.mass @ basis) @ to_standard.T)
+        inverse_square = inverse_square[::-1][:count]
+        shapes = to_standard.T @ vectors[:, ::-1][:, :count] / np.sqrt(inverse_square)
+        return 1.0 / np.sqrt(inverse_square), np.asarray(basis @ shapes)
+
+
+def motion_basis(
+    static: Callable[[FloatArray], FloatArray],
+    mass: FloatArray,
+    start: FloatArray,
+    solutions: FloatArray | None = None,
+) -> FloatArray:
+    """Return a basis of the first modes of a structure, by subspace iteration.
+
+    Parameters
+    ----------
+    static : callable
+        K^-1 of loads (n, k).
+    mass : (n, n) ndarray
+        M.
+    start : (n, r) ndarray
+        Modes of a structure near by.
+    solutions : (n, s) ndarray, optional
+        Static shapes that the basis is to hold as well.
+
+    Returns
+    -------
+    (n, r + s) ndarray
+        Orthonormal; fewer where the modes or other shapes hold a static shape already.
+    """
+    basis = start
+    for _ in range(ITERATIONS):
+        basis = np.linalg.qr(static(mass @ basis))[0]
+    if solutions is None:
+        return np.asarray(basis)
+    for shape in (solutions / np.linalg.norm(solutions, axis=0)).T:
+        # a static shape is held already but for a small part: two passes
+        rest = shape - basis @ (basis.T @ shape)
+        rest = rest - basis @ (basis.T @ rest)
+        size = float(np.linalg.norm(rest))
+        # what is held already, or given twice, would add a direction of rounding
+        if size > HELD:
+            basis = np.concatenate((basis, rest[:, np.newaxis] / size), axis=1)
+    return np.asarray(basis)
+
+
+class _Terms(NamedTuple):
+    """What the matrices of a structure are the sum of."""
+
+    theta: FloatArray  # (4,) of the stiffness terms
+    parts: IntArray  # (p,) numbers of the strips' parts that change
+    factors: FloatArray  # (p,) what is added of each
+    spring: float  # added to the root's flapping spring
+    masses: tuple[float, float]  # servo, pitot
+    points: tuple[tuple[float, FloatArray], ...]  # point mass, weights (P,) of its station
+
+
+class PatchedWing:
+    """The wing in a basis that holds the changes of `fe.patch`.
+
+    Parameters
+    ----------
+    arrays : PatchArrays
+        From `fe.patch_cache.patch_arrays`, or read from a file.
+    """
+
+    def __init__(self, arrays: PatchArrays) -> None:
+        self.arrays = arrays
+        self.size = len(arrays.load_tip)
+        lower = np.tril_indices(self.size)
+        self._strips = np.zeros((len(arrays.strip_of), self.size, self.size))
+        self._strips[:, lower[0], lower[1]] = arrays.strip_stiffness
+        self._strips[:, lower[1], lower[0]] = arrays.strip_stiffness
+
+    @property
+    def gauge_count(self) -> int:
+        """Number of gauges G."""
+        return int(self.arrays.strain_rows.shape[1])
+
+    @property
+    def span(self) -> float:
+        """Semi-span [m]."""
+        return self.arrays.semi_span
+
+    # ------------------------------------------------------------ structure
+
+    def structure(
+        self,
+        young_modulus_factor: float,
+        stiffness_loss: tuple[float, float],
+        servo_mass: float,
+        pitot_mass: float,
+        patch: ModelPatch = EMPTY,
+        temperature_difference: float = 0.0,
+    ) -> PatchedStructure:
+        """Return stiffness and mass at a state under a patch; primitives of other kinds are passed over.
+
+        Parameters
+        ----------
+        young_modulus_factor : float
+            e [1].
+        stiffness_loss : tuple of float
+            (z1, z2), fractions.
+        servo_mass, pitot_mass : float
+            Masses [kg].
+        patch : ModelPatch
+            Its point masses, root compliances, local losses and temperature coefficients act.
+        temperature_difference : float
+            Temperature less the reference temperature [K].
+
+        Raises
+        ------
+        InvalidPatchError
+            If a change leaves no stiffness, or a place lies off the wing.
+        """
+        arrays, e = self.arrays, young_modulus_factor
+        remaining = np.ones(len(arrays.strip_lines) - 1)
+        compliance = 0.0
+        points = []
+        for item in patch:
+            if isinstance(item, ModulusTemperature):
+                e = e * (1.0 - item.coefficient * temperature_difference)
+            elif isinstance(item, LocalStiffnessLoss):
+                remaining *= 1.0 - item.loss * self._overlap(item)
+            elif isinstance(item, RootCompliance):
+                compliance += item.compliance
+            elif isinstance(item, PointMass):
+                points.append((item.mass, self._along(item.station)))
+        theta = np.array((e, 1.0 - stiffness_loss[0], 1.0 - stiffness_loss[1], 1.0))
+        if not (isfinite(e) and theta.min() > 0.0):
+            raise InvalidPatchError(
+                f"The factors on the stiffness of skin and defect regions must be positive, but are "
+                f"{theta[0]:g}, {theta[1]:g} and {theta[2]:g}; lessen the losses or the coefficient."
+            )
+        if remaining.min() <= 0.0:
+            raise InvalidPatchError(
+                f"A local stiffness loss must leave some stiffness, but leaves {remaining.min():g} of it."
+            )
+        spring = 0.0
+        if compliance != 0.0:
+            flexibility = 1.0 / arrays.flap_spring + compliance
+            if flexibility <= 0.0:
+                raise InvalidPatchError(
+                    f"The root's compliance of {1.0 / arrays.flap_spring:g} rad/(N m) cannot be reduced by "
+                    f"{-compliance:g}; give a compliance above {-1.0 / arrays.flap_spring:g}."
+                )
+            spring = 1.0 / flexibility - arrays.flap_spring
+        parts = np.flatnonzero(remaining[arrays.strip_of] != 1.0).astype(np.int64)
+        factors = (remaining[arrays.strip_of[parts]] - 1.0) * theta[arrays.term_of[parts]]
+        return PatchedStructure(
+            self, _Terms(theta, parts, factors, spring, (servo_mass, pitot_mass), tuple(points))
+        )
+
+    def sum_of_stiffness(self, terms: _Terms) -> FloatArray:
+        """Return the stiffness (n, n) of a structure."""
+        stiffness = np.tensordot(terms.theta, self.arrays.stiffness, 1)
+        for part, factor in zip(terms.parts, terms.factors, strict=True):
+            stiffness += factor * self._strips[part]
+        if terms.spring != 0.0:
+            stiffness += terms.spring * np.multiply.outer(self.arrays.flap_row, self.arrays.flap_row)
+        return np.asarray(stiffness)
+
+    def sum_of_mass(self, terms: _Terms) -> FloatArray:
+        """Return the mass (n, n) of a structure."""
+        servo, pitot = terms.masses
+        mass = self.arrays.mass[0] + servo * self.arrays.mass[1] + pitot * self.arrays.mass[2]
+        for added, weights in terms.points:
+            for rows in self.arrays.line_rows[:3]:
+                row = weights @ rows
+                mass += added * np.multiply.outer(row, row)
+        return np.asarray(mass)
+
+    def _overlap(self, box: LocalStiffnessLoss) -> FloatArray:
+        """Share (S,) of each strip's length that lies in a box."""
+        lines = self.arrays.strip_lines
+        inside = np.minimum(lines[1:], box.start + box.length) - np.maximum(lines[:-1], box.start)
+        return np.asarray(np.maximum(inside, 0.0) / np.diff(lines))
+
+    # ------------------------------------------------------------ loads and rows
+
+    def _along(self, y: float) -> FloatArray:
+        """Weights (P,) of the stations at `y` m from the root: the parabola of the mesh cell."""
+        stations, span = self.arrays.stations, self.span
+        if not 0.0 <= y <= (1.0 + OVERHANG) * span:
+            raise InvalidPatchError(
+                f"A place must lie on the wing, 0 to {span:g} m from the root, but is {y:g} m."
+            )
+        if y > span:  # a force beyond the tip hangs on a stiff arm
+            inboard = 0.97 * span
+            arm = (y - inboard) / (span - inboard)
+            return np.asarray(arm * self._along(span) + (1.0 - arm) * self._along(inboard))
+        cell = min(max(int(np.searchsorted(stations[2::2], y)), 0), (len(stations) - 3) // 2)
+        first, last = stations[2 * cell], stations[2 * cell + 2]
+        t = (y - first) / (last - first)
+        weights = np.zeros(len(stations))
+        weights[2 * cell : 2 * cell + 3] = (
+            (1.0 - t) * (1.0 - 2.0 * t),
+            4.0 * t * (1.0 - t),
+            t * (2.0 * t - 1.0),
+        )
+        return weights
+
+    def displacement_row(self, y: float, chord: float) -> FloatArray:
+        """Return the row (n,) of the upward displacement of a section at a chord fraction.
+
+        Raises
+        ------
+        InvalidPatchError
+            If `y` [m from the root] lies off the wing.
+        """
+        along = self._along(y)
+        elastic, other = self.arrays.line_chord
+        share = (chord - elastic) / (other - elastic)
+        row = (1.0 - share) * (along @ self.arrays.line_rows[2])
+        return np.asarray(row + share * (along @ self.arrays.line_rows[3]) if share != 0.0 else row)
+
+    def force_row(self, place: Place, patch: ModelPatch = EMPTY) -> FloatArray:
+        """Return the load (n,) of 1 N at a place; as a row, the displacement there.
+
+        Parameters
+        ----------
+        place : str or tuple of float
+            "tip_load", or distance from the root [m] and chord fraction.
+        patch : ModelPatch
+            Its load places act.
+
+        Raises
+        ------
+        InvalidPatchError
+            If the place is not known or lies off the wing.
+        """
+        along_span = sum(item.along_span for item in patch if isinstance(item, LoadPlace))
+        along_chord = sum(item.along_chord for item in patch if isinstance(item, LoadPlace))
+        if isinstance(place, str):
+            if place != LOAD_PLACE:
+                raise InvalidPatchError(
+                    f"The place {place!r} is not known; give {LOAD_PLACE!r} or the distance from the root "
+                    "in metres and the chord fraction."
+                )
+            row = self.arrays.load_tip
+            y, chord = self.arrays.load_place, float(self.arrays.line_chord[0])
+        else:
+            y, chord = place
+            row = self.displacement_row(y, chord)
+        if along_span == 0.0 and along_chord == 0.0:
+            return row
+        arrays = self.arrays
+
+        def chord_at(distance: float) -> float:
+            return arrays.root_chord + (arrays.tip_chord - arrays.root_chord) * distance / arrays.semi_span
+
+        # how far aft of the straight chord line; outboard is along that line
+        aft = (chord - arrays.straight_chord_line) * chord_at(y) + along_chord
+        moved = y + along_span
+        moved_chord = arrays.straight_chord_line + aft / chord_at(moved)
+        shift = self.displacement_row(moved, moved_chord) - self.displacement_row(y, chord)
+        return np.asarray(row + shift)
+
+    def load(self, load_factor: float, patch: ModelPatch = EMPTY) -> FloatArray:
+        """Return the load (n,) [N] of a turn at a load factor under a patch (washout, inertia relief)."""
+        linear, square = self.load_parts(patch)
+        return np.asarray(load_factor * linear + load_factor**2 * square)
+
+    def load_parts(self, patch: ModelPatch = EMPTY) -> FloatArray:
+        """Return the parts (2, n) of `load` that go with the load factor and with its square [N]."""
+        arrays = self.arrays
+        parts = np.stack((arrays.load_lift, np.zeros(self.size)))
+        for item in patch:
+            if isinstance(item, Washout):
+                if item.exponent < 0.0:
+                    raise InvalidPatchError(
+                        f"The exponent of a washout must not be negative, but is {item.exponent:g}."
+                    )
+                eta = np.clip(arrays.stations / arrays.semi_span, 0.0, 1.0) ** item.exponent
+                parts[1] -= item.coefficient * (eta @ arrays.lift_rows)
+            elif isinstance(item, InertiaRelief):
+                parts[0] += item.fraction * arrays.weight
+        return parts
+
+    def port_row(self, name: str) -> FloatArray:
+        """Return the row (n,) of a port: "root" [rad], "tip" or "span" [m]; raises `InvalidPatchError`."""
+        if name == "root":
+            return self.arrays.flap_row
+        if name == "tip":
+            return self.arrays.load_tip
+        if name == "span":
+            return np.asarray(self.arrays.station_weights @ self.arrays.line_rows[2])
+        raise InvalidPatchError(f"The wing has no port {name!r}; it has {', '.join(PORTS)}.")
+
+    def output_row(self, name: str, component: int = 0) -> FloatArray | None:
+        """Return the row (n,) of an output, None if there is no such output.
+
+        Parameters
+        ----------
+        name : str
+            strain[k] (gauges count from 1, as in the FMU), tip_displacement, load_point_displacement,
+            displacement[y, x].
+        component : int
+            Of a strain: 0 along the span, 1 across, 2 engineering shear strain; zero for displacements.
+        """
+        strain = _STRAIN.fullmatch(name)
+        if strain is not None:
+            gauge = int(strain.group(1)) - 1
+            return self.arrays.strain_rows[component, gauge] if 0 <= gauge < self.gauge_count else None
+        row: FloatArray | None = None
+        if name == "tip_displacement":
+            row = self.arrays.tip_row
+        elif name == "load_point_displacement":
+            row = self.arrays.load_tip
+        else:
+            place = _DISPLACEMENT.fullmatch(name)
+            if place is not None and 0.0 <= float(place.group(1)) <= self.span:
+                row = self.displacement_row(float(place.group(1)), float(place.group(2)))
+        return row if row is None or component == 0 else np.zeros_like(row)
+
+    # ------------------------------------------------------------ for a model that has its own static part
+
+    def static_change(
+        self,
+        young_modulus_factor: float,
+        stiffness_loss: tuple[float, float],
+        load_factor: float,
+        tip_force: float,
+        patch: ModelPatch,
+        temperature_difference: float = 0.0,
+    ) -> tuple[FloatArray, float, float]:
+        """Return what structure and load primitives change of the static response: patched less unpatched.
+
+        Parameters
+        ----------
+        young_modulus_factor, stiffness_loss, load_factor, tip_force
+            As of `ReducedModel.static_response`.
+        patch : ModelPatch
+            Changes; internal forces and sensors are passed over.
+        temperature_difference : float
+            [K].
+
+        Returns
+        -------
+        strain : (G,) ndarray
+            Change of the strains.
+        tip_displacement, load_point_displacement : float
+            Changes [m].
+
+        Raises
+        ------
+        InvalidPatchError
+            If the patch cannot be.
+        """
+        force = tip_force
+        for item in patch:
+            if isinstance(item, LoadGain):
+                force = (1.0 + item.gain) * force + (item.tare if tip_force != 0.0 else 0.0)
+        before = self.structure(young_modulus_factor, stiffness_loss, 0.0, 0.0).static(
+            self.load(load_factor) + tip_force * self.arrays.load_tip
+        )
+        after = self.structure(
+            young_modulus_factor, stiffness_loss, 0.0, 0.0, patch, temperature_difference
+        ).static(self.load(load_factor, patch) + force * self.force_row(LOAD_PLACE, patch))
+        change = after - before
+        return (
+            np.asarray(self.arrays.strain_rows[0] @ change),
+            float(self.arrays.tip_row @ change),
+            float(self.arrays.load_tip @ change),
+        )

@@ -1,0 +1,226 @@
+"""Missing effects as variables of the wing FMU: which there are, and the patch that their values make.
+
+An effect has a switch and every number of its primitives as tunable parameters; they stand at the end of the
+table, so that value references before them stay. Standard library only: the file is copied into the FMU.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from .variables import FmuVariable, Unit
+
+TEMPERATURE = "temperature_difference"
+"""Input of FMUs with an effect of temperature: the wing's temperature less the reference temperature [K]."""
+
+ROTATING_PORT = "root"
+"""The port of the wing whose motion is a rotation."""
+
+UNITS = (
+    Unit("K", (("K", 1),)),
+    Unit("1/K", (("K", -1),), (("microstrain/K", 1e6),)),
+    Unit("rad", (("rad", 1),), (("deg", 57.29577951308232),)),
+    Unit("1/m", (("m", -1),)),
+    Unit("m/s", (("m", 1), ("s", -1))),
+    Unit("rad/s", (("rad", 1), ("s", -1))),
+    Unit("N.m", (("kg", 1), ("m", 2), ("s", -2))),
+    Unit("N/m", (("kg", 1), ("s", -2))),
+    Unit("N.m/rad", (("kg", 1), ("m", 2), ("s", -2), ("rad", -1))),
+    Unit("rad/(N.m)", (("rad", 1), ("kg", -1), ("m", -2), ("s", 2))),
+)
+"""Units of effects beside those of `variables`."""
+
+_MOTION, _SPEED, _FORCE, _STIFFNESS = ("m", "rad"), ("m/s", "rad/s"), ("N", "N.m"), ("N/m", "N.m/rad")
+_SHOWN, _SHOWN_PER_RELEASE = "of the channel", "of the channel per metre"
+_UNIT_OF: Mapping[str, Mapping[str, str | tuple[str, str]]] = {
+    "point_mass": {"mass": "kg", "station": "m"},
+    "root_compliance": {"compliance": "rad/(N.m)"},
+    "local_stiffness_loss": {"start": "m", "length": "m"},
+    "modulus_temperature": {"coefficient": "1/K"},
+    "stiffness_drift": {"rate": "1/s"},
+    "power_damping": {
+        "coefficient": _FORCE, "reference_velocity": _SPEED, "reference_displacement": _MOTION,
+    },
+    "power_stiffness": {"coefficient": _FORCE, "reference_displacement": _MOTION},
+    "free_play": {"stiffness": _STIFFNESS, "half_width": _MOTION},
+    "micro_slip": {"slip_force": _FORCE, "stiffness": _STIFFNESS},
+    "bouc_wen": {"stiffness": _STIFFNESS, "yield_displacement": _MOTION},
+    "load_place": {"along_span": "m", "along_chord": "m"},
+    "load_gain": {"tare": "N"},
+    "sensor_drift": {"amplitude": _SHOWN, "time": "s"},
+    "sensor_rotation": {"angle": "rad"},
+    "thermal_strain": {"coefficient": "1/K"},
+    "high_pass": {"time_constant": "s"},
+    "line": {"frequency": "Hz", "cosine": _SHOWN, "sine": _SHOWN},
+    "decaying_line": {"frequency": "Hz", "cosine": _SHOWN_PER_RELEASE, "sine": _SHOWN_PER_RELEASE},
+}  # fmt: skip
+"""Units of a primitive's numbers; others have none. Pairs: of a moving and of a turning port."""
+
+
+@dataclass(frozen=True)
+class Number:
+    """One number of an effect: its variable, and where it stands in the effect's primitives."""
+
+    name: str
+    primitive: int
+    key: str
+    value: float
+    unit: str
+    whole: bool
+
+
+def numbers_of(effect: Mapping[str, Any]) -> tuple[Number, ...]:
+    """Return the numbers of an effect in the order of its primitives.
+
+    A number is called `effect.<id>.<key>`; where several primitives of the effect have one of that name,
+    `effect.<id>.<key>[n]`, n the number of the primitive from 1.
+
+    Parameters
+    ----------
+    effect : mapping
+        `id`, and `primitives` as `ModelPatch.to_list` gives them.
+    """
+    found = [
+        (number, key, value, primitive)
+        for number, primitive in enumerate(effect["primitives"])
+        for key, value in primitive.items()
+        if isinstance(value, int | float) and not isinstance(value, bool)
+    ]
+    often = Counter(key for _, key, _, _ in found)
+    return tuple(
+        Number(
+            name=f"effect.{effect['id']}.{key}" + (f"[{number + 1}]" if often[key] > 1 else ""),
+            primitive=number,
+            key=key,
+            value=float(value),
+            unit=_unit(primitive, key),
+            whole=isinstance(value, int),
+        )
+        for number, key, value, primitive in found
+    )
+
+
+def _unit(primitive: Mapping[str, Any], key: str) -> str:
+    unit = _UNIT_OF.get(str(primitive["kind"]), {}).get(key, "1")
+    if isinstance(unit, tuple):
+        return unit[primitive.get("port") == ROTATING_PORT]
+    if unit in (_SHOWN, _SHOWN_PER_RELEASE):
+        channel = str(primitive["channel"])
+        displacement = channel.endswith("displacement") or primitive.get("quantity") == "displacement"
+        if unit == _SHOWN:
+            return "m" if displacement else "1"
+        return "1" if displacement else "1/m"
+    return unit
+
+
+def needs_temperature(effects: Sequence[Mapping[str, Any]]) -> bool:
+    """Return whether an effect depends on temperature."""
+    kinds = {primitive["kind"] for effect in effects for primitive in effect["primitives"]}
+    return bool(kinds & {"thermal_strain", "modulus_temperature"})
+
+
+def switch_of(effect: Mapping[str, Any]) -> str:
+    """Return the name of the switch of an effect."""
+    return f"effect.{effect['id']}.active"
+
+
+def effect_rows(
+    effects: Sequence[Mapping[str, Any]], first: int, start: Mapping[str, float]
+) -> tuple[FmuVariable, ...]:
+    """Return the rows that effects append to the table of variables.
+
+    Parameters
+    ----------
+    effects : sequence of mapping
+        `id` and `primitives` of each.
+    first : int
+        Value reference of the first row.
+    start : mapping of str to float
+        Start values by variable name; a switch that is not there is off, a number has its value in the patch.
+    """
+    rows: list[FmuVariable] = []
+
+    def add(
+        name: str, description: str, value: float, unit: str, *, whole: bool = False, top: float | None = None
+    ) -> None:
+        rows.append(
+            FmuVariable(
+                name=name,
+                reference=first + len(rows),
+                kind="Integer" if whole else "Real",
+                causality="parameter",
+                variability="tunable",
+                description=description,
+                unit=None if whole else unit,
+                display_unit=None,
+                minimum=None if top is None else 0.0,
+                maximum=top,
+                start=float(start.get(name, value)),
+            )
+        )
+
+    for effect in effects:
+        kinds = " and ".join(dict.fromkeys(str(item["kind"]) for item in effect["primitives"]))
+        add(
+            switch_of(effect),
+            f"Whether the effect {effect['id']} ({kinds.replace('_', ' ')}) acts: 0 off, 1 on",
+            0.0,
+            "1",
+            top=1.0,
+        )
+        for number in numbers_of(effect):
+            primitive = effect["primitives"][number.primitive]
+            place = primitive.get("port") or primitive.get("channel") or ""
+            where = f" at {place}" if place not in ("", "*") else ""
+            text = f"{number.key.replace('_', ' ')} of {str(primitive['kind']).replace('_', ' ')}{where}"
+            add(number.name, text[:1].upper() + text[1:], number.value, number.unit, whole=number.whole)
+    if needs_temperature(effects):
+        rows.append(
+            FmuVariable(
+                name=TEMPERATURE,
+                reference=first + len(rows),
+                kind="Real",
+                causality="input",
+                variability="continuous",
+                description="Temperature of the wing less the reference temperature",
+                unit="K",
+                display_unit=None,
+                minimum=-100.0,
+                maximum=100.0,
+                start=float(start.get(TEMPERATURE, 0.0)),
+            )
+        )
+    return tuple(rows)
+
+
+def units_of(rows: Sequence[FmuVariable]) -> tuple[Unit, ...]:
+    """Return the units of effects that rows use beside those of `variables`."""
+    used = {row.unit for row in rows}
+    return tuple(unit for unit in UNITS if unit.name in used)
+
+
+def active_primitives(
+    effects: Sequence[Mapping[str, Any]], value: Mapping[str, float]
+) -> list[dict[str, Any]]:
+    """Return the primitives of the effects that are switched on, with the values of their variables.
+
+    Parameters
+    ----------
+    effects : sequence of mapping
+        `id` and `primitives` of each.
+    value : mapping of str to float
+        Values by variable name; a switch is on above one half.
+    """
+    rows: list[dict[str, Any]] = []
+    for effect in effects:
+        if value[switch_of(effect)] <= 0.5:
+            continue
+        own = [dict(primitive) for primitive in effect["primitives"]]
+        for number in numbers_of(effect):
+            given = value[number.name]
+            own[number.primitive][number.key] = int(given) if number.whole else given
+        rows += own
+    return rows

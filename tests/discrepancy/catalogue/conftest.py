@@ -1,0 +1,14 @@
+"""A campaign with every kind of trial on a cantilever that can carry every primitive."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.cantilever import Cantilever, campaign
+from discrepancy.catalogue.entry import Setting
+
+
+@pytest.fixture(scope="session")
+def setting() -> Setting:
+    given, model = campaign(), Cantilever()
+    return Setting(given, model, model.scales(given))

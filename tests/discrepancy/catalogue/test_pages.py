@@ -1,0 +1,56 @@
+"""Pages and catalogue agree; every effect has its picture."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from benchmarks.effect_pages import FOLDER, pages, paragraphs
+from benchmarks.effect_pictures import PICTURES, draw, picture_setting
+from discrepancy.catalogue.library import library
+
+IDENTIFIERS = {effect.identifier for effect in library()}
+
+
+def test_the_pages_are_those_of_the_catalogue() -> None:
+    """If this fails: python -m benchmarks.effect_pages."""
+    made = pages()
+    assert {path.name for path in FOLDER.glob("*.md")} == set(made)
+    for name, text in made.items():
+        assert (FOLDER / name).read_text(encoding="utf-8") == text, name
+
+
+def test_every_effect_has_paragraphs_and_a_picture_of_its_own() -> None:
+    texts = paragraphs()
+    assert set(texts) == IDENTIFIERS | {"overview"}
+    assert set(PICTURES) == IDENTIFIERS
+    for effect in library():
+        text = texts[effect.identifier]
+        assert set(text) == {"what", "unit", "references", "tell"}
+        assert set(text["tell"]) == set(effect.confusable)
+        assert text["references"]
+        # The record cites in short what the page cites in full.
+        for short in effect.reference.split("; "):
+            author, year = short.split()[0].rstrip(","), next(w for w in short.split() if w[:4].isdigit())[:4]
+            assert any(author in full and f"({year})" in full for full in text["references"]), short
+
+
+@pytest.mark.parametrize("name", sorted(IDENTIFIERS))
+def test_a_picture_is_small(name: str) -> None:
+    data = (FOLDER / "images" / f"{name}.png").read_bytes()
+    assert len(data) <= 40 * 1024
+    width, height = struct.unpack(">II", data[16:24])
+    assert 500 <= width <= 700
+    assert 150 <= height <= 300
+
+
+def test_no_picture_is_left_over() -> None:
+    assert {path.stem for path in (FOLDER / "images").iterdir()} == IDENTIFIERS
+
+
+def test_a_picture_can_be_drawn_again() -> None:
+    setting = picture_setting()
+    effect = next(effect for effect in library() if effect.identifier == "cubic_stiffness")
+    assert draw(effect, setting) == draw(effect, setting)
+    assert draw(effect, setting).startswith(b"\x89PNG")

@@ -1,0 +1,246 @@
+"""Effects of a user: TOML files and entry points."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from discrepancy.catalogue.entry import Setting
+from discrepancy.catalogue.library import effect_by_identifier, library, load_catalogue
+from discrepancy.errors import CatalogueError
+from discrepancy.models.interface import Conditions
+from discrepancy.sensing import observe
+from fe.patch import PointMass, PowerDamping, PowerStiffness
+
+PYLON = """
+id = "store_pylon"
+name = "store on a pylon"
+family = "mass at a free place"
+equation = "M += m delta(y - y_p)"
+signature = "f1 falls, the static response stays"
+reference = "drawing 12-003"
+acts_on = ["ringdown", "forced"]
+confusable = ["point_mass"]
+
+[[parameters]]
+name = "mass_ratio"
+symbol = "mu"
+unit = "1"
+description = "mass over the first modal mass"
+prior = { shape = "log_normal", low = 0.01, high = 0.3 }
+magnitude = true
+
+[[primitives]]
+kind = "point_mass"
+mass = "0.1 * mass_ratio * modal_mass"
+station = "length / 2"
+"""
+
+BUFFER = """
+[[effect]]
+id = "rubber_buffer"
+name = "rubber buffer"
+family = "stiffness |x|^n, one- or two-sided"
+equation = "F = s k |x / A|^n on one side, and a loss"
+signature = "stiffer upwards"
+reference = "none"
+acts_on = ["static", "ringdown"]
+places = "ports"
+
+[[effect.parameters]]
+name = "share"
+symbol = "s"
+unit = "1"
+description = "of the force at the largest motion"
+prior = { shape = "log_normal", low = 0.01, high = 0.1 }
+magnitude = true
+
+[[effect.shape]]
+name = "power"
+symbol = "n"
+description = "exponent"
+canonical = 2.0
+prior = { shape = "uniform", low = 1.0, high = 4.0 }
+
+[[effect.primitives]]
+kind = "power_stiffness"
+port = "place"
+coefficient = "share * port_stiffness * port_displacement"
+exponent = "power"
+side = "2 - 1"
+reference_displacement = "port_displacement"
+
+[[effect.primitives]]
+kind = "power_damping"
+port = "place"
+coefficient = "0.1 * share * port_stiffness * port_displacement"
+velocity_exponent = 1.0
+displacement_exponent = 0
+reference_velocity = "port_displacement * port_angular_frequency"
+reference_displacement = "port_displacement"
+
+[[effect]]
+id = "first_gauge"
+name = "gauge g0"
+family = "sensor gain"
+equation = "eps -> (1 + g) eps"
+signature = "one channel"
+reference = "none"
+acts_on = ["static", "ringdown", "forced", "flight"]
+
+[[effect.parameters]]
+name = "g"
+symbol = "g"
+unit = "1"
+description = "gain error"
+prior = { shape = "normal", low = -0.1, high = 0.1 }
+magnitude = true
+
+[[effect.primitives]]
+kind = "sensor_gain"
+channel = "g0"
+gain = "min(max(g, -0.5), sqrt(0.25))"
+"""
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    def file(text: str) -> Path:
+        path = tmp_path / "mine.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return file
+
+
+def test_a_file_with_one_effect(write, setting: Setting) -> None:
+    catalogue = load_catalogue([write(PYLON)], installed=False)
+    assert len(catalogue) == len(library()) + 1
+    pylon = effect_by_identifier("store_pylon", catalogue)
+    assert pylon.unavailable(setting) is None
+    assert pylon.places(setting) == ("",)
+    (mass,) = pylon.patch(setting, {"mass_ratio": 0.2})
+    assert mass == PointMass(pytest.approx(0.02 * setting.scales.modal_mass), setting.scales.length / 2.0)
+    trial = setting.campaign.trials[3]
+    seen = observe(
+        setting.model,
+        setting.campaign,
+        trial,
+        pylon.patch(setting, {"mass_ratio": 0.2}),
+        Conditions(np.ones(1)),
+    )
+    assert np.max(np.abs(seen.values - trial.values)) > 1e-4
+
+
+def test_a_file_with_several_effects_places_and_a_family(write, setting: Setting) -> None:
+    buffer, gauge = load_catalogue([write(BUFFER)], installed=False)[-2:]
+    assert buffer.places(setting) == ("root", "tip", "span")
+    spring, damper = buffer.patch(setting, {"share": 0.05}, "tip")
+    port = setting.scales.ports["tip"]
+    assert isinstance(spring, PowerStiffness)
+    assert (spring.port, spring.exponent, spring.side) == ("tip", 2.0, 1)
+    assert spring.coefficient == pytest.approx(0.05 * port.stiffness * port.displacement)
+    assert isinstance(damper, PowerDamping)
+    assert damper.displacement_exponent == 0.0
+    (free, _) = buffer.patch(setting, {"share": 0.05, "power": 3.5}, "tip")
+    assert isinstance(free, PowerStiffness)
+    assert free.exponent == 3.5
+    assert gauge.patch(setting, {"g": 0.8}).to_list() == [
+        {"kind": "sensor_gain", "channel": "g0", "gain": 0.5, "quantity": ""}
+    ]
+
+
+def test_an_effect_whose_place_is_no_port(write, setting: Setting) -> None:
+    text = BUFFER.replace('places = "ports"', 'places = ["flap"]')
+    buffer = load_catalogue([write(text)], installed=False)[-2]
+    with pytest.raises(CatalogueError, match=r"needs 'port_.*', which has no value at this place"):
+        buffer.patch(setting, {"share": 0.05}, "flap")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ('id = "store_pylon"', 'id = "Store Pylon"', "lower-case letters"),
+        ('id = "store_pylon"', 'id = "point_mass"', "2 effects with the identifier 'point_mass'"),
+        ('id = "store_pylon"', "", "'id' must be a text, but is None"),
+        ('name = "store on a pylon"', "name = 3", "'name' must be a text, but is 3"),
+        ('"ringdown", "forced"', '"ringing"', "'acts_on' has 'ringing', but trials are static"),
+        ('acts_on = ["ringdown", "forced"]', "", "does not say which trials it acts on"),
+        ('confusable = ["point_mass"]', 'confusable = ["mass"]', "names 'mass' as confusable"),
+        ('confusable = ["point_mass"]', "colour = 1", "unknown key 'colour'"),
+        ('confusable = ["point_mass"]', 'places = "wings"', "'places' must be a list or one of ports"),
+        ('shape = "log_normal", low = 0.01', 'shape = "gamma", low = 0.01', "must be one of log_normal"),
+        ("low = 0.01", "low = 0.0", "must have low > 0"),
+        ("low = 0.01", "low = 0.5", "must have low < high"),
+        ("low = 0.01", "low = nan", "'low' must be a finite number"),
+        ("magnitude = true", 'magnitude = "yes"', "'magnitude' must be true or false"),
+        ('name = "mass_ratio"', 'name = "length"', "must not be called 'length'"),
+        ('kind = "point_mass"', 'kind = "mass"', "'kind' is 'mass', but known are point_mass"),
+        ('station = "length / 2"', "", "lacks station"),
+        ('station = "length / 2"', 'station = "length / 2"\nplace = 1.0', "unknown key 'place'"),
+        ('station = "length / 2"', 'station = "length / b"', "unknown name 'b'"),
+        ('station = "length / 2"', "station = \"__import__('os')\"", "may hold numbers, names"),
+        ('station = "length / 2"', "station = [1.0]", "'station' must be a finite number"),
+        ("[[primitives]]", "[[primitive]]", "unknown key 'primitive'"),
+        ('id = "store_pylon"', "id = store", "is not TOML"),
+    ],
+)
+def test_a_bad_entry_is_refused_with_one_sentence(write, old: str, new: str, sentence: str) -> None:
+    assert old in PYLON
+    with pytest.raises(CatalogueError) as caught:
+        load_catalogue([write(PYLON.replace(old, new, 1))], installed=False)
+    assert sentence in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(CatalogueError, match="cannot be read"):
+        load_catalogue([tmp_path / "none.toml"], installed=False)
+
+
+def test_effects_as_objects() -> None:
+    assert load_catalogue(library()[:0], installed=False) == library()
+    with pytest.raises(CatalogueError, match="2 effects with the identifier"):
+        load_catalogue(library()[:1], installed=False)
+
+
+def test_an_installed_package_adds_effects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package on the path with metadata of its own, as pip would leave it."""
+    (tmp_path / "pylons.py").write_text(
+        "from dataclasses import replace\n"
+        "from discrepancy.catalogue.library import library\n"
+        "def one():\n    return replace(library()[0], identifier='pylon')\n"
+        "def two():\n    return [replace(library()[1], identifier=name) for name in ('hinge', 'bolt')]\n"
+        "def wrong():\n    return [3]\n"
+        "def broken():\n    raise RuntimeError('no licence')\n",
+        encoding="utf-8",
+    )
+    info = tmp_path / "pylons-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: pylons\nVersion: 1.0\n", encoding="utf-8")
+    points = info / "entry_points.txt"
+    points.write_text("[uav_twin.effects]\none = pylons:one\ntwo = pylons:two\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "pylons", raising=False)
+    names = [effect.identifier for effect in load_catalogue()]
+    assert names[-3:] == ["pylon", "hinge", "bolt"]
+    for name, sentence in (
+        ("wrong", "returned a int"),
+        ("broken", "failed: RuntimeError: no licence"),
+        ("absent", "failed: AttributeError"),
+    ):
+        points.write_text(f"[uav_twin.effects]\n{name} = pylons:{name}\n", encoding="utf-8")
+        with pytest.raises(CatalogueError, match=f"entry point '{name}' .*{sentence}"):
+            load_catalogue()
+    sys.modules.pop("pylons", None)
+
+
+def test_values_that_no_primitive_can_have(write, setting: Setting) -> None:
+    text = BUFFER.replace('side = "2 - 1"', 'side = "0.5 * power"')
+    buffer = load_catalogue([write(text)], installed=False)[-2]
+    assert next(iter(buffer.patch(setting, {"share": 0.05}, "tip"))).side == 1  # type: ignore[attr-defined]
+    with pytest.raises(CatalogueError, match="side must be a number"):
+        buffer.patch(setting, {"share": 0.05, "power": 2.5}, "tip")

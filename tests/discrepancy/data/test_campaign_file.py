@@ -1,0 +1,420 @@
+"""Campaign folders: round trip to the last bit, units, noise records, and one sentence for what is wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from discrepancy.campaign import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign_file import read_campaign
+from discrepancy.campaign_schema import INPUT_COLUMNS
+from discrepancy.campaign_writer import write_campaign
+from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
+from discrepancy.noise_records import pre_trigger_record
+
+TOML = """
+format = 1
+name = "A mass in the laboratory"
+reference_temperature = 20.0
+[parameters.young_modulus_factor]
+mean = 1.0073
+deviation = 0.0103
+[noise]
+file = "noise.csv"
+[[channel]]
+name = "g17"
+quantity = "strain"
+unit = "microstrain"
+output = "strain[17]"
+station = 0.35
+chord = 0.3
+gain_deviation = 0.005
+offset_deviation = 2.0
+[[channel]]
+name = "tip"
+quantity = "displacement"
+unit = "mm"
+output = "tip_displacement"
+column = "w [mm]"
+offset_deviation = "free"
+noise = { standard_deviation = 0.05, degrees_of_freedom = 200 }
+[[trial]]
+name = "tip load up"
+kind = "static"
+file = "tip_up.csv"
+run = "A"
+start = 30.0
+load_place = [1.0, 0.35]
+health = { z1 = 0.2, deviation = 0.05 }
+[[trial]]
+name = "release"
+kind = "ringdown"
+file = "release.csv"
+temperature = 23.5
+release = { displacement = 50, unit = "mm" }
+[[trial]]
+name = "turn"
+kind = "flight"
+file = "turn.csv"
+held_out = true
+"""
+TABLES = {
+    "noise.csv": "time,g17\n" + "".join(f"{k * 0.01:.2f},{(-1) ** k * 1.5 + 0.5}\n" for k in range(40)),
+    "tip_up.csv": "# by hand\nforce,g17,w [mm]\n0,0.5,0.1\n# pause\n5,120.25,7.3\n10,,14.6\n",
+    "release.csv": "time,w [mm]\n" + "".join(f"{k * 0.002:.3f},{50 * math.cos(k / 10)}\n" for k in range(60)),
+    "turn.csv": "time,load_factor,g17,temperature,z1,z2\n100,1,900,20,0,0\n160,2.5,2250,18.5,0.1,0.2\n",
+}
+
+
+def folder_of(path: Path, toml: str = TOML, **tables: str) -> Path:
+    path.mkdir(exist_ok=True)
+    (path / "campaign.toml").write_text(toml, encoding="utf-8")
+    for name, text in (TABLES | {f"{key}.csv": text for key, text in tables.items()}).items():
+        (path / name).write_text(text, encoding="utf-8")
+    return path
+
+
+def test_everything_comes_out_in_si(tmp_path: Path) -> None:
+    campaign = read_campaign(folder_of(tmp_path))
+    gauge, tip = campaign.channels["g17"], campaign.channels["tip"]
+    assert (gauge.quantity, gauge.output) == (Quantity.STRAIN, "strain[17]")
+    assert (gauge.station, gauge.chord) == (0.35, 0.3)
+    assert (gauge.gain_deviation, gauge.offset_deviation) == (0.005, 2e-6)
+    assert math.isinf(tip.offset_deviation)
+    assert gauge.noise is not None
+    assert tip.noise is not None
+    assert gauge.noise.source == "pre-trigger"
+    assert gauge.noise.degrees_of_freedom == 39
+    assert gauge.noise.standard_deviation == pytest.approx(1.5e-6 * math.sqrt(40 / 39))
+    assert gauge.noise.interval == pytest.approx(0.01)
+    assert (tip.noise.standard_deviation, tip.noise.degrees_of_freedom) == (5e-5, 200.0)
+    up, release, turn = campaign.trials
+    assert up.values.tolist() == [[5e-7, 1e-4], [1.2025e-4, 7.3e-3], [1.2025e-4, 1.46e-2]]
+    assert up.used.tolist() == [[True, True], [True, True], [False, True]]
+    assert "1 of 3 readings of 'g17' in the trial 'tip load up' are empty" in campaign.remarks[0]
+    assert up.time.tolist() == [30.0] * 3
+    assert up.load_place == (1.0, 0.35)
+    assert up.health.tolist() == [[0.2, 0.0]] * 3
+    assert up.health_deviation.tolist() == [[0.05, 0.05]] * 3
+    assert up.temperature.tolist() == [0.0] * 3
+    assert release.channels == ("tip",)
+    assert release.release == Release(0.05)
+    assert release.temperature[0] == 3.5
+    assert release.interval == pytest.approx(0.002, rel=1e-12)
+    assert turn.held_out
+    assert (turn.start, turn.load_factor.tolist()) == (100.0, [1.0, 2.5])
+    assert turn.temperature.tolist() == [0.0, -1.5]
+    assert turn.health.tolist() == [[0.0, 0.0], [0.1, 0.2]]
+    assert campaign.parameters == {"young_modulus_factor": (1.0073, 0.0103)}
+    assert len(campaign.data_hash) == 64
+    assert [trial.name for trial in campaign.fitted] == ["tip load up", "release"]
+
+
+def test_hash_follows_every_file(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    before = read_campaign(folder).data_hash
+    assert read_campaign(folder / "campaign.toml").data_hash == before
+    folder_of(tmp_path, noise=TABLES["noise.csv"].replace("0.00,2.0", "0.00,2.1"))
+    assert read_campaign(folder).data_hash != before
+
+
+# ---------------------------------------------------------------- round trip
+
+finite = st.floats(-1e6, 1e6, allow_nan=False).filter(lambda x: x == 0.0 or abs(x) > 1e-200)
+positive = st.floats(1e-9, 1e6)
+names = st.text(
+    st.characters(codec="utf-8", exclude_categories=("Cc", "Cs", "Zl", "Zp", "Zs"), exclude_characters="#*"),
+    min_size=1,
+    max_size=8,
+).filter(lambda text: text == text.strip() and text not in INPUT_COLUMNS)
+
+
+@st.composite
+def campaigns(draw: st.DrawFn) -> Campaign:
+    channel_names = draw(st.lists(names, min_size=1, max_size=3, unique=True))
+    interval = draw(st.floats(1e-5, 1.0))
+    channels = {}
+    for name in channel_names:
+        noise = draw(
+            st.one_of(
+                st.builds(NoiseRecord, positive, positive | st.just(math.inf)),
+                st.builds(NoiseRecord, positive, positive, source=st.just("repeats")),
+                arrays(float, st.integers(4, 12), elements=st.floats(-1.0, 1.0), unique=True).map(
+                    lambda samples: pre_trigger_record(samples, interval, "c", "f")
+                ),
+            )
+        )
+        channels[name] = Channel(
+            name, draw(st.sampled_from(Quantity)), draw(names), noise,
+            draw(positive | st.sampled_from([0.0, math.inf])), draw(positive | st.sampled_from([0.0,
+            math.inf])), draw(st.none() | finite), draw(st.none() | finite),
+        )  # fmt: skip
+    trials = []
+    for index in range(draw(st.integers(1, 3))):
+        kind = draw(st.sampled_from(TrialKind))
+        dynamic = kind in (TrialKind.RINGDOWN, TrialKind.FORCED)
+        count = draw(st.integers(8, 20)) if dynamic else draw(st.integers(1, 5))
+        # The first trial measures every channel: one that is measured nowhere is refused.
+        chosen = draw(st.permutations(channel_names))[: None if index == 0 else draw(st.integers(1, 3))]
+        start = abs(draw(finite))
+        column = arrays(float, count, elements=finite)
+        zeros = np.zeros(count)
+        if dynamic:
+            time = draw(st.floats(1e-5, 1.0)) * np.arange(count)
+        else:
+            time = draw(st.just(np.full(count, start)) | column.map(np.sort))
+        trials.append(
+            Trial(
+                name=f"{index} {draw(names)}", kind=kind, channels=tuple(chosen),
+                values=draw(arrays(float, (count, len(chosen)), elements=finite)),
+                used=draw(arrays(bool, (count, len(chosen)))),
+                time=time,
+                force=draw(column) if kind in (TrialKind.STATIC, TrialKind.FORCED) else zeros,
+                load_factor=draw(column) if kind is TrialKind.FLIGHT else zeros,
+                load_place=draw(names | st.tuples(finite, finite)),
+                temperature=draw(st.just(zeros) | column), start=start, run=draw(st.just("") | names),
+                health=draw(arrays(float, (count, 2), elements=st.floats(0.0, 1.0))),
+                health_deviation=draw(st.just(np.zeros((count, 2))) | arrays(float, (count, 2),
+                elements=positive)), release=draw(st.builds(Release, positive, positive, st.booleans(),
+                st.integers(0, 5), positive)) if kind is TrialKind.RINGDOWN
+                else None,
+                held_out=draw(st.booleans()),
+                noise_factor=draw(st.just(1.0) | positive),
+            )
+        )  # fmt: skip
+    text = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=20)
+    return Campaign(
+        draw(text), channels, tuple(trials), draw(finite), {draw(names): (draw(finite), draw(positive))}, "",
+        tuple(draw(st.lists(text, max_size=2))),
+    )  # fmt: skip
+
+
+def same(one: object, other: object) -> bool:
+    if isinstance(one, np.ndarray):
+        return isinstance(other, np.ndarray) and one.dtype == other.dtype and np.array_equal(one, other)
+    if isinstance(one, Campaign | Trial | Channel | NoiseRecord):
+        return all(
+            item.name == "data_hash" or same(getattr(one, item.name), getattr(other, item.name))
+            for item in fields(one)
+        )
+    if isinstance(one, tuple) and isinstance(other, tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, dict) and isinstance(other, dict):
+        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
+    return one == other
+
+
+@given(campaigns())
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+def test_round_trip_is_exact(tmp_path_factory: pytest.TempPathFactory, campaign: Campaign) -> None:
+    folder = tmp_path_factory.mktemp("campaign")
+    again = read_campaign(write_campaign(campaign, folder))
+    # Only remarks of the reader itself may be new.
+    assert again.remarks[: len(campaign.remarks)] == campaign.remarks
+    assert same(replace(again, remarks=campaign.remarks), campaign)
+
+
+def test_what_the_reader_remarked_is_not_said_twice(tmp_path: Path) -> None:
+    once = read_campaign(folder_of(tmp_path / "a"))
+    twice = read_campaign(write_campaign(once, tmp_path / "b"))
+    assert same(once, twice)
+    assert len(once.remarks) == 1
+
+
+def test_what_cannot_be_written_says_so(tmp_path: Path) -> None:
+    campaign = read_campaign(folder_of(tmp_path / "a"))
+    with pytest.raises(CampaignFileError, match="no reference temperature"):
+        write_campaign(replace(campaign, reference_temperature=None), tmp_path / "b")
+    other = replace(
+        campaign.channels["tip"], noise=NoiseRecord(1.0, 9.0, np.arange(-5.0, 6.0), 0.5, "pre-trigger")
+    )
+    with pytest.raises(CampaignFileError, match="one sampling interval"):
+        write_campaign(replace(campaign, channels={**campaign.channels, "tip": other}), tmp_path / "b")
+    assert not (tmp_path / "b").exists()
+
+
+# ---------------------------------------------------------------- noise from repeats
+
+
+def test_noise_from_repeats_is_the_pooled_deviation(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    readings = rng.normal(size=(3, 4)) + np.array([0.0, 10.0, 20.0, 30.0])
+    trials = "".join(
+        f'[[trial]]\nname = "{k}"\nkind = "static"\nfile = "{k}.csv"\nrun = "{"A" if k < 3 else "B"}"\n'
+        for k in range(4)
+    )
+    toml = (
+        'format = 1\nname = "r"\n[[channel]]\nname = "w"\nquantity = "displacement"\nunit = "m"\n'
+        'output = "x"\n' + trials
+    )
+    tables = {
+        str(k): "force,w\n" + "".join(f"{5 * n},{value!r}\n" for n, value in enumerate(row))
+        for k, row in enumerate([*readings.tolist(), [100.0, 200.0, 300.0, 400.0]])
+    }
+    campaign = read_campaign(folder_of(tmp_path, toml, **tables))
+    record = campaign.channels["w"].noise
+    assert record is not None
+    assert (record.source, record.degrees_of_freedom) == ("repeats", 8.0)  # the other run is no repeat
+    assert record.standard_deviation == pytest.approx(np.sqrt(np.mean(np.var(readings, axis=0, ddof=1))))
+    assert "taken from repeated trials (8 degrees" in campaign.remarks[0]
+    # With a free zero per trial, rows and trials are taken out: a two-way layout without interaction.
+    free = toml.replace('output = "x"', 'output = "x"\noffset_deviation = "free"')
+    record = read_campaign(folder_of(tmp_path, free, **tables)).channels["w"].noise
+    assert record is not None
+    rest = readings - readings.mean(axis=0) - readings.mean(axis=1, keepdims=True) + readings.mean()
+    assert record.degrees_of_freedom == 6.0
+    assert record.standard_deviation == pytest.approx(np.sqrt(np.sum(rest**2) / 6))
+    # Without repeats nothing is known, and the campaign says so.
+    (tmp_path / "1.csv").write_text(tables["1"].replace("5,", "6,", 1))
+    (tmp_path / "2.csv").write_text(tables["2"].replace("5,", "7,", 1))
+    alone = read_campaign(tmp_path)
+    assert alone.channels["w"].noise is None
+    assert "Nothing is known of the noise of the channel 'w'" in alone.remarks[0]
+
+
+# ---------------------------------------------------------------- what is wrong
+
+RELEASE = TABLES["release.csv"]
+WRONG_TOML = [
+    ("format = 1", "format = 2", r"`format` is 2; this version reads campaigns with `format = 1`\."),
+    ("format = 1", "", "`format` is missing"),
+    ("name = ", "nam = ", r"unknown key `nam`"),
+    ('unit = "microstrain"', 'unit = "mm"', "one of the units 1, microstrain, percent, and 'mm' came"),
+    ('quantity = "strain"', 'quantity = "stress"', r"`channel\[1\].quantity` should be 'strain'"),
+    ('column = "w [mm]"', 'column = "force"', "the column 'force' holds an input"),
+    ('column = "w [mm]"', 'column = "g17"', "more than one channel reads the column 'g17'"),
+    ('column = "w [mm]"', "", "release.csv of the trial 'release' holds no channel"),
+    ('column = "w [mm]"', 'column = "g"\n[[channel]]\nname="w [mm]"\nquantity="signal"\nunit="1"\noutput="x"',
+     "channel 'tip' is in no trial: no table has a column 'g'"),
+    ('name = "tip"', 'name = "g17"', "more than one channel called 'g17'"),
+    ('name = "tip"', 'name = "*"', r"cannot be called '\*'"),
+    ('kind = "flight"', 'kind = "fly"', r"`trial\[3\].kind` should be 'static'"),
+    ('file = "turn.csv"', 'file = "turns.csv"', "There is no file turns.csv .* noise.csv, release.csv"),
+    ('file = "turn.csv"', 'file = "../turn.csv"', "must lie in the campaign's folder"),
+    ("held_out = true", 'held_out = "yes"', "should be a valid boolean, and 'yes' came"),
+    ("held_out = true", "left_out = { g17 = [3] }", "leaves out row 3 of 'g17', and turn.csv has 2 rows"),
+    ("held_out = true", "left_out = { g18 = [1] }", "names the channel 'g18'"),
+    ("held_out = true", 'channels = ["tip"]', r"turn.csv has no column 'w \[mm\]', which the chan"),
+    ("held_out = true", "temperature = 21", "gives its temperature twice"),
+    ("held_out = true", "health = { z1 = 0.1 }", "gives z1 twice"),
+    ("load_place = [1.0, 0.35]", "load_place = [1.0]", r"must be a name or \[y, x\]"),
+    ("release = {", "releases = {", r"unknown key `trial\[2\].releases`"),
+    ('release = { displacement = 50, unit = "mm" }', "", "the ring-down 'release' needs `release`"),
+    ("displacement = 50", "displacement = -50", "should be greater than 0, and -50 came"),
+    ("reference_temperature = 20.0", "", "the campaign has no `reference_temperature`"),
+    ("standard_deviation = 0.05", "standard_deviation = 0", "should be greater than 0"),
+    ("z1 = 0.2", "z1 = 20", "less than or equal to 1, and 20 came"),
+    ("[noise]", "[noise", "is not a TOML file"),
+]  # fmt: skip
+WRONG_TABLES = [
+    ("tip_up", "load,g17\n1,2\n", CampaignFileError, "tip_up.csv has no column 'force', .*are load, g17"),
+    ("tip_up", "force,strain\n1,2\n", CampaignFileError, "holds no channel: its columns are force, strain"),
+    ("tip_up", "", CampaignFileError, "is empty"),
+    ("tip_up", "force,g17\n", CampaignFileError, "no rows"),
+    ("tip_up", "force;g17\n1;2\n", CampaignFileError, "not separated by commas"),
+    ("tip_up", "force,g17,g17\n1,2,3\n", CampaignFileError, "more than one column 'g17'"),
+    ("tip_up", "force,g17\n1,2,3\n", CampaignFileError, "line 2: 3 cells came, and the header has 2"),
+    ("tip_up", "force,g17\n# x\n1,two\n", CampaignFileError,
+     "line 3: column 'g17' must hold a number, and 'two'"),
+    ("tip_up", "force,g17\n,2\n", CampaignFileError, "column 'force' must hold a number, and nothing came"),
+    ("tip_up", "force,g17\n1,nan\n", CampaignDataError, "line 2: column 'g17' holds nan; leave the cell"),
+    ("tip_up", "force,g17\n1,-inf\n", CampaignDataError, "holds -inf"),
+    ("tip_up", "force,g17\n1,\n", CampaignDataError, "no reading in the column 'g17'"),
+    ("tip_up", "time,force,g17\n2,1,1\n1,1,1\n", CampaignDataError, "times of .* run backwards"),
+    ("turn", "load_factor,g17,z1\n1,2,7\n", CampaignFileError, "z1 is a fraction from 0 to 1, and 7 came"),
+    ("release", "time,w [mm]\n0,1\n1,1\n", CampaignDataError, "holds 2 samples .* at least 8"),
+    ("release", RELEASE.replace("0.020,", "0.018,"), CampaignDataError, "does not increase after sample 10"),
+    ("release", RELEASE.replace("0.020,", "0.0195,"), CampaignDataError, "25.00% of an interval off an even"),
+    ("release", "\n".join(RELEASE.splitlines()[:20] + RELEASE.splitlines()[22:]), CampaignDataError,
+     "gap of 0.006 s after 0.036 s"),
+    ("noise", "time,g17\n" + "".join(f"{k},1.0\n" for k in range(9)), CampaignDataError, "which is no noise"),
+    ("noise", "time,x\n" + "".join(f"{k},{k}\n" for k in range(9)), CampaignFileError, "noise of no channel"),
+    ("noise", "time,g17\n" + "".join(f"{k},{k if k != 4 else ''}\n" for k in range(9)), CampaignDataError,
+     "an empty cell between"),
+    ("noise", "time,g17\n" + "".join(f"{k},{k if k < 3 else ''}\n" for k in range(9)), CampaignDataError,
+     "holds 3 samples of the channel 'g17'"),
+]  # fmt: skip
+
+
+def check_sentence(text: str) -> None:
+    assert text.endswith(".")
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize(("old", "new", "sentence"), WRONG_TOML)
+def test_a_wrong_key_is_named_in_one_sentence(tmp_path: Path, old: str, new: str, sentence: str) -> None:
+    assert old in TOML
+    folder = folder_of(tmp_path, TOML.replace(old, new, 1))
+    with pytest.raises(CampaignFileError, match=sentence) as caught:
+        read_campaign(folder)
+    if "not a TOML" not in sentence:
+        check_sentence(str(caught.value))
+
+
+@pytest.mark.parametrize(("table", "text", "error", "sentence"), WRONG_TABLES)
+def test_a_wrong_table_is_named_in_one_sentence(
+    tmp_path: Path, table: str, text: str, error: type[DiscrepancyError], sentence: str
+) -> None:
+    folder = folder_of(tmp_path, **{table: text})
+    with pytest.raises(error, match=sentence) as caught:
+        read_campaign(folder)
+    check_sentence(str(caught.value))
+
+
+def test_missing_folders_and_bytes(tmp_path: Path) -> None:
+    with pytest.raises(CampaignFileError, match="There is no folder"):
+        read_campaign(tmp_path / "nowhere")
+    with pytest.raises(CampaignFileError, match=r"There is no campaign.toml in"):
+        read_campaign(tmp_path)
+    folder = folder_of(tmp_path)
+    (folder / "turn.csv").write_bytes(b"load_factor,g17\n1,\xff\n")
+    with pytest.raises(CampaignFileError, match="is not text in UTF-8"):
+        read_campaign(folder)
+    (folder / "turn.csv").write_bytes(b"load_factor,g17\n1,\x00\n")
+    with pytest.raises(CampaignFileError, match="zero byte"):
+        read_campaign(folder)
+    (folder / "turn.csv").write_bytes("\ufeffload_factor,g17\r\n1,900\r\n".encode())  # as Excel writes it
+    assert read_campaign(folder).trials[2].values.tolist() == [[9e-4]]
+
+
+def test_times_may_be_printed_with_few_decimals(tmp_path: Path) -> None:
+    interval = 1.0 / 1613.0
+    rows = "".join(f"{k * interval:.4f},{k % 7}\n" for k in range(300))
+    trial = read_campaign(folder_of(tmp_path, release="time,w [mm]\n" + rows)).trials[1]
+    assert trial.interval == pytest.approx(interval, rel=1e-3)
+    assert np.ptp(np.diff(trial.time)) < 1e-12
+
+
+@given(st.sampled_from([*TABLES, "campaign.toml"]), st.data())
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+def test_damaged_files_are_refused_or_read_but_never_crash(
+    tmp_path_factory: pytest.TempPathFactory, file: str, data: st.DataObject
+) -> None:
+    folder = folder_of(tmp_path_factory.mktemp("hostile"))
+    content = bytearray((folder / file).read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        place = data.draw(st.integers(0, len(content) - 1))
+        piece = data.draw(
+            st.binary(max_size=4)
+            | st.sampled_from(
+                [b"nan", b"1e999", b"-", b",", b'"', b"\n", b"[", b"1_0", b"0x1", b"1e", b"=", b"\r"]
+            )
+        )
+        content[place : place + data.draw(st.integers(0, 6))] = piece
+    (folder / file).write_bytes(bytes(content))
+    try:
+        campaign = read_campaign(folder)
+    except DiscrepancyError as error:
+        check_sentence(str(error).splitlines()[-1])
+        return
+    for trial in campaign.trials:
+        assert trial.values.shape == trial.used.shape == (len(trial.time), len(trial.channels))
+        assert np.isfinite(trial.values).all()
+        assert np.isfinite(trial.force).all()

@@ -1,0 +1,379 @@
+"""Faults of data: what is found, where, and what must not be mistaken for one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from discrepancy.campaign import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
+from discrepancy.data_quality import (
+    FaultKind,
+    check_against_model,
+    check_data,
+    mark_outliers,
+    require_sound,
+)
+from discrepancy.errors import CampaignDataError
+from discrepancy.examples import ExamplePlan, example_campaign
+from discrepancy.outliers import sample_outliers
+from fe.patch import HighPass, ModelPatch, SensorDrift, SensorGain
+
+PLAN = ExamplePlan(
+    (
+        Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(5e-5, 200.0), 0.0, 1e-4),
+        Channel("g0", Quantity.STRAIN, "strain[0]", NoiseRecord(2e-6, 200.0), 0.005, 2e-6),
+        Channel("g1", Quantity.STRAIN, "strain[1]", NoiseRecord(1e-6, 200.0), 0.005, 1e-6),
+        Channel("g2", Quantity.STRAIN, "strain[2]", NoiseRecord(5e-7, 200.0), 0.005, 1e-6),
+    ),
+    force=20.0,
+    release=0.05,
+    interval=0.005,
+)
+
+
+@pytest.fixture(scope="module")
+def campaign(oscillator) -> Campaign:
+    return example_campaign(oscillator, "complete", 7, PLAN)
+
+
+def changed(campaign: Campaign, change: Callable[[Trial, np.ndarray], None], **only: object) -> Campaign:
+    """Return the campaign with the readings of trials changed in place, of those that match `only`."""
+    trials = []
+    for trial in campaign.trials:
+        values = trial.values.copy()
+        if all(getattr(trial, key) == value for key, value in only.items()):
+            change(trial, values)
+        trials.append(replace(trial, values=values))
+    return replace(campaign, trials=tuple(trials))
+
+
+def scaled(campaign: Campaign, name: str, factor: float, **only: object) -> Campaign:
+    def change(trial: Trial, values: np.ndarray) -> None:
+        values[:, trial.channels.index(name)] *= factor
+
+    return changed(campaign, change, **only)
+
+
+def found(faults) -> set[tuple[FaultKind, str]]:
+    for fault in faults:
+        assert fault.sentence.endswith(".")
+        assert "\n" not in fault.sentence
+    return {(fault.kind, fault.channel) for fault in faults}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sound_data_have_no_fault(oscillator, seed: int) -> None:
+    for patch in (
+        ModelPatch(),
+        ModelPatch((SensorGain("g0", 0.15), SensorDrift("g1", 2e-5, 5000.0))),
+        ModelPatch((SensorGain("*", -0.2, "strain"), HighPass("x", 2.0))),
+    ):
+        campaign = example_campaign(oscillator, "complete", seed, PLAN, patch)
+        assert check_data(campaign) == ()
+        assert check_against_model(campaign, oscillator) == ()
+        marked = mark_outliers(campaign)
+        assert all(trial.used.mean() > 0.999 for trial in marked.trials)
+
+
+def test_examples_repeat_and_differ(oscillator) -> None:
+    one, same, other = (example_campaign(oscillator, "laboratory", seed, PLAN) for seed in (1, 1, 2))
+    assert np.array_equal(one.trials[0].values, same.trials[0].values)
+    assert not np.array_equal(one.trials[0].values, other.trials[0].values)
+    assert {trial.kind for trial in one.trials} == {TrialKind.STATIC, TrialKind.RINGDOWN}
+    assert one.channels["g0"].noise.degrees_of_freedom == 399
+
+
+# ---------------------------------------------------------------- units, signs, exchanged channels
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "guess"),
+    [
+        ("g0", 1e6, "microstrain given as strain"),
+        ("g1", 1e-6, "strain given as microstrain"),
+        ("g0", 100.0, "percent given as strain"),
+        ("x", 1e3, "mm given as m"),
+        ("x", 1e-3, "m given as mm"),
+        ("x", 9.80665, "9.80665 times"),
+        ("x", 0.8e6, "1e\\+06 times"),
+        ("g0", -1e6, "microstrain"),
+    ],
+)
+def test_unit_slips(oscillator, campaign, name: str, factor: float, guess: str) -> None:
+    slipped = scaled(campaign, name, factor)
+    noise = replace(
+        slipped.channels[name].noise,
+        standard_deviation=slipped.channels[name].noise.standard_deviation * abs(factor),
+    )
+    # The noise record slips with the channel, or stays in the right unit.
+    for record in (noise, slipped.channels[name].noise):
+        if abs(factor) < 1.0 and record is not noise:
+            continue  # what is left is below the noise then, and says nothing
+        channels = {**slipped.channels, name: replace(slipped.channels[name], noise=record)}
+        faults = check_against_model(replace(slipped, channels=channels), oscillator)
+        assert (FaultKind.UNIT_SLIP, name) in found(faults)
+        assert {fault.channel for fault in faults} == {name}
+        with pytest.raises(CampaignDataError, match=guess):
+            require_sound(faults)
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.4, 3.0, 5.0, 30.0])
+def test_other_factors_are_no_unit_slips(oscillator, campaign, factor: float) -> None:
+    assert FaultKind.UNIT_SLIP not in {
+        kind for kind, _ in found(check_against_model(scaled(campaign, "g0", factor), oscillator))
+    }
+
+
+def test_input_slips(oscillator, campaign) -> None:
+    def kilo(trial: Trial) -> Trial:
+        return replace(trial, force=trial.force * 1e-3)
+
+    one = replace(campaign, trials=tuple(kilo(t) if t.name == "loading" else t for t in campaign.trials))
+    (fault,) = check_against_model(one, oscillator)
+    assert (fault.kind, fault.trial) == (FaultKind.INPUT_SLIP, "loading")
+    assert "about 1000 times" in fault.sentence
+    static = replace(campaign, trials=tuple(kilo(t) for t in campaign.trials if t.kind is TrialKind.STATIC))
+    (fault,) = check_against_model(static, oscillator)
+    assert fault.kind is FaultKind.INPUT_SLIP
+    assert "check the units of forces" in fault.sentence
+
+
+def test_slip_of_a_release(oscillator, campaign) -> None:
+    def in_millimetres(trial: Trial) -> Trial:
+        if trial.release is None:
+            return trial
+        return replace(trial, release=replace(trial.release, displacement=1e3 * trial.release.displacement))
+
+    faults = check_against_model(
+        replace(campaign, trials=tuple(map(in_millimetres, campaign.trials))), oscillator
+    )
+    assert {fault.kind for fault in faults} == {FaultKind.INPUT_SLIP}
+    assert {fault.trial for fault in faults} == {f"release {number}" for number in range(1, 5)}
+    assert all("about 0.001 times" in fault.sentence for fault in faults)
+
+
+def test_signs(oscillator, campaign) -> None:
+    assert found(check_against_model(scaled(campaign, "g1", -1.0), oscillator)) == {(FaultKind.SIGN, "g1")}
+    static = replace(campaign, trials=tuple(t for t in campaign.trials if t.kind is TrialKind.STATIC))
+    turned = replace(static, trials=tuple(replace(t, force=-t.force) for t in static.trials))
+    (fault,) = check_against_model(turned, oscillator)
+    assert "sign of the forces" in fault.sentence
+
+
+@pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.RINGDOWN, TrialKind.FLIGHT, None])
+@pytest.mark.parametrize("pair", [("g0", "g1"), ("g1", "g2")])
+def test_swapped_channels(oscillator, campaign, kind: TrialKind | None, pair: tuple[str, str]) -> None:
+    if kind is not None:
+        campaign = replace(campaign, trials=tuple(t for t in campaign.trials if t.kind is kind))
+
+    def swap(trial: Trial, values: np.ndarray) -> None:
+        columns = [trial.channels.index(name) for name in pair]
+        values[:, columns] = values[:, columns[::-1]]
+
+    faults = check_against_model(changed(campaign, swap), oscillator)
+    kinds = {fault.kind for fault in faults}
+    assert FaultKind.SWAPPED in kinds
+    assert all(name in next(f for f in faults if f.kind is FaultKind.SWAPPED).sentence for name in pair)
+
+
+def test_outputs_and_lengths(oscillator, campaign) -> None:
+    def with_output(output: str, quantity: Quantity = Quantity.STRAIN) -> Campaign:
+        channel = replace(campaign.channels["g0"], output=output, quantity=quantity)
+        return replace(campaign, channels={**campaign.channels, "g0": channel})
+
+    assert found(check_against_model(with_output("strain[9]"), oscillator)) == {
+        (FaultKind.MISSING_OUTPUT, "g0")
+    }
+    assert found(check_against_model(with_output("x"), oscillator)) == {(FaultKind.WRONG_QUANTITY, "g0")}
+    release = next(trial for trial in campaign.trials if trial.kind is TrialKind.RINGDOWN)
+
+    def cut(count: int, step: int = 1) -> Campaign:
+        rows = slice(0, count, step)
+        short = replace(
+            release, values=release.values[rows], used=release.used[rows], time=release.time[rows],
+            force=release.force[rows], load_factor=release.load_factor[rows],
+            temperature=release.temperature[rows],
+        )  # fmt: skip
+        return replace(campaign, trials=(short,))
+
+    assert (FaultKind.TOO_SHORT, "") in found(check_against_model(cut(100), oscillator))
+    assert found(check_against_model(cut(401), oscillator)) == set()
+    assert (FaultKind.UNDERSAMPLED, "") in found(check_against_model(cut(401, 16), oscillator))
+
+
+# ---------------------------------------------------------------- what needs no model
+
+
+def test_clipped_and_dead_channels(campaign) -> None:
+    def clip(trial: Trial, values: np.ndarray) -> None:
+        values[:, 1] = np.clip(values[:, 1], -3e-4, 1.0)
+
+    faults = check_data(changed(campaign, clip, name="release 1"))
+    assert [(fault.kind, fault.channel, fault.trial) for fault in faults] == [
+        (FaultKind.CLIPPED, "g0", "release 1")
+    ]
+    assert "smallest value -0.0003" in faults[0].sentence
+
+    def saturate(trial: Trial, values: np.ndarray) -> None:
+        values[:, 0] = np.minimum(values[:, 0], 0.02)
+
+    assert (FaultKind.CLIPPED, "x") in found(check_data(changed(campaign, saturate, kind=TrialKind.STATIC)))
+
+    def unplug(trial: Trial, values: np.ndarray) -> None:
+        values[:, 2] = 1e-6
+
+    assert found(check_data(changed(campaign, unplug, name="loading"))) == {(FaultKind.DEAD, "g1")}
+
+
+@given(st.floats(1e-7, 3e-5), st.integers(0, 100))
+@settings(max_examples=40, deadline=None)
+def test_few_digits_are_not_clipping(oscillator, digit: float, seed: int) -> None:
+    campaign = example_campaign(oscillator, "laboratory", seed, PLAN)
+
+    def rounded(trial: Trial, values: np.ndarray) -> None:
+        values[:, 1:] = np.round(values[:, 1:] / digit) * digit
+
+    assert FaultKind.CLIPPED not in {kind for kind, _ in found(check_data(changed(campaign, rounded)))}
+
+
+def test_noise_records(campaign) -> None:
+    def with_noise(record: NoiseRecord | None) -> Campaign:
+        return replace(
+            campaign, channels={**campaign.channels, "g0": replace(campaign.channels["g0"], noise=record)}
+        )
+
+    (fault,) = check_data(with_noise(None))
+    assert (fault.kind, fault.channel, fault.fatal) == (FaultKind.NO_NOISE_RECORD, "g0", False)
+    require_sound((fault,))
+    (fault,) = check_data(with_noise(NoiseRecord(1e-5, 200.0)))
+    assert fault.kind is FaultKind.NOISE_LABEL
+    assert "says 1e-05" in fault.sentence
+
+
+def test_noise_label_against_repeats() -> None:
+    rng = np.random.default_rng(1)
+    rows = 6
+
+    def trial(number: int) -> Trial:
+        zeros = np.zeros(rows)
+        return Trial(
+            str(number), TrialKind.STATIC, ("x",), (np.arange(rows) + rng.normal(size=rows))[:, None],
+            np.ones((rows, 1), dtype=bool), zeros, np.arange(rows) * 1.0, zeros, "x", zeros, 0.0, "A",
+            np.zeros((rows, 2)), np.zeros((rows, 2)),
+        )  # fmt: skip
+
+    def campaign(stated: float) -> Campaign:
+        channel = Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(stated, 100.0))
+        return Campaign("", {"x": channel}, tuple(map(trial, range(5))), None, {}, "")
+
+    assert check_data(campaign(1.0)) == ()
+    for stated in (0.2, 5.0):
+        (fault,) = check_data(campaign(stated))
+        assert fault.kind is FaultKind.NOISE_LABEL
+        assert "repeated trials scatter" in fault.sentence
+
+
+# ---------------------------------------------------------------- outliers
+
+
+def test_one_percent_of_outliers_is_found_and_left_out(campaign) -> None:
+    rng = np.random.default_rng(5)
+    places: dict[str, np.ndarray] = {}
+
+    def spoil(trial: Trial, values: np.ndarray) -> None:
+        rows = rng.choice(np.arange(3, len(values) - 3), len(values) // 100, replace=False)
+        places[trial.name] = rows
+        values[rows, 1] += rng.choice([-1.0, 1.0], len(rows)) * rng.uniform(10.0, 60.0, len(rows)) * 2e-6
+
+    spoilt = changed(campaign, spoil, kind=TrialKind.RINGDOWN)
+    assert check_data(spoilt) == ()
+    marked = mark_outliers(spoilt)
+    hit = sum((~trial.used[places[trial.name], 1]).sum() for trial in marked.trials if trial.name in places)
+    left_out = sum((~trial.used).sum() for trial in marked.trials)
+    total = sum(len(rows) for rows in places.values())
+    assert hit >= 0.9 * total
+    assert left_out - hit <= 1
+    assert (
+        f"of {len(campaign.trials[3].time)} readings of 'g0' in the trial 'release 1' are outliers"
+        in " ".join(marked.remarks)
+    )
+    assert mark_outliers(marked).trials[3].used.sum() >= marked.trials[3].used.sum() - 1
+
+
+def test_too_many_outliers_are_a_fault(campaign) -> None:
+    def spoil(trial: Trial, values: np.ndarray) -> None:
+        values[10::17, 1] += 1e-4
+
+    spoilt = changed(campaign, spoil, name="release 2")
+    (fault,) = check_data(spoilt)
+    assert (fault.kind, fault.channel, fault.trial) == (FaultKind.OUTLIERS, "g0", "release 2")
+    assert all(trial.used.all() for trial in mark_outliers(spoilt).trials)
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-3, 1e-2])
+def test_friction_impacts_and_steps_are_no_outliers(noise: float) -> None:
+    rng = np.random.default_rng(6)
+    time = np.arange(1000) * 0.002
+    w, friction = 10 * np.pi, 0.05
+    # Coulomb friction in closed form: half cosines about an alternating centre until it stops.
+    half = np.floor(time * w / np.pi)
+    amplitude = np.maximum(1.0 - friction - 2.0 * friction * half, 0.0)
+    sign = np.where(half % 2 == 0, 1.0, -1.0)
+    free = sign * friction + amplitude * np.cos(w * time)
+    stop = np.argmax(amplitude == 0.0) if (amplitude == 0.0).any() else len(time)
+    displacement = np.where(np.arange(1000) < stop, free, free[min(stop, 999) - 1])
+    records = {
+        "friction": displacement,
+        "velocity under friction": -amplitude * np.sin(w * time),
+        "impacts": np.abs(np.cos(w / 2 * time)) * np.exp(-time),
+        "step": np.cos(w * time) + (time > 0.7),
+        "release at the middle": np.where(time > 0.5, np.cos(w * (time - 0.5)) * np.exp(-(time - 0.5)), 1.0),
+    }
+    for name, record in records.items():
+        flagged = [int(sample_outliers(record + noise * rng.normal(size=1000)).sum()) for _ in range(10)]
+        assert sum(flagged) <= 3, name
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=40, deadline=None)
+def test_white_noise_has_hardly_an_outlier(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    assert sample_outliers(rng.normal(size=600)).sum() <= 1
+    assert not sample_outliers(np.zeros(50)).any()
+    assert not sample_outliers(rng.normal(size=5)).any()
+
+
+def test_rows_of_static_trials(campaign) -> None:
+    def levels(count: int, spoilt: int | None, name: str = "t", curve: float = 0.0) -> Trial:
+        load = np.arange(count, dtype=float)
+        values = 1e-3 * load + curve * load**2 + 5e-6 * np.random.default_rng(count).normal(size=count)
+        if spoilt is not None:
+            values[spoilt] += 1e-3
+        zeros = np.zeros(count)
+        return Trial(
+            name, TrialKind.STATIC, ("x",), values[:, None], np.ones((count, 1), dtype=bool), zeros, load,
+            zeros, "x", zeros, 0.0, "A",
+            np.zeros((count, 2)), np.zeros((count, 2)),
+        )  # fmt: skip
+
+    def left_out(*trials: Trial, noise: float | None = 5e-6) -> list[list[int]]:
+        record = None if noise is None else NoiseRecord(noise, 100.0)
+        channel = Channel("x", Quantity.DISPLACEMENT, "x", record)
+        marked = mark_outliers(Campaign("", {"x": channel}, trials, None, {}, ""))
+        return [np.flatnonzero(~trial.used[:, 0]).tolist() for trial in marked.trials]
+
+    assert left_out(levels(10, 4)) == [[4]]
+    assert left_out(levels(10, None)) == [[]]
+    assert left_out(levels(10, None, curve=1e-4)) == [[]]
+    assert left_out(levels(10, 4), noise=None) == [[]]
+    assert left_out(levels(6, 3)) == [[]]  # six rows alone cannot tell
+    trio = [levels(6, None, "a"), levels(6, None, "b"), levels(6, 3, "c")]
+    assert left_out(*trio) == [[], [], [3]]
+    # A trial that is off in many rows is not a matter of single readings.
+    moved = replace(trio[2], values=trio[2].values + 1e-3)
+    assert left_out(*trio[:2], moved) == [[], [], []]
