@@ -159,14 +159,14 @@ def laws_of(patch: ModelPatch, ports: Collection[str]) -> Laws:
                 f"does not have; "
                 f"{known}."
             )
+        if magnitude == 0.0:
+            continue
         for name, value in positive.items():
             if not value > 0.0:
                 raise InvalidPatchError(f"{name} of {item.kind!r} must be positive, but is {value:g}.")
         for name, value in least.items():
             if value < 0.0:
                 raise InvalidPatchError(f"{name} of {item.kind!r} must not be negative, but is {value:g}.")
-        if magnitude == 0.0:
-            continue
         if isinstance(item, MicroSlip):
             slip = slip_displacements(item)
         names.append(item.port)

@@ -29,6 +29,9 @@ half width; micro-slip: stiffness, element count; Bouc-Wen: stiffness, yield dis
 HEAD = 2
 """Columns of a memory before its hysteretic elements: 1 if friction holds the port; its last position."""
 
+FIRST_PARTS = 400
+"""Parts in which the way from a law's last position to the first one of a motion is followed."""
+
 COMPILED = (
     "power", "displacement_force", "displacement_slope", "advance_memory", "damping_kick", "holding_limit",
     "crossing", "integrate", "static_forces", "static_path",
@@ -109,8 +112,9 @@ def advance_memory(
             z += part
             rest -= part
         if rest != 0.0:  # loading: dz/dx = 1 - |z|^order, by the midpoint rule
-            count = max(int(abs(rest) * order / 0.2) + 1, least)
-            h = abs(rest) / count
+            way = min(abs(rest), 2.0 + 40.0 / order)  # by then it yields to the last bit
+            count = max(int(way * order / 0.2) + 1, least)
+            h = way / count
             size = abs(z)
             for _ in range(count):
                 middle = min(size + 0.5 * h * (1.0 - power(size, order)), 1.0)
@@ -122,7 +126,7 @@ def advance_memory(
 def damping_kick(speed: float, strength: float, exponent: float, duration: float) -> float:
     """Return the speed after s' = -`strength` |s|^`exponent` sgn s alone has acted for `duration`."""
     size = abs(speed)
-    if size == 0.0:
+    if size == 0.0 or (exponent > 1.0 and size < 1e-60):
         return speed
     if exponent == 1.0:
         return float(speed * np.exp(-strength * duration))
@@ -296,6 +300,7 @@ def integrate(
     count, modes, laws_count = len(force), len(q), len(codes)
     half = 0.5 * h
     weight = np.zeros(laws_count)  # p.p
+    pull = np.zeros((laws_count, modes))  # change of the modes for one unit of change at the port
     strength = np.zeros(laws_count)  # of damping, for the port's speed
     answer = np.zeros((laws_count, 2 * modes))  # state after the step to a unit kick at its begin
     give = np.zeros(laws_count)  # its position at the port
@@ -315,6 +320,8 @@ def integrate(
             speed += ports[j, m] * v[m]
         if weight[j] == 0.0:
             continue  # the port does not move
+        for m in range(modes):
+            pull[j, m] = ports[j, m] / weight[j]
         if codes[j] == POWER_DAMPING:
             strength[j] = weight[j] * laws[j, 0] / power(laws[j, 3], laws[j, 1])
             for m in range(2 * modes):
@@ -327,8 +334,11 @@ def integrate(
                 memory[j, 1] = x
         else:
             if codes[j] == MICRO_SLIP or codes[j] == BOUC_WEN:
-                advance_memory(codes[j], laws[j], slips[j], memory[j], x, 1)
+                advance_memory(codes[j], laws[j], slips[j], memory[j], x, FIRST_PARTS)
             current[j] = displacement_force(codes[j], laws[j], memory[j], x)
+    driven = False
+    for sample in range(count):
+        driven = driven or force[sample] != 0.0
     for sample in range(count):
         for part in range(substeps if sample > 0 else 0):
             time = start + ((sample - 1) * substeps + part) * h
@@ -363,7 +373,7 @@ def integrate(
                     after = damping_kick(speed, now, laws[j, 1], half)
                 lost[j] = speed - after
                 for m in range(modes):
-                    v[m] -= ports[j, m] * lost[j] / weight[j]
+                    v[m] -= pull[j, m] * lost[j]
             for j in range(laws_count):
                 if current[j] != 0.0:
                     for m in range(modes):
@@ -382,20 +392,19 @@ def integrate(
                         total_v += transition[i, k] * q[k] + transition[i, modes + k] * v[k]
                     q_new[m] = total_q
                     v_new[m] = total_v
+                for m in range(modes):
+                    q[m] = q_new[m]
+                    v[m] = v_new[m]
             else:
                 for m in range(modes):
                     i = modes + m
-                    q_new[m] = (
-                        transition[m, m] * q[m] + transition[m, i] * v[m]
-                        + drive_constant[m] + drive_begin[m] * force_begin + drive_end[m] * force_end
-                    )  # fmt: skip
-                    v_new[m] = (
-                        transition[i, m] * q[m] + transition[i, i] * v[m]
-                        + drive_constant[i] + drive_begin[i] * force_begin + drive_end[i] * force_end
-                    )  # fmt: skip
-            for m in range(modes):
-                q[m] = q_new[m]
-                v[m] = v_new[m]
+                    total_q = transition[m, m] * q[m] + transition[m, i] * v[m] + drive_constant[m]
+                    total_v = transition[i, m] * q[m] + transition[i, i] * v[m] + drive_constant[i]
+                    if driven:
+                        total_q += drive_begin[m] * force_begin + drive_end[m] * force_end
+                        total_v += drive_begin[i] * force_begin + drive_end[i] * force_end
+                    q[m] = total_q
+                    v[m] = total_v
             # ---- ports that friction holds: the impulse at the begin that keeps them in place
             for j in range(laws_count):
                 if codes[j] != POWER_DAMPING or memory[j, 0] != 1.0 or weight[j] == 0.0:
@@ -445,7 +454,7 @@ def integrate(
                         taken = limit if speed > 0.0 else -limit
                         memory[j, 0] = 0.0
                     for m in range(modes):
-                        v[m] -= ports[j, m] * taken / weight[j]
+                        v[m] -= pull[j, m] * taken
                     continue
                 now = strength[j] * power(abs(x / laws[j, 4]), laws[j, 2])
                 end = speed - lost[j]
@@ -477,15 +486,15 @@ def integrate(
                         memory[j, 0] = 1.0
                         memory[j, 1] = x + position
                     for m in range(modes):
-                        q[m] += ports[j, m] * d_position / weight[j]
-                        v[m] += ports[j, m] * d_speed / weight[j]
+                        q[m] += pull[j, m] * d_position
+                        v[m] += pull[j, m] * d_speed
                 else:
                     after = damping_kick(speed, now, exponent, half)
                     if after == 0.0 and exponent < 1.0 and now > 0.0:
                         memory[j, 0] = 1.0
                         memory[j, 1] = x
                     for m in range(modes):
-                        v[m] -= ports[j, m] * (speed - after) / weight[j]
+                        v[m] -= pull[j, m] * (speed - after)
         for m in range(modes):
             q_out[sample, m] = q[m]
             v_out[sample, m] = v[m]
@@ -629,6 +638,9 @@ def static_path(
                 found = size <= 1e-12 * scale
             if not found and size <= 1e-9 * scale:
                 found = True  # rounding, or a kink met exactly
+            # A solution that is not stable lies on another branch, beyond a snap.
+            if found and np.linalg.det(np.eye(count) + compliance * slope) <= -1e-9:
+                found = False
             if found:
                 x[:] = guess
                 memory[:] = reached

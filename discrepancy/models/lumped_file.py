@@ -244,8 +244,9 @@ def parse_lumped(content: dict[str, Any], source: str = "the lumped model") -> L
         return LumpedDescription.model_validate(content)
     except ValidationError as error:
         details = error.errors()
-        first = details[0]
-        place = ".".join(str(part) for part in first["loc"] if part != "function-after")
+        # Of a matrix that may also be a diagonal both readings are reported; the other one says too little.
+        first = next((detail for detail in details if detail["type"] != "tuple_type"), details[0])
+        place = ".".join(str(part) for part in first["loc"] if "tuple[" not in str(part))
         if first["type"] == "extra_forbidden":
             sentence = (
                 f"{source}: {place!r} is not a key of a lumped model; remove it or correct its spelling"

@@ -8,6 +8,7 @@ the structural part of a patch, keeps it, and asks it for a `Motion`; rows of it
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,9 @@ FloatArray = NDArray[np.float64]
 LEAST_PARTICIPATION = 0.03
 """A mode that moves the release point less than this share of the most moving one is scaled by the share."""
 
+LEAST_LEAD = 1e-9
+"""A first sample that is later than the begin by less than this share of the interval is at the begin."""
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -43,27 +47,44 @@ class Motion:
         What moved.
     time : (N,) ndarray
         Times of the motion since the release or the begin of the force [s].
-    q, velocity, acceleration : (N, M) ndarray
-        Modal coordinates and their derivatives (mass-normalised).
+    q, velocity : (N, M) ndarray
+        Modal coordinates and their rates (mass-normalised).
     force : (N,) ndarray
         Applied force [N].
     input_row : (n,) ndarray
         Where it acts.
     port_forces : (N, J) ndarray
         Internal forces.
-    port_rows : (J, n) ndarray
-        Where they act.
+    laws : Laws
+        Their laws.
+    held : int
+        First samples that lie before the release, where the shape is held.
     """
 
     system: "SecondOrderSystem"
     time: FloatArray
     q: FloatArray
     velocity: FloatArray
-    acceleration: FloatArray
     force: FloatArray
     input_row: FloatArray
     port_forces: FloatArray
-    port_rows: FloatArray
+    laws: Laws
+    held: int = 0
+
+    @cached_property
+    def acceleration(self) -> FloatArray:
+        """Second derivatives (N, M) of the modal coordinates, from the equation of motion."""
+        square = self.system.angular_frequency**2
+        modal = self.system.modal
+        acceleration = -self.q * square - self.velocity @ modal.damping.T
+        if self.laws.rate != 0.0:
+            acceleration -= self.laws.rate * self.time[:, None] * self.q * square
+        if len(self.laws):
+            acceleration -= self.port_forces @ self.laws.rows(modal.ports, self.q.shape[1])
+        if np.any(self.force):
+            acceleration += np.outer(self.force, self.input_row @ self.system.shapes)
+        acceleration[: self.held] = 0.0
+        return np.asarray(acceleration)
 
     def values(self, rows: FloatArray) -> FloatArray:
         """Return row . u (N, C) of rows (C, n); omitted modes follow the forces without delay."""
@@ -71,8 +92,9 @@ class Motion:
         if self.system.truncated:
             if np.any(self.force):
                 values += np.outer(self.force, rows @ self.system.residual(self.input_row))
-            if len(self.port_rows):
-                values -= self.port_forces @ (rows @ self.system.residual(self.port_rows.T)).T
+            if len(self.laws):
+                port_rows = self.system.port_rows(self.laws)
+                values -= self.port_forces @ (rows @ self.system.residual(port_rows.T)).T
         return np.asarray(values)
 
     def response(self, rows: FloatArray, quantities: Sequence[Quantity]) -> Response:
@@ -259,10 +281,11 @@ class SecondOrderSystem:
             held = int(np.searchsorted(times, 0.0))  # samples before the release
         nothing = np.zeros(len(times))
         if laws.linear and not self.modal.coupled:
-            all_q, all_v, acceleration = self._free(q, v, np.maximum(times, 0.0) if held else times)
-            acceleration[:held] = 0.0
+            all_q, all_v = self._free(q, v, times)
+            if held:
+                all_q[:held], all_v[:held] = q, 0.0
             none = np.zeros((len(times), 0))
-            return self._motion(times, all_q, all_v, acceleration, nothing, release_row, none, laws)
+            return Motion(self, times, all_q, all_v, nothing, release_row, none, laws, held)
         count = len(times)
         all_q, all_v = np.tile(q, (count, 1)), np.tile(v, (count, 1))
         forces = np.zeros((count, len(laws)))
@@ -273,7 +296,7 @@ class SecondOrderSystem:
             if lead < 0.0:
                 q, v = self._backwards(q, v, -lead)
                 start, lead, memory = lead, 0.0, None
-            if lead > 0.0:
+            if lead > LEAST_LEAD * interval:
                 first = simulate(
                     self.modal, laws, q=q, v=v, memory=memory, force=np.zeros(2), interval=lead,
                     refinement=refinement, kernel=compiled_kernel(),
@@ -285,9 +308,7 @@ class SecondOrderSystem:
             )  # fmt: skip
             all_q[held:], all_v[held:], forces[held:] = moved.q, moved.v, moved.port_forces
             forces[:held] = forces[held]
-        acceleration = self._acceleration(all_q, all_v, times, laws, forces, nothing, release_row)
-        acceleration[:held] = 0.0
-        return self._motion(times, all_q, all_v, acceleration, nothing, release_row, forces, laws)
+        return Motion(self, times, all_q, all_v, nothing, release_row, forces, laws, held)
 
     def forced(
         self,
@@ -318,7 +339,7 @@ class SecondOrderSystem:
             linear = np.outer(force[:1], shape) / self.angular_frequency**2
             solution = _solve(laws, linear @ rows.T, flexible @ rows.T)
             q, memory = (linear - solution.forces @ flexible)[0], solution.memory
-        if lead > 0.0:
+        if lead > LEAST_LEAD * float(time[-1] - time[0]):
             first = simulate(
                 modal, laws, q=q, v=v, memory=memory, force=np.array([force[0], acting[0]]), interval=lead,
                 shape=shape, start=start, refinement=refinement, kernel=compiled_kernel(),
@@ -329,8 +350,7 @@ class SecondOrderSystem:
             interval=float(times[-1] - times[0]) / (len(times) - 1), refinement=refinement,
             kernel=compiled_kernel(),
         )  # fmt: skip
-        acceleration = self._acceleration(moved.q, moved.v, times, laws, moved.port_forces, acting, input_row)
-        return self._motion(times, moved.q, moved.v, acceleration, acting, input_row, moved.port_forces, laws)
+        return Motion(self, times, moved.q, moved.v, acting, input_row, moved.port_forces, laws)
 
     # ------------------------------------------------------------ parts
 
@@ -370,27 +390,22 @@ class SecondOrderSystem:
         deviation[0] = 0.0
         return q + deviation, np.zeros(modes), memory
 
-    def _free(
-        self, q: FloatArray, v: FloatArray, times: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return free motion (N, M) of uncoupled modes in closed form, for any damping."""
+    def _free(self, q: FloatArray, v: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return free motion (N, M), displacement and velocity, of uncoupled modes in closed form.
+
+        `times` are evenly spaced.
+        """
         half = 0.5 * np.diag(self.modal.damping)
-        root = np.sqrt((half**2 - self.angular_frequency**2).astype(complex))
-        root = np.where(np.abs(root) < 1e-6 * self.angular_frequency, 1e-6 * self.angular_frequency, root)
+        w = self.angular_frequency
+        root = np.sqrt((half**2 - w**2).astype(complex))
+        root = np.where(np.abs(root) < 1e-6 * w, 1e-6 * w, root)  # critical: beside it, by 1e-12 of w^2
         fast, slow = -half - root, -half + root
         first = (v - fast * q) / (2.0 * root)  # q = first e^(slow t) + second e^(fast t)
-        second = q - first
-        oscillating = root.imag != 0.0
-        if np.all(oscillating):  # the two are conjugate
-            wave = 2.0 * first * np.exp(np.outer(times, slow))
-            rate = slow * wave
-            return wave.real.copy(), rate.real.copy(), np.asarray((slow * rate).real)
-        one, two = first * np.exp(np.outer(times, slow)), second * np.exp(np.outer(times, fast))
-        return (
-            np.asarray((one + two).real),
-            np.asarray((slow * one + fast * two).real),
-            np.asarray((slow**2 * one + fast**2 * two).real),
-        )
+        if np.all(root.imag != 0.0):  # the two are conjugate
+            wave = 2.0 * first * _exponentials(slow, times)
+            return np.ascontiguousarray(wave.real), np.ascontiguousarray((slow * wave).real)
+        one, two = first * _exponentials(slow, times), (q - first) * _exponentials(fast, times)
+        return np.ascontiguousarray((one + two).real), np.ascontiguousarray((slow * one + fast * two).real)
 
     def _backwards(self, q: FloatArray, v: FloatArray, duration: float) -> tuple[FloatArray, FloatArray]:
         """Return the state a duration [s] earlier, without internal forces."""
@@ -398,38 +413,6 @@ class SecondOrderSystem:
         step = linear_step(self.modal, np.zeros(modes), np.zeros(modes), duration).transition
         state = np.linalg.solve(step, np.concatenate((q, v)))
         return np.asarray(state[:modes]), np.asarray(state[modes:])
-
-    def _acceleration(
-        self,
-        q: FloatArray,
-        v: FloatArray,
-        times: FloatArray,
-        laws: Laws,
-        port_forces: FloatArray,
-        force: FloatArray,
-        row: FloatArray,
-    ) -> FloatArray:
-        acceleration = -q * self.angular_frequency**2 - v @ self.modal.damping.T
-        if laws.rate != 0.0:
-            acceleration -= laws.rate * times[:, None] * q * self.angular_frequency**2
-        if len(laws):
-            acceleration -= port_forces @ laws.rows(self.modal.ports, q.shape[1])
-        if np.any(force):
-            acceleration += np.outer(force, row @ self.shapes)
-        return np.asarray(acceleration)
-
-    def _motion(
-        self,
-        times: FloatArray,
-        q: FloatArray,
-        v: FloatArray,
-        acceleration: FloatArray,
-        force: FloatArray,
-        row: FloatArray,
-        port_forces: FloatArray,
-        laws: Laws,
-    ) -> Motion:
-        return Motion(self, times, q, v, acceleration, force, row, port_forces, self.port_rows(laws))
 
 
 def _solve(
@@ -443,3 +426,15 @@ def _solve(
         return static_solution(laws, linear, compliance, memory=memory, start=start, kernel=compiled_kernel())
     except SolutionError as cause:
         raise ModelError(str(cause)) from cause
+
+
+def _exponentials(rates: NDArray[Any], times: FloatArray) -> NDArray[np.complex128]:
+    """Return e^(rate t) (N, M) at evenly spaced times, as products of few exponentials."""
+    count, block = len(times), 32
+    if count <= 2 * block:
+        return np.asarray(np.exp(np.outer(times, rates)))
+    interval = (times[-1] - times[0]) / (count - 1)
+    blocks = -(-count // block)
+    coarse = np.exp(np.outer(times[0] + interval * block * np.arange(blocks), rates))
+    fine = np.exp(np.outer(interval * np.arange(block), rates))
+    return np.asarray((coarse[:, None, :] * fine).reshape(blocks * block, -1)[:count])
