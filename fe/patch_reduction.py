@@ -117,7 +117,8 @@ def _responses(full: PatchOperators, norm: Norm, settings: PatchSettings, *, mai
     moments = np.polynomial.legendre.legvander(2.0 * eta - 1.0, LIFT_MOMENTS - 1)
     step = max(1, stations // 13)
     lines = [
-        *(rows[step::step].toarray() for rows in (full.line_rows[2], full.line_rows[3])),
+        full.line_rows[2][2 : None : 1 if main else step].toarray(),  # where point masses may sit
+        full.line_rows[3][step::step].toarray(),
         *(rows[2 * step :: 2 * step].toarray() for rows in full.line_rows[:2]),
     ]
     flap = np.zeros(operators.unknowns)
@@ -310,7 +311,7 @@ LOAD_WEIGHT = 3.0
 """How much more the solutions under tip force, lift and a washed-out lift count than those under others."""
 TURNED_WEIGHT = 0.4
 """How much representatives of strain across a gauge and of shear count."""
-MODE_WEIGHTS = np.array([3.0, 2.0, 2.0, 1.5, 0.7, 0.5, 0.3, 0.2])
+MODE_WEIGHTS = np.array([3.0, 2.0, 3.0, 2.0, 1.0, 0.7, 0.4, 0.2])
 
 
 def _leading(gram: FloatArray, count: int) -> FloatArray:
@@ -353,7 +354,7 @@ def _patched_state(
             ranges.pitot_mass,
         )
     )
-    with_damage, with_box, with_compliance, with_mass = generator.random(4) < (0.5, 0.75, 0.4, 0.5)
+    with_damage, with_box, with_compliance, with_mass = generator.random(4) < (0.5, 0.75, 0.4, 0.6)
     start, length = generator.uniform(-0.05, 0.9) * span, generator.uniform(0.02, 0.3) * span
     loss = generator.uniform(0.1, arrays.largest_loss)
     compliance = generator.uniform(0.0, arrays.largest_compliance)

@@ -5,7 +5,6 @@ from fe.design import WingDesign, load_design
 from fe.operators import AffineOperators, assemble
 from fe.patch_arrays import PatchArrays
 from fe.patch_operators import PatchOperators, assemble_patch_operators
-from fe.patch_reduction import PatchSettings, reduce_patches
 from fe.patched_wing import PatchedWing
 from fe.reduction import Reduction, reduce_model
 
@@ -40,12 +39,6 @@ def coarse_reduction(coarse_operators: AffineOperators) -> Reduction:
 @pytest.fixture(scope="session")
 def coarse_patch_operators(coarse_operators: AffineOperators) -> PatchOperators:
     return assemble_patch_operators(coarse_operators)
-
-
-@pytest.fixture(scope="session")
-def coarse_patch_arrays(coarse_operators: AffineOperators) -> PatchArrays:
-    with threadpool_limits(1):
-        return reduce_patches(coarse_operators, PatchSettings(states=100))
 
 
 @pytest.fixture(scope="session")
