@@ -59,7 +59,7 @@ class PatchSettings:
 
     ranges: ReductionSettings = field(default_factory=ReductionSettings)
     strip_count: int = 24
-    vectors: int = 220
+    vectors: int = 240
     states: int = 160
     largest_loss: float = 0.7
     compliance_share: float = 0.4
@@ -311,7 +311,7 @@ LOAD_WEIGHT = 3.0
 """How much more the solutions under tip force, lift and a washed-out lift count than those under others."""
 TURNED_WEIGHT = 0.4
 """How much representatives of strain across a gauge and of shear count."""
-MODE_WEIGHTS = np.array([3.0, 2.0, 3.0, 2.0, 1.0, 0.7, 0.4, 0.2])
+MODE_WEIGHTS = np.array([3.0, 3.0, 4.0, 3.0, 1.5, 1.0, 0.5, 0.3])
 
 
 def _leading(gram: FloatArray, count: int) -> FloatArray:

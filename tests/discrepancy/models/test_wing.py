@@ -228,13 +228,12 @@ def test_ring_down_is_the_modal_sum_of_all_unknowns(
 def test_a_harmonic_force_reaches_the_frequency_response(model: WingModel, conditions: Conditions) -> None:
     stiffness, mass, damping = matrices(model, conditions)
     omega = 2.0 * np.pi * 9.0
-    time = np.arange(4000) / 1000.0
-    trial = make_trial(TrialKind.FORCED, 4000, time=time, force=3.0 * np.sin(omega * time))
+    time = np.arange(12000) / 1000.0
+    trial = make_trial(TrialKind.FORCED, 12000, time=time, force=3.0 * np.sin(omega * time))
     values = model.respond(trial, OUTPUTS, NONE, conditions).values[-1000:]
     dynamic = stiffness - omega**2 * mass + 1j * omega * damping
     amplitude = output_rows(model) @ np.linalg.solve(dynamic, 3.0 * model.wing.force_row("tip_load"))
     wanted = (amplitude[:, None] * np.exp(1j * omega * time[-1000:])).imag.T
-    assert np.abs(values - wanted).max(axis=0) == pytest.approx(0.0, abs=2e-3 * np.abs(amplitude).max())
     assert np.abs((values - wanted) / np.abs(amplitude)).max() < 2e-3
 
 
