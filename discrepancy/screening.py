@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +66,17 @@ class Change:
         return 0.5 * self.fits * self.scale
 
 
+class _Piece(NamedTuple):
+    """One trial of a screen: projections on its own and on shared unknowns, weights, residual, gradient."""
+
+    local: FloatArray  # (L, N C)
+    shared: FloatArray  # (K, N C)
+    index: NDArray[np.int64]  # (K,)
+    root: FloatArray  # (N C,)
+    residual: FloatArray  # (N C,)
+    gradient: FloatArray  # (L,)
+
+
 class Screen:
     """Inner products of changes at a fit.
 
@@ -87,7 +99,7 @@ class Screen:
         size = problem.shared.size
         matrix = np.diag(problem.shared.precision + 1e-12)
         gradient = -problem.shared.precision * fit.point.shared
-        self._pieces = []
+        self._pieces: list[_Piece] = []
         for number in range(len(problem.trials)):
             block, local, shared = trial_block(
                 problem, number, fit.point, fit.linearisations[number], candidate,
@@ -102,19 +114,19 @@ class Screen:
             ).ravel()
             lower = np.tril(factor[0])
             self._pieces.append(
-                (
-                    local,
-                    shared,
-                    inner,
-                    lower,
+                _Piece(
+                    # what a change leaves to the trial's own unknowns, and to the shared ones
+                    solve_triangular(lower, local, lower=True),
+                    shared - inner.T @ local,
                     block.index,
                     root,
                     fit.residuals[number].ravel() * root,
                     solve_triangular(lower, block.local_gradient, lower=True),
                 )
             )
-        self._lower = np.tril(cho_factor(matrix, lower=True)[0])
-        self._gradient = solve_triangular(self._lower, gradient, lower=True)
+        lower = np.tril(cho_factor(matrix, lower=True)[0])
+        self._inverse = solve_triangular(lower, np.eye(size), lower=True)
+        self._gradient = self._inverse @ gradient
         self._size = size
 
     def change(self, term: Term, start: FloatArray) -> Change:
@@ -127,24 +139,22 @@ class Screen:
         parts, fits, square = [], 0.0, 0.0
         tail = []
         for number, (data, piece) in enumerate(zip(problem.trials, self._pieces, strict=True)):
-            local, shared, inner, lower, index, root, residual, local_gradient = piece
             if data.trial.kind not in acting:
-                parts.append(np.zeros(len(root)))
-                tail.append(np.zeros(len(lower)))
+                parts.append(np.zeros(len(piece.root)))
+                tail.append(np.zeros(len(piece.local)))
                 continue
             patch = candidate.patch(problem.setting, effect)
             response, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch)
             gains = 1.0 + problem.shared.gains(fit.point.shared, data.trial.channels)
             moved = gains * (response - fit.responses[number])
-            d = data.standardised(moved).ravel() * root
-            z = local @ d
-            np.add.at(total, index, shared @ d - inner.T @ z)
-            z = solve_triangular(lower, z, lower=True)
-            fits += float(residual @ d) - float(local_gradient @ z)
+            d = data.standardised(moved).ravel() * piece.root
+            z = piece.local @ d
+            total[piece.index] += piece.shared @ d
+            fits += float(piece.residual @ d) - float(piece.gradient @ z)
             square += float(d @ d) - float(z @ z)
             parts.append(d)
             tail.append(z)
-        y = solve_triangular(self._lower, total, lower=True)
+        y = self._inverse @ total
         fits -= float(self._gradient @ y)
         square -= float(y @ y)
         vector = np.concatenate((*parts, *tail, y))
@@ -153,8 +163,8 @@ class Screen:
     @property
     def sign(self) -> FloatArray:
         """Signs (D,) of the inner product: changes count, their projections are taken off."""
-        samples = sum(len(piece[5]) for piece in self._pieces)
-        rest = sum(len(piece[3]) for piece in self._pieces) + self._size
+        samples = sum(len(piece.root) for piece in self._pieces)
+        rest = sum(len(piece.local) for piece in self._pieces) + self._size
         return np.concatenate((np.ones(samples), -np.ones(rest)))
 
     def changes(self, term: Term) -> Iterator[Change]:
