@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import helmert
 
 from calibration.errors import CalibrationError
 from calibration.experiments import LoadDisplacementData, read_measurements
@@ -18,6 +19,7 @@ from .campaign import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, 
 from .campaign_file import read_campaign
 from .campaign_writer import write_campaign
 from .errors import CampaignDataError, CampaignFileError
+from .noise_records import pre_trigger_record
 
 FloatArray = NDArray[np.float64]
 
@@ -53,8 +55,9 @@ class RecordPlan:
         Columns of the plot that are averaged into one sample. Four (32 ms) have a zero of their frequency
         response at 30.8 Hz, where the second bending mode rings.
     detrended : bool
-        Whether the slow zero of the signal is taken off: its average over three periods (Hann weights). It moves
-        by a third of a millivolt in all five trials alike and is no motion of the wing.
+        Whether the slow zero that the trials share is taken off: the moving average over three periods (Hann
+        weights), averaged over the trials. It moves by a third of a millivolt and is no motion of the wing. What
+        moves slowly in one trial alone is noise and stays.
     release : float
         Nominal displacement of the tip at the window's begin [m]; the unknown scale of the signal makes any value
         as good.
@@ -109,19 +112,23 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
         raise CampaignDataError(
             f"{data} must hold two or more ring-down records of one length; it holds {len(records)}."
         )
-    windows = [_windowed(record, plan) for record in records]
+    zero = _shared_zero(records) if plan.detrended else np.zeros(records[0].count)
+    windows = [_windowed(record, zero, plan) for record in records]
     scatter = trial_scatter(windows)
-    noise = replace(scatter, standard_deviation=float(np.hypot(scatter.standard_deviation, READING_ERROR)))
+    spread = float(np.std(scatter, ddof=1))
+    noise = pre_trigger_record(
+        scatter * np.hypot(1.0, READING_ERROR / spread), _interval(windows), SIGNAL, str(data)
+    )
     channels = {
         SIGNAL: Channel(SIGNAL, Quantity.SIGNAL, ROOT_GAUGE, noise, inf, inf),
     }
     trials: list[Trial] = []
     if pairs is not None:
-        spread = np.hypot(
+        displacement_deviation = np.hypot(
             pairs.displacement_standard_deviation,
             pairs.load_standard_deviation * float(np.median(pairs.displacement / pairs.load)),
         )
-        channels[TIP] = Channel(TIP, Quantity.DISPLACEMENT, "load_point_displacement", NoiseRecord(float(spread), inf))
+        channels[TIP] = Channel(TIP, Quantity.DISPLACEMENT, "load_point_displacement", NoiseRecord(float(displacement_deviation), inf))
         trials += _loading_runs(pairs)
     for number, (time, signal) in enumerate(windows, start=1):
         trials.append(
@@ -141,7 +148,7 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
         (
             f"Ring-downs: {records[0].source} to {records[-1].source}, from {plan.begin:g} s after the release; "
             f"{plan.columns} columns of the plot averaged into a sample of {1e3 * _interval(windows):.3g} ms.",
-            f"Noise of the signal: scatter between the trials, {1e6 * scatter.standard_deviation:.3g} microvolt, and "
+            f"Noise of the signal: scatter between the trials, {1e6 * spread:.3g} microvolt, and "
             f"the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
         ),
     )
@@ -152,53 +159,53 @@ def write_wing_campaign(data: Path | str, out: Path | str, plan: RecordPlan | No
     return read_campaign(write_campaign(wing_campaign(data, plan), out))
 
 
-def trial_scatter(windows: list[tuple[FloatArray, FloatArray]], duration: float = 0.8) -> NoiseRecord:
-    """Return the noise of the signal from what differs between trials.
+def trial_scatter(windows: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
+    """Return noise of the signal ((R - 1) N,) [V] from what differs between R trials of N samples.
 
-    All trials are releases of one kind, so that what they share is the motion, whatever its law, and what
-    differs beside amplitude, delay and zero is noise. In stretches of `duration` each trial is fitted by the
-    mean of all, its rate and its second derivative, a constant and a straight line; what is left is noise, with
-    n - 5 degrees of freedom in each stretch, less the share of the mean.
+    All trials are releases of one kind, so that what they share is the motion, whatever its law; what differs
+    beside amplitude, delay and zero is noise. Each trial is fitted by the mean of all, its rate, its second
+    derivative and a constant; the R - 1 orthonormal contrasts of what is left (Helmert) are independent of each
+    other and have the variance of a single trial. Four degrees of freedom of each contrast went into the fit, and the
+    variance allows for it.
+
+    Raises
+    ------
+    CampaignDataError
+        If the records are too short.
     """
     signals = np.array([signal for _, signal in windows])
-    interval = _interval(windows)
-    size = max(round(duration / interval), 12)
-    count = len(signals)
-    squares = freedom = 0.0
-    for first in range(0, signals.shape[1] - size + 1, size):
-        part = signals[:, first : first + size]
-        mean = part.mean(axis=0)
-        rate = np.gradient(mean)
-        known = np.stack((mean, rate, np.gradient(rate), np.ones(size), np.linspace(-1.0, 1.0, size)), axis=1)
-        known /= np.linalg.norm(known, axis=0)
-        left = part.T - known @ np.linalg.lstsq(known, part.T, rcond=None)[0]
-        squares += float(np.sum(left**2))
-        freedom += (count - 1) * (size - known.shape[1])
-    if freedom < 3.0:
-        raise CampaignDataError(
-            f"The ring-downs of {signals.shape[1]} samples are too short to say how they scatter; begin earlier."
-        )
-    return NoiseRecord(float(np.sqrt(squares / freedom)), freedom, None, None, "repeats")
+    count, size = signals.shape
+    mean = signals.mean(axis=0)
+    rate = np.gradient(mean)
+    known = np.stack((mean, rate, np.gradient(rate), np.ones(size)), axis=1)
+    known /= np.linalg.norm(known, axis=0)
+    left = signals.T - known @ np.linalg.lstsq(known, signals.T, rcond=None)[0]
+    noise = (left @ helmert(count).T).T
+    return np.asarray(noise.ravel() * np.sqrt(size / (size - known.shape[1])))
 
 
-def _windowed(record: RingDownRecord, plan: RecordPlan) -> tuple[FloatArray, FloatArray]:
+def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
+    """Return the slow zero (N,) that all records share, NaN at the ends where the moving average has no value."""
+    weights = np.hanning(TREND + 2)[1:-1]
+    mean = np.mean([record.signal for record in records], axis=0)
+    zero = np.full(len(mean), np.nan)
+    zero[TREND // 2 : len(mean) - TREND // 2] = np.convolve(mean, weights / weights.sum(), "valid")
+    return zero
+
+
+def _windowed(record: RingDownRecord, zero: FloatArray, plan: RecordPlan) -> tuple[FloatArray, FloatArray]:
     """Return times since the first and samples of a record in the plan's window."""
-    inside = np.flatnonzero((record.time >= plan.begin) & (record.time <= plan.end))
-    time, signal = record.time, record.signal
-    if plan.detrended:
-        inside = inside[(inside >= TREND // 2) & (inside < record.count - TREND // 2)]
-        weights = np.hanning(TREND + 2)[1:-1]
-        slow = np.convolve(signal, weights / weights.sum(), "same")
-        signal = signal - slow
+    known = np.isfinite(zero)
+    inside = np.flatnonzero(known & (record.time >= plan.begin) & (record.time <= plan.end))
     count = len(inside) // plan.columns
     if count < 60:
         raise CampaignDataError(
             f"{record.source}: {count} samples are left between {plan.begin:g} and {plan.end:g} s; 60 are needed."
         )
     kept = inside[: count * plan.columns].reshape(count, plan.columns)
-    time = time[kept].mean(axis=1)
+    time = record.time[kept].mean(axis=1)
     interval = float(time[-1] - time[0]) / (count - 1)
-    return interval * np.arange(count), signal[kept].mean(axis=1)
+    return interval * np.arange(count), (record.signal - zero)[kept].mean(axis=1)
 
 
 def _interval(windows: list[tuple[FloatArray, FloatArray]]) -> float:
