@@ -9,6 +9,7 @@ This file is copied into the FMU; what it needs of `fe` is handed to it, as in `
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -263,6 +264,8 @@ class PatchedBehaviour(WingBehaviour):
         )
         shown, self._filters = stream.read(sample, self._filters, duration)
         self._shown = shown.tolist()
+        if not math.isfinite(sum(self._shown)):
+            raise UnacceptableEffectError("With the effects that are on, an output is not finite.")
         return Response(shown[:-2], float(shown[-2]))
 
     # ------------------------------------------------------------------ patches

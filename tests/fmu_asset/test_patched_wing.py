@@ -46,7 +46,7 @@ from fe.reduced import ReducedModel
 from fmu_asset.binding import Binding, parse_binding
 from fmu_asset.build import build_fmu
 from fmu_asset.check import check_fmu
-from fmu_asset.errors import FmuCallError, PatchFileError
+from fmu_asset.errors import FmuBuildError, FmuCallError, FmuInputError, PatchFileError
 from fmu_asset.patch_file import SCHEMA, PatchFile, load_patch, parse_patch
 from fmu_asset.patched_runtime import output_channels
 from fmu_asset.session import FmiAsset
@@ -334,6 +334,39 @@ def test_impossible_values_are_refused_and_change_nothing(patched: Path, door: B
         assert asset.step().values.tobytes() == seen.tobytes()
 
 
+def test_whole_numbers_are_whole(patched: Path, door: Binding) -> None:
+    with FmiAsset(patched, door, isolated=False, parameters=on("slip", "crack")) as asset:
+        asset.reset(control={"load_factor": 0.0})
+        asset.step(load={"tip_force": 14.0})
+        many = asset.step(load={"tip_force": -6.0}).values
+    one = on("slip", "crack") | {"effect.slip.element_count": 1, "effect.crack.side": 0}
+    with FmiAsset(patched, door, isolated=False, parameters=one) as asset:
+        asset.reset(control={"load_factor": 0.0})
+        asset.step(load={"tip_force": 14.0})
+        single = asset.step(load={"tip_force": -6.0}).values
+    assert np.abs(many - single).max() > 1e-3 * np.abs(many).max()
+    for name, value in (("slip.element_count", 2.5), ("slip.element_count", 0), ("crack.side", 2)):
+        with pytest.raises(FmuInputError):
+            FmiAsset(patched, door, parameters={f"effect.{name}": value})
+
+
+def test_what_has_no_bounds_is_refused(patched: Path, door: Binding) -> None:
+    soft = on("crack") | {
+        "effect.crack.side": 0,
+        "effect.crack.coefficient": -1e9,
+        "response": 2.0,
+        "release": 0.001,
+    }
+    with pytest.raises(FmuCallError, match="takes more stiffness than the structure has"):
+        FmiAsset(patched, door, parameters=soft).reset()
+    wild = on("drifting") | {"effect.drifting.rate": -1e6, "response": 2.0, "release": 0.001}
+    with (
+        FmiAsset(patched, door, parameters=wild) as asset,
+        pytest.raises(FmuCallError, match="is not finite"),
+    ):
+        asset.simulate({"load_factor": 0.0}, steps=2000)
+
+
 def test_it_is_sound(patched: Path, model: ReducedModel, arrays: PatchArrays, tmp_path: Path) -> None:
     again = build_fmu(model, tmp_path / "again.fmu", patch=patch_of(*EFFECTS), arrays=arrays).path
     assert again.read_bytes() == patched.read_bytes()
@@ -356,6 +389,12 @@ def test_what_cannot_be_packed_is_refused(model: ReducedModel, arrays: PatchArra
     patch = parse_patch(json.dumps({"schema": SCHEMA, "effects": [other]}).encode())
     with pytest.raises(PatchFileError, match="'nose', which this model does not have"):
         build_fmu(model, tmp_path / "c.fmu", patch=patch, arrays=arrays)
+    record = ModelPatch(EFFECTS["crack"]).to_list()
+    record[0]["side"] = 3
+    rows = [{"id": "crack", "primitives": record}]
+    patch = parse_patch(json.dumps({"schema": SCHEMA, "effects": rows}).encode())
+    with pytest.raises(FmuBuildError, match=r"crack\.side lies outside -1 to 1"):
+        build_fmu(model, tmp_path / "d.fmu", patch=patch, arrays=arrays)
     assert not list(tmp_path.iterdir())
 
 
