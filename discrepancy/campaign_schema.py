@@ -96,12 +96,19 @@ class ChannelSection(Section):
 class ReleaseSection(Section):
     """`release` of a ring-down."""
 
-    displacement: Positive
+    displacement: Number
     unit: Literal["m", "mm", "um", "V", "mV", "1"] = "m"
     deviation: Positive = 0.05
     at_rest: bool = True
     mode_count: Annotated[int, Field(ge=0)] = 3
     time_zero_deviation: NotNegative = 0.0
+
+    @field_validator("displacement")
+    @classmethod
+    def _somewhere(cls, displacement: float) -> float:
+        if displacement == 0.0:
+            raise ValueError("must not be zero: its sign is the side to which the structure is held")
+        return displacement
 
 
 class HealthSection(Section):

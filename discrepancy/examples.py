@@ -74,7 +74,7 @@ class ExamplePlan:
         return chosen or tuple(channel.name for channel in self.channels)
 
 
-def wing_plan(gauges: tuple[int, ...] = (0, 4, 8, 12, 17, 21)) -> ExamplePlan:
+def wing_plan(gauges: tuple[int, ...] = (1, 5, 9, 13, 18, 22)) -> ExamplePlan:
     """Return the plan of a wing test: some gauges of 2 microstrain and the tip's displacement of 0.05 mm."""
     strain = NoiseRecord(2e-6, 200.0)
     channels = [

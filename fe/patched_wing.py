@@ -391,14 +391,15 @@ class PatchedWing:
         Parameters
         ----------
         name : str
-            strain[k], tip_displacement, load_point_displacement, displacement[y, x].
+            strain[k] (gauges count from 1, as in the FMU), tip_displacement, load_point_displacement,
+            displacement[y, x].
         component : int
             Of a strain: 0 along the span, 1 across, 2 engineering shear strain; zero for displacements.
         """
         strain = _STRAIN.fullmatch(name)
         if strain is not None:
-            gauge = int(strain.group(1))
-            return self.arrays.strain_rows[component, gauge] if gauge < self.gauge_count else None
+            gauge = int(strain.group(1)) - 1
+            return self.arrays.strain_rows[component, gauge] if 0 <= gauge < self.gauge_count else None
         row: FloatArray | None = None
         if name == "tip_displacement":
             row = self.arrays.tip_row

@@ -21,14 +21,14 @@ from benchmarks.blind.lumped_rig import SPRINGS, LumpedRig, lumped_campaign
 from benchmarks.blind.plan import CampaignPlan
 from benchmarks.blind.wing_basis import REGION_LINES, WingBasisStore
 from benchmarks.blind.wing_campaign import wing_campaign
-from benchmarks.blind.wing_rig import WingRig
+from benchmarks.blind.wing_rig import LOAD_POINT, WingRig
 from fe.grid import span_lines
 
 FloatArray = NDArray[np.float64]
 
 DETECTABLE = 50.0
 """Least d^2 of an effect that is to be found."""
-ATTEMPTS = 12
+ATTEMPTS = 40
 KINDS = ("catalogue", "null", "outside", "pair", "trap")
 NOT_TOGETHER = (
     frozenset({"coulomb_friction", "structural_damping"}),
@@ -146,6 +146,9 @@ def _wing_bench(work: Workbench) -> Bench:
     spring = rig.store.basis().flap_spring
     w = structure.angular_frequency
     motion = rig.equivalents(structure)
+    flight, _ = rig.respond(
+        structure, Changes(), next(trial for trial in work.plan.trials if trial.kind == "flight")
+    )
     lines = span_lines(rig.design)
     places = tuple((float(lines[a]), float(lines[b])) for a, b in REGION_LINES)
     return Bench(
@@ -156,6 +159,7 @@ def _wing_bench(work: Workbench) -> Bench:
             w / (2.0 * np.pi),
         ),
         compliance=compliance,
+        largest=float(np.abs(flight[:, LOAD_POINT - 3]).max()),
         length=rig.design.planform.semi_span,
         modal_mass=1.0 / motion["tip"] ** 2,
         region_places=places,
@@ -185,6 +189,7 @@ def _lumped_bench(work: Workbench) -> Bench:
             w / (2.0 * np.pi),
         ),
         compliance=compliance,
+        largest=release,
     )
 
 
@@ -266,12 +271,13 @@ def _trap(
         changes = changes.with_other(effect.changes)
     distances = []
     if trap.largest is not None:
-        # Halve the effect until it hides below the noise.
+        # Make the effect smaller until it hides below the noise.
         for _ in range(60):
             distance = known.distance(true_signals(work.rig, work.plan, chance, changes))
             if distance <= trap.largest:
                 break
-            drawn = [traps.scaled(effect, 0.7) for effect in drawn]
+            factor = min(0.7, 0.9 * float(np.sqrt(trap.largest / distance)))
+            drawn = [traps.scaled(effect, factor) for effect in drawn]
             changes = drawn[0].changes
     for effect in drawn:
         distances.append(known.distance(true_signals(work.rig, work.plan, chance, effect.changes)))

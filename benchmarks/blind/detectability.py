@@ -2,8 +2,8 @@
 
 d^2 is the least sum of squared differences, over noise, between the signals with the effect and those of
 the nominal structure whose calibrated parameters, gains, zeros and release amplitudes may move as their
-priors let them: twice the log likelihood ratio that the data could at best show. Gauss-Newton, with
-derivatives taken once.
+priors let them: twice the log likelihood ratio that the data could at best show. Levenberg-Marquardt, with
+new derivatives where the old ones no longer help.
 """
 
 from __future__ import annotations
@@ -19,9 +19,13 @@ from benchmarks.blind.instruments import Chance, Rig, Signals, true_signals
 from benchmarks.blind.plan import CampaignPlan
 
 FloatArray = NDArray[np.float64]
-DIFFERENCE = 0.1  # prior deviations
-ITERATIONS = 4
-FARTHEST = 4.0  # prior deviations that a parameter may move
+# In prior deviations:
+DIFFERENCE = 0.02
+ITERATIONS = 12
+QUICK, SETTLED = 0.5, 0.02  # relative gains: above, derivatives are kept; below, the fit is done
+NEGLIGIBLE = 1e-9
+STARTS = (-3.0, -2.25, -1.5, -0.75, -0.35, 0.35, 0.75, 1.5, 2.25, 3.0)
+LONGEST = 1.5  # step of a parameter
 
 
 @dataclass(frozen=True)
@@ -46,44 +50,82 @@ class Reference:
     normal: FloatArray
 
     def distance(self, signals: Signals) -> float:
-        """Return d^2 of signals."""
-        plan, names = self.plan, list(self.plan.priors)
+        """Return d^2 of signals: the least cost that Levenberg-Marquardt finds.
+
+        It begins at the truth or where another value of the first parameter, which scales the stiffness, fits
+        better: out of phase, a record says nothing about its frequency.
+        """
+        matrix, normal, fresh, damping = self.matrix, self.normal, True, 0.0
         moved = np.zeros(self.matrix.shape[1])
-        best = np.inf
+        residual = self._residual(signals, moved)
+        cost = float(residual @ residual)
+        for first in STARTS if cost > 100.0 else ():
+            there = np.zeros(len(moved))
+            there[0] = first
+            after = self._residual(signals, there)
+            reached = float(after @ after + first**2)
+            if reached < cost:
+                moved, residual, cost, fresh = there, after, reached, False
+        if not fresh:
+            matrix, fresh = self._derivatives(moved), True
+            normal = matrix.T @ matrix + np.eye(len(moved))
         for _ in range(ITERATIONS):
-            there = self._moved(moved, len(names))
-            gains = dict(zip(plan.channels, moved[len(names) :], strict=False))
-            difference = {
-                t.name: signals[t.name]
-                - there[t.name] * [1.0 + plan.channels[c].gain * gains[c] for c in t.channels]
-                for t in plan.trials
-            }
-            residual = whitened(plan, difference)
-            cost = float(residual @ residual + moved @ moved)
-            if cost > 0.999 * best:
-                best = min(best, cost)
+            if cost < NEGLIGIBLE:
                 break
-            best = cost
-            moved = moved + np.linalg.solve(self.normal, self.matrix.T @ residual - moved)
-            moved[: len(names)] = np.clip(moved[: len(names)], -FARTHEST, FARTHEST)
-        return best
+            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), matrix.T @ residual - moved)
+            longest = float(np.abs(step[: len(self.plan.priors)]).max())
+            there = moved + step * min(1.0, LONGEST / longest)
+            after = self._residual(signals, there)
+            reached = float(after @ after + there @ there)
+            if reached < cost:
+                gain = 1.0 - reached / cost
+                moved, residual, cost, damping = there, after, reached, 0.1 * damping
+                if gain < SETTLED and fresh:
+                    break
+                fresh = False
+                if gain > QUICK:
+                    continue
+            elif fresh:
+                damping = max(10.0 * damping, 0.1)
+                continue
+            matrix, fresh = self._derivatives(moved), True
+            normal = matrix.T @ matrix + np.eye(len(moved))
+        return cost
+
+    def _residual(self, signals: Signals, moved: FloatArray) -> FloatArray:
+        plan = self.plan
+        there = self._moved(moved, len(plan.priors))
+        gains = dict(zip(plan.channels, moved[len(plan.priors) :], strict=False))
+        difference = {
+            t.name: signals[t.name]
+            - there[t.name] * [1.0 + plan.channels[c].gain * gains[c] for c in t.channels]
+            for t in plan.trials
+        }
+        return whitened(plan, difference)
+
+    def _derivatives(self, moved: FloatArray) -> FloatArray:
+        return _derivatives(
+            self.rig, self.plan, self._chance(moved), self._moved(moved, len(self.plan.priors))
+        )
 
     def _moved(self, moved: FloatArray, parameters: int) -> Signals:
         if not moved.any():
             return self.nominal
+        return true_signals(self.rig, self.plan, self._chance(moved), Changes())
+
+    def _chance(self, moved: FloatArray) -> Chance:
         plan = self.plan
         values = {
             name: self.chance.parameters[name] + deviation * moved[k]
             for k, (name, (_, deviation)) in enumerate(plan.priors.items())
         }
         rings = [t for t in plan.trials if t.kind == "ringdown"]
-        first = parameters + len(plan.channels)
+        first = len(plan.priors) + len(plan.channels)
         amplitude = {
             t.name: self.chance.amplitude[t.name] * (1.0 + plan.release_deviation * moved[first + k])
             for k, t in enumerate(rings)
         }
-        chance = replace(self.chance, parameters=values, amplitude=amplitude)
-        return true_signals(self.rig, plan, chance, Changes())
+        return replace(self.chance, parameters=values, amplitude=amplitude)
 
 
 def whitened(plan: CampaignPlan, difference: Mapping[str, FloatArray]) -> FloatArray:
@@ -104,6 +146,12 @@ def whitened(plan: CampaignPlan, difference: Mapping[str, FloatArray]) -> FloatA
 def reference(rig: Rig, plan: CampaignPlan, chance: Chance) -> Reference:
     """Return the nominal signals of a case and their derivatives."""
     nominal = true_signals(rig, plan, chance, Changes())
+    matrix = _derivatives(rig, plan, chance, nominal)
+    return Reference(rig, plan, chance, nominal, matrix, matrix.T @ matrix + np.eye(matrix.shape[1]))
+
+
+def _derivatives(rig: Rig, plan: CampaignPlan, chance: Chance, nominal: Signals) -> FloatArray:
+    """Return derivatives (n, k) by parameters, gains and release amplitudes, per prior deviation."""
     columns = []
     for name, (_, deviation) in plan.priors.items():
         step = DIFFERENCE * deviation
@@ -124,5 +172,4 @@ def reference(rig: Rig, plan: CampaignPlan, chance: Chance) -> Reference:
                 t.name: nominal[t.name] * (plan.release_deviation if t is ring else 0.0) for t in plan.trials
             }
             columns.append(whitened(plan, part))
-    matrix = np.array(columns).T
-    return Reference(rig, plan, chance, nominal, matrix, matrix.T @ matrix + np.eye(matrix.shape[1]))
+    return np.array(columns).T

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.blind.changes import Changes, Fault
-from benchmarks.blind.laws import BOUC_WEN, FRICTION, GAP, JENKINS, POWER, Law
+from benchmarks.blind.laws import BOUC_WEN, DRAG, FRICTION, GAP, JENKINS, POWER, Law
 
 FloatArray = NDArray[np.float64]
 Truth = dict[str, float]
@@ -55,8 +55,8 @@ class Bench:
         Largest reading of each of them [unit].
     noise, scale : mapping of str to float
         Noise of each channel [unit]; SI value of its unit.
-    release : float
-        Largest release [m].
+    release, largest : float
+        Largest release, and largest motion of the free place in the whole campaign [m].
     displacements : tuple of str
         Displacement channels of static trials.
     runs : tuple of str
@@ -86,6 +86,7 @@ class Bench:
     noise: Mapping[str, float]
     scale: Mapping[str, float]
     release: float
+    largest: float
     displacements: tuple[str, ...]
     runs: tuple[str, ...]
     force: float
@@ -204,8 +205,6 @@ def quadratic_damping(generator: np.random.Generator, bench: Bench) -> Hidden:
     at_free = ratio * 3.0 * np.pi * scale.stiffness / (4.0 * scale.displacement * scale.frequency**2)
     truth = "quadratic_damping.coefficient"
     if bench.strip_shares is None or bench.strip_motion is None or bench.port_motion is None:
-        from benchmarks.blind.laws import DRAG
-
         law = Law(scale.port, DRAG, (at_free,))
         return Hidden("quadratic_damping", Changes(laws=(law,)), {truth: at_free}, scale.port)
     # Equal loss in the first mode.
@@ -216,21 +215,27 @@ def quadratic_damping(generator: np.random.Generator, bench: Bench) -> Hidden:
 
 
 def cubic_stiffness(generator: np.random.Generator, bench: Bench) -> Hidden:
-    scale = bench.free
+    """Hide a cubic spring where the structure moves most; stiffening at the largest motion of the campaign."""
     # Softer than -0.15 the tangent at the largest motion nearly vanishes.
-    ratio = (
-        log_uniform(generator, 0.02, 0.3) if generator.random() < 0.6 else -log_uniform(generator, 0.02, 0.15)
+    hard = generator.random() < 0.6
+    ratio = log_uniform(generator, 0.02, 0.3) if hard else -log_uniform(generator, 0.02, 0.15)
+    force = ratio * bench.free.stiffness / bench.largest**2
+    law = Law(bench.free.port, POWER, (force, 3.0, 0.0))
+    return Hidden(
+        "cubic_stiffness", Changes(laws=(law,)), {"cubic_stiffness.coefficient": force}, bench.free.port
     )
-    at_free = ratio * scale.stiffness / scale.displacement**2
-    truth = "cubic_stiffness.coefficient"
-    spread = bench.strip_shares is not None and bool(generator.integers(2))
-    if not spread or bench.strip_shares is None or bench.strip_motion is None or bench.port_motion is None:
-        law = Law(scale.port, POWER, (at_free, 3.0, 0.0))
-        return Hidden("cubic_stiffness", Changes(laws=(law,)), {truth: at_free}, scale.port)
+
+
+def spread_cubic_stiffness(generator: np.random.Generator, bench: Bench) -> Hidden:
+    """Hide cubic springs spread over the wing's area."""
+    if bench.strip_shares is None or bench.strip_motion is None or bench.port_motion is None:
+        raise ValueError("cubic springs can only be spread over the wing")
+    at_tip = log_uniform(generator, 0.02, 0.2) * bench.free.stiffness / bench.largest**2
     fourth = float(bench.strip_shares @ bench.strip_motion**4)
-    spread_cubic = at_free * bench.port_motion["tip"] ** 4 / fourth
-    values = {f"{truth}@{port}": spread_cubic * fourth / m**4 for port, m in bench.port_motion.items()}
-    return Hidden("cubic_stiffness", Changes(spread_cubic=spread_cubic), values, "span")
+    spread = at_tip * bench.port_motion["tip"] ** 4 / fourth
+    truth = "cubic_stiffness.coefficient"
+    values = {f"{truth}@{port}": spread * fourth / m**4 for port, m in bench.port_motion.items()}
+    return Hidden("cubic_stiffness", Changes(spread_cubic=spread), values, "span")
 
 
 def breathing_crack(generator: np.random.Generator, bench: Bench) -> Hidden:
@@ -245,7 +250,7 @@ def breathing_crack(generator: np.random.Generator, bench: Bench) -> Hidden:
 def free_play(generator: np.random.Generator, bench: Bench) -> Hidden:
     share = float(generator.uniform(0.4, 0.9)) if bench.rig == "wing" else log_uniform(generator, 0.1, 0.8)
     stiffness = share * bench.joint.stiffness
-    half_width = log_uniform(generator, 0.01, 0.2) * bench.joint.displacement
+    half_width = log_uniform(generator, 0.01, 0.4) * bench.joint.displacement
     law = Law(bench.joint.port, GAP, (stiffness, half_width))
     return Hidden(
         "free_play",
@@ -265,7 +270,7 @@ def jenkins(port: str, stiffness: float, slip_force: float, chi: float, count: i
 def joint_micro_slip(generator: np.random.Generator, bench: Bench) -> Hidden:
     share = float(generator.uniform(0.4, 0.9)) if bench.rig == "wing" else log_uniform(generator, 0.05, 0.5)
     stiffness = share * bench.joint.stiffness
-    slip_force = log_uniform(generator, 0.1, 1.0) * stiffness * bench.joint.displacement
+    slip_force = log_uniform(generator, 0.1, 2.0) * stiffness * bench.joint.displacement
     return Hidden(
         "joint_micro_slip",
         Changes(laws=(jenkins(bench.joint.port, stiffness, slip_force, -0.5),)),
@@ -277,7 +282,7 @@ def joint_micro_slip(generator: np.random.Generator, bench: Bench) -> Hidden:
 def bouc_wen_hysteresis(generator: np.random.Generator, bench: Bench) -> Hidden:
     share = float(generator.uniform(0.4, 0.9)) if bench.rig == "wing" else log_uniform(generator, 0.05, 0.5)
     stiffness = share * bench.joint.stiffness
-    limit = log_uniform(generator, 0.15, 1.5) * bench.joint.displacement
+    limit = log_uniform(generator, 0.15, 3.0) * bench.joint.displacement
     law = Law(bench.joint.port, BOUC_WEN, (stiffness, limit, 1.0))
     return Hidden(
         "bouc_wen_hysteresis",
@@ -360,7 +365,7 @@ def gauge_gain(generator: np.random.Generator, bench: Bench) -> Hidden:
 
 def gauge_misalignment(generator: np.random.Generator, bench: Bench) -> Hidden:
     channel = _pick(generator, bench.gauges)
-    value = float(np.radians(_signed(generator, 2.0, 15.0)))
+    value = float(np.radians(_signed(generator, 5.0, 15.0)))
     return _fault(
         "gauge_misalignment", Fault("rotation", (channel,), (value,)),
         {"gauge_misalignment.angle": value}, channel,

@@ -217,26 +217,21 @@ class Structure:
         z, bouc, forces = np.zeros(slip.shape), np.zeros(len(laws)), np.zeros(len(laws))
         if not any(law.is_elastic for law in laws):
             return target / unit, forces, z, bouc
+        # The displacement is held, not the force: force = (target + coupling . F) / unit.
         compliance = self.solve(ports.T)
-        flexibility, coupling = ports @ compliance, release.measured_at @ compliance
-        along = ports @ bend
-
-        def reached(force: float) -> float:
-            z[:], bouc[:] = 0.0, 0.0
-            forces[:] = _static_path(
-                (force * along)[None], flexibility, kinds, numbers, slip, stiffness, z, bouc, 4 * LOAD_STEPS
-            )[0]
-            return force * unit - float(coupling @ forces) - target
-
-        # Secant iteration: the path is nearly straight.
-        one, two = target / unit, 1.02 * target / unit
-        first, second = reached(one), reached(two)
-        for _ in range(40):
-            if abs(second) <= 1e-10 * abs(target) or second == first:
-                break
-            one, two, first = two, two - second * (two - one) / (second - first), second
-            second = reached(two)
-        return two, forces, z, bouc
+        coupling, along = release.measured_at @ compliance, ports @ bend
+        forces = _static_path(
+            (target / unit * along)[None],
+            np.ascontiguousarray(ports @ compliance - np.outer(along, coupling) / unit),
+            kinds,
+            numbers,
+            slip,
+            stiffness,
+            z,
+            bouc,
+            4 * LOAD_STEPS,
+        )[0]
+        return (target + float(coupling @ forces)) / unit, forces, z, bouc
 
     def ringdown(self, release: Release, laws: Sequence[Law] = (), refinement: int = 1) -> FloatArray:
         """Return the outputs (n, C) after a release, at `release.times`."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.blind.changes import Changes, Fault
-from benchmarks.blind.effects import DRAWS, Bench, Hidden, log_uniform
+from benchmarks.blind.effects import DRAWS, Bench, Hidden, log_uniform, spread_cubic_stiffness
 from benchmarks.blind.instruments import Measured, Signals
 from benchmarks.blind.laws import FRICTION, Law
 from benchmarks.blind.plan import CampaignPlan
@@ -159,6 +159,10 @@ def _friction_elsewhere(generator: np.random.Generator, bench: Bench) -> tuple[H
     )  # fmt: skip
 
 
+def _spread_cubic(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, ...]:
+    return (spread_cubic_stiffness(generator, bench),)
+
+
 # ---------------------------------------------------------------- spoiled data
 
 
@@ -245,6 +249,7 @@ TRAPS: dict[str, Trap] = {
     "two effects that cancel in f1": Trap(_cancelling, ("unexplained",), rigs=("wing",)),
     "gain error at a damage site": Trap(_gain_at_damage, ("unexplained",), rigs=("wing",)),
     "known effect in an unexpected place": Trap(_friction_elsewhere, ("unexplained",)),
+    "cubic springs spread over the wing": Trap(_spread_cubic, ("unexplained", "family"), rigs=("wing",)),
     "outliers": Trap(_nothing, MODEST, _outliers),
     "clipped channel": Trap(_nothing, ("data error", "unexplained"), _clipped),
     "swapped channels": Trap(_nothing, ("data error", "unexplained"), _swapped),

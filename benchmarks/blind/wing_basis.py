@@ -51,7 +51,7 @@ PORT_STATIONS = (0.4, 1.828)
 """Stations [m] between which something may sit on the wing."""
 MIDDLE = (0.914, 0.3)
 """The place of a middle load and displacement: y [m], chord fraction; there a rib meets a web."""
-REGION_LINES = ((4, 6), (7, 9), (11, 13), (14, 16), (16, 18), (17, 19), (23, 25), (25, 27), (27, 30))
+REGION_LINES = ((4, 7), (7, 9), (12, 14), (13, 15), (15, 17), (17, 19), (24, 26), (26, 28), (27, 30))
 """Regions that may be damaged: first and last mesh line along the span."""
 REGION_LOSSES = (0.25, 0.6)
 """Losses at which the solutions in a damaged region's basis are taken."""

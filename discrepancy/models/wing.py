@@ -402,8 +402,8 @@ class WingModel:
             row = self.wing.output_row(output, component)
             if own is None or row is None:
                 raise ModelError(
-                    f"The wing has no output {output!r}; it has strain[0] to "
-                    f"strain[{self.wing.gauge_count - 1}], tip_displacement, load_point_displacement and "
+                    f"The wing has no output {output!r}; it has strain[1] to "
+                    f"strain[{self.wing.gauge_count}], tip_displacement, load_point_displacement and "
                     f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction."
                 )
             moving = own is Quantity.DISPLACEMENT and quantity in (Quantity.VELOCITY, Quantity.ACCELERATION)

@@ -1,0 +1,455 @@
+"""Hidden effects against closed forms and other integrators."""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import benchmarks.blind
+from benchmarks.blind.cases import DETECTABLE, KINDS, Order, make_case, orders, workbench
+from benchmarks.blind.changes import Changes, Fault
+from benchmarks.blind.detectability import reference
+from benchmarks.blind.effects import DRAWS, LUMPED, jenkins
+from benchmarks.blind.instruments import Chance, draw_chance, measure, true_signals
+from benchmarks.blind.laws import BOUC_WEN, DRAG, FRICTION, GAP, POWER, Law
+from benchmarks.blind.lumped_rig import MASS, PORTS, LumpedRig, lumped_campaign, model_text
+from benchmarks.blind.structure import Release, Structure
+from benchmarks.blind.traps import TRAPS
+from benchmarks.blind.writing import write_case
+
+RATE = 250.0
+STIFFNESS, W = 1000.0, 10.0 * np.pi  # N/m, rad/s: 5 Hz
+
+
+def oscillator(alpha: float = 0.0, **more: float) -> Structure:
+    """One mass on one spring; its motion is the port."""
+    one = np.ones(1)
+    return Structure(
+        np.array([[STIFFNESS]]),
+        np.array([[STIFFNESS / W**2]]),
+        alpha,
+        0.0,
+        np.ones((1, 1)),
+        {"x": one},
+        1,
+        **more,
+    )
+
+
+def release(amplitude: float = 0.01, seconds: float = 2.0) -> Release:
+    one = np.ones(1)
+    return Release(amplitude, one, one, np.arange(int(seconds * RATE)) / RATE)
+
+
+def peaks(values: np.ndarray) -> np.ndarray:
+    inner = values[1:-1]
+    at = np.flatnonzero((inner >= values[:-2]) & (inner > values[2:])) + 1
+    # the vertex of the parabola through three samples
+    a, b, c = values[at - 1], values[at], values[at + 1]
+    return b - (c - a) ** 2 / (8.0 * (a - 2.0 * b + c))
+
+
+def motion(
+    law: Law, amplitude: float = 0.01, seconds: float = 2.0, structure: Structure | None = None
+) -> np.ndarray:
+    return (structure or oscillator()).ringdown(release(amplitude, seconds), [law])[:, 0]
+
+
+# ---------------------------------------------------------------- laws
+
+
+def test_dry_friction_takes_two_widths_from_every_half_swing_and_stops_within_one() -> None:
+    friction = 0.4
+    width = friction / STIFFNESS
+    values = motion(Law("x", FRICTION, (friction, 0.0)))
+    swing = 2.0 * np.pi / W
+    turns = np.interp(np.arange(0.0, 12.5) * swing / 2.0, np.arange(len(values)) / RATE, values)
+    wanted = (0.01 - 2.0 * width * np.arange(13)) * (-1.0) ** np.arange(13)
+    # between samples the turning points are rounded off by (w dt)^2 / 8
+    np.testing.assert_allclose(turns[:12], wanted[:12], atol=0.01 * 0.01)
+    assert np.ptp(values[-50:]) == 0.0
+    assert abs(values[-1]) <= width
+
+
+def test_structural_damping_has_the_same_decrement_at_every_amplitude() -> None:
+    loss = 0.05
+    tops = peaks(motion(Law("x", FRICTION, (loss * STIFFNESS, 1.0))))
+    # Moving from rest at a to rest at b: (1 + g) b^2 = (1 - g) a^2 in each half, out and back.
+    wanted = (1.0 - loss) / (1.0 + loss)
+    np.testing.assert_allclose(tops[1:] / tops[:-1], wanted, rtol=2e-3)
+
+
+def test_drag_follows_the_energy_balance_of_a_half_swing() -> None:
+    drag = 3.0
+    mass = STIFFNESS / W**2
+    tops = np.concatenate([[0.01], peaks(motion(Law("x", DRAG, (drag,)), seconds=1.0))])
+    # (1 + s x) exp(-s x), s = 2 c / m, is the same at both ends of a half swing.
+    for before, after in itertools.pairwise(tops[:4]):
+        half = _after_half_swing(2.0 * drag / mass, before)
+        assert _after_half_swing(2.0 * drag / mass, half) == pytest.approx(after, rel=1e-3)
+
+
+def _after_half_swing(s: float, start: float) -> float:
+    # x' = -v: v^2 = A exp(s x) + (w^2 / s^2)(2 + 2 s x) ... solved for the other turning point
+    from scipy.optimize import brentq
+
+    def kept(x: float) -> float:
+        return (1.0 + s * x) * np.exp(-s * x)
+
+    return -float(brentq(lambda x: kept(x) - kept(start), -start, -1e-9))
+
+
+@pytest.mark.parametrize("ratio", [0.1, 0.3, -0.2])
+def test_cubic_spring_has_the_period_of_duffing(ratio: float) -> None:
+    amplitude = 0.01
+    values = motion(Law("x", POWER, (ratio * STIFFNESS / amplitude**2, 3.0, 0.0)), amplitude)
+    # Period by the energy integral, x = A sin t: T = 4/w int (1 + r (1 + sin^2 t) / 2)^(-1/2) dt.
+    t, weight = np.polynomial.legendre.leggauss(40)
+    t, weight = np.pi / 4.0 * (t + 1.0), np.pi / 4.0 * weight
+    period = 4.0 / W * float(weight @ (1.0 + 0.5 * ratio * (1.0 + np.sin(t) ** 2)) ** -0.5)
+    assert _period(values) == pytest.approx(period, rel=1e-4)
+
+
+def _period(values: np.ndarray) -> float:
+    up = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
+    crossing = (up + values[up] / (values[up] - values[up + 1])) / RATE
+    return float((crossing[-1] - crossing[0]) / (len(crossing) - 1))
+
+
+def test_breathing_crack_has_half_a_period_of_each_spring() -> None:
+    values = motion(Law("x", POWER, (-0.4 * STIFFNESS, 1.0, -1.0)), seconds=4.0)
+    period = np.pi / W * (1.0 + 1.0 / np.sqrt(0.6))
+    assert _period(values) == pytest.approx(period, rel=1e-4)
+
+
+def test_free_play_lengthens_the_period_by_the_flight_through_the_gap() -> None:
+    amplitude, gap = 0.01, 0.002
+    values = motion(Law("x", GAP, (STIFFNESS, gap)), amplitude, 4.0)
+    bend = amplitude - gap
+    period = 2.0 * np.pi / W + 4.0 * gap / (W * bend)
+    assert _period(values) == pytest.approx(period, rel=1e-4)
+
+
+def test_drifting_stiffness_follows_airy_functions() -> None:
+    from scipy.special import airy
+
+    rate = 0.05
+    values = oscillator(stiffness_rate=rate).ringdown(release())[:, 0]
+    scale = (rate * W**2) ** (1.0 / 3.0)
+
+    def argument(t: np.ndarray | float) -> np.ndarray:
+        return -(1.0 + rate * np.asarray(t)) * W**2 / scale**2
+
+    a0, da0, b0, db0 = airy(argument(0.0))
+    a, b = np.linalg.solve([[a0, b0], [da0, db0]], [0.01, 0.0])
+    ai, _, bi, _ = airy(argument(release().times))
+    np.testing.assert_allclose(values, a * ai + b * bi, atol=1e-8)
+
+
+def test_masing_rule_holds_for_jenkins_elements() -> None:
+    """Loads up, down, up: the unloading branch is the first branch twice as large."""
+    law = jenkins("x", 0.8 * STIFFNESS, 5.0, -0.5)
+    forces = np.concatenate([np.linspace(0.1, 6.0, 60), np.linspace(6.0, -6.0, 121)[1:]])
+    values = oscillator().static(forces[None], [law])[:, 0]
+    first = np.interp(np.linspace(0.0, 6.0, 25), [0.0, *forces[:60]], [0.0, *values[:60]])
+    down = values[59] - np.interp(np.linspace(0.0, 12.0, 25), 6.0 - forces[59:180], values[59:180])
+    np.testing.assert_allclose(down, 2.0 * first, atol=2e-3 * values.max())
+    assert values[59] > 6.0 / STIFFNESS * 1.05
+
+
+def test_jenkins_elements_hold_the_stated_force_when_all_slip() -> None:
+    stiffness, slip = 800.0, 5.0
+    for chi in (-0.5, 0.0, -0.8):
+        law = jenkins("x", stiffness, slip, chi, 4000)
+        assert float(law.stiffness @ law.slip) == pytest.approx(slip, rel=2e-3)
+
+
+def test_bouc_wen_against_the_quadrature_of_its_loading_branch() -> None:
+    share, limit = 0.6, 0.004
+    force = 5.0
+    x = float(
+        oscillator().static(np.array([[force]]), [Law("x", BOUC_WEN, (share * STIFFNESS, limit, 1.0))])[0, 0]
+    )
+    # order 1: z = z_y (1 - exp(-x / z_y)) while loading
+    z = limit * (1.0 - np.exp(-x / limit))
+    assert (1.0 - share) * STIFFNESS * x + share * STIFFNESS * z == pytest.approx(force, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        Law("joint", GAP, (2000.0, 4e-4)),
+        Law("joint", POWER, (-1500.0, 1.0, -1.0)),
+        Law("end", POWER, (4e6, 3.0, 0.0)),
+        Law("end", DRAG, (8.0,)),
+        Law("joint", BOUC_WEN, (2000.0, 0.002, 1.0)),
+    ],
+)
+def test_motion_of_the_rig_against_a_general_integrator(law: Law) -> None:
+    structure = LumpedRig().structure(_mean(), Changes())
+    end, port = PORTS["end"], PORTS[law.port]
+    times = np.arange(250) / RATE
+    values = structure.ringdown(Release(0.012, end, end, times), [law])
+    inverse = np.linalg.inv(structure.mass)
+    damping = structure.alpha * structure.mass + structure.beta * structure.stiffness
+
+    def force(x: float, z: float) -> float:
+        a, b, *_ = (*law.numbers, 0.0, 0.0)
+        if law.kind == GAP:
+            return -a * float(np.clip(x, -b, b))
+        if law.kind == POWER:
+            return 0.0 if law.numbers[2] * x < 0.0 else a * abs(x) ** b * np.sign(x)
+        return a * (z - x) if law.kind == BOUC_WEN else 0.0
+
+    def rates(t: float, state: np.ndarray) -> np.ndarray:
+        u, v, z = state[:3], state[3:6], state[6]
+        x, speed = port @ u, port @ v
+        inside = force(x, z) if law.kind != DRAG else law.numbers[0] * abs(speed) * speed
+        a = inverse @ (-structure.stiffness @ u - damping @ v - port * inside)
+        dz = (
+            speed * (1.0 if speed * z <= 0.0 else 1.0 - abs(z) / law.numbers[1])
+            if law.kind == BOUC_WEN
+            else 0.0
+        )
+        return np.concatenate([v, a, [dz]])
+
+    # The held state: the rig's own first sample, checked for equilibrium apart from the holding force.
+    start = values[0, :3]
+    z = law.numbers[1] * (1.0 - np.exp(-(port @ start) / law.numbers[1])) if law.kind == BOUC_WEN else 0.0
+    rest = structure.stiffness @ start + port * force(port @ start, z)
+    np.testing.assert_allclose(rest[:2], 0.0, atol=2e-3)
+    assert start[2] == pytest.approx(0.012)
+    found = solve_ivp(
+        rates,
+        (0.0, times[-1]),
+        [*start, 0.0, 0.0, 0.0, z],
+        "DOP853",
+        times,
+        rtol=1e-9,
+        atol=1e-12,
+        max_step=1e-3,
+    )
+    np.testing.assert_allclose(values[:, :3], found.y[:3].T, atol=0.012 * 3e-4)
+
+
+def _mean() -> dict[str, float]:
+    return {name: mean for name, (mean, _) in lumped_campaign().priors.items()}
+
+
+def test_flexibility_behind_a_port_is_the_limit_of_light_masses() -> None:
+    """Higher modes without inertia: the same as with all modes, where their masses are small."""
+    stiffness = np.array([[3000.0, -2000.0], [-2000.0, 2000.0]])
+    mass = np.diag([1e-3, 1.0])
+    ports = {"root": np.array([1.0, 0.0])}
+    end = np.array([0.0, 1.0])
+    parts = (stiffness, mass, 0.2, 2e-3, np.eye(2), ports)
+    few, all_modes = Structure(*parts, 1), Structure(*parts, 2)
+    law = Law("root", GAP, (600.0, 0.001))
+    at = Release(0.02, end, end, np.arange(300) / RATE)
+    # The light mass is stiff: a small step for it.
+    wanted = all_modes.ringdown(at, [law], refinement=10)
+    np.testing.assert_allclose(few.ringdown(at, [law]), wanted, atol=0.02 * 3e-3)
+
+
+def test_friction_behind_a_flexibility_sticks_where_a_rigid_one_sticks() -> None:
+    """The joint of a beam on a stiff spring: it holds until the spring's force exceeds the friction."""
+    stiffness = np.array([[3000.0, -2000.0], [-2000.0, 2000.0]])
+    mass = np.diag([1e-6, 1.0])
+    parts = (stiffness, mass, 0.0, 1e-3, np.eye(2), {"root": np.array([1.0, 0.0])})
+    end = np.array([0.0, 1.0])
+    at = Release(0.02, end, end, np.arange(500) / RATE)
+    values = Structure(*parts, 1).ringdown(at, [Law("root", FRICTION, (5.0, 0.0))])[:, 0]
+    moves = np.abs(np.diff(values)) > 1e-6
+    assert moves[:20].any()
+    assert not moves[-250:].any()
+    # Stuck, the end swings on the second spring alone.
+    end_motion = Structure(*parts, 1).ringdown(at, [Law("root", FRICTION, (5.0, 0.0))])[-250:, 1]
+    assert _period(end_motion - end_motion.mean()) == pytest.approx(2.0 * np.pi / np.sqrt(2000.0), rel=5e-3)
+
+
+# ---------------------------------------------------------------- instruments
+
+
+def _signals(changes: Changes) -> dict[str, np.ndarray]:
+    work = workbench("lumped")
+    return true_signals(work.rig, work.plan, work.mean, changes)
+
+
+def test_nothing_hidden_is_the_linear_rig() -> None:
+    work = workbench("lumped")
+    structure = work.rig.structure(work.mean.parameters, Changes())
+    trial = next(t for t in work.plan.trials if t.kind == "ringdown")
+    shown = _signals(Changes())[trial.name][:, trial.channels.index("x3")] * 1e-3
+    w2, shapes = np.linalg.eigh(
+        np.linalg.solve(np.sqrt(MASS), structure.stiffness) @ np.linalg.inv(np.sqrt(MASS))
+    )
+    start = np.linalg.solve(structure.stiffness, PORTS["end"])
+    start *= trial.release / start[2]
+    decay = 0.5 * (structure.alpha + structure.beta * w2)
+    damped = np.sqrt(w2 - decay**2)
+    t = trial.rows[:, None]
+    q = np.exp(-decay * t) * (np.cos(damped * t) + decay / damped * np.sin(damped * t))
+    wanted = (q * (shapes.T @ np.sqrt(MASS) @ start)) @ shapes.T @ np.linalg.inv(np.sqrt(MASS))
+    np.testing.assert_allclose(shown, wanted[:, 2], atol=1e-12)
+
+
+def test_integrated_linear_motion_is_the_closed_form() -> None:
+    work = workbench("lumped")
+    structure = work.rig.structure(work.mean.parameters, Changes())
+    end = PORTS["end"]
+    at = Release(0.012, end, end, np.arange(500) / RATE + 1.3e-3)
+    np.testing.assert_allclose(structure.ringdown(at), structure.free_ringdown(at), atol=0.012 * 1e-6)
+
+
+def test_high_pass_turns_and_shrinks_a_steady_tone_as_its_transfer_function_says() -> None:
+    tau = 0.05
+    before, after = _signals(Changes()), _signals(Changes(faults=(Fault("high_pass", ("x3",), (tau,)),)))
+    trial = next(t for t in workbench("lumped").plan.trials if t.release == 0.012)
+    k = trial.channels.index("x3")
+    assert after[trial.name][0, k] == 0.0
+    late = slice(250, 850)
+    structure = workbench("lumped").rig.structure(_mean(), Changes())
+    w = structure.angular_frequency[0]
+    decay = 0.5 * (structure.alpha + structure.beta * w**2)
+    pole = complex(-decay, np.sqrt(w**2 - decay**2))
+    t = trial.rows[late]
+    basis = np.column_stack([np.exp(pole * t).real, -np.exp(pole * t).imag])
+    (a, b), (c, d) = (np.linalg.lstsq(basis, s[trial.name][late, k], rcond=None)[0] for s in (before, after))
+    wanted = pole * tau / (1.0 + pole * tau)
+    assert complex(c, d) / complex(a, b) == pytest.approx(wanted, rel=2e-2)
+
+
+def test_clock_gain_offset_drift_and_temperature() -> None:
+    plan = workbench("lumped").plan
+    plain = _signals(Changes())
+    shown = _signals(
+        Changes(
+            clock_rate=0.01,
+            faults=(
+                Fault("gain", ("s1",), (0.1,)),
+                Fault("drift", ("s3",), (50.0, 1.0)),
+                Fault("thermal", ("s2",), (2e-6,)),
+                Fault("offset", ("x1",), (3e-4,), "B"),
+            ),
+        )
+    )
+    warm = next(t for t in plan.trials if t.kind == "static" and t.temperature)
+    other = next(t for t in plan.trials if t.run == "B")
+    columns = {name: k for k, name in enumerate(warm.channels)}
+    change = shown[warm.name] - plain[warm.name]
+    np.testing.assert_allclose(change[:, columns["s1"]], 0.1 * plain[warm.name][:, columns["s1"]])
+    np.testing.assert_allclose(change[:, columns["s2"]], 2.0 * warm.temperature)
+    np.testing.assert_allclose(change[:, columns["s3"]], 50.0 * warm.campaign_times / plan.duration)
+    np.testing.assert_allclose(change[:, columns["x1"]], 0.0)
+    np.testing.assert_allclose((shown[other.name] - plain[other.name])[:, columns["x1"]], 0.3)
+    ring = next(t for t in plan.trials if t.kind == "ringdown")
+    x = ring.channels.index("x1")
+    early = np.interp(1.01 * ring.rows[:500], ring.rows, plain[ring.name][:, x])
+    np.testing.assert_allclose(shown[ring.name][:500, x], early, atol=0.03)
+
+
+def test_load_cell_and_modulus() -> None:
+    plan = workbench("lumped").plan
+    plain = _signals(Changes())
+    trial = plan.trials[0]
+    shown = _signals(Changes(force_gain=0.03, force_tare=0.5))[trial.name]
+    np.testing.assert_allclose(shown, plain[trial.name] * (1.03 + 0.5 / trial.rows[:, None]), rtol=1e-9)
+    warm = next(t for t in plan.trials if t.kind == "static" and t.temperature)
+    soft = _signals(Changes(modulus_temperature=2e-3))
+    np.testing.assert_allclose(soft[warm.name], plain[warm.name] / (1.0 - 2e-3 * 15.0))
+    np.testing.assert_allclose(soft[trial.name], plain[trial.name])
+
+
+def test_noise_is_as_large_and_as_coloured_as_asked() -> None:
+    work = workbench("lumped")
+    generator = np.random.default_rng(3)
+    measured = measure(generator, work.plan, work.nominal, Changes(), correlation=0.7)
+    for name, samples in measured.noise.items():
+        assert np.std(samples) == pytest.approx(work.plan.channels[name].noise, rel=0.25)
+        assert np.corrcoef(samples[1:], samples[:-1])[0, 1] == pytest.approx(0.7, abs=0.12)
+
+
+# ---------------------------------------------------------------- detectability and cases
+
+
+def test_distance_is_zero_for_what_calibration_absorbs_and_large_for_what_it_cannot() -> None:
+    work = workbench("lumped")
+    known = reference(work.rig, work.plan, work.mean)
+    assert known.distance(known.nominal) == 0.0
+    shifted = {**work.mean.parameters, "stiffness_factor": 1.01}
+    moved = true_signals(work.rig, work.plan, replace(work.mean, parameters=shifted), Changes())
+    assert known.distance(moved) <= 1.05  # one prior deviation
+    law = Law("joint", FRICTION, (0.3, 0.0))
+    assert known.distance(_signals(Changes(laws=(law,)))) > 1e4
+
+
+@pytest.mark.parametrize("identifier", LUMPED)
+def test_every_effect_of_the_rig_is_detectable_and_repeats_bit_for_bit(identifier: str) -> None:
+    order = Order("case-1", "catalogue", "lumped", (identifier,), 5)
+    one, two = make_case(order), make_case(order)
+    assert one.truth == two.truth
+    assert one.truth["d2"][identifier] >= DETECTABLE
+    assert one.truth["identifiers"] == [identifier]
+    for name, values in one.measured.values.items():
+        assert np.isfinite(values).all()
+        np.testing.assert_array_equal(values, two.measured.values[name])
+
+
+@pytest.mark.parametrize("trap", [name for name, trap in TRAPS.items() if "lumped" in trap.rigs])
+def test_traps_are_set(trap: str) -> None:
+    case = make_case(Order("case-1", "trap", "lumped", (), 8, trap))
+    assert case.truth["trap"] == trap
+    assert case.truth["accepted"]
+    if TRAPS[trap].largest is not None:
+        assert max(case.truth["d2"].values()) <= TRAPS[trap].largest
+    if trap == "wrong noise label":
+        assert not case.measured.noise
+
+
+def test_written_case_tells_nothing_and_seals_everything(tmp_path: Path) -> None:
+    case = make_case(Order("case-0007", "catalogue", "lumped", ("coulomb_friction",), 5))
+    write_case(case, tmp_path / "campaigns", tmp_path / "sealed")
+    folder = tmp_path / "campaigns" / "case-0007"
+    text = "".join(file.read_text(encoding="utf-8") for file in sorted(folder.iterdir()))
+    assert not any(identifier in text for identifier in set(DRAWS) - {"load_place"})  # a key
+    assert (folder / "model.toml").read_text(encoding="utf-8") == model_text()
+    sealed = json.loads((tmp_path / "sealed" / "case-0007.json").read_text(encoding="utf-8"))
+    assert sealed["identifiers"] == ["coulomb_friction"]
+    rows = np.loadtxt(folder / "05.csv", delimiter=",", skiprows=1)
+    trial = case.plan.trials[4]
+    np.testing.assert_allclose(rows[:, 0], trial.rows, atol=1e-9)
+    np.testing.assert_allclose(rows[:, 1:], case.measured.values[trial.name], rtol=1e-6)
+
+
+def test_orders_hold_every_kind_and_names_tell_nothing() -> None:
+    made = orders(2, 10, 6, 1, 1, seed=4)
+    assert {order.kind for order in made} == set(KINDS)
+    assert sum(order.kind == "catalogue" for order in made) == 2 * len(DRAWS)
+    assert [order.name for order in made] == [f"case-{k:04d}" for k in range(1, len(made) + 1)]
+    assert len({order.seed for order in made}) == len(made)
+    assert made == orders(2, 10, 6, 1, 1, seed=4)
+    assert made != orders(2, 10, 6, 1, 1, seed=5)
+
+
+def test_generators_share_no_code_with_what_names() -> None:
+    forbidden = ("discrepancy", "fe.patch", "fe.motion", "fe.patched_wing", "fe.sensors", "fe.reduced")
+    for file in Path(benchmarks.blind.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            assert not [name for name in names if name.startswith(forbidden)], file
+
+
+def test_chance_stays_within_reach_of_the_prior() -> None:
+    plan = lumped_campaign()
+    for seed in range(20):
+        chance: Chance = draw_chance(np.random.default_rng(seed), plan)
+        for name, (mean, deviation) in plan.priors.items():
+            assert abs(chance.parameters[name] - mean) <= 2.5 * deviation
