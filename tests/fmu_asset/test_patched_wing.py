@@ -159,8 +159,7 @@ def trial(kind: TrialKind, count: int, release: float = 0.0, **given: object) ->
 def expected(
     model: WingModel, given: Trial, patch: ModelPatch, health: Sequence[float] = (0.0, 0.0)
 ) -> np.ndarray:
-    names = [f"strain[{gauge}]" for gauge in range(24)] + OUTPUTS[24:]  # gauges count from 0 there
-    outputs = tuple((name, model.output_quantity(name) or Quantity.STRAIN) for name in names)
+    outputs = tuple((name, model.output_quantity(name) or Quantity.STRAIN) for name in OUTPUTS)
     bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SensorRotation)))
     turned = len(bare) < len(patch)
     conditions = Conditions(STATE, health=np.array([health]))
@@ -228,7 +227,7 @@ def test_flights_are_those_of_the_naming_side(
     factors = np.array([1.0, 2.0, 3.5, -0.5, 2.5])
     damage = np.column_stack((0.15 * np.arange(5), 0.1 * np.ones(5)))
     given = trial(TrialKind.FLIGHT, 5, load_factor=factors, time=np.arange(5.0))
-    outputs = tuple((f"strain[{gauge}]", Quantity.STRAIN) for gauge in range(24))
+    outputs = tuple((name, Quantity.STRAIN) for name in OUTPUTS[:24])
     patch = ModelPatch(EFFECTS[name])
     wanted = naming_side.respond(given, outputs, patch, Conditions(STATE, health=damage)).values
     with FmiAsset(patched, door, isolated=False, parameters=on(name)) as asset:
@@ -402,15 +401,15 @@ def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(
     model: ReducedModel, arrays: PatchArrays, fmu: Path, door: Binding, tmp_path: Path
 ) -> None:
     channels = {
-        "g2": Channel("g2", Quantity.STRAIN, "strain[2]", None),
+        "g3": Channel("g3", Quantity.STRAIN, "strain[3]", None),
         "tip": Channel("tip", Quantity.DISPLACEMENT, "tip_displacement", None),
         "rate": Channel("rate", Quantity.VELOCITY, "tip_displacement", None),
     }
     campaign = Campaign("chain", channels, (), None, {}, "")
     outputs = fmu_outputs(campaign)
-    assert outputs == {"g2": "strain[3]", "tip": "tip_displacement"}
-    patch = ModelPatch((SensorGain("g2", 0.25),))
-    named = NamedEffect("gauge_gain", "Gauge gain", "g2", "gain", (), (), patch)
+    assert outputs == {"g3": "strain[3]", "tip": "tip_displacement"}
+    patch = ModelPatch((SensorGain("g3", 0.25),))
+    named = NamedEffect("gauge_gain", "Gauge gain", "g3", "gain", (), (), patch)
     origin = Origin("chain", "wing", "ab" * 32, "cd" * 32, "uav-twin", collect_provenance(1))
     path = write_patch(tmp_path / "patch.json", (named,), origin, channels=outputs)
     assert read_patch(path).channels == outputs
