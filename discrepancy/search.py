@@ -181,7 +181,7 @@ class Search:
         enough = PROMISING * ranked[0][0].gain if ranked else 0.0
         first = max(LEAST_PROMISING, sum(changes[0].gain >= enough for changes in ranked))
         found = self._from_beginnings(base, near, ranked[:first])
-        if not any(absolute_gate(self.problem, item).passed for item in found):
+        if not base.candidate.terms and not any(absolute_gate(self.problem, item).passed for item in found):
             found += self._from_beginnings(base, near, ranked[first:])
         return found
 
