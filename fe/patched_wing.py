@@ -41,6 +41,10 @@ _STRAIN = re.compile(r"strain\[(\d+)\]")
 _NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
 _DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
 
+TIP_OFFSET = 1.02
+"""Where the weight of a part of the skin would vanish, in semi-spans."""
+LEAST_GAUGE_LENGTH = 1e-3
+"""A gauge without a length averages over this [m]."""
 ITERATIONS = 3
 """Steps of the subspace iteration for the modes of a patched wing."""
 EMPTY = ModelPatch()
@@ -136,6 +140,16 @@ def motion_basis(
     return np.asarray(np.concatenate((basis, np.linalg.qr(rest)[0]), axis=1))
 
 
+def _boxes(patch: ModelPatch) -> list[LocalStiffnessLoss]:
+    return [item for item in patch if isinstance(item, LocalStiffnessLoss) and item.loss != 0.0]
+
+
+def strain_gauge(output: str) -> int:
+    """Return k of an output strain[k], -1 for other outputs."""
+    strain = _STRAIN.fullmatch(output)
+    return -1 if strain is None else int(strain.group(1))
+
+
 class _Terms(NamedTuple):
     """What the matrices of a structure are the sum of."""
 
@@ -206,14 +220,11 @@ class PatchedWing:
             If a change leaves no stiffness, or a place lies off the wing.
         """
         arrays, e = self.arrays, young_modulus_factor
-        remaining = np.ones(len(arrays.strip_lines) - 1)
         compliance = 0.0
         points = []
         for item in patch:
             if isinstance(item, ModulusTemperature):
                 e = e * (1.0 - item.coefficient * temperature_difference)
-            elif isinstance(item, LocalStiffnessLoss):
-                remaining *= 1.0 - item.loss * self._overlap(item)
             elif isinstance(item, RootCompliance):
                 compliance += item.compliance
             elif isinstance(item, PointMass):
@@ -224,10 +235,6 @@ class PatchedWing:
                 f"The factors on the stiffness of skin and defect regions must be positive, but are "
                 f"{theta[0]:g}, {theta[1]:g} and {theta[2]:g}; lessen the losses or the coefficient."
             )
-        if remaining.min() <= 0.0:
-            raise InvalidPatchError(
-                f"A local stiffness loss must leave some stiffness, but leaves {remaining.min():g} of it."
-            )
         spring = 0.0
         if compliance != 0.0:
             flexibility = 1.0 / arrays.flap_spring + compliance
@@ -237,6 +244,8 @@ class PatchedWing:
                     f"{-compliance:g}; give a compliance above {-1.0 / arrays.flap_spring:g}."
                 )
             spring = 1.0 / flexibility - arrays.flap_spring
+        boxes = _boxes(patch)
+        remaining = self._smeared(*self._remaining(boxes)) if boxes else np.ones(len(arrays.strip_lines) - 1)
         parts = np.flatnonzero(remaining[arrays.strip_of] != 1.0).astype(np.int64)
         factors = (remaining[arrays.strip_of[parts]] - 1.0) * theta[arrays.term_of[parts]]
         return PatchedStructure(
@@ -262,11 +271,32 @@ class PatchedWing:
                 mass += added * np.multiply.outer(row, row)
         return np.asarray(mass)
 
-    def _overlap(self, box: LocalStiffnessLoss) -> FloatArray:
-        """Share (S,) of each strip's length that lies in a box."""
+    def _remaining(self, boxes: list[LocalStiffnessLoss]) -> tuple[FloatArray, FloatArray]:
+        """Return breaks (m + 1,) along the span and what the skin keeps (m,) of its stiffness between them."""
         lines = self.arrays.strip_lines
-        inside = np.minimum(lines[1:], box.start + box.length) - np.maximum(lines[:-1], box.start)
-        return np.asarray(np.maximum(inside, 0.0) / np.diff(lines))
+        edges = [edge for box in boxes for edge in (box.start, box.start + box.length)]
+        breaks = np.unique(np.concatenate((lines, np.clip(edges, lines[0], lines[-1]))))
+        middles = 0.5 * (breaks[1:] + breaks[:-1])
+        remaining = np.ones(len(middles))
+        for box in boxes:
+            remaining *= 1.0 - box.loss * ((middles > box.start) & (middles < box.start + box.length))
+        if remaining.min() <= 0.0:
+            raise InvalidPatchError(
+                f"A local stiffness loss must leave some stiffness, but leaves {remaining.min():g} of it."
+            )
+        return breaks, remaining
+
+    def _smeared(self, breaks: FloatArray, remaining: FloatArray) -> FloatArray:
+        """Return what each strip (S,) keeps, so that the tip moves as much as with the box as it is.
+
+        The harmonic mean, since its parts bend one after the other, weighed by the square of the distance
+        from the tip: the moment of a force there, and the way on which the tip follows the bending.
+        """
+        lines = self.arrays.strip_lines
+        strip = np.searchsorted(lines, 0.5 * (breaks[1:] + breaks[:-1])) - 1
+        lengths = -np.diff((TIP_OFFSET * lines[-1] - breaks) ** 3)
+        whole = np.bincount(strip, lengths, len(lines) - 1)
+        return np.asarray(whole / np.bincount(strip, lengths / remaining, len(lines) - 1))
 
     # ------------------------------------------------------------ loads and rows
 
@@ -379,7 +409,7 @@ class PatchedWing:
             return np.asarray(self.arrays.station_weights @ self.arrays.line_rows[2])
         raise InvalidPatchError(f"The wing has no port {name!r}; it has {', '.join(PORTS)}.")
 
-    def output_row(self, name: str, component: int = 0) -> FloatArray | None:
+    def output_row(self, name: str, component: int = 0, patch: ModelPatch = EMPTY) -> FloatArray | None:
         """Return the row (n,) of an output, None if there is no such output.
 
         Parameters
@@ -388,11 +418,16 @@ class PatchedWing:
             strain[k], tip_displacement, load_point_displacement, displacement[y, x].
         component : int
             Of a strain: 0 along the span, 1 across, 2 engineering shear strain; zero for displacements.
+        patch : ModelPatch
+            Its local losses act on the strains, see `strain_factors`.
         """
-        strain = _STRAIN.fullmatch(name)
-        if strain is not None:
-            gauge = int(strain.group(1))
-            return self.arrays.strain_rows[component, gauge] if gauge < self.gauge_count else None
+        gauge = strain_gauge(name)
+        if gauge >= 0:
+            if gauge >= self.gauge_count:
+                return None
+            factors = self.strain_factors(patch)
+            measured = self.arrays.strain_rows[component, gauge]
+            return measured if factors is None else np.asarray(factors[gauge] * measured)
         row: FloatArray | None = None
         if name == "tip_displacement":
             row = self.arrays.tip_row
@@ -403,6 +438,48 @@ class PatchedWing:
             if place is not None and 0.0 <= float(place.group(1)) <= self.span:
                 row = self.displacement_row(float(place.group(1)), float(place.group(2)))
         return row if row is None or component == 0 else np.zeros_like(row)
+
+    @cached_property
+    def _skin_share(self) -> FloatArray:
+        """Share (G,) of the bending stiffness at each gauge that the skin has, as the strain shows it."""
+        softer = np.array((0.7, 0.7, 0.7, 1.0))
+        whole, less = (
+            self.arrays.strain_rows[0]
+            @ np.linalg.solve(np.tensordot(theta, self.arrays.stiffness, 1), self.arrays.load_lift)
+            for theta in (np.ones(4), softer)
+        )
+        return np.asarray((1.0 - whole / less) / (1.0 - softer[0]))
+
+    def strain_factors(self, patch: ModelPatch) -> FloatArray | None:
+        """Return factors (G,) on the strain rows by where the edges of local losses lie in their strips.
+
+        The structure has a loss smeared over the strip that the edge of its box parts; what a gauge there
+        reads is the curvature of its own section. At a given bending moment the strain of a section whose
+        skin keeps r of its stiffness is as 1 / (1 - s (1 - r)), s the skin's share of the bending
+        stiffness; the factor is the mean of that over the gauge with the box as it is, over the same with
+        the box as smeared. It is one where boxes end at the edges of strips.
+
+        Returns
+        -------
+        (G,) ndarray or None
+            None: there is no local loss.
+        """
+        boxes = _boxes(patch)
+        if not boxes:
+            return None
+        breaks, exact = self._remaining(boxes)
+        smeared = self._smeared(breaks, exact)
+        strip = np.searchsorted(self.arrays.strip_lines, 0.5 * (breaks[1:] + breaks[:-1])) - 1
+        stations = self.arrays.gauge_stations[:, None]
+        half = 0.5 * max(self.arrays.gauge_length, LEAST_GAUGE_LENGTH)
+        lengths = np.maximum(
+            np.minimum(breaks[1:], stations + half) - np.maximum(breaks[:-1], stations - half), 0.0
+        )
+        share = self._skin_share[:, None]
+        means = [
+            (lengths / (1.0 - share * (1.0 - remaining))).sum(axis=1) for remaining in (exact, smeared[strip])
+        ]
+        return np.asarray(means[0] / means[1])
 
     # ------------------------------------------------------------ for a model that has its own static part
 
@@ -449,8 +526,12 @@ class PatchedWing:
             young_modulus_factor, stiffness_loss, 0.0, 0.0, patch, temperature_difference
         ).static(self.load(load_factor, patch) + force * self.force_row(LOAD_PLACE, patch))
         change = after - before
+        strain = self.arrays.strain_rows[0] @ change
+        factors = self.strain_factors(patch)
+        if factors is not None:
+            strain = strain + (factors - 1.0) * (self.arrays.strain_rows[0] @ after)
         return (
-            np.asarray(self.arrays.strain_rows[0] @ change),
+            np.asarray(strain),
             float(self.arrays.tip_row @ change),
             float(self.arrays.load_tip @ change),
         )

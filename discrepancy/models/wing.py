@@ -34,7 +34,7 @@ from fe.patch import (
 )
 from fe.patch_arrays import PatchArrays
 from fe.patch_cache import patch_arrays
-from fe.patched_wing import LOAD_PLACE, PORTS, PatchedWing, Place, motion_basis
+from fe.patched_wing import LOAD_PLACE, PORTS, PatchedWing, Place, motion_basis, strain_gauge
 from fe.reduced_arrays import PARAMETER_NAMES
 from fe.reduction import Progress
 
@@ -270,9 +270,9 @@ class WingModel:
             raise ModelError(
                 f"The wing has {len(self._parameters)} parameters, but {len(conditions.parameters)} came."
             )
-        rows = self._output_rows(outputs, 0)
         quantities = [quantity for _, quantity in outputs]
         try:
+            rows = self._output_rows(outputs, 0, patch.of(LocalStiffnessLoss))
             forces = patch.of(*INTERNAL_FORCES)
             laws = laws_of(forces, PORTS) if len(forces) else NO_LAWS
             if not trial.is_dynamic:
@@ -307,7 +307,7 @@ class WingModel:
         amounts = _amounts(trial, loads)
         blocks = [rows]
         if components:
-            blocks += [self._output_rows(outputs, 1), self._output_rows(outputs, 2)]
+            blocks += [self._output_rows(outputs, number, patch.of(LocalStiffnessLoss)) for number in (1, 2)]
         values = np.empty((size, len(blocks) * len(outputs)))
         place = None if trial.kind is TrialKind.FLIGHT else trial.load_place
         memory: FloatArray | None = None
@@ -388,13 +388,23 @@ class WingModel:
         response = motion.response(rows @ basis, quantities)
         if not components:
             return response
-        across, shear = (motion.values(self._output_rows(outputs, number) @ basis) for number in (1, 2))
+        across, shear = (
+            motion.values(self._output_rows(outputs, number, structure.of(LocalStiffnessLoss)) @ basis)
+            for number in (1, 2)
+        )
         return Response(response.values, response.rates, across, shear)
 
     # ------------------------------------------------------------ parts
 
-    def _output_rows(self, outputs: Outputs, component: int) -> FloatArray:
-        return self._rows.get((outputs, component), lambda: self._made_rows(outputs, component))
+    def _output_rows(self, outputs: Outputs, component: int, losses: ModelPatch) -> FloatArray:
+        rows = self._rows.get((outputs, component), lambda: self._made_rows(outputs, component))
+        factors = self.wing.strain_factors(losses)
+        if factors is None:
+            return rows
+        gauges = self._rows.get(
+            (outputs, "gauges"), lambda: np.array([strain_gauge(output) for output, _ in outputs])
+        )
+        return rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
 
     def _made_rows(self, outputs: Outputs, component: int) -> FloatArray:
         rows = []
