@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import InvalidPatchError
+from .local_loss import boxes_of, remaining_skin, strain_factors
 from .patch import (
     InertiaRelief,
     LoadGain,
     LoadPlace,
-    LocalStiffnessLoss,
     ModelPatch,
     ModulusTemperature,
     PointMass,
@@ -31,6 +31,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Place = str | tuple[float, float]
 
+PATCH_RUNTIME_FILES = ("patch.py", "patch_arrays.py", "local_loss.py", "patched_wing.py")
+"""Files of this package that evaluate a wing with changes, besides `fe.reduced.RUNTIME_FILES`."""
 LOAD_PLACE = "tip_load"
 """Name of the place of the static test."""
 OVERHANG = 0.15
@@ -41,10 +43,6 @@ _STRAIN = re.compile(r"strain\[(\d+)\]")
 _NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
 _DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
 
-TIP_OFFSET = 1.02
-"""Where the weight of a part of the skin would vanish, in semi-spans."""
-LEAST_GAUGE_LENGTH = 1e-3
-"""A gauge without a length averages over this [m]."""
 ITERATIONS = 3
 """Steps of the subspace iteration for the modes of a patched wing."""
 EMPTY = ModelPatch()
@@ -138,10 +136,6 @@ def motion_basis(
     rest = rest - basis @ (basis.T @ rest)
     rest = rest - basis @ (basis.T @ rest)
     return np.asarray(np.concatenate((basis, np.linalg.qr(rest)[0]), axis=1))
-
-
-def _boxes(patch: ModelPatch) -> list[LocalStiffnessLoss]:
-    return [item for item in patch if isinstance(item, LocalStiffnessLoss) and item.loss != 0.0]
 
 
 def strain_gauge(output: str) -> int:
@@ -244,8 +238,10 @@ class PatchedWing:
                     f"{-compliance:g}; give a compliance above {-1.0 / arrays.flap_spring:g}."
                 )
             spring = 1.0 / flexibility - arrays.flap_spring
-        boxes = _boxes(patch)
-        remaining = self._smeared(*self._remaining(boxes)) if boxes else np.ones(len(arrays.strip_lines) - 1)
+        boxes = boxes_of(patch)
+        remaining = np.ones(len(arrays.strip_lines) - 1)
+        if boxes:
+            remaining = remaining_skin(boxes, arrays.strip_lines).of_strips
         parts = np.flatnonzero(remaining[arrays.strip_of] != 1.0).astype(np.int64)
         factors = (remaining[arrays.strip_of[parts]] - 1.0) * theta[arrays.term_of[parts]]
         return PatchedStructure(
@@ -270,33 +266,6 @@ class PatchedWing:
                 row = weights @ rows
                 mass += added * np.multiply.outer(row, row)
         return np.asarray(mass)
-
-    def _remaining(self, boxes: list[LocalStiffnessLoss]) -> tuple[FloatArray, FloatArray]:
-        """Return breaks (m + 1,) along the span and what the skin keeps (m,) of its stiffness between them."""
-        lines = self.arrays.strip_lines
-        edges = [edge for box in boxes for edge in (box.start, box.start + box.length)]
-        breaks = np.unique(np.concatenate((lines, np.clip(edges, lines[0], lines[-1]))))
-        middles = 0.5 * (breaks[1:] + breaks[:-1])
-        remaining = np.ones(len(middles))
-        for box in boxes:
-            remaining *= 1.0 - box.loss * ((middles > box.start) & (middles < box.start + box.length))
-        if remaining.min() <= 0.0:
-            raise InvalidPatchError(
-                f"A local stiffness loss must leave some stiffness, but leaves {remaining.min():g} of it."
-            )
-        return breaks, remaining
-
-    def _smeared(self, breaks: FloatArray, remaining: FloatArray) -> FloatArray:
-        """Return what each strip (S,) keeps, so that the tip moves as much as with the box as it is.
-
-        The harmonic mean, since its parts bend one after the other, weighed by the square of the distance
-        from the tip: the moment of a force there, and the way on which the tip follows the bending.
-        """
-        lines = self.arrays.strip_lines
-        strip = np.searchsorted(lines, 0.5 * (breaks[1:] + breaks[:-1])) - 1
-        lengths = -np.diff((TIP_OFFSET * lines[-1] - breaks) ** 3)
-        whole = np.bincount(strip, lengths, len(lines) - 1)
-        return np.asarray(whole / np.bincount(strip, lengths / remaining, len(lines) - 1))
 
     # ------------------------------------------------------------ loads and rows
 
@@ -453,33 +422,19 @@ class PatchedWing:
     def strain_factors(self, patch: ModelPatch) -> FloatArray | None:
         """Return factors (G,) on the strain rows by where the edges of local losses lie in their strips.
 
-        The structure has a loss smeared over the strip that the edge of its box parts; what a gauge there
-        reads is the curvature of its own section. At a given bending moment the strain of a section whose
-        skin keeps r of its stiffness is as 1 / (1 - s (1 - r)), s the skin's share of the bending
-        stiffness; the factor is the mean of that over the gauge with the box as it is, over the same with
-        the box as smeared. It is one where boxes end at the edges of strips.
+        `fe.local_loss.strain_factors` says what they are. They are one where boxes end at edges of strips.
 
         Returns
         -------
         (G,) ndarray or None
             None: there is no local loss.
         """
-        boxes = _boxes(patch)
+        boxes = boxes_of(patch)
         if not boxes:
             return None
-        breaks, exact = self._remaining(boxes)
-        smeared = self._smeared(breaks, exact)
-        strip = np.searchsorted(self.arrays.strip_lines, 0.5 * (breaks[1:] + breaks[:-1])) - 1
-        stations = self.arrays.gauge_stations[:, None]
-        half = 0.5 * max(self.arrays.gauge_length, LEAST_GAUGE_LENGTH)
-        lengths = np.maximum(
-            np.minimum(breaks[1:], stations + half) - np.maximum(breaks[:-1], stations - half), 0.0
-        )
-        share = self._skin_share[:, None]
-        means = [
-            (lengths / (1.0 - share * (1.0 - remaining))).sum(axis=1) for remaining in (exact, smeared[strip])
-        ]
-        return np.asarray(means[0] / means[1])
+        arrays = self.arrays
+        skin = remaining_skin(boxes, arrays.strip_lines)
+        return strain_factors(skin, arrays.gauge_stations, arrays.gauge_length, self._skin_share)
 
     # ------------------------------------------------------------ for a model that has its own static part
 

@@ -1,9 +1,8 @@
 """The wing as a model: its reduced structure under patches, in static tests, flights and ring-downs."""
 
-from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from discrepancy.campaign import Campaign, Quantity, Trial, TrialKind
 from discrepancy.compiled_motion import compiled_kernel
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
 from fe.design import load_design
 from fe.errors import FiniteElementError, InvalidPatchError, SolutionError
@@ -54,30 +54,6 @@ paper, its masses, and the damping of the joint posterior, whose spread holds th
 DAMPING_LIMITS = {"damping_alpha": (0.0, 20.0), "damping_beta": (0.0, 1e-2)}
 MODE_COUNT = 6
 """Modes that move in ring-downs and under forces; those of the FMU."""
-KEPT = 256
-"""Structures, and results of each kind, that are remembered."""
-
-_Value = TypeVar("_Value")
-
-
-class _Memory:
-    """Results by key, the least recently used forgotten."""
-
-    def __init__(self, size: int = KEPT) -> None:
-        self._size = size
-        self._values: OrderedDict[Key, Any] = OrderedDict()
-
-    def get(self, key: Key, make: Callable[[], _Value]) -> _Value:
-        """Return what `make` returned for `key`, calling it if need be."""
-        try:
-            value = self._values[key]
-        except KeyError:
-            value = self._values[key] = make()
-            if len(self._values) > self._size:
-                self._values.popitem(last=False)
-            return value
-        self._values.move_to_end(key)
-        return value  # type: ignore[no-any-return]
 
 
 class _Stiffness:
@@ -135,8 +111,8 @@ class WingModel:
         )
         self._ports = {port: self.wing.port_row(port) for port in PORTS}
         self._port_rows = np.stack([self._ports[port] for port in PORTS])
-        self._stiffnesses, self._systems = _Memory(), _Memory()
-        self._rows, self._statics = _Memory(), _Memory(2048)
+        self._stiffnesses, self._systems = Memory(), Memory()
+        self._rows, self._statics = Memory(), Memory(2048)
 
     @classmethod
     def shipped(cls, progress: Progress | None = None) -> "WingModel":
