@@ -145,9 +145,9 @@ def motion_basis(
 
 
 def strain_gauge(output: str) -> int:
-    """Return k of an output strain[k], -1 for other outputs."""
+    """Return the row k - 1 of an output strain[k], k from 1; -1 for other outputs."""
     strain = _STRAIN.fullmatch(output)
-    return -1 if strain is None else int(strain.group(1))
+    return -1 if strain is None else int(strain.group(1)) - 1
 
 
 class _Terms(NamedTuple):
@@ -397,12 +397,6 @@ class PatchedWing:
         patch : ModelPatch
             Its local losses act on the strains, see `strain_factors`.
         """
-<<<<<<< HEAD
-        strain = _STRAIN.fullmatch(name)
-        if strain is not None:
-            gauge = int(strain.group(1)) - 1
-            return self.arrays.strain_rows[component, gauge] if 0 <= gauge < self.gauge_count else None
-=======
         gauge = strain_gauge(name)
         if gauge >= 0:
             if gauge >= self.gauge_count:
@@ -410,7 +404,6 @@ class PatchedWing:
             factors = self.strain_factors(patch)
             measured = self.arrays.strain_rows[component, gauge]
             return measured if factors is None else np.asarray(factors[gauge] * measured)
->>>>>>> dd89444d689b737b0c71cfa22a9f7df45ab92fdb
         row: FloatArray | None = None
         if name == "tip_displacement":
             row = self.arrays.tip_row
