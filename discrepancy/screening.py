@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.special import ndtri
 
 from .candidate import Candidate, Term
 from .catalogue.entry import EffectParameter
@@ -29,6 +30,11 @@ FloatArray = NDArray[np.float64]
 
 LEVELS = {1: (-1.5, -0.5, 0.5, 1.5), 2: (-1.3, 0.0, 1.3), 3: (-1.2, 0.0, 1.2)}
 """Grid of the scaled parameters that are not a mere scale, by their number; two levels from four on."""
+
+LARGEST_START = 2.5
+"""Fits do not begin at larger magnitudes than this many prior deviations: far off, scales mean little."""
+PADDED, PEAKS = 4, 3
+"""Zero padding of spectra, and peaks that are tried."""
 
 
 @dataclass(frozen=True)
@@ -160,6 +166,32 @@ class Screen:
         vector = np.concatenate((*parts, *tail, y))
         return Change(term, start, vector, fits, max(square, 0.0))
 
+    def _peaks(self, term: Term) -> tuple[float, ...]:
+        """Return peaks of the residuals' mean spectrum at a term's channel, over the first frequency."""
+        if not term.effect.spectral:
+            return ()
+        problem = self.problem
+        spectra: dict[tuple[int, float], FloatArray] = {}
+        for data, residual in zip(problem.trials, self.fit.residuals, strict=True):
+            if data.trial.kind not in term.effect.acts_on or term.place not in data.trial.channels:
+                continue
+            series = residual[:, data.trial.channels.index(term.place)]
+            key = (len(series), data.trial.interval)
+            power = np.abs(np.fft.rfft(series - series.mean(), PADDED * len(series))) ** 2
+            spectra[key] = spectra.get(key, 0.0) + power
+        found: list[float] = []
+        for (count, interval), power in spectra.items():
+            resolution = 1.0 / (PADDED * count * interval)
+            inner = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
+            best = inner[np.argsort(power[inner])[::-1][: 4 * PEAKS]]
+            kept: list[int] = []
+            for index in best:
+                if all(abs(index - other) > 2 * PADDED for other in kept) and len(kept) < PEAKS:
+                    kept.append(int(index))
+            first = problem.setting.scales.angular_frequency / (2.0 * np.pi)
+            found += [index * resolution / first for index in kept]
+        return tuple(found)
+
     @property
     def sign(self) -> FloatArray:
         """Signs (D,) of the inner product: changes count, their projections are taken off."""
@@ -169,15 +201,18 @@ class Screen:
 
     def changes(self, term: Term) -> Iterator[Change]:
         """Yield the changes of a term over the grid of its parameters, where the model can follow."""
-        for start in grid(term):
+        for start in grid(term, self._peaks(term)):
             try:
                 yield self.change(term, start)
             except ModelError:  # such as a spring softer than what is taken from it
                 continue
 
 
-def grid(term: Term) -> Iterator[FloatArray]:
-    """Yield scaled parameters to try: magnitudes at one value, since changes scale with them."""
+def grid(term: Term, peaks: tuple[float, ...] = ()) -> Iterator[FloatArray]:
+    """Yield scaled parameters to try: magnitudes at one value, since changes scale with them.
+
+    A spectral parameter is tried at the given peaks.
+    """
     axes: list[tuple[float, ...]] = []
     scaled = False
     count = sum(1 for item in term.parameters if not _is_magnitude(item))
@@ -190,6 +225,10 @@ def grid(term: Term) -> Iterator[FloatArray]:
             else:
                 axes.append((1.0,) if signed else (0.0,))
                 scaled = True
+        elif item.name == term.effect.spectral and peaks:
+            axes.append(tuple(float(np.clip(item.prior.normal(peak), -3.0, 3.0)) for peak in peaks))
+        elif isinstance(item, EffectParameter) and item.levels:
+            axes.append(tuple(float(ndtri((k + 0.5) / item.levels)) for k in range(item.levels)))
         elif item in term.effect.shape:
             axes.append((item.prior.normal(item.canonical),))  # type: ignore[union-attr]
         else:
@@ -211,9 +250,9 @@ def rescaled(change: Change) -> FloatArray:
             continue
         prior = item.prior
         value = prior.value(float(start[number])) * factor
-        if prior.shape == "log_normal":
+        if prior.shape == "log_normal":  # it cannot change its sign
             value = max(value, prior.value(-0.7 * LARGEST_EFFECT))
-        start[number] = np.clip(prior.normal(value), -0.7 * LARGEST_EFFECT, 0.7 * LARGEST_EFFECT)
+        start[number] = np.clip(prior.normal(value), -0.7 * LARGEST_EFFECT, LARGEST_START)
     return start
 
 

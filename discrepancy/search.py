@@ -134,6 +134,9 @@ class Search:
         return {effect.identifier: self._starts(screen, effect) for effect in effects}
 
     def _starts(self, screen: Screen, effect: Effect, count: int = STARTS) -> list[Change]:
+        """Return the most promising changes of an effect; more of them where its place is a parameter."""
+        if sum(not item.magnitude for item in effect.parameters) > 1:
+            count *= 3
         found: list[Change] = []
         for place in effect.places(self.problem.setting):
             best: list[Change] = []
@@ -181,7 +184,7 @@ class Search:
         enough = PROMISING * ranked[0][0].gain if ranked else 0.0
         first = max(LEAST_PROMISING, sum(changes[0].gain >= enough for changes in ranked))
         found = self._from_beginnings(base, near, ranked[:first])
-        if not any(absolute_gate(self.problem, item).passed for item in found):
+        if not base.candidate.terms and not any(absolute_gate(self.problem, item).passed for item in found):
             found += self._from_beginnings(base, near, ranked[first:])
         return found
 
