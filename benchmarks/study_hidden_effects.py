@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -227,6 +228,15 @@ def investigated(folder: Path, seed: int) -> Verdict:
     return investigate(run_campaign(folder), run_model(folder), seed=seed, thorough=False).verdict
 
 
+def believed(verdict: Verdict) -> tuple[NamedEffect, ...]:
+    """Return the effects that the twin is given: those named, or of a group the most probable member."""
+    if verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY):
+        return verdict.effects
+    if verdict.kind is VerdictKind.GROUP and verdict.hypotheses:
+        return verdict.hypotheses[0].effects
+    return ()
+
+
 def study(hidden: Hidden, seed: int, work: Path) -> Case:
     """Fly with a hidden effect, find it, and fly again with what was found."""
     began = perf_counter()
@@ -234,8 +244,9 @@ def study(hidden: Hidden, seed: int, work: Path) -> Case:
     before = fly_mission(place.with_name(place.name + "_before"), seed, hidden.primitives)
     verdict = investigated(place.with_name(place.name + "_before"), seed)
     after = None
-    if verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY):
-        found = outputs_of(sum((effect.patch for effect in verdict.effects), ModelPatch()))
+    chosen = believed(verdict)
+    if chosen:
+        found = outputs_of(sum((effect.patch for effect in chosen), ModelPatch()))
         corrections = tuple(item for item in map(undone, found) if item is not None)
         known = tuple(item for item in found if undone(item) is None)
         after = fly_mission(
@@ -244,9 +255,16 @@ def study(hidden: Hidden, seed: int, work: Path) -> Case:
     return Case(hidden, seed, verdict, before, after, perf_counter() - began)
 
 
-def is_right(hidden: Hidden, effects: Sequence[NamedEffect]) -> bool:
-    """Return whether exactly the hidden effect was named, at its place."""
-    return [(effect.identifier, effect.place) for effect in effects] == [(hidden.identifier, hidden.place)]
+def outcome(hidden: Hidden, verdict: Verdict) -> str:
+    """Return "named", "in the group", "wrong" (another one was named), or the kind of an open verdict."""
+    if not hidden.identifier:
+        return "none" if verdict.kind is VerdictKind.NOTHING_MISSING else verdict.kind.value
+    if verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY):
+        names = [(effect.identifier, effect.place) for effect in verdict.effects]
+        return "named" if names == [(hidden.identifier, hidden.place)] else f"wrong: {names}"
+    if verdict.kind is VerdictKind.GROUP:
+        return "in the group" if hidden.identifier in verdict.group else f"wrong group: {verdict.group}"
+    return verdict.kind.value
 
 
 def main() -> int:
@@ -256,7 +274,7 @@ def main() -> int:
     parser.add_argument("--only", help="identifiers of hidden effects, with commas")
     given = parser.parse_args()
     console = Console(width=150)
-    table = Table("hidden", "named right", "other verdicts", "rms z1, z2 before", "after", "90 % sets before", "after")
+    table = Table("hidden", "verdicts", "rms z1, z2 before", "90 % sets", "rms after", "90 % sets")
     chosen = [item for item in HIDDEN if given.only is None or item.identifier in given.only.split(",")]
     with tempfile.TemporaryDirectory() as folder:
         for hidden in chosen:
@@ -275,19 +293,16 @@ def main() -> int:
 
 
 def _row(hidden: Hidden, cases: Sequence[Case]) -> tuple[str, ...]:
-    if hidden.identifier:
-        right = [case for case in cases if is_right(hidden, case.verdict.effects) and case.after is not None]
-    else:
-        right = [case for case in cases if case.verdict.kind is VerdictKind.NOTHING_MISSING]
-    others = [case.verdict.kind.value for case in cases if case not in right]
-    again = [case.after for case in cases if case.after is not None]
+    counts = Counter(outcome(hidden, case.verdict) for case in cases)
+    again = [case for case in cases if case.after is not None]
     return (
-        hidden.text, f"{len(right)} of {len(cases)}", ", ".join(others),
-        _rms([case.before for case in cases if case.after is not None or not hidden.identifier]),
-        _rms(again) if again else "",
+        hidden.text,
+        ", ".join(f"{name} {count}" for name, count in counts.most_common()),
+        _rms([case.before for case in cases]),
         f"{np.mean([case.before.coverage for case in cases]):.2f}",
-        f"{np.mean([item.coverage for item in again]):.2f}" if again else "",
-    )  # fmt: skip
+        _rms([case.after for case in again if case.after is not None]),
+        f"{np.mean([case.after.coverage for case in again if case.after is not None]):.2f}" if again else "",
+    )
 
 
 def _rms(flown: Sequence[Flown]) -> str:
