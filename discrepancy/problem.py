@@ -63,7 +63,7 @@ class TrialData:
         zeros = np.zeros((self.unknowns.zeros, *self.weight.shape))
         rows = np.arange(self.unknowns.zeros)
         zeros[rows, :, self.unknowns.zero_columns] = self.unknowns.zero_scale[:, np.newaxis]
-        return self.standardised(zeros).reshape(len(zeros), -1)
+        return self.standardised(zeros).reshape(len(zeros), self.weight.size)
 
     def standardised(self, columns: FloatArray) -> FloatArray:
         """Return columns (..., N, C) over s0, whitened in time, zero where a sample does not count."""
