@@ -134,6 +134,9 @@ class Search:
         return {effect.identifier: self._starts(screen, effect) for effect in effects}
 
     def _starts(self, screen: Screen, effect: Effect, count: int = STARTS) -> list[Change]:
+        """Return the most promising changes of an effect; more of them where its place is a parameter."""
+        if sum(not item.magnitude for item in effect.parameters) > 1:
+            count *= 3
         found: list[Change] = []
         for place in effect.places(self.problem.setting):
             best: list[Change] = []
