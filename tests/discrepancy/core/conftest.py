@@ -257,10 +257,12 @@ def closed_problem(
     parameters: Mapping[str, tuple[float, float]] | None = None,
     left_out: Mapping[int, Sequence[tuple[int, int]]] | None = None,
     kinds: Sequence[str] = ("static", "ringdown"),
+    extra: Callable[[FloatArray], FloatArray] | None = None,
 ) -> Problem:
     """Return a problem on the closed form: two static trials, two ring-downs, three channels.
 
-    `effect` is an offset of y1 in run A, in metres. What is unknown is drawn from its prior.
+    `effect` is an offset of y1 in run A, in metres; `extra` gives what the first channel of every trial shows
+    besides, from the row numbers. What is unknown is drawn from its prior.
     """
     generator = np.random.default_rng(seed)
     record = (noise or NoiseRecord(0.02, inf)) if known_noise else None
@@ -301,6 +303,8 @@ def closed_problem(
         prediction = problem.prediction(number, _local_point(problem, shared, local, number), response)
         deviation = data.trial.noise_factor * (0.02 if record is None else record.standard_deviation)
         values = prediction + deviation * generator.standard_normal(response.shape)
+        if extra is not None:
+            values[:, 0] += extra(np.arange(len(values), dtype=np.float64))
         used = np.ones(values.shape, dtype=bool)
         for row, column in (left_out or {}).get(number, ()):
             used[row, column] = False
