@@ -463,7 +463,9 @@ class WingModel:
             ports = {port: row @ basis for port, row in self._ports.items()}
             return _Moved(
                 basis,
-                SecondOrderSystem(small_mass, alpha * small_mass + beta * small, small, ports, MODE_COUNT),
+                SecondOrderSystem(
+                    small_mass, alpha * small_mass + beta * small, small, ports, MODE_COUNT, beta
+                ),
             )
 
         return self._systems.get((key, masses.primitives, parameters[1:].tobytes(), place), make)
