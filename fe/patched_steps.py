@@ -28,12 +28,14 @@ _LOADS = 2  # load factor and tip force, as they are recorded
 
 
 class _Moving(NamedTuple):
-    """State of a motion: modes, forces of the laws as omitted modes follow them, loads, memory of the laws."""
+    """State of a motion: modes, forces of the laws as omitted modes follow them, loads, what omitted modes still
+    feel of a force that held the wing (1,), memory of the laws."""
 
     q: FloatArray
     v: FloatArray
     forces: FloatArray
     loads: FloatArray
+    holding: FloatArray
     memory: FloatArray
 
 
@@ -207,6 +209,13 @@ class PatchedSteps:
             beta,
         )
 
+    @cached_property
+    def _held_left_out(self) -> FloatArray:
+        """Part (n,) of the answer to a unit force at the release point that the modes leave out."""
+        holding, modes = self._wing.arrays.load_tip, self._modes
+        shape = modes.shapes @ (holding @ modes.shapes / modes.frequency**2)
+        return np.asarray(self._patched.static(holding) - shape)
+
     def _feed(self, constant: FloatArray) -> FloatArray:
         """Return what the modes leave out of the positions (2, J) of the laws' ports under acting loads (3,)."""
         fed = self._port_rows @ (self._left_out[:, :3] @ constant)
@@ -274,11 +283,11 @@ class PatchedSteps:
             force += float(along @ (moved.forces[0] - forces)) / compliance
             forces, memory = moved.forces[0], moved.memory
             # of the ports' positions; fades after the release
-            left_out = flexible - modes.shapes @ (holding @ modes.shapes / omega2)
-            memory[:, 3] = force * (self._port_rows @ left_out)
+            memory[:, 3] = force * (self._port_rows @ self._held_left_out)
         acts = self._participation @ loads + force * (holding @ modes.shapes) - forces @ self._ports_of_modes
         q = acts / omega2
-        state = _Moving(q, np.zeros_like(q), forces, np.array((load_factor, tip_force)), memory)
+        last = np.array((load_factor, tip_force)), np.array((force,))
+        state = _Moving(q, np.zeros_like(q), forces, *last, memory)
         return self._packed(self._felt(state))
 
     def _felt(self, state: _Moving) -> _Moving:
@@ -323,7 +332,10 @@ class PatchedSteps:
             start=time,
         )
         loads = np.array((load_factor, tip_force))
-        return self._packed(_Moving(moved.q[-1], moved.v[-1], moved.lagged[-1], loads, moved.memory))
+        _, beta = self._rayleigh
+        holding = before.holding * (np.exp(-duration / beta) if beta > 0.0 else float(duration == 0.0))
+        state = _Moving(moved.q[-1], moved.v[-1], moved.lagged[-1], loads, holding, moved.memory)
+        return self._packed(state)
 
     # ------------------------------------------------------------ what is seen
 
@@ -348,6 +360,8 @@ class PatchedSteps:
             acting = self._acting(load_factor, tip_force)
             still = np.concatenate((acting, -now.forces))
             displacement = self._modes.shapes @ now.q + self._left_out @ still
+            if now.holding[0] != 0.0:
+                displacement = displacement + now.holding[0] * self._held_left_out
         else:
             load_factor, tip_force = state[:_LOADS]
             acting = np.array(state[_LOADS : _LOADS + 3])
@@ -418,7 +432,8 @@ class PatchedSteps:
     ) -> list[float]:
         """Return the state with displacement and velocity (n,) of the whole wing."""
         to_modes = self._modes.to_modes
-        state = _Moving(to_modes @ place, to_modes @ velocity, np.zeros(len(self._laws)), loads, memory)
+        none, held = np.zeros(len(self._laws)), np.zeros(1)
+        state = _Moving(to_modes @ place, to_modes @ velocity, none, loads, held, memory)
         return self._packed(self._felt(state))
 
     def _packed(self, state: _Moving) -> list[float]:
@@ -426,9 +441,9 @@ class PatchedSteps:
 
     def _unpacked(self, state: Sequence[float]) -> _Moving:
         values, memory = np.array(state, dtype=np.float64), self._laws.memory()
-        sizes = (len(self._modes.frequency),) * 2 + (len(self._laws), _LOADS)
-        q, v, forces, loads, rest = np.split(values, np.cumsum(sizes))
-        return _Moving(q, v, forces, loads, rest.reshape(memory.shape))
+        sizes = (len(self._modes.frequency),) * 2 + (len(self._laws), _LOADS, 1)
+        q, v, forces, loads, holding, rest = np.split(values, np.cumsum(sizes))
+        return _Moving(q, v, forces, loads, holding, rest.reshape(memory.shape))
 
 
 def _symmetric(matrix: FloatArray) -> FloatArray:
