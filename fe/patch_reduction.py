@@ -225,6 +225,8 @@ def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) ->
         lift_rows=np.asarray(full.lift_rows @ basis),
         weight=full.weight @ basis,
         strain_rows=np.stack([np.asarray(rows @ basis) for rows in (along, *full.strain_rows)]),
+        gauge_stations=np.array([place for place, _ in design.gauges.positions]),
+        gauge_length=design.gauges.averaging_spanwise,
         tip_row=operators.tip_displacement_output @ basis,
         start_shapes=np.eye(size)[:, :START_SHAPES],
     )

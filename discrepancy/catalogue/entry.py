@@ -63,6 +63,8 @@ class EffectParameter:
         In the unit.
     magnitude : bool
         Whether the effect vanishes with this parameter.
+    levels : int
+        Number of values, evenly over the prior, at which fits may begin; 0 leaves the choice to the search.
     """
 
     name: str
@@ -71,6 +73,7 @@ class EffectParameter:
     description: str
     prior: Prior
     magnitude: bool = False
+    levels: int = 0
 
 
 @dataclass(frozen=True)
@@ -145,6 +148,9 @@ class Effect:
         setting -> why it cannot be tested here, or None.
     confusable : tuple of str
         Identifiers of effects that some campaigns cannot tell from it.
+    spectral : str
+        Name of a parameter that is a frequency over the first natural frequency; fits of it begin at peaks of
+        the residuals' spectrum at the place, a channel. Empty if there is none.
     """
 
     identifier: str
@@ -160,6 +166,7 @@ class Effect:
     places: Callable[[Setting], tuple[str, ...]] = field(default=nowhere_else)
     unavailable: Callable[[Setting], str | None] = field(default=always_available)
     confusable: tuple[str, ...] = ()
+    spectral: str = ""
 
     def canonical_shape(self) -> dict[str, float]:
         """Return the shape values of the named effect."""

@@ -144,6 +144,48 @@ def test_local_loss_between_mesh_lines_is_softer_cells(
     assert frequency[1] == pytest.approx(wanted[1], rel=1e-3)
 
 
+@pytest.mark.parametrize(("start", "end", "loss"), [(0.2, 0.45, 0.4), (0.75, 1.15, 0.3), (0.5, 0.6, 0.5)])
+def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(
+    coarse_patched_wing: PatchedWing, coarse_design: WingDesign, start: float, end: float, loss: float
+) -> None:
+    wing = coarse_patched_wing
+    operators = assemble(coarse_design.changed(mesh={"span_size": 0.005}))  # cells of 20 mm
+    mesh = operators.wing_mesh
+    start, end = (float(mesh.span_lines[np.abs(mesh.span_lines - place).argmin()]) for place in (start, end))
+    elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
+    inside = (mesh.centres[:, 1] > start) & (mesh.centres[:, 1] < end)
+    cells = np.flatnonzero(inside & np.isin(mesh.region, (SKIN, DEFECT_1, DEFECT_2)))
+    part = operators.discretisation.stiffness(cells, elasticity[cells], variation[cells])
+    whole = operators.stiffness()
+    softer = whole - loss * (operators.expansion.T @ (part @ operators.expansion))
+    before, after = (solved(operators, operators.load_lift, matrix) for matrix in (whole, softer.tocsr()))
+    # ratios, because the two meshes differ a little in themselves
+    strain = operators.gauge_output @ before
+    wanted = operators.gauge_output @ after / strain
+    patch = patched(LocalStiffnessLoss(loss, start, end - start))
+    plain = wing.structure(1.0, (0.0, 0.0), *MASSES).static(wing.load(1.0))
+    u = wing.structure(1.0, (0.0, 0.0), *MASSES, patch).static(wing.load(1.0))
+    factors = wing.strain_factors(patch)
+    assert factors is not None
+    ratio = factors * (wing.arrays.strain_rows[0] @ u) / (wing.arrays.strain_rows[0] @ plain)
+    scale = np.abs(strain) / np.abs(strain).max()
+    assert np.abs((ratio - wanted) * scale).max() < 0.03 * np.abs((wanted - 1.0) * scale).max()
+    # the strips of this mesh are 0.26 m long, four times those of the shipped one
+    tip = operators.tip_displacement_output
+    moved = wing.arrays.tip_row
+    effect = float(tip @ after) / float(tip @ before) - 1.0
+    assert float(moved @ u) / float(moved @ plain) - 1.0 == pytest.approx(effect, rel=0.05)
+
+
+def test_strains_need_no_factor_where_a_box_ends_at_strips(coarse_patched_wing: PatchedWing) -> None:
+    wing = coarse_patched_wing
+    start, end = wing.arrays.strip_lines[[3, 6]]
+    factors = wing.strain_factors(patched(LocalStiffnessLoss(0.4, start, end - start)))
+    assert factors is not None
+    assert factors == pytest.approx(1.0, abs=1e-12)
+    assert wing.strain_factors(patched(PointMass(0.1, 1.0), LocalStiffnessLoss(0.0, 0.1, 0.2))) is None
+
+
 def test_the_strips_together_are_the_skin(coarse_patched_wing: PatchedWing) -> None:
     wing = coarse_patched_wing
     span = wing.span

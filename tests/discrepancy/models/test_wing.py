@@ -86,8 +86,8 @@ def matrices(model: WingModel, conditions: Conditions, patch: ModelPatch = NONE)
     return structure.stiffness, structure.mass, alpha * structure.mass + beta * structure.stiffness
 
 
-def output_rows(model: WingModel) -> Any:
-    return np.array([model.wing.output_row(name) for name, _ in OUTPUTS])
+def output_rows(model: WingModel, patch: ModelPatch = NONE) -> Any:
+    return np.array([model.wing.output_row(name, 0, patch) for name, _ in OUTPUTS])
 
 
 def test_it_is_a_model(model: WingModel) -> None:
@@ -110,7 +110,7 @@ def test_static_is_the_solution_of_the_matrices(model: WingModel, conditions: Co
     stiffness = matrices(model, conditions, patch)[0]
     u = np.linalg.solve(stiffness, model.wing.force_row("tip_load", patch))
     response = model.respond(STATIC, OUTPUTS, patch, conditions)
-    assert response.values == pytest.approx(np.outer(STATIC.force, output_rows(model) @ u), rel=1e-9)
+    assert response.values == pytest.approx(np.outer(STATIC.force, output_rows(model, patch) @ u), rel=1e-9)
 
 
 def test_flight_is_the_solution_of_the_matrices(model: WingModel, conditions: Conditions) -> None:
@@ -217,7 +217,7 @@ def test_ring_down_is_the_modal_sum_of_all_unknowns(
         ((root + half) * np.exp((root - half) * time) + (root - half) * np.exp(-(root + half) * time))
         / (2.0 * root)
     )
-    wanted = motion.real @ (output_rows(model) @ shapes).T
+    wanted = motion.real @ (output_rows(model, patch) @ shapes).T
     values = model.respond(RING, OUTPUTS, patch, conditions).values
     scale = np.abs(wanted).max(axis=0)
     late = RING.time > 0.03  # what more than six modes do has died out
