@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .motion import Laws, ModalSystem, laws_of, simulate, static_solution
-from .patch import LOADS, LoadGain, ModelPatch
+from .patch import LOADS, LoadGain, ModelPatch, PointMass
 from .patched_wing import LOAD_PLACE, PORTS, PatchedStructure, PatchedWing, motion_basis
 from .reduced import ReducedModel
 from .transient import ModalIntegrator, TransientState
@@ -95,7 +95,7 @@ class PatchedSteps:
         self._patched = wing.structure(*self._state, patch, temperature)
         arrays = wing.arrays
         self._rows = np.vstack((arrays.strain_rows[0], arrays.tip_row, arrays.load_tip))
-        self._units = np.vstack((wing.load_parts(self._loads), wing.force_row(LOAD_PLACE, self._loads)))
+        self._units = np.vstack((wing.load_parts(patch.of(*LOADS, PointMass)), wing.force_row(LOAD_PLACE, self._loads)))
         ports = {name: wing.port_row(name) for name in PORTS}
         self._port_rows = self._laws.rows(ports, wing.size)
 
