@@ -286,7 +286,7 @@ class Search:
                 break
             current = longer
         if not absolute_gate(self.problem, self.best()).passed and len(self.effects) > 1:
-            self._pairs()
+            self.fit_pairs()
             self._extended(self.best())
         self._deletions()
 
@@ -300,7 +300,7 @@ class Search:
         fitted = self.refine(self.scan(current, others), before - 2.0)
         return fitted[0] if fitted and self.score(fitted[0]) > before else None
 
-    def _pairs(self) -> None:
+    def fit_pairs(self) -> None:
         """Fit the most promising of all pairs of effects, by their changes at the fit without effect."""
         far = self._far(self.none)
         near = self._near(self.none) if far else self.none
