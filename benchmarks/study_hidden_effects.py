@@ -90,8 +90,8 @@ HIDDEN = (
     Hidden("gauge_gain", "g17", (SensorGain("strain[17]", -0.12),), "gauge 17 shows 12 % too little"),
     Hidden("washout", "", (Washout(0.04, 2.0),), "washout of 4 % per g at the tip"),
     Hidden(
-        "local_stiffness_loss", "", (LocalStiffnessLoss(0.25, 0.45, 0.4),),
-        "skin from 0.45 to 0.85 m has lost 25 %",
+        "local_stiffness_loss", "", (LocalStiffnessLoss(0.15, 0.45, 0.4),),
+        "skin from 0.45 to 0.85 m has lost 15 %",
     ),
     Hidden("inertia_relief", "", (InertiaRelief(0.25),), "structure's weight relieves the lift by 25 % more"),
 )  # fmt: skip
