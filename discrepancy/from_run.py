@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from fmu_asset.errors import FmuError
 from fmu_asset.patch_file import load_patch
+from fmu_asset.patched_runtime import output_channels
 from reporting.provenance import hash_file
 
 from .campaign import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
@@ -29,7 +31,11 @@ from .models.wing import WingModel
 FloatArray = NDArray[np.float64]
 
 RUN_FILE, CONFIG_FILE = "run.nc", "config.json"
-DESIGN_FILE, CALIBRATION_FILE, BINDING_FILE = "asset/design.toml", "asset/calibration.nc", "asset/binding.toml"
+DESIGN_FILE, CALIBRATION_FILE, BINDING_FILE = (
+    "asset/design.toml",
+    "asset/calibration.nc",
+    "asset/binding.toml",
+)
 MODEL_PATCH_FILE = "asset/model_patch.json"
 STRAIN = "strain"
 TEMPERATURE = ("temperature_difference", "temperature")
@@ -46,10 +52,10 @@ class RunPlan:
     Attributes
     ----------
     health : {"belief", "broad"}
-        Mean of the health in a turn: the smoothed belief, or the same in all turns.
+        Mean of the health in a turn: the smoothed belief, or the same in all.
     health_deviation : float
-        Least prior deviation of a stiffness loss in a turn. The belief was led astray by what is looked for, and is
-        much surer than it is right; 24 gauges tell the health of a turn anyway.
+        Least prior deviation of a stiffness loss in a turn. The belief was led astray by what is looked for,
+        and is much surer than it is right; 24 gauges tell the health of a turn anyway.
     block : int
         Turns of a block that is held out.
     held_out_share : float
@@ -78,8 +84,9 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
     Returns
     -------
     Campaign
-        Strain channels g1, g2, ...; flight trials whose rows are turns, some of them held out. The time of a turn
-        is that at its end, as the FMU has it. Health is uncertain in every turn. The truth of the run is not read.
+        Strain channels g1, g2, ...; flight trials whose rows are turns, some of them held out. The time of a
+        turn is that at its end, as the FMU has it. Health is uncertain in every turn. The truth of the run is
+        not read.
 
     Raises
     ------
@@ -91,14 +98,19 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
     folder, plan = Path(folder), plan or RunPlan()
     config = _config(folder)
     scenario = config["scenario"]
-    if scenario["observation"].get("role") != STRAIN or {item["name"] for item in scenario["state"]} != {"z1", "z2"}:
+    if scenario["observation"].get("role") != STRAIN or {item["name"] for item in scenario["state"]} != {
+        "z1",
+        "z2",
+    }:
         raise CampaignFileError(
-            f"{folder} is the run of another asset than the wing: strains under the damage states z1 and z2 are needed."
+            f"{folder} is the run of another asset than the wing: strains under the damage states z1 and z2 are "
+            "needed."
         )
     force = (scenario["asset"].get("load") or {}).get("tip_force", 0.0)
     if force:
         raise CampaignDataError(
-            f"A force of {force:g} N at the tip acts in all turns of {folder}; only flights without it can be read."
+            f"A force of {force:g} N at the tip acts in all turns of {folder}; only flights without it can be "
+            "read."
         )
     run = _run(folder)
     observed, smoothed = run["observed"], run["smoothed"]
@@ -107,7 +119,7 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
     if not used.any():
         raise CampaignDataError(f"No strain reached the twin in {folder}: there is nothing to compare.")
     size, gauges = strain.shape
-    names = tuple(f"g{number}" for number in observed["sensor"].values.tolist())
+    names = tuple(f"g{number}" for number in np.asarray(observed["sensor"].values).tolist())
     mean = np.asarray(smoothed["mean"].values, dtype=np.float64)
     deviation = np.asarray(smoothed["standard_deviation"].values, dtype=np.float64)
     if plan.health == "broad":
@@ -120,7 +132,8 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
         name: Channel(name, Quantity.STRAIN, f"strain[{name[1:]}]", NoiseRecord(noise, inf)) for name in names
     }
     whole = Trial(
-        name="turns", kind=TrialKind.FLIGHT, channels=names, values=np.where(used, strain, 0.0), used=used, time=time,
+        name="turns", kind=TrialKind.FLIGHT, channels=names,
+        values=np.where(used, strain, 0.0), used=used, time=time,
         force=np.zeros(size), load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64),
         load_place="tip_load", temperature=temperature, start=0.0, run=str(run.attrs.get("scenario", "run")),
         health=mean, health_deviation=deviation,
@@ -138,8 +151,8 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
         parameters=_calibrated(run),
         data_hash=hash_file(folder / RUN_FILE),
         remarks=(
-            f"Flight of {size} turns read from a run folder; health in each turn: {plan.health} with a deviation of "
-            f"{plan.health_deviation:g} or more.",
+            f"Flight of {size} turns read from a run folder; health in each turn: {plan.health} with a "
+            f"deviation of {plan.health_deviation:g} or more.",
             f"Noise of a gauge: {1e6 * noise:.4g} microstrain, {source}.",
             *((f"{lost} of {size * gauges} readings were lost.",) if lost else ()),
         ),
@@ -147,7 +160,7 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
 
 
 def run_model(folder: Path | str) -> Model:
-    """Return the model that the twin of a run believed: the wing of its design, or of its calibration, with its patch.
+    """Return the model that the twin of a run believed: the wing of its design or calibration, with its patch.
 
     Raises
     ------
@@ -165,7 +178,8 @@ def run_model(folder: Path | str) -> Model:
         model = WingModel.of_design(folder / DESIGN_FILE)
     else:
         raise CampaignFileError(
-            f"{folder} holds no design (`{DESIGN_FILE}`): its twin believed no model of a wing that could be patched."
+            f"{folder} holds no design (`{DESIGN_FILE}`): its twin believed no model of a wing that could be "
+            "patched."
         )
     if (folder / MODEL_PATCH_FILE).is_file():
         try:
@@ -178,13 +192,15 @@ def run_model(folder: Path | str) -> Model:
 
 
 def held_out_turns(count: int, block: int, share: float) -> NDArray[np.bool_]:
-    """Return which of `count` turns are held out (count,): whole blocks, evenly spread, the first block never."""
+    """Return which of `count` turns are held out (count,): whole blocks, evenly spread, never the first."""
     held = np.zeros(count, dtype=bool)
     blocks = count // block
     wanted = round(share * count / block)
     if blocks < 2 or wanted < 1:
         return held
-    for number in np.unique(np.round(np.linspace(1, blocks - 1, min(wanted, blocks - 1) + 1)[:-1]).astype(int)).tolist():
+    for number in np.unique(
+        np.round(np.linspace(1, blocks - 1, min(wanted, blocks - 1) + 1)[:-1]).astype(int)
+    ).tolist():
         held[number * block : (number + 1) * block] = True
     return held
 
@@ -196,7 +212,9 @@ def _config(folder: Path) -> dict[str, Any]:
     try:
         config = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError) as cause:
-        raise CampaignFileError(f"{folder} is no run folder: {CONFIG_FILE} cannot be read ({cause}).") from cause
+        raise CampaignFileError(
+            f"{folder} is no run folder: {CONFIG_FILE} cannot be read ({cause})."
+        ) from cause
     if not isinstance(config, dict) or not isinstance(config.get("scenario"), dict):
         raise CampaignFileError(f"{folder / CONFIG_FILE} is not that of a run: it has no `scenario`.")
     return config
@@ -211,7 +229,9 @@ def _run(folder: Path) -> xr.DataTree:
         raise CampaignFileError(f"{path} is not a whole run ({cause}): resume it or fly it again.") from cause
     missing = {"observed", "smoothed", "calibration"} - {*run.children}
     if missing:
-        raise CampaignFileError(f"{path} lacks the groups {', '.join(sorted(missing))}: it is no run of a twin.")
+        raise CampaignFileError(
+            f"{path} lacks the groups {', '.join(sorted(missing))}: it is no run of a twin."
+        )
     for name in (STRAIN, "load_factor"):
         if name not in run["observed"]:
             raise CampaignFileError(f"{path} lacks the observed {name!r}: it is no run of a wing.")
@@ -255,12 +275,12 @@ def _calibrated(run: xr.DataTree) -> dict[str, tuple[float, float]]:
     return {name: (float(draws.mean()), spread)} if name and spread > 0.0 else {}
 
 
-def _outputs(folder: Path) -> dict[str, str]:
-    from fmu_asset.patched_runtime import output_channels
-
+def _outputs(folder: Path) -> Sequence[tuple[str, str]]:
     return output_channels(len(_run(folder)["observed"]["sensor"]))
 
 
 def _rows(trial: Trial, rows: NDArray[np.bool_], name: str, *, held_out: bool) -> Trial:
     parts = ("values", "used", "time", "force", "load_factor", "temperature", "health", "health_deviation")
-    return replace(trial, name=name, held_out=held_out, **{part: getattr(trial, part)[rows] for part in parts})
+    return replace(
+        trial, name=name, held_out=held_out, **{part: getattr(trial, part)[rows] for part in parts}
+    )

@@ -28,8 +28,9 @@ SIGNAL, TIP = "spanwise", "tip"
 ROOT_GAUGE = "strain[16]"
 """Where the model's strain is read for the signal; its place only sets the scale, which is unknown."""
 READING_ERROR = 33e-6 / 3.0**0.5
-"""Deviation of a value read off the plot: evenly within +-33 microvolt (a pixel is 66). The five plots show the same
-motion on the same grid of pixels, so that its error is common to the trials, and no average makes it less [V]."""
+"""Deviation of a value read off the plot: evenly within +-33 microvolt (a pixel is 66). The five plots show the
+same motion on the same grid of pixels, so that its error is common to the trials, and no average makes it less
+[V]."""
 TREND = 67
 """Columns of the moving average that is the slow zero: 0.54 s, three periods of the first mode."""
 PARAMETERS = {
@@ -39,8 +40,8 @@ PARAMETERS = {
     "damping_alpha": (1.03, 0.37),
     "damping_beta": (7.56e-4, 1.84e-4),
 }
-"""Mean and deviation of the calibrated parameters: the joint posterior (docs/calibration.md), which allows for
-what the amplitude does to the frequency and the damping ratio that were calibrated to."""
+"""Mean and deviation of the calibrated parameters: the joint posterior (docs/calibration.md), which allows
+for what the amplitude does to the frequency and the damping ratio that were calibrated to."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +57,11 @@ class RecordPlan:
         response at 30.8 Hz, where the second bending mode rings.
     detrended : bool
         Whether the slow zero that the trials share is taken off: the moving average over three periods (Hann
-        weights), averaged over the trials. It moves by a third of a millivolt and is no motion of the wing. What
-        moves slowly in one trial alone is noise and stays.
+        weights), averaged over the trials. It moves by a third of a millivolt and is no motion of the wing.
+        What moves slowly in one trial alone is noise and stays.
     release : float
-        Nominal displacement of the tip at the window's begin [m]; the unknown scale of the signal makes any value
-        as good.
+        Nominal displacement of the tip at the window's begin [m]; the unknown scale of the signal makes any
+        value as good.
     mode_count : int
         Modes whose state at the begin is free.
     loading_runs : bool
@@ -128,7 +129,12 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
             pairs.displacement_standard_deviation,
             pairs.load_standard_deviation * float(np.median(pairs.displacement / pairs.load)),
         )
-        channels[TIP] = Channel(TIP, Quantity.DISPLACEMENT, "load_point_displacement", NoiseRecord(float(displacement_deviation), inf))
+        channels[TIP] = Channel(
+            TIP,
+            Quantity.DISPLACEMENT,
+            "load_point_displacement",
+            NoiseRecord(float(displacement_deviation), inf),
+        )
         trials += _loading_runs(pairs)
     for number, (time, signal) in enumerate(windows, start=1):
         trials.append(
@@ -146,8 +152,9 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
         PARAMETERS,
         hash_record([[*trial.values.ravel().tolist()] for trial in trials]),
         (
-            f"Ring-downs: {records[0].source} to {records[-1].source}, from {plan.begin:g} s after the release; "
-            f"{plan.columns} columns of the plot averaged into a sample of {1e3 * _interval(windows):.3g} ms.",
+            f"Ring-downs: {records[0].source} to {records[-1].source}, from {plan.begin:g} s after the "
+            f"release; {plan.columns} columns of the plot averaged into a sample of "
+            f"{1e3 * _interval(windows):.3g} ms.",
             f"Noise of the signal: scatter between the trials, {1e6 * spread:.3g} microvolt, and "
             f"the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
         ),
@@ -155,7 +162,7 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
 
 
 def write_wing_campaign(data: Path | str, out: Path | str, plan: RecordPlan | None = None) -> Campaign:
-    """Write `wing_campaign` as a folder and return it as read from there; errors as there and of the writer."""
+    """Write `wing_campaign` as a folder and return it as read from there; errors as there and of writing."""
     return read_campaign(write_campaign(wing_campaign(data, plan), out))
 
 
@@ -164,9 +171,9 @@ def trial_scatter(windows: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
 
     All trials are releases of one kind, so that what they share is the motion, whatever its law; what differs
     beside amplitude, delay and zero is noise. Each trial is fitted by the mean of all, its rate, its second
-    derivative and a constant; the R - 1 orthonormal contrasts of what is left (Helmert) are independent of each
-    other and have the variance of a single trial. Four degrees of freedom of each contrast went into the fit, and the
-    variance allows for it.
+    derivative and a constant; the R - 1 orthonormal contrasts of what is left (Helmert) are independent of
+    each other and have the variance of a single trial. Four degrees of freedom of each contrast went into the
+    fit, and the variance allows for it.
 
     Raises
     ------
@@ -185,7 +192,7 @@ def trial_scatter(windows: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
 
 
 def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
-    """Return the slow zero (N,) that all records share, NaN at the ends where the moving average has no value."""
+    """Return the slow zero (N,) that all records share, NaN at the ends, where no average is known."""
     weights = np.hanning(TREND + 2)[1:-1]
     mean = np.mean([record.signal for record in records], axis=0)
     zero = np.full(len(mean), np.nan)
@@ -200,12 +207,13 @@ def _windowed(record: RingDownRecord, zero: FloatArray, plan: RecordPlan) -> tup
     count = len(inside) // plan.columns
     if count < 60:
         raise CampaignDataError(
-            f"{record.source}: {count} samples are left between {plan.begin:g} and {plan.end:g} s; 60 are needed."
+            f"{record.source}: {count} samples are left between {plan.begin:g} and {plan.end:g} s; 60 are "
+            "needed."
         )
     kept = inside[: count * plan.columns].reshape(count, plan.columns)
     time = record.time[kept].mean(axis=1)
     interval = float(time[-1] - time[0]) / (count - 1)
-    return interval * np.arange(count), (record.signal - zero)[kept].mean(axis=1)
+    return interval * np.arange(count), np.asarray((record.signal - zero)[kept].mean(axis=1))
 
 
 def _interval(windows: list[tuple[FloatArray, FloatArray]]) -> float:
@@ -213,7 +221,9 @@ def _interval(windows: list[tuple[FloatArray, FloatArray]]) -> float:
 
 
 def _has_pairs(data: Path) -> bool:
-    return any((data / above / "step2").is_dir() for above in (Path(), Path("datafiles"), Path("src") / "datafiles"))
+    return any(
+        (data / above / "step2").is_dir() for above in (Path(), Path("datafiles"), Path("src") / "datafiles")
+    )
 
 
 def _loading_runs(pairs: LoadDisplacementData) -> list[Trial]:
@@ -221,17 +231,24 @@ def _loading_runs(pairs: LoadDisplacementData) -> list[Trial]:
     for number in np.unique(pairs.run).tolist():
         rows = pairs.run == number
         trial = _trial(
-            f"loading run {number + 1}", TrialKind.STATIC, (TIP,), pairs.displacement[rows][:, None], np.zeros(rows.sum())
+            f"loading run {number + 1}",
+            TrialKind.STATIC,
+            (TIP,),
+            pairs.displacement[rows][:, None],
+            np.zeros(rows.sum()),
         )
         trials.append(replace(trial, force=pairs.load[rows], run=f"run {number + 1}"))
     return trials
 
 
-def _trial(name: str, kind: TrialKind, channels: tuple[str, ...], values: FloatArray, time: FloatArray) -> Trial:
+def _trial(
+    name: str, kind: TrialKind, channels: tuple[str, ...], values: FloatArray, time: FloatArray
+) -> Trial:
     size = len(values)
     zeros = np.zeros(size)
     return Trial(
-        name=name, kind=kind, channels=channels, values=values, used=np.ones(values.shape, dtype=bool), time=time,
+        name=name, kind=kind, channels=channels, values=values,
+        used=np.ones(values.shape, dtype=bool), time=time,
         force=zeros, load_factor=zeros, load_place="tip_load", temperature=zeros, start=0.0, run="",
         health=np.zeros((size, 2)), health_deviation=np.zeros((size, 2)),
     )  # fmt: skip
