@@ -41,6 +41,7 @@ from fmu_asset.patch_file import SCHEMA
 from reporting.files import atomic_write_text
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
+from twin_master.asset_source import AssetSource
 from twin_master.crew import prepare_knowledge
 from twin_master.mission import fly
 from twin_master.resolution import (
@@ -52,6 +53,7 @@ from twin_master.resolution import (
 )
 from twin_master.results import MissionResult
 from twin_master.run_folder import create_run_folder
+from twin_master.scenario import Scenario
 from twin_master.scenario_file import load_scenario
 from twin_master.store import store_mission
 from twin_master.study import in_credible_set
@@ -178,7 +180,7 @@ def fly_mission(
     return _fly(folder, located_scenario(portable, folder), source, seed)
 
 
-def _fly(folder, scenario, source, seed):  # type: ignore[no-untyped-def]
+def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> Flown:
     knowledge = prepare_knowledge(scenario, source, seed)
     truth = knowledge.truth(seed)
     asset = source.open()

@@ -25,7 +25,7 @@ BEGINS = (0.8, 1.0, 1.25)
 
 def report(found: Investigation, table: Table, label: str) -> None:
     proof = found.proof
-    scores = [] if proof is None else [proof.held_out_before, proof.held_out_after]
+    scores = [] if proof is None else [item for item in (proof.held_out_before, proof.held_out_after) if item]
     rms = " to ".join(f"{1e3 * score.rms[SIGNAL]:.3f}" for score in scores if SIGNAL in score.rms)
     chi = " to ".join(f"{score.chi_square_per_dof:.2f}" for score in scores)
     table.add_row(label, found.verdict.kind.value, found.verdict.sentence, rms, chi)
@@ -54,7 +54,7 @@ def draw(found: Investigation, folder: Path) -> None:
         axis.set_ylabel("residual, $\\mu$V")
         axis.set_title(label, fontsize=9)
     axes[2].set_xlabel("time since the release, s")
-    figure.savefig(folder / "real_wing_residuals.png", dpi=80)
+    figure.savefig(folder / "real_wing_residuals.png", dpi=60)
     plt.close(figure)
 
 

@@ -103,14 +103,14 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
         "z2",
     }:
         raise CampaignFileError(
-            f"{folder} is the run of another asset than the wing: strains under the damage states z1 and z2 are "
-            "needed."
+            f"{folder} is the run of another asset than the wing: strains under the damage states z1 and z2 "
+            "are needed."
         )
     force = (scenario["asset"].get("load") or {}).get("tip_force", 0.0)
     if force:
         raise CampaignDataError(
-            f"A force of {force:g} N at the tip acts in all turns of {folder}; only flights without it can be "
-            "read."
+            f"A force of {force:g} N at the tip acts in all turns of {folder}; only flights without it can "
+            "be read."
         )
     run = _run(folder)
     observed, smoothed = run["observed"], run["smoothed"]
@@ -160,7 +160,7 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
 
 
 def run_model(folder: Path | str) -> Model:
-    """Return the model that the twin of a run believed: the wing of its design or calibration, with its patch.
+    """Return the model that the twin of a run believed: the wing of its design or calibration, patched.
 
     Raises
     ------

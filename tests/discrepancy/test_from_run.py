@@ -51,7 +51,7 @@ def test_every_turn_is_in_one_trial_as_it_was_observed(run: Path) -> None:
         rows = np.concatenate([getattr(trial, field) for trial in campaign.trials])[order]
         np.testing.assert_array_equal(rows, tree["observed"][name].values)
     assert all(np.all(trial.health_deviation >= 0.25) for trial in campaign.trials)
-    draws = tree["calibration"]["draw_value"].values
+    draws = np.asarray(tree["calibration"]["draw_value"].values)
     assert campaign.parameters["young_modulus_factor"][0] == pytest.approx(draws.mean())
 
 
@@ -74,10 +74,10 @@ def test_the_model_of_the_run_gives_the_strains_that_the_fmu_had(run: Path) -> N
     trial = run_campaign(run, RunPlan(held_out_share=0.0)).trials[0]
     values = [1.0073 if item.name == "young_modulus_factor" else item.mean for item in model.parameters]
     outputs = tuple((f"strain[{number}]", Quantity.STRAIN) for number in range(1, 25))
-    conditions = Conditions(np.array(values), health=tree["truth"]["state"].values)
+    conditions = Conditions(np.array(values), health=np.asarray(tree["truth"]["state"].values))
     response = model.respond(trial, outputs, ModelPatch(), conditions).values.copy()
     response[:, 16] += DRIFT.amplitude * trial.time / DRIFT.time
-    truth = tree["truth"]["strain"].values
+    truth = np.asarray(tree["truth"]["strain"].values)
     np.testing.assert_allclose(response, truth, atol=2e-4 * np.abs(truth).max())
 
 
@@ -107,6 +107,8 @@ def test_a_drifting_gauge_is_found_in_the_run(run: Path) -> None:
     members = {(effect.identifier, effect.place) for effect in found.verdict.effects}
     assert ("gauge_zero_drift", "g17") in members
     assert found.proof is not None
+    assert found.proof.held_out_before is not None
+    assert found.proof.held_out_after is not None
     assert found.proof.held_out_after.chi_square_per_dof < found.proof.held_out_before.chi_square_per_dof
 
 

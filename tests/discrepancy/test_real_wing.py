@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from discrepancy.campaign import TrialKind
 from discrepancy.errors import CampaignDataError, CampaignFileError
@@ -42,7 +43,7 @@ def write_records(folder: Path, count: int = 4, size: int = 795, seed: int = 3) 
             delimiter=",",
             header="t_s,V_low,V_mid,V_high",
         )
-    return zero
+    return np.asarray(zero)
 
 
 def test_a_sample_is_the_mean_of_four_columns_without_the_shared_zero(tmp_path: Path) -> None:
@@ -66,7 +67,7 @@ def test_the_scatter_between_trials_is_the_noise(tmp_path: Path) -> None:
     time = 0.03 * np.arange(400)
     # a motion of no law that a model could have, the same in all trials but for size, delay and zero
     motion = np.sin(30.0 * np.sqrt(1.0 + time)) / (1.0 + time)
-    windows = [
+    windows: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = [
         (
             time,
             (1.0 + 0.02 * k) * motion
