@@ -1,7 +1,7 @@
 """Name what is hidden in blind campaigns: `python -m benchmarks.blind_naming DIR [--jobs 2]`.
 
-DIR is what `python -m benchmarks.blind generate --out DIR` wrote. Only DIR/campaigns and DIR/leave_out.json are
-read; a verdict for each campaign goes to DIR/verdicts.
+DIR is what `python -m benchmarks.blind generate --out DIR` wrote. Only DIR/campaigns and DIR/leave_out.json
+are read; a verdict for each campaign goes to DIR/verdicts.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def verdict_row(found: Investigation) -> dict[str, Any]:
 
 
 def at_unit(patch: ModelPatch) -> ModelPatch:
-    """Return the patch with coefficients of power laws at unit speed and displacement, as the truth has them."""
+    """Return the patch with coefficients of power laws at unit speed and displacement, as the truth is."""
     primitives = []
     for item in patch:
         if isinstance(item, PowerDamping):
