@@ -37,6 +37,7 @@ STRUCTURE_FILES = (
     "motion.py",
     "motion_kernel.py",
     "patch_arrays.py",
+    "local_loss.py",
     "patched_wing.py",
     "patched_steps.py",
 )
