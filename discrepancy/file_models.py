@@ -237,6 +237,9 @@ class PatchDocument(_Document):
 
     schema_: Literal["uav-twin patch 1"] = Field(alias="schema")
     effects: list[PatchEffectModel]
+    channels: dict[str, str] = Field(
+        default_factory=dict, description="Outputs of the wing FMU by the names of channels."
+    )
 
 
 def json_schema(document: type[BaseModel]) -> str:

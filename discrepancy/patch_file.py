@@ -1,12 +1,14 @@
 """`patch.json`: the change of a model that an effect stands for, with posterior intervals and units."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
 
 import numpy as np
 
+from discrepancy.campaign import Campaign, Quantity
 from discrepancy.document_file import (
     Origin,
     effects_of,
@@ -25,6 +27,8 @@ from fe.patch import ModelPatch
 PATCH_NAME = "patch.json"
 
 _INTERVAL = (0.05, 0.95)
+_STRAIN = re.compile(r"strain\[(\d+)\]")
+_DISPLACEMENTS = ("tip_displacement", "load_point_displacement")
 
 
 @dataclass(frozen=True)
@@ -44,11 +48,12 @@ class PrimitiveInterval:
 
 @dataclass(frozen=True)
 class StoredPatch:
-    """Content of patch.json: effects, the intervals of their primitives by effect, and the origin."""
+    """Content of patch.json: effects, intervals of their primitives, origin, FMU outputs by channel."""
 
     effects: tuple[NamedEffect, ...]
     intervals: tuple[tuple[PrimitiveInterval, ...], ...]
     origin: Origin
+    channels: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def patch(self) -> ModelPatch:
@@ -93,6 +98,7 @@ def write_patch(
     effects: Sequence[NamedEffect],
     origin: Origin,
     draws: Sequence[Sequence[ModelPatch]] = (),
+    channels: Mapping[str, str] | None = None,
 ) -> Path:
     """Write patch.json, whole or not at all.
 
@@ -106,6 +112,9 @@ def write_patch(
         What it was found from.
     draws : sequence of sequence of ModelPatch, optional
         For each effect, in order: its patch at draws of the posterior. Without, intervals are null.
+    channels : mapping of str to str, optional
+        Outputs of the wing FMU by the names of channels, as `fmu_outputs` returns them: by it the FMU knows
+        what the patch's sensors are.
 
     Raises
     ------
@@ -120,9 +129,29 @@ def write_patch(
     for place, effect in enumerate(effects):
         intervals = primitive_intervals(effect.patch, draws[place] if draws else ())
         rows.append(plain(effect) | {"intervals": [plain(item) for item in intervals]})
-    return write_document(
-        path, {"schema": PATCH_SCHEMA, **origin_rows(origin), "effects": rows}, PatchDocument
-    )
+    content = {
+        "schema": PATCH_SCHEMA,
+        **origin_rows(origin),
+        "effects": rows,
+        "channels": dict(channels or {}),
+    }
+    return write_document(path, content, PatchDocument)
+
+
+def fmu_outputs(campaign: Campaign) -> dict[str, str]:
+    """Return the outputs of the wing FMU by the names of the channels that measure them.
+
+    Gauges count from 0 in a campaign, as in the design, and from 1 in the FMU. Channels that the FMU has no
+    output for (velocities, displacements of other places) are not in it.
+    """
+    outputs = {}
+    for name, channel in campaign.channels.items():
+        gauge = _STRAIN.fullmatch(channel.output)
+        if channel.quantity is Quantity.STRAIN and gauge is not None:
+            outputs[name] = f"strain[{int(gauge.group(1)) + 1}]"
+        elif channel.quantity is Quantity.DISPLACEMENT and channel.output in _DISPLACEMENTS:
+            outputs[name] = channel.output
+    return outputs
 
 
 def read_patch(path: Path) -> StoredPatch:
@@ -145,4 +174,4 @@ def read_patch(path: Path) -> StoredPatch:
         )
         for row in content["effects"]
     )  # fmt: skip
-    return StoredPatch(effects, intervals, origin_of(content))
+    return StoredPatch(effects, intervals, origin_of(content), content.get("channels", {}))

@@ -235,10 +235,7 @@ def fmu_bytes(
     _check_start(table)
     effects = []
     if patch is not None:
-        if kind != "python":
-            raise PatchFileError(
-                f"The {kind} FMU cannot carry missing effects: build the kind `python` with this patch."
-            )
+        check_kind(kind)
         effects = plain_effects(patch.for_outputs(output_channels(model.gauge_count)))
         start |= {switch_of(effect): float(activate) for effect in effects}
         table += effect_rows(effects, len(table), start)
@@ -267,6 +264,15 @@ def fmu_bytes(
     if kind == "compiled":
         members |= binary_of(members, f"uav_wing_{content_hash[:_TAG_LENGTH]}")
     return _archive(members), content_hash
+
+
+def check_kind(kind: FmuKind) -> None:
+    """Refuse a kind of FMU that cannot carry missing effects; raises `PatchFileError`."""
+    if kind != "python":
+        raise PatchFileError(
+            f"The FMU of the kind {kind!r} cannot carry missing effects: build the kind 'python' with this "
+            "patch."
+        )
 
 
 def start_values(state: DigitalState) -> dict[str, float]:

@@ -1,12 +1,15 @@
 """Patch files as an FMU takes them: effects with an id and primitives, channels named as outputs.
 
-The file may hold more (verdict, posterior, data hash); what is read here is
+The file may hold more (posterior, data hash); what is read here, in the names of `discrepancy.patch_file` or
+in shorter ones, is
 
 ```json
 {"schema": "uav-twin patch 1",
  "effects": [{"id": "gauge_zero_drift", "primitives": [{"kind": "sensor_drift", "channel": "g17", ...}]}],
  "channels": {"g17": "strain[17]"}}
 ```
+
+where `id` may also be called `identifier`, and `primitives` `patch`.
 """
 
 from __future__ import annotations
@@ -169,14 +172,14 @@ def _effects(rows: list[dict[str, Any]], where: str) -> tuple[Effect, ...]:
     effects: list[Effect] = []
     taken: set[str] = set()
     for number, row in enumerate(rows, start=1):
-        name = row.get("id")
+        name = row.get("id", row.get("identifier"))
         if not isinstance(name, str) or not _IDENTIFIER.fullmatch(name):
             raise PatchFileError(
                 f'{where}: the "id" of effect {number} must be letters, digits and underscores, but is '
                 f"{name!r}."
             )
         try:
-            patch = ModelPatch.from_list(row.get("primitives"), f"{where}, effect {name}")
+            patch = ModelPatch.from_list(row.get("primitives", row.get("patch")), f"{where}, effect {name}")
         except InvalidPatchError as cause:
             raise PatchFileError(str(cause)) from cause
         if not len(patch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +11,9 @@ import typer
 from uav_twin.fmu_bind import bind
 from uav_twin.fmu_check import check
 from uav_twin.fmu_simulate import simulate
+
+_SWITCH = re.compile(r"effect\.[A-Za-z0-9_]+\.active")
+"""The switch of a missing effect among the variables of an FMU."""
 
 fmu_app = typer.Typer(no_args_is_help=True, help="Build, describe, bind, check and simulate FMUs.")
 
@@ -43,7 +47,7 @@ def build(
     from fe.cache import reduced_model
     from fe.design import load_design
     from fe.patch_cache import patch_arrays
-    from fmu_asset.build import build_fmu
+    from fmu_asset.build import build_fmu, check_kind
     from fmu_asset.compiled.compiler import find_compiler
     from fmu_asset.errors import FmuBuildError
     from fmu_asset.patch_file import load_patch
@@ -60,6 +64,8 @@ def build(
         _build_script(script, out, replace=replace, other=for_the_wing)
         return
     effects = None if patch is None else load_patch(patch)
+    if effects is not None:
+        check_kind(kind)
     if kind == "compiled":
         find_compiler()  # before the wing is modelled, which can take a minute
     if calibration is None:
@@ -119,6 +125,12 @@ def info(
             facts.add_row(name.replace("_", " "), str(value))
         elif name == "platforms":
             facts.add_row("platforms", ", ".join(value))
+    switches = [row for row in record["variables"] if _SWITCH.fullmatch(row["name"])]
+    if switches:
+        effects = (
+            f"{row['name'].split('.')[1]} ({'on' if float(row['start']) else 'off'})" for row in switches
+        )
+        facts.add_row("effects", ", ".join(effects))
     console.print(facts)
     if variables:
         table = Table("variable", "causality", "unit", "least", "largest", "start", "description")

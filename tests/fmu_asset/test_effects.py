@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -343,5 +344,45 @@ def test_an_id_that_comes_twice_is_numbered() -> None:
 
 
 def test_the_compiled_kind_names_the_other(model: ReducedModel, patch: PatchFile, tmp_path: Path) -> None:
-    with pytest.raises(PatchFileError, match="build the kind `python`"):
+    with pytest.raises(PatchFileError, match="build the kind 'python'"):
         build_fmu(model, tmp_path / "wing.fmu", kind="source", patch=patch)
+
+
+def command(*words: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "uav_twin", "fmu", *map(str, words)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_the_command_line_refuses_before_it_models_a_wing(tmp_path: Path) -> None:
+    (tmp_path / "patch.json").write_bytes(content())
+    (tmp_path / "broken.json").write_bytes(b"{")
+    out = tmp_path / "wing.fmu"
+    for words, sentence in (
+        (("--patch", tmp_path / "patch.json", "--kind", "compiled"), "build the kind 'python'"),
+        (("--patch", tmp_path / "broken.json"), "is not JSON"),
+        (("--patch", tmp_path / "none.json"), "cannot be read"),
+        (("--activate",), "no --patch"),
+        (("--script", "gear_pump", "--patch", tmp_path / "patch.json"), "are for the wing"),
+    ):
+        done = command("build", "--out", out, *words)
+        assert done.returncode != 0
+        assert sentence in " ".join(done.stderr.replace("│", " ").split())
+        assert "Traceback" not in done.stderr
+        assert not out.exists()
+
+
+@pytest.mark.slow
+def test_the_command_line_packs_a_patch_and_lists_its_effects(tmp_path: Path) -> None:
+    (tmp_path / "patch.json").write_bytes(content())
+    done = command("build", "--out", tmp_path / "wing.fmu", "--patch", tmp_path / "patch.json", "--activate")
+    assert done.returncode == 0, done.stderr
+    shown = command("info", tmp_path / "wing.fmu")
+    assert "gauge_zero_drift (on)" in " ".join(shown.stdout.split())
+    assert "tunable" not in shown.stderr
+    shown = command("info", tmp_path / "wing.fmu", "--no-variables")
+    assert "effect.gauge_zero_drift.amplitude" not in shown.stdout

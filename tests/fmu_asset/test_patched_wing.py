@@ -13,9 +13,12 @@ import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 
-from discrepancy.campaign import Quantity, Release, Trial, TrialKind
+from discrepancy.campaign import Campaign, Channel, Quantity, Release, Trial, TrialKind
+from discrepancy.document_file import Origin
 from discrepancy.models.interface import Conditions
 from discrepancy.models.wing import WingModel
+from discrepancy.patch_file import fmu_outputs, read_patch, write_patch
+from discrepancy.verdict import NamedEffect
 from fe.patch import (
     STRUCTURE,
     BoucWen,
@@ -32,6 +35,7 @@ from fe.patch import (
     PowerStiffness,
     Primitive,
     RootCompliance,
+    SensorGain,
     SensorRotation,
     StiffnessDrift,
     Washout,
@@ -43,9 +47,10 @@ from fmu_asset.binding import Binding, parse_binding
 from fmu_asset.build import build_fmu
 from fmu_asset.check import check_fmu
 from fmu_asset.errors import FmuCallError, PatchFileError
-from fmu_asset.patch_file import SCHEMA, PatchFile, parse_patch
+from fmu_asset.patch_file import SCHEMA, PatchFile, load_patch, parse_patch
 from fmu_asset.patched_runtime import output_channels
 from fmu_asset.session import FmiAsset
+from reporting.provenance import collect_provenance
 
 OUTPUTS = [name for name, _ in output_channels(24)]
 STATE = np.array([1.0, 0.169, 0.134, 1.0735, 7.3124e-4])
@@ -154,9 +159,7 @@ def trial(kind: TrialKind, count: int, release: float = 0.0, **given: object) ->
 def expected(
     model: WingModel, given: Trial, patch: ModelPatch, health: Sequence[float] = (0.0, 0.0)
 ) -> np.ndarray:
-    # the FMU counts gauges from 1
-    first = 1 if model.output_quantity("strain[0]") is None else 0
-    names = [f"strain[{gauge + first}]" for gauge in range(24)] + OUTPUTS[24:]
+    names = [f"strain[{gauge}]" for gauge in range(24)] + OUTPUTS[24:]  # gauges count from 0 there
     outputs = tuple((name, model.output_quantity(name) or Quantity.STRAIN) for name in names)
     bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SensorRotation)))
     turned = len(bare) < len(patch)
@@ -225,8 +228,7 @@ def test_flights_are_those_of_the_naming_side(
     factors = np.array([1.0, 2.0, 3.5, -0.5, 2.5])
     damage = np.column_stack((0.15 * np.arange(5), 0.1 * np.ones(5)))
     given = trial(TrialKind.FLIGHT, 5, load_factor=factors, time=np.arange(5.0))
-    first = 1 if naming_side.output_quantity("strain[0]") is None else 0
-    outputs = tuple((f"strain[{gauge + first}]", Quantity.STRAIN) for gauge in range(24))
+    outputs = tuple((f"strain[{gauge}]", Quantity.STRAIN) for gauge in range(24))
     patch = ModelPatch(EFFECTS[name])
     wanted = naming_side.respond(given, outputs, patch, Conditions(STATE, health=damage)).values
     with FmiAsset(patched, door, isolated=False, parameters=on(name)) as asset:
@@ -355,3 +357,33 @@ def test_what_cannot_be_packed_is_refused(model: ReducedModel, arrays: PatchArra
     with pytest.raises(PatchFileError, match="'nose', which this model does not have"):
         build_fmu(model, tmp_path / "c.fmu", patch=patch, arrays=arrays)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(
+    model: ReducedModel, arrays: PatchArrays, fmu: Path, door: Binding, tmp_path: Path
+) -> None:
+    channels = {
+        "g2": Channel("g2", Quantity.STRAIN, "strain[2]", None),
+        "tip": Channel("tip", Quantity.DISPLACEMENT, "tip_displacement", None),
+        "rate": Channel("rate", Quantity.VELOCITY, "tip_displacement", None),
+    }
+    campaign = Campaign("chain", channels, (), None, {}, "")
+    outputs = fmu_outputs(campaign)
+    assert outputs == {"g2": "strain[3]", "tip": "tip_displacement"}
+    patch = ModelPatch((SensorGain("g2", 0.25),))
+    named = NamedEffect("gauge_gain", "Gauge gain", "g2", "gain", (), (), patch)
+    origin = Origin("chain", "wing", "ab" * 32, "cd" * 32, "uav-twin", collect_provenance(1))
+    path = write_patch(tmp_path / "patch.json", (named,), origin, channels=outputs)
+    assert read_patch(path).channels == outputs
+    packed = build_fmu(
+        model, tmp_path / "wing.fmu", patch=load_patch(path), arrays=arrays, activate=True
+    ).path
+    record = door.model_dump(exclude_none=True, mode="json")
+    del record["load"]["temperature"]
+    rows = []
+    for which in (fmu, packed):
+        with FmiAsset(which, parse_binding(record), isolated=False) as asset:
+            rows.append(asset.step({"load_factor": 2.0}).values)
+    ratio = rows[1] / rows[0]
+    assert ratio[2] == pytest.approx(1.25, rel=1e-14)
+    assert np.all(np.delete(ratio, 2) == 1.0)
