@@ -141,14 +141,14 @@ def write_patch(
 def fmu_outputs(campaign: Campaign) -> dict[str, str]:
     """Return the outputs of the wing FMU by the names of the channels that measure them.
 
-    Gauges count from 0 in a campaign, as in the design, and from 1 in the FMU. Channels that the FMU has no
-    output for (velocities, displacements of other places) are not in it.
+    Gauges count from 1 in both. Channels that the FMU has no output for (velocities, displacements of other
+    places) are not in it.
     """
     outputs = {}
     for name, channel in campaign.channels.items():
         gauge = _STRAIN.fullmatch(channel.output)
         if channel.quantity is Quantity.STRAIN and gauge is not None:
-            outputs[name] = f"strain[{int(gauge.group(1)) + 1}]"
+            outputs[name] = channel.output
         elif channel.quantity is Quantity.DISPLACEMENT and channel.output in _DISPLACEMENTS:
             outputs[name] = channel.output
     return outputs

@@ -159,7 +159,7 @@ def trial(kind: TrialKind, count: int, release: float = 0.0, **given: object) ->
 def expected(
     model: WingModel, given: Trial, patch: ModelPatch, health: Sequence[float] = (0.0, 0.0)
 ) -> np.ndarray:
-    names = [f"strain[{gauge}]" for gauge in range(24)] + OUTPUTS[24:]  # gauges count from 0 there
+    names = [f"strain[{gauge}]" for gauge in range(1, 25)] + OUTPUTS[24:]
     outputs = tuple((name, model.output_quantity(name) or Quantity.STRAIN) for name in names)
     bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SensorRotation)))
     turned = len(bare) < len(patch)
@@ -228,7 +228,7 @@ def test_flights_are_those_of_the_naming_side(
     factors = np.array([1.0, 2.0, 3.5, -0.5, 2.5])
     damage = np.column_stack((0.15 * np.arange(5), 0.1 * np.ones(5)))
     given = trial(TrialKind.FLIGHT, 5, load_factor=factors, time=np.arange(5.0))
-    outputs = tuple((f"strain[{gauge}]", Quantity.STRAIN) for gauge in range(24))
+    outputs = tuple((f"strain[{gauge}]", Quantity.STRAIN) for gauge in range(1, 25))
     patch = ModelPatch(EFFECTS[name])
     wanted = naming_side.respond(given, outputs, patch, Conditions(STATE, health=damage)).values
     with FmiAsset(patched, door, isolated=False, parameters=on(name)) as asset:
@@ -369,7 +369,7 @@ def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(
     }
     campaign = Campaign("chain", channels, (), None, {}, "")
     outputs = fmu_outputs(campaign)
-    assert outputs == {"g2": "strain[3]", "tip": "tip_displacement"}
+    assert outputs == {"g2": "strain[2]", "tip": "tip_displacement"}
     patch = ModelPatch((SensorGain("g2", 0.25),))
     named = NamedEffect("gauge_gain", "Gauge gain", "g2", "gain", (), (), patch)
     origin = Origin("chain", "wing", "ab" * 32, "cd" * 32, "uav-twin", collect_provenance(1))
@@ -385,5 +385,5 @@ def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(
         with FmiAsset(which, parse_binding(record), isolated=False) as asset:
             rows.append(asset.step({"load_factor": 2.0}).values)
     ratio = rows[1] / rows[0]
-    assert ratio[2] == pytest.approx(1.25, rel=1e-14)
-    assert np.all(np.delete(ratio, 2) == 1.0)
+    assert ratio[1] == pytest.approx(1.25, rel=1e-14)
+    assert np.all(np.delete(ratio, 1) == 1.0)
