@@ -1,0 +1,394 @@
+"""Ring-downs before and after: time histories, spectra of residuals, backbones, restoring force."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.signal import butter, sosfiltfilt, welch
+
+from discrepancy.backbone import Backbone, backbones, restoring_force_surface
+from discrepancy.campaign import TrialKind
+from discrepancy.errors import FitError
+from discrepancy.report.residual_figures import UNIT_OF, size
+from discrepancy.residual_dependence import predicted_frequencies
+from discrepancy.residuals import FittedTrial, ResidualSet
+from reporting.figures import (
+    OBSERVED,
+    PAST,
+    PREDICTION,
+    REFERENCE,
+    new_figure,
+    publication_style,
+)
+
+FloatArray = NDArray[np.float64]
+
+BEFORE, AFTER = "model as it was", "with the effect"
+LEAST_POINTS = 4
+"""Fewest measured points of a mode whose backbone is drawn."""
+LARGEST_ERROR = 0.25
+"""Largest error of a damping ratio, relative to the median ratio, of a point that is drawn."""
+FORCE_BINS = 24
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The record with the largest gap: index of the trial in its set, name of the channel."""
+
+    trial: int
+    channel: str
+
+
+def worst_record(before: ResidualSet) -> Worst | None:
+    """Return the dynamic record whose residuals exceed the noise most; None without one."""
+    found = [
+        (size(item, column), number, name)
+        for number, item in enumerate(before.trials)
+        if item.trial.is_dynamic
+        for column, name in enumerate(item.trial.channels)
+        if item.used[:, column].any()
+    ]
+    found = [row for row in found if np.isfinite(row[0])]
+    if not found:
+        return None
+    _, number, name = max(found)
+    return Worst(number, name)
+
+
+def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure:
+    """Draw the worst record: measured and predicted values, and the residuals against the noise."""
+    item = before.trials[worst.trial]
+    column = item.column(worst.channel)
+    factor, unit = UNIT_OF[before.channels[worst.channel].quantity]
+    time, used = item.trial.time, item.used[:, column]
+    with publication_style():
+        rows = 3 if after is not None else 2
+        figure = new_figure(1.45 * rows + 0.35)
+        grid = figure.add_gridspec(
+            rows, 1, left=0.095, right=0.985, bottom=0.38 / (1.45 * rows), top=1.0 - 0.2 / (1.45 * rows),
+            hspace=0.34, height_ratios=[1.25, *([1.0] * (rows - 1))],
+        )  # fmt: skip
+        axes = figure.add_subplot(grid[0, 0])
+        axes.plot(
+            time[used], factor * item.trial.values[used, column], ".", ms=1.8, color=OBSERVED, label="measured"
+        )
+        axes.plot(
+            time, factor * item.prediction[:, column], "--", lw=0.9, color=PREDICTION, label=BEFORE
+        )
+        if after is not None:
+            other = after.trials[worst.trial]
+            axes.plot(time, factor * other.prediction[:, column], lw=0.9, color=PAST, label=AFTER)
+        axes.set_ylabel(f"{worst.channel}, {unit}")
+        axes.set_title(f"a  {worst.channel} in {item.trial.name}", loc="left")
+        axes.legend(ncol=3, loc="upper right")
+        axes.margins(x=0.01)
+        panels = [(item, PREDICTION, f"b  residual, {BEFORE}")]
+        if after is not None:
+            panels.append((after.trials[worst.trial], PAST, f"c  residual, {AFTER} (own scale)"))
+        for number, (each, colour, title) in enumerate(panels, start=1):
+            below = figure.add_subplot(grid[number, 0], sharex=axes)
+            noise = factor * float(each.noise_deviation[column])
+            below.axhspan(-2.0 * noise, 2.0 * noise, color=REFERENCE, alpha=0.3, lw=0.0, label="noise, ± 2 s0")
+            below.plot(time[used], factor * each.residual[used, column], lw=0.6, color=colour)
+            below.set_ylabel(f"residual, {unit}")
+            below.set_title(title, loc="left")
+            below.margins(x=0.01)
+            if number == 1:
+                below.legend(loc="upper right")
+        figure.axes[-1].set_xlabel("time, s")
+        for above in figure.axes[:-1]:
+            above.tick_params(labelbottom=False)
+    return figure
+
+
+def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure | None:
+    """Draw spectra of the residuals of the worst channel over all dynamic trials, with that of the noise."""
+    items = [(before, PREDICTION, "--", BEFORE)] + ([(after, PAST, "-", AFTER)] if after is not None else [])
+    drawn = []
+    for residuals, colour, dashes, label in items:
+        spectrum = _spectrum(residuals, worst.channel)
+        if spectrum is not None:
+            drawn.append((*spectrum, colour, dashes, label))
+    if not drawn:
+        return None
+    noise = before.channels[worst.channel].noise
+    with publication_style():
+        figure = new_figure(2.6)
+        axes = figure.add_axes((0.095, 0.165, 0.885, 0.755))
+        if noise is not None and noise.samples is not None and noise.interval and len(noise.samples) >= 32:
+            count = min(len(noise.samples), 128)
+            at, power = welch(noise.samples / noise.standard_deviation, 1.0 / noise.interval, nperseg=count)
+            axes.plot(
+                at[1:], power[1:] * 0.5 / noise.interval, color=OBSERVED, lw=0.8, alpha=0.7, label="noise record"
+            )
+        axes.axhline(1.0, color=REFERENCE, lw=1.2, label="white noise of the stated size")
+        for at, power, colour, dashes, label in drawn:
+            axes.plot(at, power, dashes, color=colour, lw=1.1, label=label)
+        for number, frequency in enumerate(_frequencies(before)[:4], start=1):
+            axes.axvline(frequency, color=REFERENCE, lw=0.6, ls=":")
+            axes.annotate(
+                f"mode {number}", (frequency, 1.0), (2.0, -2.0), xycoords=("data", "axes fraction"),
+                textcoords="offset points", rotation=90, va="top", fontsize=6.5, color=OBSERVED,
+            )  # fmt: skip
+        axes.set_yscale("log")
+        axes.set_xlim(0.0, float(drawn[0][0][-1]))
+        axes.set_xlabel("frequency, Hz")
+        axes.set_ylabel("power / white noise")
+        axes.set_title(f"residuals of {worst.channel}, all dynamic trials", loc="left")
+        axes.legend(loc="upper right")
+    return figure
+
+
+def _spectrum(residuals: ResidualSet, channel: str) -> tuple[FloatArray, FloatArray] | None:
+    """Return frequency [Hz] and power over that of white noise with the stated deviation, mean of the trials."""
+    found: dict[float, list[tuple[FloatArray, FloatArray]]] = {}
+    for item in residuals.trials:
+        if not item.trial.is_dynamic or channel not in item.trial.channels or len(item.trial.time) < 32:
+            continue
+        series = np.nan_to_num(item.standardised[:, item.column(channel)])
+        count = min(len(series), 512)
+        at, power = welch(series, 1.0 / item.trial.interval, nperseg=count, detrend="constant")
+        found.setdefault(round(item.trial.interval * len(at), 9), []).append(
+            (at[1:], power[1:] * 0.5 / item.trial.interval)
+        )
+    if not found:
+        return None
+    most = max(found.values(), key=len)
+    return most[0][0], np.mean([power for _, power in most], axis=0)
+
+
+def _ringdowns(residuals: ResidualSet) -> list[FittedTrial]:
+    return [item for item in residuals.trials if item.trial.kind is TrialKind.RINGDOWN]
+
+
+def _frequencies(residuals: ResidualSet) -> tuple[float, ...]:
+    items = [item for item in residuals.trials if item.trial.is_dynamic]
+    return predicted_frequencies(items) if items else ()
+
+
+def _clearest(items: Sequence[FittedTrial]) -> str:
+    """Return the channel whose motion exceeds its noise most."""
+    sizes: dict[str, float] = {}
+    for item in items:
+        for column, name in enumerate(item.trial.channels):
+            ratio = float(np.std(item.prediction[:, column]) / item.noise_deviation[column])
+            sizes[name] = max(sizes.get(name, 0.0), ratio)
+    return max(sizes, key=lambda name: sizes[name])
+
+
+def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure, str] | None:
+    """Draw frequency and damping ratio over the amplitude of the modes of the ring-downs, and name the channel.
+
+    None where no record is long enough or no mode rings long enough.
+    """
+    items = _ringdowns(before)
+    frequencies = _frequencies(before)
+    if not items or not frequencies:
+        return None
+    channel = _clearest(items)
+    measured = _backbones(items, channel, frequencies, None)
+    curves = [(_backbones(items, channel, frequencies, "prediction"), PREDICTION, "--", BEFORE)]
+    if after is not None:
+        curves.append((_backbones(_ringdowns(after), channel, frequencies, "prediction"), PAST, "-", AFTER))
+    modes = [mode for mode in sorted(measured) if sum(len(c.time) for c in measured[mode]) >= LEAST_POINTS][:2]
+    if not modes:
+        return None
+    factor, unit = UNIT_OF[before.channels[channel].quantity]
+    with publication_style():
+        figure = new_figure(2.3 * len(modes) + 0.3)
+        grid = figure.add_gridspec(
+            len(modes), 2, left=0.09, right=0.985, bottom=0.19 / len(modes) + 0.02,
+            top=1.0 - 0.22 / (2.3 * len(modes)), hspace=0.4, wspace=0.26,
+        )  # fmt: skip
+        for row, mode in enumerate(modes):
+            for place, (name, label) in enumerate(
+                (("frequency", "frequency, Hz"), ("damping_ratio", "damping ratio, %"))
+            ):
+                axes = figure.add_subplot(grid[row, place])
+                scale = 100.0 if name == "damping_ratio" else 1.0
+                for found, colour, dashes, text in curves:
+                    _draw_curves(axes, found.get(mode, []), name, factor, scale, colour, dashes, text)
+                _draw_points(axes, measured[mode], name, factor, scale)
+                axes.set_xscale("log")
+                axes.set_ylabel(label)
+                axes.set_title(f"{'abcd'[2 * row + place]}  mode {mode}", loc="left")
+                axes.set_xlabel(f"amplitude of {channel}, {unit}")
+                _range(axes, measured[mode], name, scale)
+                if row == 0 and place == 1:
+                    axes.legend(loc="best")
+    return figure, channel
+
+
+def _backbones(
+    items: Sequence[FittedTrial], channel: str, frequencies: Sequence[float], source: str | None
+) -> dict[int, list[Backbone]]:
+    found: dict[int, list[Backbone]] = {}
+    for item in items:
+        if channel not in item.trial.channels:
+            continue
+        column = item.column(channel)
+        noise = float(item.noise_deviation[column])
+        values = item.prediction[:, column] if source else np.where(
+            item.used[:, column], item.trial.values[:, column], item.prediction[:, column]
+        )  # fmt: skip
+        try:
+            curves = backbones(item.trial.time, values, list(frequencies), noise_deviation=noise)
+        except FitError:
+            continue
+        for curve in curves:
+            clear = _clear(curve)
+            if clear is not None:
+                found.setdefault(curve.mode, []).append(clear)
+    return found
+
+
+def _clear(curve: Backbone) -> Backbone | None:
+    """Return the points of a curve whose errors leave something to be seen."""
+    if not curve.time.size:
+        return None
+    limit = LARGEST_ERROR * max(float(np.median(np.abs(curve.damping_ratio))), 1e-4)
+    keep = curve.damping_ratio_error < limit
+    if not keep.any():
+        return None
+    fields = (
+        "time", "amplitude", "amplitude_error", "frequency", "frequency_error", "damping_ratio",
+        "damping_ratio_error",
+    )  # fmt: skip
+    return Backbone(curve.mode, *(getattr(curve, name)[keep] for name in fields))
+
+
+def _draw_points(axes: Axes, curves: Sequence[Backbone], name: str, factor: float, scale: float) -> None:
+    label = "measured, ± 1 standard error"
+    for curve in curves:
+        axes.errorbar(
+            factor * curve.amplitude, scale * getattr(curve, name), scale * getattr(curve, f"{name}_error"),
+            fmt="o", ms=2.6, color=OBSERVED, elinewidth=0.6, lw=0.0, alpha=0.85, label=label, zorder=3,
+        )  # fmt: skip
+        label = "_nolegend_"
+
+
+def _draw_curves(
+    axes: Axes,
+    curves: Sequence[Backbone],
+    name: str,
+    factor: float,
+    scale: float,
+    colour: str,
+    dashes: str,
+    label: str,
+) -> None:
+    for curve in curves:
+        axes.plot(
+            factor * curve.amplitude, scale * getattr(curve, name), dashes, color=colour, lw=1.1, alpha=0.8,
+            label=label,
+        )  # fmt: skip
+        label = "_nolegend_"
+
+
+def _range(axes: Axes, curves: Sequence[Backbone], name: str, scale: float) -> None:
+    """Show what was measured and its surroundings, whatever a wrong model does."""
+    values = scale * np.concatenate([getattr(curve, name) for curve in curves])
+    low, high = np.quantile(values, (0.02, 0.98))
+    drawn = axes.get_ylim()
+    wide = max(float(high - low), 0.02 * abs(float(np.median(values))))
+    axes.set_ylim(max(drawn[0], low - 1.2 * wide), min(drawn[1], high + 1.2 * wide))
+
+
+def force_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure, str] | None:
+    """Draw what the restoring force of the first mode has beside its linear part, over velocity and displacement.
+
+    Measured and predicted signals are filtered and evaluated alike. None where a record is too short or too
+    coarse.
+    """
+    items = _ringdowns(before)
+    frequencies = _frequencies(before)
+    if not items or not frequencies:
+        return None
+    channel = _clearest(items)
+    number = max(
+        (n for n, item in enumerate(items) if channel in item.trial.channels),
+        key=lambda n: float(np.ptp(items[n].prediction[:, items[n].column(channel)])),
+    )
+    item = items[number]
+    column = item.column(channel)
+    values = np.where(item.used[:, column], item.trial.values[:, column], item.prediction[:, column])
+    signals = [(values, "measured"), (item.prediction[:, column], "before")]
+    if after is not None:
+        signals.append((_ringdowns(after)[number].prediction[:, column], "after"))
+    try:
+        surfaces = {
+            name: restoring_force_surface(
+                item.trial.time, _first_mode(signal, item.trial.interval, frequencies), frequencies[0]
+            )
+            for signal, name in signals
+        }
+    except (FitError, ValueError):
+        return None
+    rate = 2.0 * np.pi * frequencies[0]
+    shown = surfaces["measured"]
+    top = float(np.abs(shown.displacement).max())
+    design = np.column_stack((shown.displacement, shown.velocity, np.ones_like(shown.velocity)))
+    line = np.linalg.lstsq(design, -shown.acceleration, rcond=None)[0]
+    styles = {
+        "before": (PREDICTION, "--", BEFORE),
+        "after": (PAST, "-", AFTER),
+    }
+    with publication_style():
+        figure = new_figure(2.5)
+        grid = figure.add_gridspec(1, 2, left=0.09, right=0.985, bottom=0.17, top=0.9, wspace=0.26)
+        for place, (name, label) in enumerate(
+            (("velocity", "velocity / largest"), ("displacement", "displacement / largest"))
+        ):
+            axes = figure.add_subplot(grid[0, place])
+            for key, surface in surfaces.items():
+                table = np.column_stack((surface.displacement, surface.velocity, np.ones_like(surface.velocity)))
+                rest = 100.0 * (-surface.acceleration - table @ line) / (rate**2 * top)
+                x, v = surface.displacement / top, surface.velocity / (rate * top)
+                along, other = (v, x) if name == "velocity" else (x, v)
+                near = np.abs(other) < 0.35 * np.hypot(x, v)
+                middles, means, errors = _binned(along[near], rest[near])
+                if key == "measured":
+                    axes.errorbar(
+                        middles, means, errors, fmt="o", ms=2.8, color=OBSERVED, elinewidth=0.7, label="measured"
+                    )
+                else:
+                    colour, dashes, text = styles[key]
+                    axes.plot(middles, means, dashes, color=colour, lw=1.2, label=text)
+            axes.axhline(0.0, color=REFERENCE, lw=0.6, zorder=0)
+            axes.set_xlabel(label)
+            axes.set_ylabel("force less linear part, %" if place == 0 else "")
+            axes.set_title(
+                ("a  while passing through rest", "b  while turning back")[place], loc="left"
+            )
+            if place == 0:
+                axes.legend(loc="best")
+    return figure, f"{channel} in {item.trial.name}"
+
+
+def _first_mode(signal: FloatArray, interval: float, frequencies: Sequence[float]) -> FloatArray:
+    """Return the signal below the second mode: zero phase, so that no force is turned into another."""
+    higher = [f for f in frequencies if f > 1.5 * frequencies[0]]
+    if not higher:
+        return signal
+    cut = float(np.sqrt(frequencies[0] * higher[0]))
+    if cut >= 0.45 / interval:
+        return signal
+    return np.asarray(sosfiltfilt(butter(4, cut, fs=1.0 / interval, output="sos"), signal))
+
+
+def _binned(along: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    edges = np.linspace(-1.0, 1.0, FORCE_BINS + 1)
+    place = np.clip(np.digitize(along, edges) - 1, 0, FORCE_BINS - 1)
+    rows = [
+        (0.5 * (edges[n] + edges[n + 1]), values[place == n].mean(),
+         values[place == n].std() / np.sqrt(np.sum(place == n)))
+        for n in range(FORCE_BINS)
+        if np.sum(place == n) >= 3
+    ]  # fmt: skip
+    table = np.array(rows).reshape(-1, 3)
+    return table[:, 0], table[:, 1], table[:, 2]
+
+
