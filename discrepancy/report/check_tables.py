@@ -45,10 +45,14 @@ def _row(found: Separability, item: Detectability) -> tuple[str, ...]:
 
 
 def can_decide_table(found: Separability) -> Table:
-    """Return the rows as a table of the page; reasons stand where sizes would."""
+    """Return the rows as a table of the page, those that can be tested."""
     return Table(
-        tuple(Column(title, numeric=title == "prior median") for title in HEADINGS),
-        [tuple(cell.replace("_", " ") for cell in row) for row in rows_of(found)],
+        tuple(Column(title, numeric=title in ("prior median", "detectable from")) for title in HEADINGS),
+        [
+            tuple(cell.replace("_", " ") for cell in row)
+            for row, item in zip(rows_of(found), found.detectability, strict=True)
+            if not item.reason
+        ],
     )
 
 

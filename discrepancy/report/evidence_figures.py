@@ -25,31 +25,29 @@ def evidence_figure(hypotheses: Sequence[Hypothesis]) -> Figure:
     none = next((item for item in hypotheses if not item.effects), None)
     if none is not None and none not in shown:
         shown.append(none)
-    names = [hypothesis_name(item) for item in shown]
-    height = 0.27 * len(shown) + 0.75
+    names = [_wrapped(hypothesis_name(item)) for item in shown]
+    height = 0.3 * len(shown) + 0.8
     with publication_style():
         figure = new_figure(height)
-        left = min(0.1 + 0.0082 * max(len(name) for name in names), 0.52)
-        axes = figure.add_axes((left, 0.46 / height, 0.99 - left - 0.2, 1.0 - 0.72 / height))
+        longest = max(len(line) for name in names for line in name.split("\n"))
+        left = min(0.03 + 0.0092 * longest, 0.5)
+        axes = figure.add_axes((left, 0.46 / height, 0.80 - left, 1.0 - 0.76 / height))
+        columns = axes.get_yaxis_transform()
+        reach = 1.0 / (0.80 - left)  # of the figure's width, in widths of the axes
         for row, item in enumerate(shown):
-            chosen = row == 0
             value = max(item.probability, LEAST_PROBABILITY)
-            colour = PAST if chosen else OBSERVED
-            axes.plot([LEAST_PROBABILITY, value], [row, row], color=colour, lw=1.6 if chosen else 1.0)
+            colour = PAST if row == 0 else OBSERVED
+            axes.plot([LEAST_PROBABILITY, value], [row, row], color=colour, lw=1.6 if row == 0 else 1.0)
             beyond = item.probability < LEAST_PROBABILITY
             axes.plot(value, row, "<" if beyond else "o", color=colour, ms=5.0, clip_on=False)
-            gain = "" if none is None else f"{item.log_evidence - none.log_evidence:+,.1f}"
+            gain = "" if none is None else _signed(item.log_evidence - none.log_evidence)
+            for place, text in ((0.095, probability_text(item.probability)), (0.185, gain)):
+                axes.text(
+                    1.0 + reach * place, row, text, transform=columns, va="center", ha="right", fontsize=7.0
+                )
+        for place, text in ((0.095, "p"), (0.185, "ln B")):
             axes.text(
-                1.03, row, probability_text(item.probability), transform=axes.get_yaxis_transform(), va="center",
-                fontsize=7.0,
-            )  # fmt: skip
-            axes.text(
-                1.30, row, "0" if item is none else gain.replace("-", "\N{MINUS SIGN}"),
-                transform=axes.get_yaxis_transform(), va="center", ha="right", fontsize=7.0,
-            )  # fmt: skip
-        for place, text, align in ((1.03, "p", "left"), (1.30, "ln B", "right")):
-            axes.text(
-                place, -0.9, text, transform=axes.get_yaxis_transform(), va="center", ha=align, fontsize=7.0,
+                1.0 + reach * place, -0.95, text, transform=columns, va="center", ha="right", fontsize=7.0,
                 fontweight="bold",
             )  # fmt: skip
         axes.axvline(0.95, color=REFERENCE, lw=0.8, ls=":")
@@ -58,8 +56,20 @@ def evidence_figure(hypotheses: Sequence[Hypothesis]) -> Figure:
         axes.set_ylim(len(shown) - 0.5, -0.6)
         axes.set_yticks(range(len(shown)), names)
         axes.tick_params(axis="y", length=0)
-        axes.set_xlabel("probability among the hypotheses compared (dotted: what a name needs)")
+        axes.set_xlabel("probability among the hypotheses compared")
     return figure
+
+
+def _wrapped(name: str) -> str:
+    """Return a long set of effects in two lines."""
+    return name.replace(" + ", "\n+ ", 1) if len(name) > 38 else name
+
+
+def _signed(value: float) -> str:
+    if value == 0.0:
+        return "0"
+    text = f"{value:+,.0f}" if abs(value) >= 1000.0 else f"{value:+.1f}"
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
 def pit_figure(scores: Mapping[str, Scores]) -> Figure:

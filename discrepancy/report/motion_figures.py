@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt, welch
 
@@ -20,6 +21,7 @@ from reporting.figures import (
     PAST,
     PREDICTION,
     REFERENCE,
+    TRUTH,
     new_figure,
     publication_style,
 )
@@ -122,9 +124,9 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
             count = min(len(noise.samples), 128)
             at, power = welch(noise.samples / noise.standard_deviation, 1.0 / noise.interval, nperseg=count)
             axes.plot(
-                at[1:], power[1:] * 0.5 / noise.interval, color=OBSERVED, lw=0.8, alpha=0.7, label="noise record"
+                at[1:], power[1:] * 0.5 / noise.interval, color=OBSERVED, lw=0.8, alpha=0.6, label="noise record"
             )
-        axes.axhline(1.0, color=REFERENCE, lw=1.2, label="white noise of the stated size")
+        axes.axhline(1.0, color=TRUTH, lw=0.7, ls="-.", label="white noise of the stated size")
         for at, power, colour, dashes, label in drawn:
             axes.plot(at, power, dashes, color=colour, lw=1.1, label=label)
         for number, frequency in enumerate(_frequencies(before)[:4], start=1):
@@ -169,14 +171,35 @@ def _frequencies(residuals: ResidualSet) -> tuple[float, ...]:
     return predicted_frequencies(items) if items else ()
 
 
-def _clearest(items: Sequence[FittedTrial]) -> str:
-    """Return the channel whose motion exceeds its noise most."""
-    sizes: dict[str, float] = {}
+def _clearest(items: Sequence[FittedTrial], frequency: float) -> str:
+    """Return the channel that shows the first mode best: clear of noise, and by itself."""
+    clear: dict[str, float] = {}
+    pure: dict[str, float] = {}
     for item in items:
+        at = np.fft.rfftfreq(len(item.trial.time), item.trial.interval)
+        near = (at > frequency / 1.4) & (at < frequency * 1.4)
+        power = np.abs(np.fft.rfft(item.prediction - item.prediction.mean(axis=0), axis=0)) ** 2
         for column, name in enumerate(item.trial.channels):
-            ratio = float(np.std(item.prediction[:, column]) / item.noise_deviation[column])
-            sizes[name] = max(sizes.get(name, 0.0), ratio)
-    return max(sizes, key=lambda name: sizes[name])
+            total = float(power[1:, column].sum())
+            first = float(power[near, column].sum())
+            ratio = float(np.sqrt(first) / item.noise_deviation[column])
+            clear[name] = max(clear.get(name, 0.0), ratio)
+            pure[name] = min(pure.get(name, 1.0), first / total if total > 0.0 else 0.0)
+    least = 0.1 * max(clear.values())
+    return max((name for name in clear if clear[name] >= least), key=lambda name: pure[name])
+
+
+def _others(values: FloatArray, interval: float, frequency: float) -> list[float]:
+    """Return the frequencies of peaks above a first mode, down to a millionth of its power."""
+    series = (values - values.mean()) * np.hanning(2 * len(values))[len(values) :]
+    power = np.abs(np.fft.rfft(series)) ** 2
+    at = np.fft.rfftfreq(len(values), interval)
+    found = []
+    for number in np.flatnonzero((at > 1.6 * frequency) & (power > 1e-6 * power.max())):
+        near = (at > at[number] / 1.25) & (at < at[number] * 1.25)
+        if power[number] >= power[near].max() and power[number] > 10.0 * np.median(power[near]):
+            found.append(float(at[number]))
+    return found
 
 
 def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure, str] | None:
@@ -188,7 +211,7 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
     frequencies = _frequencies(before)
     if not items or not frequencies:
         return None
-    channel = _clearest(items)
+    channel = _clearest(items, frequencies[0])
     measured = _backbones(items, channel, frequencies, None)
     curves = [(_backbones(items, channel, frequencies, "prediction"), PREDICTION, "--", BEFORE)]
     if after is not None:
@@ -213,6 +236,9 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
                     _draw_curves(axes, found.get(mode, []), name, factor, scale, colour, dashes, text)
                 _draw_points(axes, measured[mode], name, factor, scale)
                 axes.set_xscale("log")
+                axes.xaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0)))
+                axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+                axes.xaxis.set_minor_locator(NullLocator())
                 axes.set_ylabel(label)
                 axes.set_title(f"{'abcd'[2 * row + place]}  mode {mode}", loc="left")
                 axes.set_xlabel(f"amplitude of {channel}, {unit}")
@@ -307,7 +333,7 @@ def force_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure
     frequencies = _frequencies(before)
     if not items or not frequencies:
         return None
-    channel = _clearest(items)
+    channel = _clearest(items, frequencies[0])
     number = max(
         (n for n, item in enumerate(items) if channel in item.trial.channels),
         key=lambda n: float(np.ptp(items[n].prediction[:, items[n].column(channel)])),
@@ -318,10 +344,14 @@ def force_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure
     signals = [(values, "measured"), (item.prediction[:, column], "before")]
     if after is not None:
         signals.append((_ringdowns(after)[number].prediction[:, column], "after"))
+    others = _others(values, item.trial.interval, frequencies[0])
+    edge = round(1.0 / (frequencies[0] * item.trial.interval))  # where the filter has seen one side only
     try:
         surfaces = {
             name: restoring_force_surface(
-                item.trial.time, _first_mode(signal, item.trial.interval, frequencies), frequencies[0]
+                item.trial.time[edge:-edge],
+                _first_mode(signal, item.trial.interval, frequencies[0], others)[edge:-edge],
+                frequencies[0],
             )
             for signal, name in signals
         }
@@ -368,15 +398,16 @@ def force_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure
     return figure, f"{channel} in {item.trial.name}"
 
 
-def _first_mode(signal: FloatArray, interval: float, frequencies: Sequence[float]) -> FloatArray:
+def _first_mode(
+    signal: FloatArray, interval: float, frequency: float, others: Sequence[float]
+) -> FloatArray:
     """Return the signal below the second mode: zero phase, so that no force is turned into another."""
-    higher = [f for f in frequencies if f > 1.5 * frequencies[0]]
-    if not higher:
+    if not others:
         return signal
-    cut = float(np.sqrt(frequencies[0] * higher[0]))
+    cut = float(np.sqrt(frequency * min(others)))
     if cut >= 0.45 / interval:
         return signal
-    return np.asarray(sosfiltfilt(butter(4, cut, fs=1.0 / interval, output="sos"), signal))
+    return np.asarray(sosfiltfilt(butter(6, cut, fs=1.0 / interval, output="sos"), signal))
 
 
 def _binned(along: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

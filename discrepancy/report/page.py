@@ -28,6 +28,7 @@ from discrepancy.report.text import (
     added_label,
     catalogue_of,
     estimate_text,
+    formula,
     headline,
     hypothesis_name,
     listing,
@@ -224,8 +225,8 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
     investigation, origin = content.investigation, content.origin
     verdict = investigation.verdict
     page = Page(
-        f"What {origin.model} lacks: {origin.campaign}",
-        "Discrepancy between a model and measured data: located, named, added, proved",
+        origin.campaign,
+        f"What the model “{origin.model}” lacks beside these data: located, named, added, proved",
         footer=(
             f"Repeat it: {origin.command}",
             f"Data {origin.data_hash[:16]}, model {origin.model_hash[:16]}, seed {origin.provenance.seed}.",
@@ -295,8 +296,8 @@ def _add_verdict(page: Page, content: ReportInput) -> None:
         entry = catalogue.get(effect.identifier)
         if entry is not None:
             page.add_paragraph(
-                f"{effect.name[0].upper()}{effect.name[1:]}: {entry.equation}. Signature: {entry.signature}. "
-                f"Source: {entry.reference}."
+                f"{effect.name[0].upper()}{effect.name[1:]}: {formula(entry.equation)}. Its signature: "
+                f"{_sentence(formula(entry.signature))} Source: {_sentence(entry.reference)}"
             )
     rows = []
     for effect in verdict.effects:
@@ -304,7 +305,7 @@ def _add_verdict(page: Page, content: ReportInput) -> None:
             value, interval = estimate_text(item)
             rows.append(
                 (
-                    effect.name, effect.place or "\N{EN DASH}", item.description or item.name.replace("_", " "),
+                    effect.name, effect.place or "\N{EN DASH}", formula(item.description or item.name.replace("_", " ")),
                     value, interval, unit_text(item.unit),
                 )
             )  # fmt: skip
@@ -323,6 +324,10 @@ def _add_verdict(page: Page, content: ReportInput) -> None:
         title="What is added" if verdict.kind is VerdictKind.NAMED else "What could be added",
     )  # fmt: skip
     _add_primitives(page, content)
+
+
+def _sentence(text: str) -> str:
+    return text.rstrip(".") + "."
 
 
 def _distinct(effects: Sequence[NamedEffect]) -> list[NamedEffect]:
@@ -531,6 +536,13 @@ def _add_separability(page: Page, content: ReportInput) -> None:
         return
     for line in group_lines(found):
         page.add_paragraph(line)
+    untested = [(i.effect.name, i.reason) for i in found.detectability if i.reason]
+    if untested:
+        page.add_table(
+            Table((Column("effect"), Column("why not")), untested),
+            "These can be neither named nor excluded by this campaign and model.",
+            title="Effects that cannot be tested here",
+        )
     page.add_table(
         can_decide_table(found),
         "From the model, the inputs and the noise alone. Detectable from: the size at which d² reaches 25, with "

@@ -189,7 +189,7 @@ def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
     norm = scale_of(np.concatenate([table.ravel() for _, _, table in tables]))
     titles = ("a  model as it was", "b  with the effect") if after is not None else ("model as it is",)
     longest = max(len(name) for name in trials)
-    below = min(0.55 + 0.045 * longest, 1.6)
+    below = min(0.22 + 0.042 * longest, 1.5)
     height = max(0.22 * len(channels), 0.9) + below + 0.35
     with publication_style():
         figure = new_figure(height)

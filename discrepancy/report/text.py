@@ -1,5 +1,6 @@
 """Numbers and sentences of the report and of the summary on the terminal."""
 
+import re
 from collections.abc import Iterable, Sequence
 from math import floor, isfinite, isnan, log10
 
@@ -136,3 +137,17 @@ def listing(words: Iterable[str]) -> str:
     if len(found) < 2:
         return "".join(found)
     return f"{', '.join(found[:-1])} and {found[-1]}"
+
+
+_GREEK = {
+    "alpha": "α", "beta": "β", "chi": "χ", "delta": "δ", "eps": "ε", "eta": "η", "kappa": "κ", "mu": "μ", "nu": "ν",
+    "phi": "φ", "pi": "π", "rho": "ρ", "tau": "τ", "theta": "θ", "zeta": "ζ",
+}  # fmt: skip
+_GREEK_WORD = re.compile(rf"\b({'|'.join(_GREEK)})(?=\b|_)")
+_POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def formula(text: str) -> str:
+    """Return an equation of the catalogue with Greek letters, powers and arrows as they are printed."""
+    text = _GREEK_WORD.sub(lambda match: _GREEK[match.group(1)], text).replace("->", "→")
+    return re.sub(r"\^(\d)(?!\w)", lambda match: match.group(1).translate(_POWERS), text)
