@@ -26,6 +26,8 @@ _SLIPS = (
     (100.0, 1.7), (0.01, 1.7), (9.80665, 1.35), (1.0 / 9.80665, 1.35),
 )  # fmt: skip
 """Factors of a unit slip, and the factor by which physics may be off besides."""
+SURE_SLIP = 500.0
+"""Slips beyond this factor are seen in a single trial of a channel; smaller ones need several trials."""
 _FROM_MOTION = {Quantity.DISPLACEMENT, Quantity.VELOCITY, Quantity.ACCELERATION}
 _VISIBLE = 0.01  # share of the largest prediction of its kind below which a channel tells nothing
 _ABOVE_NOISE = 5.0
@@ -205,7 +207,13 @@ def _slips(campaign: Campaign, scales: dict[tuple[str, str], float]) -> Iterator
     wrong_channels = {
         name: factors[0]
         for name, factors in by_channel.items()
-        if factors[0] is not None and all(item == factors[0] for item in factors)
+        if factors[0] is not None
+        and all(item == factors[0] for item in factors)
+        and (
+            campaign.channels[name].quantity is Quantity.ACCELERATION
+            or not 1.0 / SURE_SLIP < factors[0] < SURE_SLIP
+            or len(factors) > 1
+        )
     }
     shared = set(wrong_channels.values())
     if set(wrong_channels) == set(by_channel) and len(by_channel) > 1 and len(shared) == 1:
@@ -232,7 +240,9 @@ def _slips(campaign: Campaign, scales: dict[tuple[str, str], float]) -> Iterator
             )
         elif len(factors) > 0:
             for (name, where), factor in found.items():
-                if where == trial and name not in wrong_channels and factor is not None:
+                # a small factor in one trial alone may well be physics: lift that leaves the outer wing
+                plain = factor is not None and not 1.0 / SURE_SLIP < factor < SURE_SLIP
+                if where == trial and name not in wrong_channels and factor is not None and plain:
                     yield DataFault(
                         FaultKind.UNIT_SLIP,
                         _slip_sentence(campaign, name, factor, f" in the trial {trial!r}"),

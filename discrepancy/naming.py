@@ -83,6 +83,8 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         )  # fmt: skip
 
     gate = absolute_gate(problem, best)
+    # sets that hold the best one and more agree with it; they only leave a further effect open
+    p_top = sum(p for names, p in probabilities.items() if set(top) <= set(names))
     if p_top >= SURE and bayes >= BAYES_FACTOR:
         shape, family = _shape(found, best)
         if gate.passed is not False and shape.passed:

@@ -27,7 +27,7 @@ from fe.patch import ModelPatch
 PATCH_NAME = "patch.json"
 
 _INTERVAL = (0.05, 0.95)
-_STRAIN = re.compile(r"strain\[(\d+)\]")
+_STRAIN = re.compile(r"strain\[\d+\]")
 _DISPLACEMENTS = ("tip_displacement", "load_point_displacement")
 
 
@@ -141,15 +141,13 @@ def write_patch(
 def fmu_outputs(campaign: Campaign) -> dict[str, str]:
     """Return the outputs of the wing FMU by the names of the channels that measure them.
 
-    Gauges count from 1 in both. Channels that the FMU has no output for (velocities, displacements of other
-    places) are not in it.
+    Channels that the FMU has no output for (velocities, displacements of other places) are not in it.
     """
     outputs = {}
     for name, channel in campaign.channels.items():
-        gauge = _STRAIN.fullmatch(channel.output)
-        if channel.quantity is Quantity.STRAIN and gauge is not None:
-            outputs[name] = channel.output
-        elif channel.quantity is Quantity.DISPLACEMENT and channel.output in _DISPLACEMENTS:
+        strain = channel.quantity is Quantity.STRAIN and _STRAIN.fullmatch(channel.output)
+        displacement = channel.quantity is Quantity.DISPLACEMENT and channel.output in _DISPLACEMENTS
+        if strain or displacement:
             outputs[name] = channel.output
     return outputs
 

@@ -7,6 +7,7 @@ leaves: -ln L = sum over channels of (n0 + n) / 2 ln(1 + RSS / n0) + constant, R
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import inf
 
 import numpy as np
@@ -31,7 +32,7 @@ PARAMETER_STEP = 1e-2
 """Step of the forward differences in scaled variables."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrialData:
     """One trial, ready to be compared.
 
@@ -55,6 +56,14 @@ class TrialData:
     unknowns: LocalUnknowns
     weight: FloatArray
     noise: tuple[NoiseModel, ...]
+
+    @cached_property
+    def by_zero(self) -> FloatArray:
+        """Standardised derivatives (Z, N C) by the zeros; they never change."""
+        zeros = np.zeros((self.unknowns.zeros, *self.weight.shape))
+        rows = np.arange(self.unknowns.zeros)
+        zeros[rows, :, self.unknowns.zero_columns] = self.unknowns.zero_scale[:, np.newaxis]
+        return self.standardised(zeros).reshape(len(zeros), -1)
 
     def standardised(self, columns: FloatArray) -> FloatArray:
         """Return columns (..., N, C) over s0, whitened in time, zero where a sample does not count."""
@@ -160,6 +169,7 @@ class Problem:
         self.counts = counts
         self.freedom = np.array([self.noise[name].degrees_of_freedom for name in self.channel_names])
         self._responses: dict[object, tuple[FloatArray, FloatArray | None]] = {}
+        self._gains: dict[tuple[str, ...], tuple[IntArray, IntArray]] = {}
         if like is not None:
             self.shared = like.shared
         else:
@@ -385,38 +395,39 @@ class Problem:
         data = self.trials[number]
         channels = data.trial.channels
         gains = 1.0 + self.shared.gains(point.shared, channels)
-        shape = parts.response.shape
-        zeros = np.zeros((data.unknowns.zeros, *shape))
-        for row, (column, scale) in enumerate(
-            zip(data.unknowns.zero_columns, data.unknowns.zero_scale, strict=True)
-        ):
-            zeros[row, :, column] = scale
-        local = np.concatenate((zeros, parts.local * gains))
+        size = parts.response.size
         count = len(self.shared.parameter_mean)
-        by_gain, gain_index = [], []
-        for position, name in enumerate(self.shared.gain_channels):
-            if name in channels:
-                column = np.zeros(shape)
-                at = channels.index(name)
-                column[:, at] = self.shared.gain_scale[position] * parts.response[:, at]
-                by_gain.append(column)
-                gain_index.append(count + position)
+        position, column = self._gain_entries(channels)
+        by_gain = np.zeros((len(position), *parts.response.shape))
+        by_gain[np.arange(len(position)), :, column] = (
+            self.shared.gain_scale[position, np.newaxis] * parts.response.T[column]
+        )
         acting = [k for k in range(candidate.size) if data.trial.kind in candidate.acting(k)]
-        blocks = [parts.parameters * gains]
-        if by_gain:
-            blocks.append(np.stack(by_gain))
+        blocks = [parts.parameters * gains, by_gain]
         if acting:
             blocks.append(parts.effect[acting] * gains)
-        shared = np.concatenate(blocks)
+        local = data.by_zero
+        if len(parts.local):
+            own = data.standardised(parts.local * gains).reshape(len(parts.local), size)
+            local = np.concatenate((local, own))
+        shared = data.standardised(np.concatenate(blocks))
         index = np.array(
-            [*range(count), *gain_index, *(self.shared.size + k for k in acting)], dtype=np.int64
+            [*range(count), *(count + position), *(self.shared.size + k for k in acting)], dtype=np.int64
         )
-        size = shape[0] * shape[1]
-        return (
-            data.standardised(local).reshape(len(local), size),
-            data.standardised(shared).reshape(len(shared), size),
-            index,
-        )
+        return local, shared.reshape(len(shared), size), index
+
+    def _gain_entries(self, channels: tuple[str, ...]) -> tuple[IntArray, IntArray]:
+        """Return which gains act in a trial, and on which of its columns."""
+        found = self._gains.get(channels)
+        if found is None:
+            entries = [
+                (position, channels.index(name))
+                for position, name in enumerate(self.shared.gain_channels)
+                if name in channels
+            ]
+            table = np.array(entries, dtype=np.int64).reshape(-1, 2)
+            found = self._gains[channels] = (table[:, 0], table[:, 1])
+        return found
 
     # -------------------------------------------------------------------------- likelihood
 

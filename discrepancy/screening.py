@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,9 @@ FloatArray = NDArray[np.float64]
 
 LEVELS = {1: (-1.5, -0.5, 0.5, 1.5), 2: (-1.3, 0.0, 1.3), 3: (-1.2, 0.0, 1.2)}
 """Grid of the scaled parameters that are not a mere scale, by their number; two levels from four on."""
+
+PADDED, PEAKS = 4, 3
+"""Zero padding of spectra, and peaks that are tried."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,17 @@ class Change:
         return 0.5 * self.fits * self.scale
 
 
+class _Piece(NamedTuple):
+    """One trial of a screen: projections on its own and on shared unknowns, weights, residual, gradient."""
+
+    local: FloatArray  # (L, N C)
+    shared: FloatArray  # (K, N C)
+    index: NDArray[np.int64]  # (K,)
+    root: FloatArray  # (N C,)
+    residual: FloatArray  # (N C,)
+    gradient: FloatArray  # (L,)
+
+
 class Screen:
     """Inner products of changes at a fit.
 
@@ -87,7 +102,7 @@ class Screen:
         size = problem.shared.size
         matrix = np.diag(problem.shared.precision + 1e-12)
         gradient = -problem.shared.precision * fit.point.shared
-        self._pieces = []
+        self._pieces: list[_Piece] = []
         for number in range(len(problem.trials)):
             block, local, shared = trial_block(
                 problem, number, fit.point, fit.linearisations[number], candidate,
@@ -102,19 +117,19 @@ class Screen:
             ).ravel()
             lower = np.tril(factor[0])
             self._pieces.append(
-                (
-                    local,
-                    shared,
-                    inner,
-                    lower,
+                _Piece(
+                    # what a change leaves to the trial's own unknowns, and to the shared ones
+                    solve_triangular(lower, local, lower=True),
+                    shared - inner.T @ local,
                     block.index,
                     root,
                     fit.residuals[number].ravel() * root,
                     solve_triangular(lower, block.local_gradient, lower=True),
                 )
             )
-        self._lower = np.tril(cho_factor(matrix, lower=True)[0])
-        self._gradient = solve_triangular(self._lower, gradient, lower=True)
+        lower = np.tril(cho_factor(matrix, lower=True)[0])
+        self._inverse = solve_triangular(lower, np.eye(size), lower=True)
+        self._gradient = self._inverse @ gradient
         self._size = size
 
     def change(self, term: Term, start: FloatArray) -> Change:
@@ -127,47 +142,74 @@ class Screen:
         parts, fits, square = [], 0.0, 0.0
         tail = []
         for number, (data, piece) in enumerate(zip(problem.trials, self._pieces, strict=True)):
-            local, shared, inner, lower, index, root, residual, local_gradient = piece
             if data.trial.kind not in acting:
-                parts.append(np.zeros(len(root)))
-                tail.append(np.zeros(len(lower)))
+                parts.append(np.zeros(len(piece.root)))
+                tail.append(np.zeros(len(piece.local)))
                 continue
             patch = candidate.patch(problem.setting, effect)
             response, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch)
             gains = 1.0 + problem.shared.gains(fit.point.shared, data.trial.channels)
             moved = gains * (response - fit.responses[number])
-            d = data.standardised(moved).ravel() * root
-            z = local @ d
-            np.add.at(total, index, shared @ d - inner.T @ z)
-            z = solve_triangular(lower, z, lower=True)
-            fits += float(residual @ d) - float(local_gradient @ z)
+            d = data.standardised(moved).ravel() * piece.root
+            z = piece.local @ d
+            total[piece.index] += piece.shared @ d
+            fits += float(piece.residual @ d) - float(piece.gradient @ z)
             square += float(d @ d) - float(z @ z)
             parts.append(d)
             tail.append(z)
-        y = solve_triangular(self._lower, total, lower=True)
+        y = self._inverse @ total
         fits -= float(self._gradient @ y)
         square -= float(y @ y)
         vector = np.concatenate((*parts, *tail, y))
         return Change(term, start, vector, fits, max(square, 0.0))
 
+    def _peaks(self, term: Term) -> tuple[float, ...]:
+        """Return peaks of the residuals' mean spectrum at a term's channel, over the first frequency."""
+        if not term.effect.spectral:
+            return ()
+        problem = self.problem
+        spectra: dict[tuple[int, float], FloatArray] = {}
+        for data, residual in zip(problem.trials, self.fit.residuals, strict=True):
+            if data.trial.kind not in term.effect.acts_on or term.place not in data.trial.channels:
+                continue
+            series = residual[:, data.trial.channels.index(term.place)]
+            key = (len(series), data.trial.interval)
+            power = np.abs(np.fft.rfft(series - series.mean(), PADDED * len(series))) ** 2
+            spectra[key] = spectra.get(key, 0.0) + power
+        found: list[float] = []
+        for (count, interval), power in spectra.items():
+            resolution = 1.0 / (PADDED * count * interval)
+            inner = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
+            best = inner[np.argsort(power[inner])[::-1][: 4 * PEAKS]]
+            kept: list[int] = []
+            for index in best:
+                if all(abs(index - other) > 2 * PADDED for other in kept) and len(kept) < PEAKS:
+                    kept.append(int(index))
+            first = problem.setting.scales.angular_frequency / (2.0 * np.pi)
+            found += [index * resolution / first for index in kept]
+        return tuple(found)
+
     @property
     def sign(self) -> FloatArray:
         """Signs (D,) of the inner product: changes count, their projections are taken off."""
-        samples = sum(len(piece[5]) for piece in self._pieces)
-        rest = sum(len(piece[3]) for piece in self._pieces) + self._size
+        samples = sum(len(piece.root) for piece in self._pieces)
+        rest = sum(len(piece.local) for piece in self._pieces) + self._size
         return np.concatenate((np.ones(samples), -np.ones(rest)))
 
     def changes(self, term: Term) -> Iterator[Change]:
         """Yield the changes of a term over the grid of its parameters, where the model can follow."""
-        for start in grid(term):
+        for start in grid(term, self._peaks(term)):
             try:
                 yield self.change(term, start)
             except ModelError:  # such as a spring softer than what is taken from it
                 continue
 
 
-def grid(term: Term) -> Iterator[FloatArray]:
-    """Yield scaled parameters to try: magnitudes at one value, since changes scale with them."""
+def grid(term: Term, peaks: tuple[float, ...] = ()) -> Iterator[FloatArray]:
+    """Yield scaled parameters to try: magnitudes at one value, since changes scale with them.
+
+    A spectral parameter is tried at the given peaks.
+    """
     axes: list[tuple[float, ...]] = []
     scaled = False
     count = sum(1 for item in term.parameters if not _is_magnitude(item))
@@ -180,6 +222,8 @@ def grid(term: Term) -> Iterator[FloatArray]:
             else:
                 axes.append((1.0,) if signed else (0.0,))
                 scaled = True
+        elif item.name == term.effect.spectral and peaks:
+            axes.append(tuple(float(np.clip(item.prior.normal(peak), -3.0, 3.0)) for peak in peaks))
         elif item in term.effect.shape:
             axes.append((item.prior.normal(item.canonical),))  # type: ignore[union-attr]
         else:

@@ -19,7 +19,7 @@ from .screening import Change, Screen, rescaled
 FloatArray = NDArray[np.float64]
 
 PRIOR_NONE = 0.5
-SET_SHARES = (0.9, 0.09, 0.01)
+SET_SHARES = (0.97, 0.029, 0.001)
 """How the rest of the prior is shared among sets of one, two and three effects."""
 LARGEST_SET = len(SET_SHARES)
 STARTS, FAR_STARTS = 2, 3
@@ -28,8 +28,13 @@ CHORD_STEPS = 8
 CLOSE = 12.0
 """Candidates within this log evidence of the best are fitted exactly [nat]."""
 EXACT_FITS = 5
-WORTH_ADDING = 1.0
-"""Screened gain below which one more effect is not fitted [nat]."""
+WORTH_FITTING = 2.0
+"""Screened gain below which an effect is not fitted at all: it could not win a name [nat]."""
+WORTH_ADDING = 4.0
+"""The same for one more effect, whose prior is smaller."""
+PROMISING, LEAST_PROMISING = 0.25, 6
+"""Far from the truth, effects are fitted whose screened gain is at least this share of the best one's, and at
+least so many; the others too if none of these fits."""
 PAIRS_FITTED = 10
 FAR = 1.5
 """Chi-square per sample above which a fit is far from the truth."""
@@ -154,9 +159,12 @@ class Search:
 
     def _scan_near(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
         found = []
+        least = WORTH_ADDING if base.candidate.terms else WORTH_FITTING
         for changes in self.screened(base, effects).values():
             fits = []
             for change in changes:
+                if change.gain < least:
+                    continue
                 try:
                     fits.append(self.roughly(base, base.candidate.plus(change.term), rescaled(change)))
                 except ModelError:  # the best scale is more than the structure can carry
@@ -168,11 +176,21 @@ class Search:
     def _scan_far(self, base: Fit, effects: tuple[Effect, ...]) -> list[Fit]:
         near = self._near(base)
         screen = Screen(self._short(), near)
+        ranked = [changes for effect in effects if (changes := self._starts(screen, effect, FAR_STARTS))]
+        ranked.sort(key=lambda changes: -changes[0].gain)
+        enough = PROMISING * ranked[0][0].gain if ranked else 0.0
+        first = max(LEAST_PROMISING, sum(changes[0].gain >= enough for changes in ranked))
+        found = self._from_beginnings(base, near, ranked[:first])
+        if not base.candidate.terms and not any(absolute_gate(self.problem, item).passed for item in found):
+            found += self._from_beginnings(base, near, ranked[first:])
+        return found
+
+    def _from_beginnings(self, base: Fit, near: Fit, ranked: list[list[Change]]) -> list[Fit]:
+        """Fit effects to the beginnings of the records, the best of them to whole records."""
         starts = []
-        for effect in effects:
+        for changes in ranked:
             fits = [
-                self._shortly(near, base.candidate.plus(change.term), rescaled(change))
-                for change in self._starts(screen, effect, FAR_STARTS)
+                self._shortly(near, base.candidate.plus(change.term), rescaled(change)) for change in changes
             ]
             found = [item for item in fits if item is not None]
             if found:
@@ -276,12 +294,7 @@ class Search:
         before = self.score(current)
         there = {term.effect.identifier for term in current.candidate.terms}
         others = [effect for effect in self.effects if effect.identifier not in there]
-        promising = [
-            effect
-            for effect, changes in zip(others, self.screened(current, others).values(), strict=True)
-            if changes and changes[0].gain > WORTH_ADDING
-        ]
-        fitted = self.refine(self.scan(current, promising), before - 2.0)
+        fitted = self.refine(self.scan(current, others), before - 2.0)
         return fitted[0] if fitted and self.score(fitted[0]) > before else None
 
     def _pairs(self) -> None:

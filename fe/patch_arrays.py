@@ -83,6 +83,10 @@ class PatchArrays:
         Weight, downwards [N].
     strain_rows : (3, G, n) ndarray
         Strain of the gauges along the span, across it, and engineering shear strain, positive as measured.
+    gauge_stations : (G,) ndarray
+        Middles of the gauges [m from the root].
+    gauge_length : float
+        Length along the span over which they average [m].
     tip_row : (n,) ndarray
         Displacement of the tip.
     start_shapes : (n, r) ndarray
@@ -116,6 +120,8 @@ class PatchArrays:
     lift_rows: FloatArray
     weight: FloatArray
     strain_rows: FloatArray
+    gauge_stations: FloatArray
+    gauge_length: float
     tip_row: FloatArray
     start_shapes: FloatArray
 
@@ -137,6 +143,11 @@ class PatchArrays:
                 raise ReducedModelFileError(
                     f"The {name} of a wing for patches must be positive, but is {value!r}; build it anew."
                 )
+        if not (isfinite(self.gauge_length) and self.gauge_length >= 0.0):
+            raise ReducedModelFileError(
+                f"The gauge_length of a wing for patches must not be negative, but is "
+                f"{self.gauge_length!r}; build it anew."
+            )
         if not 0.0 <= self.straight_chord_line <= 1.0:
             raise ReducedModelFileError(
                 f"The straight_chord_line of a wing for patches must be a fraction, but is "
@@ -174,6 +185,7 @@ class PatchArrays:
             "lift_rows": (p, n),
             "weight": (n,),
             "strain_rows": (3, self.strain_rows.shape[1], n),
+            "gauge_stations": (self.strain_rows.shape[1],),
             "tip_row": (n,),
             "start_shapes": (n, self.start_shapes.shape[-1]),
         }
@@ -217,7 +229,7 @@ class PatchArrays:
         values: dict[str, Any] = {name: arrays[name] for name in names}
         try:
             values["design_hash"] = str(arrays["design_hash"])
-            for name in (*SCALARS, "straight_chord_line"):
+            for name in (*SCALARS, "straight_chord_line", "gauge_length"):
                 values[name] = float(arrays[name])
             return cls(**values)
         except (TypeError, ValueError, IndexError) as cause:

@@ -5,7 +5,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .cache import locked, cache_folder, modelling_hash
+from .cache import cache_folder, locked, modelling_hash
 from .errors import ReducedModelFileError
 from .patch_arrays import PatchArrays
 

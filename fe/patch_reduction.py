@@ -59,7 +59,7 @@ class PatchSettings:
 
     ranges: ReductionSettings = field(default_factory=ReductionSettings)
     strip_count: int = 24
-    vectors: int = 160
+    vectors: int = 240
     states: int = 160
     largest_loss: float = 0.7
     compliance_share: float = 0.4
@@ -92,7 +92,8 @@ def reduce_patches(
         healthy = Norm(operators.stiffness(1.0, (0.0, 0.0)))
         damaged = Norm(operators.stiffness(1.0, DAMAGED_ANCHOR))
         snapshots = np.concatenate(
-            [_responses(full, healthy, settings), _responses(full, damaged, settings)], axis=1
+            [_responses(full, healthy, settings, main=True), _responses(full, damaged, settings, main=False)],
+            axis=1,
         )
         basis = _orthonormal(snapshots, healthy.stiffness)
     with stage_of(progress, "Reducing the patched wing"):
@@ -105,15 +106,19 @@ def _unit_energy(vectors: FloatArray, stiffness: Any) -> FloatArray:
     return np.asarray(vectors / np.sqrt(np.where(energy > 0.0, energy, 1.0)))
 
 
-def _responses(full: PatchOperators, norm: Norm, settings: PatchSettings) -> FloatArray:
-    """Solutions (n, k) of the full model at one state of health, in their natural sizes."""
+def _responses(full: PatchOperators, norm: Norm, settings: PatchSettings, *, main: bool) -> FloatArray:
+    """Return solutions (n, k) of the full model at one state of health, in their natural sizes.
+
+    `main`: more of them, for the state of health that is looked at most.
+    """
     operators, stiffness = full.operators, norm.stiffness
     stations = len(full.stations)
     eta = full.stations / full.stations[-1]
     moments = np.polynomial.legendre.legvander(2.0 * eta - 1.0, LIFT_MOMENTS - 1)
-    step = max(1, stations // 16)
+    step = max(1, stations // 13)
     lines = [
-        *(rows[step::step].toarray() for rows in (full.line_rows[2], full.line_rows[3])),
+        full.line_rows[2][2 : None : 1 if main else step].toarray(),  # where point masses may sit
+        full.line_rows[3][step::step].toarray(),
         *(rows[2 * step :: 2 * step].toarray() for rows in full.line_rows[:2]),
     ]
     flap = np.zeros(operators.unknowns)
@@ -127,6 +132,7 @@ def _responses(full: PatchOperators, norm: Norm, settings: PatchSettings) -> Flo
             full.weight,
             flap,
             *lines,
+            *(rows.toarray() for rows in (full.strain_rows if main else ())),
             operators.gauge_output.toarray(),
         ]
     ).T
@@ -141,15 +147,15 @@ def _responses(full: PatchOperators, norm: Norm, settings: PatchSettings) -> Flo
     _, coordinates = eigh(vectors.T @ (stiffness @ vectors), vectors.T @ (mass @ vectors))
     modes = _unit_energy(vectors @ coordinates[:, :MODES], stiffness)
     # what each part of the skin does to the main solutions, and to the gauges near it
-    main = np.concatenate((solutions[:, :2], modes[:, :6]), axis=1)
-    changes = [np.asarray(part @ main) for part in full.strip_stiffness]
+    shapes = np.concatenate((solutions[:, :2], modes[:, : 6 if main else 3]), axis=1)
+    changes = [np.asarray(part @ shapes) for part in full.strip_stiffness]
     places = np.array(operators.wing_mesh.design.gauges.positions)[:, 0]
     middle = 0.5 * (full.strip_lines[1:] + full.strip_lines[:-1])
     reach = 1.5 * float(np.diff(full.strip_lines).max())
     gauges = _unit_energy(gauges, stiffness)
     for part, strip in zip(full.strip_stiffness, full.strip_of, strict=True):
         near = np.flatnonzero(np.abs(places - middle[strip]) < reach)
-        if near.size:
+        if main and near.size:
             changes.append(np.asarray(part @ gauges[:, near]))
     inertia = [np.asarray(term @ modes[:, :6]) for term in operators.mass_terms]
     answered = norm.riesz(np.concatenate((*changes, *inertia), axis=1))
@@ -166,7 +172,7 @@ def _orthonormal(snapshots: FloatArray, stiffness: Any) -> FloatArray:
     return np.asarray(snapshots @ (vectors[:, kept] / np.sqrt(values[kept])))
 
 
-WORKING_TOLERANCE = 1e-9
+WORKING_TOLERANCE = 3e-7
 """Squared size, relative to the largest, of a direction that the working basis leaves out."""
 
 
@@ -219,6 +225,8 @@ def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) ->
         lift_rows=np.asarray(full.lift_rows @ basis),
         weight=full.weight @ basis,
         strain_rows=np.stack([np.asarray(rows @ basis) for rows in (along, *full.strain_rows)]),
+        gauge_stations=np.array([place for place, _ in design.gauges.positions]),
+        gauge_length=design.gauges.averaging_spanwise,
         tip_row=operators.tip_displacement_output @ basis,
         start_shapes=np.eye(size)[:, :START_SHAPES],
     )
@@ -285,7 +293,7 @@ def _directions(arrays: PatchArrays, settings: PatchSettings) -> FloatArray:
     for number in range(settings.states):
         stiffness, mass, loads = _patched_state(arrays, strips, settings, generator, plain=number == 0)
         factor = cho_factor(stiffness)
-        gauges = arrays.strain_rows[0].T
+        gauges = np.concatenate(arrays.strain_rows).T
         columns = np.concatenate((loads, gauges, arrays.flap_row[:, None], span_row[:, None]), axis=1)
         solutions = _unit(cho_solve(factor, columns))
         modes = start
@@ -293,7 +301,8 @@ def _directions(arrays: PatchArrays, settings: PatchSettings) -> FloatArray:
             modes = _first_modes(cho_solve(factor, mass @ modes), stiffness, mass)
         modes = _unit(modes[:, :MODES])
         weights = np.ones(solutions.shape[1])
-        weights[:3], weights[len(loads.T) :] = LOAD_WEIGHT, 1.0
+        weights[:3] = LOAD_WEIGHT
+        weights[len(loads.T) + len(gauges.T) // 3 : -2] = TURNED_WEIGHT
         plainly = 10.0 if number == 0 else 1.0  # the wing as it was is looked at most
         shapes = np.concatenate((solutions * weights, modes * MODE_WEIGHTS), axis=1) * plainly
         all_snapshots += shapes @ shapes.T
@@ -302,7 +311,9 @@ def _directions(arrays: PatchArrays, settings: PatchSettings) -> FloatArray:
 
 LOAD_WEIGHT = 3.0
 """How much more the solutions under tip force, lift and a washed-out lift count than those under others."""
-MODE_WEIGHTS = np.array([3.0, 2.0, 2.0, 1.5, 0.7, 0.5, 0.3, 0.2])
+TURNED_WEIGHT = 0.4
+"""How much representatives of strain across a gauge and of shear count."""
+MODE_WEIGHTS = np.array([3.0, 3.0, 4.0, 3.0, 1.5, 1.0, 0.5, 0.3])
 
 
 def _leading(gram: FloatArray, count: int) -> FloatArray:
@@ -345,7 +356,7 @@ def _patched_state(
             ranges.pitot_mass,
         )
     )
-    with_damage, with_box, with_compliance, with_mass = generator.random(4) < (0.5, 0.75, 0.4, 0.5)
+    with_damage, with_box, with_compliance, with_mass = generator.random(4) < (0.5, 0.75, 0.4, 0.6)
     start, length = generator.uniform(-0.05, 0.9) * span, generator.uniform(0.02, 0.3) * span
     loss = generator.uniform(0.1, arrays.largest_loss)
     compliance = generator.uniform(0.0, arrays.largest_compliance)

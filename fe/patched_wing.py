@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import InvalidPatchError
+from .local_loss import boxes_of, remaining_skin, strain_factors
 from .patch import (
     InertiaRelief,
     LoadGain,
     LoadPlace,
-    LocalStiffnessLoss,
     ModelPatch,
     ModulusTemperature,
     PointMass,
@@ -31,6 +31,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Place = str | tuple[float, float]
 
+PATCH_RUNTIME_FILES = ("patch.py", "patch_arrays.py", "local_loss.py", "patched_wing.py")
+"""Files of this package that evaluate a wing with changes, besides `fe.reduced.RUNTIME_FILES`."""
 LOAD_PLACE = "tip_load"
 """Name of the place of the static test."""
 OVERHANG = 0.15
@@ -142,6 +144,12 @@ def motion_basis(
     return np.asarray(basis)
 
 
+def strain_gauge(output: str) -> int:
+    """Return the row k - 1 of an output strain[k], k from 1; -1 for other outputs."""
+    strain = _STRAIN.fullmatch(output)
+    return -1 if strain is None else int(strain.group(1)) - 1
+
+
 class _Terms(NamedTuple):
     """What the matrices of a structure are the sum of."""
 
@@ -212,14 +220,11 @@ class PatchedWing:
             If a change leaves no stiffness, or a place lies off the wing.
         """
         arrays, e = self.arrays, young_modulus_factor
-        remaining = np.ones(len(arrays.strip_lines) - 1)
         compliance = 0.0
         points = []
         for item in patch:
             if isinstance(item, ModulusTemperature):
                 e = e * (1.0 - item.coefficient * temperature_difference)
-            elif isinstance(item, LocalStiffnessLoss):
-                remaining *= 1.0 - item.loss * self._overlap(item)
             elif isinstance(item, RootCompliance):
                 compliance += item.compliance
             elif isinstance(item, PointMass):
@@ -230,10 +235,6 @@ class PatchedWing:
                 f"The factors on the stiffness of skin and defect regions must be positive, but are "
                 f"{theta[0]:g}, {theta[1]:g} and {theta[2]:g}; lessen the losses or the coefficient."
             )
-        if remaining.min() <= 0.0:
-            raise InvalidPatchError(
-                f"A local stiffness loss must leave some stiffness, but leaves {remaining.min():g} of it."
-            )
         spring = 0.0
         if compliance != 0.0:
             flexibility = 1.0 / arrays.flap_spring + compliance
@@ -243,6 +244,10 @@ class PatchedWing:
                     f"{-compliance:g}; give a compliance above {-1.0 / arrays.flap_spring:g}."
                 )
             spring = 1.0 / flexibility - arrays.flap_spring
+        boxes = boxes_of(patch)
+        remaining = np.ones(len(arrays.strip_lines) - 1)
+        if boxes:
+            remaining = remaining_skin(boxes, arrays.strip_lines).of_strips
         parts = np.flatnonzero(remaining[arrays.strip_of] != 1.0).astype(np.int64)
         factors = (remaining[arrays.strip_of[parts]] - 1.0) * theta[arrays.term_of[parts]]
         return PatchedStructure(
@@ -267,12 +272,6 @@ class PatchedWing:
                 row = weights @ rows
                 mass += added * np.multiply.outer(row, row)
         return np.asarray(mass)
-
-    def _overlap(self, box: LocalStiffnessLoss) -> FloatArray:
-        """Share (S,) of each strip's length that lies in a box."""
-        lines = self.arrays.strip_lines
-        inside = np.minimum(lines[1:], box.start + box.length) - np.maximum(lines[:-1], box.start)
-        return np.asarray(np.maximum(inside, 0.0) / np.diff(lines))
 
     # ------------------------------------------------------------ loads and rows
 
@@ -385,7 +384,7 @@ class PatchedWing:
             return np.asarray(self.arrays.station_weights @ self.arrays.line_rows[2])
         raise InvalidPatchError(f"The wing has no port {name!r}; it has {', '.join(PORTS)}.")
 
-    def output_row(self, name: str, component: int = 0) -> FloatArray | None:
+    def output_row(self, name: str, component: int = 0, patch: ModelPatch = EMPTY) -> FloatArray | None:
         """Return the row (n,) of an output, None if there is no such output.
 
         Parameters
@@ -395,11 +394,16 @@ class PatchedWing:
             displacement[y, x].
         component : int
             Of a strain: 0 along the span, 1 across, 2 engineering shear strain; zero for displacements.
+        patch : ModelPatch
+            Its local losses act on the strains, see `strain_factors`.
         """
-        strain = _STRAIN.fullmatch(name)
-        if strain is not None:
-            gauge = int(strain.group(1)) - 1
-            return self.arrays.strain_rows[component, gauge] if 0 <= gauge < self.gauge_count else None
+        gauge = strain_gauge(name)
+        if gauge >= 0:
+            if gauge >= self.gauge_count:
+                return None
+            factors = self.strain_factors(patch)
+            measured = self.arrays.strain_rows[component, gauge]
+            return measured if factors is None else np.asarray(factors[gauge] * measured)
         row: FloatArray | None = None
         if name == "tip_displacement":
             row = self.arrays.tip_row
@@ -410,6 +414,34 @@ class PatchedWing:
             if place is not None and 0.0 <= float(place.group(1)) <= self.span:
                 row = self.displacement_row(float(place.group(1)), float(place.group(2)))
         return row if row is None or component == 0 else np.zeros_like(row)
+
+    @cached_property
+    def _skin_share(self) -> FloatArray:
+        """Share (G,) of the bending stiffness at each gauge that the skin has, as the strain shows it."""
+        softer = np.array((0.7, 0.7, 0.7, 1.0))
+        whole, less = (
+            self.arrays.strain_rows[0]
+            @ np.linalg.solve(np.tensordot(theta, self.arrays.stiffness, 1), self.arrays.load_lift)
+            for theta in (np.ones(4), softer)
+        )
+        return np.asarray((1.0 - whole / less) / (1.0 - softer[0]))
+
+    def strain_factors(self, patch: ModelPatch) -> FloatArray | None:
+        """Return factors (G,) on the strain rows by where the edges of local losses lie in their strips.
+
+        `fe.local_loss.strain_factors` says what they are. They are one where boxes end at edges of strips.
+
+        Returns
+        -------
+        (G,) ndarray or None
+            None: there is no local loss.
+        """
+        boxes = boxes_of(patch)
+        if not boxes:
+            return None
+        arrays = self.arrays
+        skin = remaining_skin(boxes, arrays.strip_lines)
+        return strain_factors(skin, arrays.gauge_stations, arrays.gauge_length, self._skin_share)
 
     # ------------------------------------------------------------ for a model that has its own static part
 
@@ -456,8 +488,12 @@ class PatchedWing:
             young_modulus_factor, stiffness_loss, 0.0, 0.0, patch, temperature_difference
         ).static(self.load(load_factor, patch) + force * self.force_row(LOAD_PLACE, patch))
         change = after - before
+        strain = self.arrays.strain_rows[0] @ change
+        factors = self.strain_factors(patch)
+        if factors is not None:
+            strain = strain + (factors - 1.0) * (self.arrays.strain_rows[0] @ after)
         return (
-            np.asarray(self.arrays.strain_rows[0] @ change),
+            np.asarray(strain),
             float(self.arrays.tip_row @ change),
             float(self.arrays.load_tip @ change),
         )

@@ -239,6 +239,7 @@ def fmu_bytes(
         effects = plain_effects(patch.for_outputs(output_channels(model.gauge_count)))
         start |= {switch_of(effect): float(activate) for effect in effects}
         table += effect_rows(effects, len(table), start)
+        _check_start(table)
     description = f"{DESCRIPTION} {note}".strip()
     if kind == "python":
         template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start}, description)
@@ -329,7 +330,11 @@ def _check_start(table: Iterable[FmuVariable]) -> None:
         if not low <= row.start <= high:
             raise FmuBuildError(
                 f"The start value {row.start:g} of {row.name} lies outside {low:g} to {high:g}, the range of "
-                "the reduced model; give another state or build a model with a wider range."
+                + (
+                    "that number of an effect; correct the patch."
+                    if row.variability == "tunable"
+                    else "the reduced model; give another state or build a model with a wider range."
+                )
             )
 
 

@@ -19,6 +19,9 @@ TEMPERATURE = "temperature_difference"
 ROTATING_PORT = "root"
 """The port of the wing whose motion is a rotation."""
 
+RANGES: Mapping[str, tuple[float, float]] = {"side": (-1.0, 1.0), "element_count": (1.0, 1000.0)}
+"""Ranges of the whole numbers of primitives; of the others the wing says itself what cannot be."""
+
 UNITS = (
     Unit("K", (("K", 1),)),
     Unit("1/K", (("K", -1),), (("microstrain/K", 1e6),)),
@@ -144,20 +147,24 @@ def effect_rows(
     rows: list[FmuVariable] = []
 
     def add(
-        name: str, description: str, value: float, unit: str, *, whole: bool = False, top: float | None = None
+        name: str,
+        description: str,
+        value: float,
+        unit: str | None,
+        box: tuple[float, float] | tuple[None, None] = (None, None),
     ) -> None:
         rows.append(
             FmuVariable(
                 name=name,
                 reference=first + len(rows),
-                kind="Integer" if whole else "Real",
+                kind="Real" if unit else "Integer",
                 causality="parameter",
                 variability="tunable",
                 description=description,
-                unit=None if whole else unit,
+                unit=unit,
                 display_unit=None,
-                minimum=None if top is None else 0.0,
-                maximum=top,
+                minimum=box[0],
+                maximum=box[1],
                 start=float(start.get(name, value)),
             )
         )
@@ -169,14 +176,15 @@ def effect_rows(
             f"Whether the effect {effect['id']} ({kinds.replace('_', ' ')}) acts: 0 off, 1 on",
             0.0,
             "1",
-            top=1.0,
+            (0.0, 1.0),
         )
         for number in numbers_of(effect):
             primitive = effect["primitives"][number.primitive]
             place = primitive.get("port") or primitive.get("channel") or ""
             where = f" at {place}" if place not in ("", "*") else ""
             text = f"{number.key.replace('_', ' ')} of {str(primitive['kind']).replace('_', ' ')}{where}"
-            add(number.name, text[:1].upper() + text[1:], number.value, number.unit, whole=number.whole)
+            unit, box = (None, RANGES[number.key]) if number.whole else (number.unit, (None, None))
+            add(number.name, text[:1].upper() + text[1:], number.value, unit, box)
     if needs_temperature(effects):
         rows.append(
             FmuVariable(

@@ -9,6 +9,7 @@ This file is copied into the FMU; what it needs of `fe` is handed to it, as in `
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -89,6 +90,7 @@ class PatchedBehaviour(WingBehaviour):
         self._patch: ModelPatch | None = None
         self._start = 0.0
         self._steps: PatchedSteps | None = None
+        self._made: tuple[object, PatchedSteps] | None = None  # the last one: it never changes
         self._motion: list[float] = []
         self._filters: list[float] | None = None
         self._shown: list[float] | None = None
@@ -263,6 +265,8 @@ class PatchedBehaviour(WingBehaviour):
         )
         shown, self._filters = stream.read(sample, self._filters, duration)
         self._shown = shown.tolist()
+        if not math.isfinite(sum(self._shown)):
+            raise UnacceptableEffectError("With the effects that are on, an output is not finite.")
         return Response(shown[:-2], float(shown[-2]))
 
     # ------------------------------------------------------------------ patches
@@ -283,8 +287,11 @@ class PatchedBehaviour(WingBehaviour):
     ) -> PatchedSteps:
         if self._patched.steps is None:
             raise RuntimeError("this FMU holds no arrays for effects of structure and loads")
+        key = (parameters, inputs[1], inputs[2], tuple(applied))
+        if self._made is not None and self._made[0] == key:
+            return self._made[1]
         value = dict(zip(self._names, applied, strict=True))
-        return self._patched.steps(
+        steps = self._patched.steps(
             young_modulus_factor=parameters.young_modulus_factor,
             stiffness_loss=(inputs[1], inputs[2]),
             servo_mass=parameters.servo_mass,
@@ -294,6 +301,8 @@ class PatchedBehaviour(WingBehaviour):
             patch=patch,
             temperature=float(value.get(TEMPERATURE, 0.0)),
         )
+        self._made = (key, steps)
+        return steps
 
 
 def _given(moment: Moment | None) -> Moment:

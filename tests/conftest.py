@@ -13,6 +13,7 @@ import pytest
 
 if TYPE_CHECKING:
     from calibration.result import CalibrationResult
+    from fe.patch_arrays import PatchArrays
 
 LEVELS = (0, 20, 40, 60, 80)
 
@@ -92,6 +93,15 @@ def synthetic_calibration(
 def make_calibration() -> Callable[..., CalibrationResult]:
     """What makes a calibration without a wing."""
     return synthetic_calibration
+
+
+@pytest.fixture(scope="session")
+def coarse_patch_arrays() -> PatchArrays:
+    """The shipped wing for patches, on a coarse mesh."""
+    from fe.design import load_design
+    from fe.patch_cache import build_patch_arrays
+
+    return build_patch_arrays(load_design().changed(mesh={"refinement": 0.25}))
 
 
 REFERENCE = Path(__file__).parents[1].parent / "shared" / "reference"

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from fe.cache import reduced_model
 from fe.design import load_design
-from fmu_asset.archive import plain_folder
-from fmu_asset.binding import INPUT_ROLES, Binding, load_binding
+from fmu_asset.archive import plain_folder, read_fmu
+from fmu_asset.binding import INPUT_ROLES, Binding, Parameter, load_binding
 from fmu_asset.build import build_fmu
 from fmu_asset.coupling.layout import Layout
 from fmu_asset.coupling.roles import resolve_roles
@@ -75,6 +75,7 @@ def export_scenario(
         if isinstance(source, CoupledSource):
             wiring = source.wiring()
         else:
+            binding = _with_own_names(binding, source.fmu_path(), source.parameters())
             wiring = single_system(scenario.mission.name, source.fmu_path(), binding)
         wiring, names = _with_values(wiring, binding, source.parameters(), scenario.asset.load)
         stop = scenario.mission.steps * binding.step_size
@@ -110,6 +111,17 @@ def single_system(name: str, fmu: Path, binding: Binding) -> Wiring:
     ]
     component = Component(own, fmu)
     return Wiring(SystemStructure(name, (component,), tuple(connectors), tuple(connections)))
+
+
+def _with_own_names(binding: Binding, fmu: Path, parameters: Mapping[str, float]) -> Binding:
+    """Return a binding that also has the parameters which go by their own names in the FMU."""
+    description = read_fmu(fmu)
+    added = {
+        name: Parameter(variable=name, unit=variable.unit or "1")
+        for name in parameters
+        if name not in binding.parameter and (variable := description.variable(name)) is not None
+    }
+    return binding.model_copy(update={"parameter": {**binding.parameter, **added}})
 
 
 def _with_values(

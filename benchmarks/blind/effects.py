@@ -215,7 +215,7 @@ def quadratic_damping(generator: np.random.Generator, bench: Bench) -> Hidden:
 
 
 def cubic_stiffness(generator: np.random.Generator, bench: Bench) -> Hidden:
-    """Hide a cubic spring where the structure moves most; stiffening at the largest motion of the campaign."""
+    """Hide a cubic spring where the structure moves most; sized at the largest motion of the campaign."""
     # Softer than -0.15 the tangent at the largest motion nearly vanishes.
     hard = generator.random() < 0.6
     ratio = log_uniform(generator, 0.02, 0.3) if hard else -log_uniform(generator, 0.02, 0.15)
@@ -350,10 +350,14 @@ def thermal_strain(generator: np.random.Generator, bench: Bench) -> Hidden:
 def gauge_zero_drift(generator: np.random.Generator, bench: Bench) -> Hidden:
     channel = _pick(generator, bench.gauges)
     value = _signed(generator, 0.01, 0.2) * bench.dynamic_range[channel]
-    # The rate is what can be told, whatever time the amplitude refers to.
+    # The amplitude is that over the whole campaign.
     return _fault(
         "gauge_zero_drift", Fault("drift", (channel,), (value, 1.0)),
-        {"gauge_zero_drift.rate": bench.scale[channel] * value / bench.duration}, channel,
+        {
+            "gauge_zero_drift.rate": bench.scale[channel] * value / bench.duration,
+            "gauge_zero_drift.amplitude": bench.scale[channel] * value,
+        },
+        channel,
     )  # fmt: skip
 
 
@@ -390,6 +394,14 @@ def clock_error(generator: np.random.Generator, bench: Bench) -> Hidden:
     )
 
 
+def _wave(identifier: str, amplitude: float, phase: float) -> Truth:
+    return {
+        f"{identifier}.amplitude": amplitude,
+        f"{identifier}.cosine": amplitude * float(np.cos(phase)),
+        f"{identifier}.sine": amplitude * float(np.sin(phase)),
+    }
+
+
 def mains_hum(generator: np.random.Generator, bench: Bench) -> Hidden:
     channel = _pick(generator, bench.dynamic)
     line = float(generator.choice([50.0, 60.0, 400.0]))
@@ -399,7 +411,7 @@ def mains_hum(generator: np.random.Generator, bench: Bench) -> Hidden:
     return _fault(
         "mains_hum",
         Fault("line", (channel,), (frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))),
-        {"mains_hum.frequency": frequency, "mains_hum.amplitude": amplitude * bench.scale[channel]},
+        {"mains_hum.frequency": frequency, **_wave("mains_hum", amplitude * bench.scale[channel], phase)},
         f"{line:g} Hz, {channel}",
     )
 
@@ -419,7 +431,7 @@ def unmodelled_mode(generator: np.random.Generator, bench: Bench) -> Hidden:
         {
             "unmodelled_mode.frequency": float(frequency),
             "unmodelled_mode.damping_ratio": ratio,
-            "unmodelled_mode.amplitude": amplitude * bench.scale[channel],
+            **_wave("unmodelled_mode", amplitude * bench.scale[channel], phase),
         },
         channel,
     )

@@ -116,7 +116,7 @@ def with_free_phase(
 
 def _cancelling(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, ...]:
     """Hide a mass at the tip, which lowers f1, and a slow clock, which raises all frequencies by as much."""
-    ratio = float(generator.uniform(0.006, 0.018))
+    ratio = float(generator.uniform(0.03, 0.05))
     mass = ratio * bench.modal_mass
     # f1 falls by half the mass ratio; a sample stamped t is taken later, so that the motion looks faster.
     rate = 1.0 / np.sqrt(1.0 / (1.0 + ratio)) - 1.0

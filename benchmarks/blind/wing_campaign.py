@@ -30,7 +30,16 @@ def wing_campaign(design: WingDesign) -> CampaignPlan:
     """Return the plan of the campaign."""
     channels = {
         f"g{k:02d}": ChannelPlan(
-            f"g{k:02d}", "strain", "microstrain", f"strain[{k + 1}]", MICROSTRAIN, STRAIN_NOISE, 0.005, 2.0, y, x
+            f"g{k:02d}",
+            "strain",
+            "microstrain",
+            f"strain[{k + 1}]",
+            MICROSTRAIN,
+            STRAIN_NOISE,
+            0.005,
+            2.0,
+            y,
+            x,
         )
         for k, (y, x) in enumerate(design.gauges.positions)
     }

@@ -236,6 +236,7 @@ UNMODELLED_MODE = Effect(
     places=_mode_places,
     unavailable=needs(trial_of(RINGDOWN)),
     confusable=("mains_hum", "stiffness_drift", "joint_micro_slip"),
+    spectral="frequency_ratio",
 )
 
 EFFECTS = (CLOCK_ERROR, MAINS_HUM, UNMODELLED_MODE)

@@ -145,6 +145,9 @@ class Effect:
         setting -> why it cannot be tested here, or None.
     confusable : tuple of str
         Identifiers of effects that some campaigns cannot tell from it.
+    spectral : str
+        Name of a parameter that is a frequency over the first natural frequency; fits of it begin at peaks of
+        the residuals' spectrum at the place, a channel. Empty if there is none.
     """
 
     identifier: str
@@ -160,6 +163,7 @@ class Effect:
     places: Callable[[Setting], tuple[str, ...]] = field(default=nowhere_else)
     unavailable: Callable[[Setting], str | None] = field(default=always_available)
     confusable: tuple[str, ...] = ()
+    spectral: str = ""
 
     def canonical_shape(self) -> dict[str, float]:
         """Return the shape values of the named effect."""

@@ -3,6 +3,9 @@ from threadpoolctl import threadpool_limits
 
 from fe.design import WingDesign, load_design
 from fe.operators import AffineOperators, assemble
+from fe.patch_arrays import PatchArrays
+from fe.patch_operators import PatchOperators, assemble_patch_operators
+from fe.patched_wing import PatchedWing
 from fe.reduction import Reduction, reduce_model
 
 
@@ -31,3 +34,13 @@ def shipped_operators(shipped_design: WingDesign) -> AffineOperators:
 def coarse_reduction(coarse_operators: AffineOperators) -> Reduction:
     with threadpool_limits(1):
         return reduce_model(coarse_operators)
+
+
+@pytest.fixture(scope="session")
+def coarse_patch_operators(coarse_operators: AffineOperators) -> PatchOperators:
+    return assemble_patch_operators(coarse_operators)
+
+
+@pytest.fixture(scope="session")
+def coarse_patched_wing(coarse_patch_arrays: PatchArrays) -> PatchedWing:
+    return PatchedWing(coarse_patch_arrays)

@@ -46,7 +46,7 @@ from fe.reduced import ReducedModel
 from fmu_asset.binding import Binding, parse_binding
 from fmu_asset.build import build_fmu
 from fmu_asset.check import check_fmu
-from fmu_asset.errors import FmuCallError, PatchFileError
+from fmu_asset.errors import FmuBuildError, FmuCallError, FmuInputError, PatchFileError
 from fmu_asset.patch_file import SCHEMA, PatchFile, load_patch, parse_patch
 from fmu_asset.patched_runtime import output_channels
 from fmu_asset.session import FmiAsset
@@ -159,8 +159,7 @@ def trial(kind: TrialKind, count: int, release: float = 0.0, **given: object) ->
 def expected(
     model: WingModel, given: Trial, patch: ModelPatch, health: Sequence[float] = (0.0, 0.0)
 ) -> np.ndarray:
-    names = [f"strain[{gauge}]" for gauge in range(1, 25)] + OUTPUTS[24:]
-    outputs = tuple((name, model.output_quantity(name) or Quantity.STRAIN) for name in names)
+    outputs = tuple((name, model.output_quantity(name) or Quantity.STRAIN) for name in OUTPUTS)
     bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SensorRotation)))
     turned = len(bare) < len(patch)
     conditions = Conditions(STATE, health=np.array([health]))
@@ -228,7 +227,7 @@ def test_flights_are_those_of_the_naming_side(
     factors = np.array([1.0, 2.0, 3.5, -0.5, 2.5])
     damage = np.column_stack((0.15 * np.arange(5), 0.1 * np.ones(5)))
     given = trial(TrialKind.FLIGHT, 5, load_factor=factors, time=np.arange(5.0))
-    outputs = tuple((f"strain[{gauge}]", Quantity.STRAIN) for gauge in range(1, 25))
+    outputs = tuple((name, Quantity.STRAIN) for name in OUTPUTS[:24])
     patch = ModelPatch(EFFECTS[name])
     wanted = naming_side.respond(given, outputs, patch, Conditions(STATE, health=damage)).values
     with FmiAsset(patched, door, isolated=False, parameters=on(name)) as asset:
@@ -334,6 +333,39 @@ def test_impossible_values_are_refused_and_change_nothing(patched: Path, door: B
         assert asset.step().values.tobytes() == seen.tobytes()
 
 
+def test_whole_numbers_are_whole(patched: Path, door: Binding) -> None:
+    with FmiAsset(patched, door, isolated=False, parameters=on("slip", "crack")) as asset:
+        asset.reset(control={"load_factor": 0.0})
+        asset.step(load={"tip_force": 14.0})
+        many = asset.step(load={"tip_force": -6.0}).values
+    one = on("slip", "crack") | {"effect.slip.element_count": 1, "effect.crack.side": 0}
+    with FmiAsset(patched, door, isolated=False, parameters=one) as asset:
+        asset.reset(control={"load_factor": 0.0})
+        asset.step(load={"tip_force": 14.0})
+        single = asset.step(load={"tip_force": -6.0}).values
+    assert np.abs(many - single).max() > 1e-3 * np.abs(many).max()
+    for name, value in (("slip.element_count", 2.5), ("slip.element_count", 0), ("crack.side", 2)):
+        with pytest.raises(FmuInputError):
+            FmiAsset(patched, door, parameters={f"effect.{name}": value})
+
+
+def test_what_has_no_bounds_is_refused(patched: Path, door: Binding) -> None:
+    soft = on("crack") | {
+        "effect.crack.side": 0,
+        "effect.crack.coefficient": -1e9,
+        "response": 2.0,
+        "release": 0.001,
+    }
+    with pytest.raises(FmuCallError, match="takes more stiffness than the structure has"):
+        FmiAsset(patched, door, parameters=soft).reset()
+    wild = on("drifting") | {"effect.drifting.rate": -1e6, "response": 2.0, "release": 0.001}
+    with (
+        FmiAsset(patched, door, parameters=wild) as asset,
+        pytest.raises(FmuCallError, match="is not finite"),
+    ):
+        asset.simulate({"load_factor": 0.0}, steps=2000)
+
+
 def test_it_is_sound(patched: Path, model: ReducedModel, arrays: PatchArrays, tmp_path: Path) -> None:
     again = build_fmu(model, tmp_path / "again.fmu", patch=patch_of(*EFFECTS), arrays=arrays).path
     assert again.read_bytes() == patched.read_bytes()
@@ -356,6 +388,12 @@ def test_what_cannot_be_packed_is_refused(model: ReducedModel, arrays: PatchArra
     patch = parse_patch(json.dumps({"schema": SCHEMA, "effects": [other]}).encode())
     with pytest.raises(PatchFileError, match="'nose', which this model does not have"):
         build_fmu(model, tmp_path / "c.fmu", patch=patch, arrays=arrays)
+    record = ModelPatch(EFFECTS["crack"]).to_list()
+    record[0]["side"] = 3
+    rows = [{"id": "crack", "primitives": record}]
+    patch = parse_patch(json.dumps({"schema": SCHEMA, "effects": rows}).encode())
+    with pytest.raises(FmuBuildError, match=r"crack\.side lies outside -1 to 1"):
+        build_fmu(model, tmp_path / "d.fmu", patch=patch, arrays=arrays)
     assert not list(tmp_path.iterdir())
 
 
@@ -363,15 +401,15 @@ def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(
     model: ReducedModel, arrays: PatchArrays, fmu: Path, door: Binding, tmp_path: Path
 ) -> None:
     channels = {
-        "g2": Channel("g2", Quantity.STRAIN, "strain[2]", None),
+        "g3": Channel("g3", Quantity.STRAIN, "strain[3]", None),
         "tip": Channel("tip", Quantity.DISPLACEMENT, "tip_displacement", None),
         "rate": Channel("rate", Quantity.VELOCITY, "tip_displacement", None),
     }
     campaign = Campaign("chain", channels, (), None, {}, "")
     outputs = fmu_outputs(campaign)
-    assert outputs == {"g2": "strain[2]", "tip": "tip_displacement"}
-    patch = ModelPatch((SensorGain("g2", 0.25),))
-    named = NamedEffect("gauge_gain", "Gauge gain", "g2", "gain", (), (), patch)
+    assert outputs == {"g3": "strain[3]", "tip": "tip_displacement"}
+    patch = ModelPatch((SensorGain("g3", 0.25),))
+    named = NamedEffect("gauge_gain", "Gauge gain", "g3", "gain", (), (), patch)
     origin = Origin("chain", "wing", "ab" * 32, "cd" * 32, "uav-twin", collect_provenance(1))
     path = write_patch(tmp_path / "patch.json", (named,), origin, channels=outputs)
     assert read_patch(path).channels == outputs
@@ -385,5 +423,5 @@ def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(
         with FmiAsset(which, parse_binding(record), isolated=False) as asset:
             rows.append(asset.step({"load_factor": 2.0}).values)
     ratio = rows[1] / rows[0]
-    assert ratio[1] == pytest.approx(1.25, rel=1e-14)
-    assert np.all(np.delete(ratio, 1) == 1.0)
+    assert ratio[2] == pytest.approx(1.25, rel=1e-14)
+    assert np.all(np.delete(ratio, 2) == 1.0)

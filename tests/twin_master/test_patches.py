@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,14 @@ from fe.patch import (
     Washout,
 )
 from fmu_asset.patch_file import SCHEMA, parse_patch
+from reporting.progress import SilentProgress
 from scenarios import scenario_files
 from twin_master import workflow
 from twin_master.errors import MissionInputError, ScenarioError
 from twin_master.patches import check_model_patch
 from twin_master.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.scenario_file import load_scenario
+from twin_master.system_export import export_scenario
 from twin_master.workflow import RunOutcome, new_run, resume_run
 from uav_twin import cli
 
@@ -190,3 +193,18 @@ def test_a_twin_that_knows_the_effect_has_no_misfit(mission: Any, tmp_path: Path
     # percent; what is left where the twin knows the effect is the mean of the draws of e against the true e
     assert misfit["knowing"] < 0.1
     assert min(misfit["ignorant"], misfit["mistaken"]) > 20.0 * misfit["knowing"]
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wing")
+def test_the_asset_with_its_effects_can_be_exported(tmp_path: Path) -> None:
+    write_patch(tmp_path / "p.json", *DRIFT)
+    scenario = write_scenario(tmp_path, 'patch = "p.json"\n', '"effect.hidden.gain" = 0.2')
+    system = export_scenario(
+        load_scenario(scenario), tmp_path / "wing.ssp", seed=1, replace_file=False, progress=SilentProgress()
+    )
+    with zipfile.ZipFile(system) as archive:
+        names = [name for name in archive.namelist() if name.endswith((".ssd", ".ssv"))]
+        text = "".join(archive.read(name).decode() for name in names)
+    assert "effect.hidden.gain" in text
+    assert "0.2" in text

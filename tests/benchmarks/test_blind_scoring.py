@@ -1,0 +1,101 @@
+"""What verdicts are worth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from scipy.stats import binomtest
+
+from benchmarks.blind.__main__ import main
+from benchmarks.blind.effects import DRAWS
+from benchmarks.blind.scoring import FAMILIES, Outcome, coverage, outcome, wilson
+
+
+def _truth(*identifiers: str, kind: str = "catalogue", **more: Any) -> dict[str, Any]:
+    return {"identifiers": list(identifiers), "kind": kind, "accepted": [], "places": {}, "truth": {}, **more}
+
+
+def _said(kind: str, *identifiers: str, **more: Any) -> dict[str, Any]:
+    return {"kind": kind, "identifiers": list(identifiers), **more}
+
+
+@pytest.mark.parametrize(
+    ("truth", "verdict", "wanted"),
+    [
+        (_truth("a"), _said("named", "a"), Outcome.RIGHT),
+        (_truth("a"), _said("named", "b"), Outcome.WRONG),
+        (_truth("a"), _said("named", "a", "b"), Outcome.WRONG),
+        (_truth("a"), _said("group", group=["a", "b"]), Outcome.GROUP),
+        (_truth("a"), _said("group", group=["b", "c"]), Outcome.WRONG),
+        (_truth("a"), _said("nothing missing"), Outcome.MISSED),
+        (_truth("a"), _said("unexplained"), Outcome.OPEN),
+        (_truth("coulomb_friction"), _said("family", family="damping |v|^p |x|^a"), Outcome.GROUP),
+        (_truth("coulomb_friction"), _said("family", family="dead zone"), Outcome.WRONG),
+        (_truth(kind="null"), _said("nothing missing"), Outcome.RIGHT),
+        (_truth(kind="null"), _said("named", "a"), Outcome.WRONG),
+        (_truth(kind="null"), _said("unexplained"), Outcome.OPEN),
+        (_truth("a", kind="outside"), _said("unexplained"), Outcome.OPEN),
+        (_truth("a", kind="outside"), _said("named", "b"), Outcome.WRONG),
+        (_truth("a", "b", kind="pair"), _said("named", "b", "a"), Outcome.RIGHT),
+        (_truth("a", "b", kind="pair"), _said("named", "b"), Outcome.PART),
+        (_truth("a", "b", kind="pair"), _said("named", "b", "c"), Outcome.WRONG),
+        (_truth(kind="trap", accepted=["data error"]), _said("data error"), Outcome.RIGHT),
+        (_truth(kind="trap", accepted=["data error"]), _said("named", "a"), Outcome.WRONG),
+        (_truth("a", kind="trap", accepted=["unexplained"]), _said("named", "a"), Outcome.RIGHT),
+    ],
+)
+def test_outcomes(truth: dict[str, Any], verdict: dict[str, Any], wanted: Outcome) -> None:
+    assert outcome(truth, verdict) is wanted
+
+
+def test_every_effect_has_a_family() -> None:
+    assert set(FAMILIES) == set(DRAWS)
+
+
+def test_interval_is_compared_at_the_port_where_the_effect_was_named() -> None:
+    truth = _truth("quadratic_damping", places={"quadratic_damping": "span"})
+    truth["truth"] = {"quadratic_damping.coefficient@span": 10.0, "quadratic_damping.coefficient@tip": 0.5}
+    name = "quadratic_damping.coefficient"
+    for port, low, high, wanted in (
+        ("span", 9.0, 11.0, True), ("span", 0.4, 0.6, False), ("tip", 0.4, 0.6, True), ("", 9.0, 11.0, None),
+    ):  # fmt: skip
+        verdict = _said("named", estimates={name: [low, 1.0, high]}, places={"quadratic_damping": port})
+        assert coverage(truth, verdict) == {name: wanted}
+    local = _truth("free_play", places={"free_play": "root"}, truth={"free_play.stiffness": 4.0})
+    estimates = {"free_play.stiffness": [3.0, 4.0, 5.0], "gauge_gain.gain": [0.0, 0.1, 0.2]}
+    assert coverage(local, _said("named", estimates=estimates, places={"free_play": "root"})) == {
+        "free_play.stiffness": True
+    }
+    assert coverage(local, _said("named", estimates=estimates, places={"free_play": "tip"})) == {
+        "free_play.stiffness": None
+    }
+
+
+@pytest.mark.parametrize(("hits", "count"), [(0, 10), (10, 10), (97, 100), (1, 3)])
+def test_interval_of_a_share(hits: int, count: int) -> None:
+    wanted = binomtest(hits, count).proportion_ci(method="wilson")
+    assert wilson(hits, count) == pytest.approx((wanted.low, wanted.high), abs=1e-6)
+
+
+def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--out", str(tmp_path)]
+    sizes = ["--count-per-effect", "0", "--nulls", "3", "--pairs", "2", "--outside", "0", "--traps", "0"]
+    assert main(["generate", *out, *sizes, "--seed", "7", "--rigs", "lumped", "--jobs", "1"]) == 0
+    sealed = sorted((tmp_path / "sealed").glob("*.json"))
+    assert len(sealed) == len(list((tmp_path / "campaigns").iterdir())) >= 2
+    assert main(["score", *out]) == 2
+    (tmp_path / "verdicts").mkdir()
+    for file in sealed:
+        truth = json.loads(file.read_text(encoding="utf-8"))
+        names = truth["identifiers"]
+        verdict = _said("named" if names else "nothing missing", *names, gap_closed=0.95, seconds=1.0)
+        (tmp_path / "verdicts" / file.name).write_text(json.dumps(verdict), encoding="utf-8")
+    capsys.readouterr()
+    assert main(["score", *out]) == 0
+    page = capsys.readouterr().out
+    assert (tmp_path / "score.md").read_text(encoding="utf-8") in page
+    assert "| Nothing hidden | lumped |" in page
+    assert "100.0 %" in page
