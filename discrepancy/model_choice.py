@@ -84,7 +84,8 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
         return _calibrated(path, progress)
     if path.suffix not in ("", ".toml"):
         raise ModelError(
-            f"{path} is no model: a calibration (.nc), a wing design or a lumped model (.toml), or the name of a "
+            f"{path} is no model: a calibration (.nc), a wing design or a lumped model (.toml), or the "
+            "name of a "
             f"shipped lumped model ({', '.join(shipped_lumped_models())}) is expected."
         )
     if path.suffix == ".toml" and not _is_lumped(path):
@@ -92,9 +93,7 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
     model = LumpedModel.load(path)
     shipped = not path.suffix and not path.exists()
     file = SHIPPED_MODELS / f"{path}.toml" if shipped else path
-    return ModelChoice(
-        model, ModelKind.LUMPED, path.name, hash_file(file), path=None if shipped else path
-    )
+    return ModelChoice(model, ModelKind.LUMPED, path.name, hash_file(file), path=None if shipped else path)
 
 
 def shipped_lumped_models() -> tuple[str, ...]:

@@ -8,7 +8,7 @@ was hidden. Motion is simulated with half the time step of the naming side.
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from math import isinf
@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.stats import binomtest
+
+from reporting.files import atomic_write_text
 
 from .campaign import Campaign, Trial
 from .candidate import Candidate, Term
@@ -33,7 +35,7 @@ from .problem import Point, Problem
 from .screening import Screen
 from .separability import DETECTED, as_predicted, usable
 from .verdict import VerdictKind
-from .workflow import Progress, checked, investigate
+from .workflow import checked, investigate
 
 FloatArray = NDArray[np.float64]
 
@@ -203,9 +205,7 @@ class Simulator:
         problem = Problem(campaign, model, self.setting)
         self.fitted = fit(problem, Candidate(), problem.start(Candidate()))
         self.problem = problem.with_trials(campaign.trials)
-        everywhere = fit(
-            self.problem, Candidate(), self._start(self.fitted), local_only=True, evidence=False
-        )
+        everywhere = fit(self.problem, Candidate(), self._start(self.fitted), local_only=True, evidence=False)
         self.found = everywhere.point
 
     def _start(self, fitted: Fit) -> Point:
@@ -261,7 +261,9 @@ class Simulator:
             values = problem.prediction(number, point, response).copy()
             for column, name in enumerate(data.trial.channels):
                 values[:, column] += (
-                    channels[name] * data.trial.noise_factor * _noise(data.noise[column], data.trial, generator)
+                    channels[name]
+                    * data.trial.noise_factor
+                    * _noise(data.noise[column], data.trial, generator)
                 )
             trials.append(replace(data.trial, values=values))
         return replace(self.campaign, name=f"{self.campaign.name} (simulated)", trials=tuple(trials))
@@ -301,7 +303,7 @@ def self_calibrate(
     *,
     seed: int = 0,
     workers: int = 2,
-    progress: Progress | None = None,
+    advance: Callable[[], object] | None = None,
 ) -> SelfCalibration:
     """Simulate and investigate campaigns of one geometry.
 
@@ -319,8 +321,8 @@ def self_calibrate(
         The result depends on it, not on the number of workers.
     workers : int
         Processes; 1: this one.
-    progress : Progress, optional
-        Where to report.
+    advance : callable, optional
+        Called after each campaign.
 
     Raises
     ------
@@ -353,14 +355,20 @@ def self_calibrate(
         hidden.append(found)
     jobs = list(zip(hidden, own, strict=True))
     cases: list[CalibrationCase] = []
+
+    def collect(found: Iterable[CalibrationCase]) -> None:
+        for case in found:
+            cases.append(case)
+            if advance is not None:
+                advance()
+
     if workers <= 1 or count == 1:
-        for job in jobs:
-            cases.append(_investigated(simulator, effects, *job))
+        collect(_investigated(simulator, effects, *job) for job in jobs)
     else:
         with ProcessPoolExecutor(
             workers, get_context("spawn"), initializer=_begin, initargs=(campaign, model, tuple(effects))
         ) as pool:
-            cases.extend(pool.map(_one, jobs, chunksize=1))
+            collect(pool.map(_one, jobs, chunksize=1))
     return SelfCalibration(tuple(cases), tuple(absent), seed)
 
 
@@ -381,7 +389,9 @@ def _investigated(
     generator = np.random.default_rng(seed)
     try:
         campaign = simulator.simulate(hidden, generator)
-    except ModelError:  # at the edge of what the structure carries: the effect at its mean conditions is known to go
+    except (
+        ModelError
+    ):  # at the edge of what the structure carries: the effect at its mean conditions is known to go
         generator = np.random.default_rng(seed.spawn(1)[0])
         campaign = simulator.simulate(hidden, generator)
     found = investigate(campaign, simulator.model, effects, thorough=False).verdict
@@ -433,8 +443,6 @@ def write_self_calibration(path: Path, found: SelfCalibration, origin: Origin) -
     reporting.errors.FileNotWrittenError
         If the file cannot be written.
     """
-    from reporting.files import atomic_write_text
-
     rows, columns, counts = found.confusion()
     content = {
         "schema": SCHEMA,
@@ -443,7 +451,8 @@ def write_self_calibration(path: Path, found: SelfCalibration, origin: Origin) -
         "not_detectable": list(found.not_detectable),
         "outcomes": {
             name: {
-                outcome: plain(found.share(outcome, null=null)) | {"share": plain(found.share(outcome, null=null).value)}
+                outcome: plain(found.share(outcome, null=null))
+                | {"share": plain(found.share(outcome, null=null).value)}
                 for outcome in outcomes(found, null=null)
             }
             for name, null in (("with_an_effect", False), ("with_nothing", True))
@@ -458,5 +467,14 @@ def write_self_calibration(path: Path, found: SelfCalibration, origin: Origin) -
 def outcomes(found: SelfCalibration, *, null: bool) -> list[str]:
     """Return the outcomes that occurred, "right" and "wrong" always, in a fixed order."""
     counts = Counter(case.outcome for case in found.cases if (case.hidden == NOTHING) is null)
-    order = ("right", "wrong", "group", "family", "missed", "unexplained", "below detectability", "data error")
+    order = (
+        "right",
+        "wrong",
+        "group",
+        "family",
+        "missed",
+        "unexplained",
+        "below detectability",
+        "data error",
+    )
     return [name for name in order if counts[name] or name in ("right", "wrong")]

@@ -9,7 +9,15 @@ from discrepancy.report.text import listing, number, unit_text
 from discrepancy.separability import DETECTED, Detectability, Separability
 from reporting.page import Column, Table
 
-HEADINGS = ("effect", "testable", "shows best at", "parameter", "detectable from", "prior median", "confused with")
+HEADINGS = (
+    "effect",
+    "testable",
+    "shows best at",
+    "parameter",
+    "detectable from",
+    "prior median",
+    "confused with",
+)
 _KIND_WORDS = {
     TrialKind.STATIC: "a static loading",
     TrialKind.RINGDOWN: "a ring-down",
@@ -61,7 +69,8 @@ def group_lines(found: Separability) -> list[str]:
     if not found.groups:
         return ["Every effect that can be tested here can be told from every other at its prior median."]
     return [
-        f"These data cannot tell apart {listing(name.replace('_', ' ') for name in group)} (chained where each is "
+        f"These data cannot tell apart {listing(name.replace('_', ' ') for name in group)} (chained where "
+        "each is "
         "close to the next): of such effects a group is what can be named."
         if len(group) > 2
         else f"These data cannot tell {group[0].replace('_', ' ')} from {group[1].replace('_', ' ')}."
@@ -82,12 +91,14 @@ def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) ->
         names = listing(name.replace("_", " ") for name in group)
         if apart:
             lines.append(
-                f"To tell {names} apart, add {' or '.join(_KIND_WORDS[kind] for kind in apart)}: some of them "
+                f"To tell {names} apart, add {' or '.join(_KIND_WORDS[kind] for kind in apart)}: some of "
+                "them "
                 "act there and others do not."
             )
         else:
             lines.append(
-                f"To tell {names} apart, vary what was held: another amplitude, sign or place of the load, a known "
+                f"To tell {names} apart, vary what was held: another amplitude, sign or place of the "
+                "load, a known "
                 "added mass, another temperature, strain beside displacement."
             )
     hidden = [
@@ -99,16 +110,20 @@ def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) ->
         worst = max(hidden, key=lambda item: item.distance)
         factor = (DETECTED / worst.distance) ** 0.5 if worst.distance > 0.0 else float("inf")
         lines.append(
-            f"At their prior medians {listing(i.effect.identifier.replace('_', ' ') for i in hidden)} would not be "
+            f"At their prior medians {listing(i.effect.identifier.replace('_', ' ') for i in hidden)} "
+            "would not be "
             f"seen; the nearest to it, {worst.effect.identifier.replace('_', ' ')}, would be with noise "
             f"{factor:.2g} times smaller or {factor**2:.2g} times as many trials."
         )
     unknown = [name for name, channel in campaign.channels.items() if channel.noise is None]
     if unknown:
         lines.append(
-            f"Give a noise record for {', '.join(unknown)} (samples at rest, or a standard deviation with its degrees "
+            f"Give a noise record for {', '.join(unknown)} (samples at rest, or a standard deviation with "
+            "its degrees "
             "of freedom): without it the absolute gate cannot be applied."
         )
     if not campaign.held_out:
-        lines.append("Hold out a trial, or measure one more at another level: without it nothing can be proved.")
+        lines.append(
+            "Hold out a trial, or measure one more at another level: without it nothing can be proved."
+        )
     return lines

@@ -33,7 +33,11 @@ LEAST_POINTS = 4
 """Fewest measured points of a mode whose backbone is drawn."""
 LARGEST_ERROR = 0.25
 """Largest error of a damping ratio, relative to the median ratio, of a point that is drawn."""
+COMPARABLE = 6.0
+"""Ratio of residuals before and after up to which they are drawn at one scale."""
 FORCE_BINS = 24
+MOST_MODES = 3
+"""Modes that are fitted together in a window."""
 
 
 @dataclass(frozen=True)
@@ -75,11 +79,14 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
         )  # fmt: skip
         axes = figure.add_subplot(grid[0, 0])
         axes.plot(
-            time[used], factor * item.trial.values[used, column], ".", ms=1.8, color=OBSERVED, label="measured"
+            time[used],
+            factor * item.trial.values[used, column],
+            ".",
+            ms=1.8,
+            color=OBSERVED,
+            label="measured",
         )
-        axes.plot(
-            time, factor * item.prediction[:, column], "--", lw=0.9, color=PREDICTION, label=BEFORE
-        )
+        axes.plot(time, factor * item.prediction[:, column], "--", lw=0.9, color=PREDICTION, label=BEFORE)
         if after is not None:
             other = after.trials[worst.trial]
             axes.plot(time, factor * other.prediction[:, column], lw=0.9, color=PAST, label=AFTER)
@@ -89,17 +96,25 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
         axes.margins(x=0.01)
         panels = [(item, PREDICTION, f"b  residual, {BEFORE}")]
         if after is not None:
-            panels.append((after.trials[worst.trial], PAST, f"c  residual, {AFTER} (own scale)"))
+            alike = size(item, column) < COMPARABLE * size(after.trials[worst.trial], column)
+            title = f"c  residual, {AFTER}" + ("" if alike else " (own scale)")
+            panels.append((after.trials[worst.trial], PAST, title))
         for number, (each, colour, title) in enumerate(panels, start=1):
             below = figure.add_subplot(grid[number, 0], sharex=axes)
             noise = factor * float(each.noise_deviation[column])
-            below.axhspan(-2.0 * noise, 2.0 * noise, color=REFERENCE, alpha=0.3, lw=0.0, label="noise, ± 2 s0")
+            below.axhspan(
+                -2.0 * noise, 2.0 * noise, color=REFERENCE, alpha=0.3, lw=0.0, label="noise, ± 2 s0"
+            )
             below.plot(time[used], factor * each.residual[used, column], lw=0.6, color=colour)
             below.set_ylabel(f"residual, {unit}")
             below.set_title(title, loc="left")
             below.margins(x=0.01)
             if number == 1:
                 below.legend(loc="upper right")
+        if after is not None and alike:
+            limits = [limit for below in figure.axes[1:] for limit in below.get_ylim()]
+            for below in figure.axes[1:]:
+                below.set_ylim(min(limits), max(limits))
         figure.axes[-1].set_xlabel("time, s")
         for above in figure.axes[:-1]:
             above.tick_params(labelbottom=False)
@@ -124,7 +139,12 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
             count = min(len(noise.samples), 128)
             at, power = welch(noise.samples / noise.standard_deviation, 1.0 / noise.interval, nperseg=count)
             axes.plot(
-                at[1:], power[1:] * 0.5 / noise.interval, color=OBSERVED, lw=0.8, alpha=0.6, label="noise record"
+                at[1:],
+                power[1:] * 0.5 / noise.interval,
+                color=OBSERVED,
+                lw=0.8,
+                alpha=0.6,
+                label="noise record",
             )
         axes.axhline(1.0, color=TRUTH, lw=0.7, ls="-.", label="white noise of the stated size")
         for at, power, colour, dashes, label in drawn:
@@ -185,8 +205,9 @@ def _clearest(items: Sequence[FittedTrial], frequency: float) -> str:
             ratio = float(np.sqrt(first) / item.noise_deviation[column])
             clear[name] = max(clear.get(name, 0.0), ratio)
             pure[name] = min(pure.get(name, 1.0), first / total if total > 0.0 else 0.0)
-    least = 0.1 * max(clear.values())
-    return max((name for name in clear if clear[name] >= least), key=lambda name: pure[name])
+    # Among those that other modes disturb little, the clearest.
+    limit = 3.0 * min(1.0 - share for share in pure.values()) + 0.02
+    return max((name for name in clear if 1.0 - pure[name] <= limit), key=lambda name: clear[name])
 
 
 def _others(values: FloatArray, interval: float, frequency: float) -> list[float]:
@@ -202,6 +223,23 @@ def _others(values: FloatArray, interval: float, frequency: float) -> list[float
     return found
 
 
+def _all_frequencies(
+    items: Sequence[FittedTrial], channel: str, frequencies: Sequence[float]
+) -> tuple[float, ...]:
+    """Return the first frequency and the lowest that a channel's records show above it.
+
+    Every mode that rings must be fitted along, or it scatters the first one.
+    """
+    found = [list(frequencies[1:])]
+    for item in items:
+        if channel in item.trial.channels:
+            column = item.column(channel)
+            values = np.where(item.used[:, column], item.trial.values[:, column], item.prediction[:, column])
+            found.append(_others(values, item.trial.interval, frequencies[0]))
+    most = max(found, key=len)
+    return (frequencies[0], *sorted(most)[: MOST_MODES - 1])
+
+
 def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure, str] | None:
     """Draw frequency and damping ratio over the amplitude of the modes of the ring-downs, and name the channel.
 
@@ -212,11 +250,14 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
     if not items or not frequencies:
         return None
     channel = _clearest(items, frequencies[0])
+    frequencies = _all_frequencies(items, channel, frequencies)
     measured = _backbones(items, channel, frequencies, None)
     curves = [(_backbones(items, channel, frequencies, "prediction"), PREDICTION, "--", BEFORE)]
     if after is not None:
         curves.append((_backbones(_ringdowns(after), channel, frequencies, "prediction"), PAST, "-", AFTER))
-    modes = [mode for mode in sorted(measured) if sum(len(c.time) for c in measured[mode]) >= LEAST_POINTS][:2]
+    modes = [mode for mode in sorted(measured) if sum(len(c.time) for c in measured[mode]) >= LEAST_POINTS][
+        :2
+    ]
     if not modes:
         return None
     factor, unit = UNIT_OF[before.channels[channel].quantity]
@@ -327,7 +368,7 @@ def force_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure
     """Draw what the restoring force of the first mode has beside its linear part, over velocity and displacement.
 
     Measured and predicted signals are filtered and evaluated alike. None where a record is too short or too
-    coarse.
+    coarse, or where noise hides what there is to see.
     """
     items = _ringdowns(before)
     frequencies = _frequencies(before)
@@ -369,12 +410,16 @@ def force_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure
     with publication_style():
         figure = new_figure(2.5)
         grid = figure.add_gridspec(1, 2, left=0.09, right=0.985, bottom=0.17, top=0.9, wspace=0.26)
+        seen: list[float] = []
+        hidden: list[float] = []
         for place, (name, label) in enumerate(
             (("velocity", "velocity / largest"), ("displacement", "displacement / largest"))
         ):
             axes = figure.add_subplot(grid[0, place])
             for key, surface in surfaces.items():
-                table = np.column_stack((surface.displacement, surface.velocity, np.ones_like(surface.velocity)))
+                table = np.column_stack(
+                    (surface.displacement, surface.velocity, np.ones_like(surface.velocity))
+                )
                 rest = 100.0 * (-surface.acceleration - table @ line) / (rate**2 * top)
                 x, v = surface.displacement / top, surface.velocity / (rate * top)
                 along, other = (v, x) if name == "velocity" else (x, v)
@@ -382,25 +427,33 @@ def force_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure
                 middles, means, errors = _binned(along[near], rest[near])
                 if key == "measured":
                     axes.errorbar(
-                        middles, means, errors, fmt="o", ms=2.8, color=OBSERVED, elinewidth=0.7, label="measured"
+                        middles,
+                        means,
+                        errors,
+                        fmt="o",
+                        ms=2.8,
+                        color=OBSERVED,
+                        elinewidth=0.7,
+                        label="measured",
                     )
                 else:
                     colour, dashes, text = styles[key]
                     axes.plot(middles, means, dashes, color=colour, lw=1.2, label=text)
+                if key == "measured":
+                    seen.append(float(np.nanstd(means)) if np.isfinite(means).any() else 0.0)
+                    hidden.append(float(np.nanmedian(errors)) if np.isfinite(errors).any() else 1.0)
             axes.axhline(0.0, color=REFERENCE, lw=0.6, zorder=0)
             axes.set_xlabel(label)
             axes.set_ylabel("force less linear part, %" if place == 0 else "")
-            axes.set_title(
-                ("a  while passing through rest", "b  while turning back")[place], loc="left"
-            )
+            axes.set_title(("a  while passing through rest", "b  while turning back")[place], loc="left")
             if place == 0:
                 axes.legend(loc="best")
+    if all(size_ < 3.0 * error for size_, error in zip(seen, hidden, strict=True)):
+        return None
     return figure, f"{channel} in {item.trial.name}"
 
 
-def _first_mode(
-    signal: FloatArray, interval: float, frequency: float, others: Sequence[float]
-) -> FloatArray:
+def _first_mode(signal: FloatArray, interval: float, frequency: float, others: Sequence[float]) -> FloatArray:
     """Return the signal below the second mode: zero phase, so that no force is turned into another."""
     if not others:
         return signal
@@ -416,10 +469,9 @@ def _binned(along: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArr
     rows = [
         (0.5 * (edges[n] + edges[n + 1]), values[place == n].mean(),
          values[place == n].std() / np.sqrt(np.sum(place == n)))
-        for n in range(FORCE_BINS)
         if np.sum(place == n) >= 3
+        else (0.5 * (edges[n] + edges[n + 1]), np.nan, np.nan)
+        for n in range(FORCE_BINS)
     ]  # fmt: skip
     table = np.array(rows).reshape(-1, 3)
     return table[:, 0], table[:, 1], table[:, 2]
-
-

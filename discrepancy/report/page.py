@@ -114,18 +114,22 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
             add(
                 "residual_map", planform_figure(before, after, content.design),
                 "Residuals on the wing",
-                "Seen from above, root on the left. Circles are strain gauges, squares displacements; the colour is "
-                "the root mean square of the residual over all trials, in units of what noise would leave: 1 is "
+                "Seen from above, root on the left. Circles are strain gauges, squares displacements; the "
+                "colour is "
+                "the root mean square of the residual over all trials, in units of what noise would "
+                "leave: 1 is "
                 f"noise.{scale} Broken outlines are the regions whose stiffness loss the model knows.",
             )  # fmt: skip
         add(
             "residual_table", heat_figure(before, after), "Residuals by channel and trial",
-            "Root mean square of the residual in units of what noise would leave: 1 is noise. Trials with * are "
+            "Root mean square of the residual in units of what noise would leave: 1 is noise. Trials with "
+            "* are "
             f"held out: nothing was fitted to them.{scale}",
         )  # fmt: skip
         add(
             "load", load_figure(before, after), "Residuals over the load",
-            "Static trials and flights, all channels of a quantity in one panel; open marks are held-out trials. A "
+            "Static trials and flights, all channels of a quantity in one panel; open marks are held-out "
+            "trials. A "
             "slope is a stiffness or a gain, an offset a zero, a bend a nonlinearity.",
         )  # fmt: skip
         worst = worst_record(before)
@@ -133,21 +137,26 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
             role = "held out" if before.trials[worst.trial].trial.held_out else "fitted"
             add(
                 "history", history_figure(before, after, worst), "The record with the largest gap",
-                f"Channel {worst.channel} ({role} trial). The grey band is two standard deviations of the noise "
+                f"Channel {worst.channel} ({role} trial). The grey band is two standard deviations of the "
+                "noise "
                 "record.",
             )  # fmt: skip
             add(
                 "spectrum", spectrum_figure(before, after, worst), "Spectra of the residuals",
-                "Power relative to white noise of the stated size; peaks at the modes are missing dynamics, single "
+                "Power relative to white noise of the stated size; peaks at the modes are missing "
+                "dynamics, single "
                 "lines elsewhere come from outside.",
             )  # fmt: skip
         backbone = backbone_figure(before, after)
         if backbone is not None:
             add(
                 "backbone", backbone[0], "Frequency and damping over the amplitude",
-                f"All ring-downs, channel {backbone[1]}, windows of four periods. Viscous damping and a linear "
-                "spring are flat; Coulomb friction gives a damping ratio that falls as 1/A, quadratic damping one "
-                "that rises with A, a cubic spring a frequency that goes with A squared; under micro-slip the "
+                f"All ring-downs, channel {backbone[1]}, windows of four periods. Viscous damping and a "
+                "linear "
+                "spring are flat; Coulomb friction gives a damping ratio that falls as 1/A, quadratic "
+                "damping one "
+                "that rises with A, a cubic spring a frequency that goes with A squared; under micro-slip "
+                "the "
                 "frequency falls and the damping rises with A.",
             )  # fmt: skip
         force = force_figure(before, after)
@@ -155,7 +164,8 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
             add(
                 "restoring_force", force[0], "Restoring force of the first mode",
                 f"What is left of the force per modal mass after the best straight line in displacement and "
-                f"velocity, in percent of the largest elastic force; {force[1]}. Measured and predicted signals are "
+                f"velocity, in percent of the largest elastic force; {force[1]}. Measured and predicted "
+                "signals are "
                 "filtered and evaluated alike; means in bins with standard errors.",
             )  # fmt: skip
     _add_evidence(content, add)
@@ -167,7 +177,8 @@ def _add_evidence(content: ReportInput, add: Callable[[str, Figure | None, str, 
     if verdict.hypotheses:
         add(
             "evidence", evidence_figure(verdict.hypotheses), "Evidence",
-            "The best hypotheses and their probabilities (p) on a logarithmic scale; ln B is the logarithm of the "
+            "The best hypotheses and their probabilities (p) on a logarithmic scale; ln B is the "
+            "logarithm of the "
             "evidence over that of nothing missing (for the best place of the effect, before prior "
             "probabilities).",
         )  # fmt: skip
@@ -186,12 +197,14 @@ def _add_evidence(content: ReportInput, add: Callable[[str, Figure | None, str, 
         if scores:
             add(
                 "pit", pit_figure(scores), "Calibration of the predictions",
-                f"{where} A right model gives a flat histogram; full ends mean intervals that are too narrow.",
+                f"{where} A right model gives a flat histogram; full ends mean intervals that are too "
+                "narrow.",
             )  # fmt: skip
     if content.separability is not None:
         add(
             "separability", separability_figure(content.separability), "What this campaign can tell apart",
-            "Squared distance, in noise deviations and with all nuisances adapted, of the effect of the row at its "
+            "Squared distance, in noise deviations and with all nuisances adapted, of the effect of the "
+            "row at its "
             "prior median from the nearest that the effect of the column can do. Crosses: closer than "
             f"{CONFUSED:g} in either direction, a confusion group. Made before the data were looked at.",
         )  # fmt: skip
@@ -203,7 +216,7 @@ def _add_evidence(content: ReportInput, add: Callable[[str, Figure | None, str, 
         )  # fmt: skip
 
 
-def _after(investigation: Investigation):  # type: ignore[no-untyped-def] # noqa: ANN202
+def _after(investigation: Investigation):  # type: ignore[no-untyped-def]
     """Return the residuals with the effect where one was added, else None."""
     if investigation.fit is None or not investigation.fit.candidate.terms:
         return None
@@ -289,7 +302,9 @@ def _add_verdict(page: Page, content: ReportInput) -> None:
     catalogue = catalogue_of(investigation)
     if verdict.kind is VerdictKind.UNEXPLAINED and verdict.resembles:
         names = [catalogue[name].name if name in catalogue else name for name in verdict.resembles]
-        page.add_paragraph(f"The nearest in the catalogue is {listing(names)}; this is a resemblance, no name.")
+        page.add_paragraph(
+            f"The nearest in the catalogue is {listing(names)}; this is a resemblance, no name."
+        )
     if not verdict.effects:
         return
     for effect in _distinct(verdict.effects):
@@ -355,7 +370,12 @@ def _add_primitives(page: Page, content: ReportInput) -> None:
     fmu = f" {content.fmu}" if content.fmu else ""
     page.add_table(
         Table(
-            (Column("number"), Column("value", numeric=True), Column("90 % interval", numeric=True), Column("unit")),
+            (
+                Column("number"),
+                Column("value", numeric=True),
+                Column("90 % interval", numeric=True),
+                Column("unit"),
+            ),
             rows,
         ),
         f"patch.json holds it in SI units, ready for the model and its FMU.{marked}{fmu}",
@@ -396,7 +416,8 @@ def _percent(share: float) -> str:
 
 def _add_next(page: Page, investigation: Investigation) -> None:
     page.add_paragraph(
-        "What would decide most between the hypotheses that are still open, for its cost. Information is the mutual "
+        "What would decide most between the hypotheses that are still open, for its cost. Information is "
+        "the mutual "
         "information of hypothesis and data, by simulation; ln 2 = 0.69 nat decides between two equals."
     )
     page.add_table(
@@ -421,12 +442,16 @@ def _add_location(page: Page, investigation: Investigation) -> None:
         page.add_paragraph("The residuals were not searched for patterns.")
         return
     if not location.disagrees:
-        page.add_paragraph("No global test finds a disagreement between the model as it was and the fitted trials.")
+        page.add_paragraph(
+            "No global test finds a disagreement between the model as it was and the fitted trials."
+        )
     else:
         significant = sum(cell.significant for cell in location.cells)
         page.add_paragraph(
-            f"The model as it was disagrees with the fitted trials; {significant} of {len(location.cells)} cells of "
-            "the map (channel, trial, and bin of time, amplitude, frequency or load) are discoveries at a false "
+            f"The model as it was disagrees with the fitted trials; {significant} of "
+            f"{len(location.cells)} cells of "
+            "the map (channel, trial, and bin of time, amplitude, frequency or load) are discoveries at a "
+            "false "
             "discovery rate of 5 %."
         )
     findings = [item for item in location.disagreements if item.share >= LEAST_SHARE][:SHOWN_FINDINGS]
@@ -434,13 +459,24 @@ def _add_location(page: Page, investigation: Investigation) -> None:
         page.add_paragraph(f"• {item.sentence}")
     page.add_table(
         Table(
-            (Column("test"), Column("statistic", numeric=True), Column("p", numeric=True), Column("disagrees")),
+            (
+                Column("test"),
+                Column("statistic", numeric=True),
+                Column("p", numeric=True),
+                Column("disagrees"),
+            ),
             [
-                (test.name, number(test.statistic, 4), p_value_text(test.p_value), "yes" if test.rejected else "no")
+                (
+                    test.name,
+                    number(test.statistic, 4),
+                    p_value_text(test.p_value),
+                    "yes" if test.rejected else "no",
+                )
                 for test in location.tests
             ],
         ),
-        "Residuals of the model as it was on fitted trials, each against what noise would leave after the fit; "
+        "Residuals of the model as it was on fitted trials, each against what noise would leave after the "
+        "fit; "
         "Holm's rule at 1 % over the tests.",
         title="Global tests",
     )
@@ -465,7 +501,8 @@ def _add_gates(page: Page, investigation: Investigation) -> None:
                 for gate in gates
             ],
         ),
-        "A name must fit the noise record (absolute fit), and freeing its shape must not gain more than two nats.",
+        "A name must fit the noise record (absolute fit), and freeing its shape must not gain more than "
+        "two nats.",
         title="Gates",
     )  # fmt: skip
 
@@ -485,7 +522,7 @@ def _add_inclusion(page: Page, investigation: Investigation) -> None:
 def _add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
     if investigation.verdict.kind is not VerdictKind.NAMED:
         page.add_notice(
-            f"The model \"with the effect\" has {added_label(investigation)} here, which is not named: the figures "
+            f'The model "with the effect" has {added_label(investigation)} here, which is not named: the figures '
             "say how well it does, not that it is there."
         )
     page.add_paragraph(proof.remaining)
@@ -517,7 +554,9 @@ def _add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
         factor, unit = UNIT_OF[channels[name].quantity] if name in channels else (1.0, "")
         add(
             f"rms of {name}, {unit}",
-            lambda s, name=name, factor=factor: number(factor * s.rms[name]) if name in s.rms else "\N{EN DASH}",  # type: ignore[misc]
+            lambda s, name=name, factor=factor: (
+                number(factor * s.rms[name]) if name in s.rms else "\N{EN DASH}"
+            ),  # type: ignore[misc]
         )
     gain = "Nothing is held out, so that nothing is proved." if proof.held_out_after is None else (
         f"Gain in log score on held-out trials {number(proof.log_score_gain, 4)} "
@@ -527,7 +566,9 @@ def _add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
         f"Gap closed: {_percent(proof.gap_closed)} %." if isfinite(proof.gap_closed) else proof.gap_reason
     )
     trials = f" Held out: {', '.join(held)}; only their own releases and zeros were adapted." if held else ""
-    page.add_table(Table(columns, rows), f"{gain}{closed}{trials}", title="Before and after, at the same scale")
+    page.add_table(
+        Table(columns, rows), f"{gain}{closed}{trials}", title="Before and after, at the same scale"
+    )
 
 
 def _add_separability(page: Page, content: ReportInput) -> None:
@@ -545,7 +586,8 @@ def _add_separability(page: Page, content: ReportInput) -> None:
         )
     page.add_table(
         can_decide_table(found),
-        "From the model, the inputs and the noise alone. Detectable from: the size at which d² reaches 25, with "
+        "From the model, the inputs and the noise alone. Detectable from: the size at which d² reaches "
+        "25, with "
         "all nuisances adapted.",
         title="Detectable sizes",
     )
@@ -575,7 +617,8 @@ def _add_self_calibration(page: Page, content: ReportInput) -> None:
     )
     page.add_table(
         Table((Column("campaigns"), Column("outcome"), Column("share, 90 % Wilson interval")), rows),
-        "Simulated by the model that looks for the effect, with half its time step: this says what the campaign and "
+        "Simulated by the model that looks for the effect, with half its time step: this says what the "
+        "campaign and "
         f"the workflow can do, not that the model is right.{absent} self_calibration.json has every case.",
         title="Verdicts on simulated campaigns of this geometry",
     )

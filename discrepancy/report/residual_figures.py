@@ -62,7 +62,9 @@ def size_by_channel(residuals: ResidualSet) -> dict[str, float]:
 
 def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray]:
     """Return channels (C), trials (T), and the sizes (C, T) of the residuals; nan where there is none."""
-    channels = [name for name in residuals.channels if any(name in i.trial.channels for i in residuals.trials)]
+    channels = [
+        name for name in residuals.channels if any(name in i.trial.channels for i in residuals.trials)
+    ]
     table = np.full((len(channels), len(residuals.trials)), np.nan)
     for place, item in enumerate(residuals.trials):
         for column, name in enumerate(item.trial.channels):
@@ -167,7 +169,13 @@ def _draw_gauges(
             linewidths=0.6, zorder=3,
         )  # fmt: skip
         axes.annotate(
-            name, (station, depth), (0.0, -6.5), textcoords="offset points", ha="center", va="top", fontsize=6.5
+            name,
+            (station, depth),
+            (0.0, -6.5),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            fontsize=6.5,
         )
 
 
@@ -258,7 +266,9 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
             noise = _draw_loads(axes, before, kind, names, factor, PREDICTION, "o", "model as it was")
             if after is not None:
                 _draw_loads(axes, after, kind, names, factor, PAST, "D", "with the effect")
-            axes.axhspan(-2.0 * noise, 2.0 * noise, color=REFERENCE, alpha=0.25, lw=0.0, label="noise, ± 2 s0")
+            axes.axhspan(
+                -2.0 * noise, 2.0 * noise, color=REFERENCE, alpha=0.25, lw=0.0, label="noise, ± 2 s0"
+            )
             axes.axhline(0.0, color=OBSERVED, lw=0.6)
             axes.set_xlabel(label)
             axes.set_ylabel(f"residual, {unit}")
