@@ -48,7 +48,7 @@ class PrimitiveInterval:
 
 @dataclass(frozen=True)
 class StoredPatch:
-    """Content of patch.json: effects, intervals of their primitives, origin, FMU outputs by channel, verdict."""
+    """Content of patch.json: effects, intervals of their primitives, origin, outputs by channel, verdict."""
 
     effects: tuple[NamedEffect, ...]
     intervals: tuple[tuple[PrimitiveInterval, ...], ...]

@@ -1,9 +1,9 @@
 """Simulation-based calibration of the workflow itself, on the geometry of a user's own campaign.
 
-Campaigns are simulated with the model, the inputs, the channels and the noise of a real one. In a third of them
-nothing is hidden; in the others an effect drawn from its prior, where this campaign can detect it (d^2 >= 25, the
-limit of `discrepancy.separability`). Each is investigated as the real one is, and verdicts are compared with what
-was hidden. Motion is simulated with half the time step of the naming side.
+Campaigns are simulated with the model, the inputs, the channels and the noise of a real one. In a third of
+them nothing is hidden; in the others an effect drawn from its prior, where this campaign can detect it
+(d^2 >= 25, the limit of `discrepancy.separability`). Each is investigated as the real one is, and verdicts
+are compared with what was hidden. Motion is simulated with half the time step of the naming side.
 """
 
 import json
@@ -421,8 +421,8 @@ def _investigated(
 def outcome_of(hidden: str, kind: VerdictKind, named: tuple[str, ...], group: tuple[str, ...]) -> str:
     """Return how a verdict compares with what was hidden.
 
-    A group that holds the effect, and a family whose nearest member it is, are honest but less than the name; a
-    group or a family without it is wrong, and so is any name where nothing was hidden.
+    A group that holds the effect, and a family whose nearest member it is, are honest but less than the name;
+    a group or a family without it is wrong, and so is any name where nothing was hidden.
     """
     if kind is VerdictKind.NOTHING_MISSING:
         return "right" if hidden == NOTHING else "missed"

@@ -1,4 +1,4 @@
-"""The folder that an investigation leaves: verdict, patch, residuals, figures, report; whole or not at all."""
+"""The folder that an investigation leaves: verdict, patch, residuals, figures, report; whole or not."""
 
 import shutil
 import tempfile
@@ -9,7 +9,9 @@ from pathlib import Path
 from discrepancy.document_file import Origin
 from discrepancy.naming import named_effects
 from discrepancy.patch_file import PATCH_NAME, fmu_outputs, primitive_intervals, write_patch
-from discrepancy.report.page import ReportInput, draw, render_report, report_figures
+from discrepancy.report.content import ReportInput
+from discrepancy.report.figures import draw, report_figures
+from discrepancy.report.page import render_report
 from discrepancy.report.text import added_label
 from discrepancy.residual_file import RESIDUALS_NAME, write_residuals
 from discrepancy.self_calibration import SELF_CALIBRATION_NAME, SelfCalibration, write_self_calibration

@@ -76,9 +76,12 @@ def _show(effect: Effect, console: object) -> None:
         table.add_row(item.name, item.symbol, prior, unit_text(item.unit), item.description)
     for shape in effect.shape:
         table.add_row(
-            shape.name, shape.symbol, f"{shape.canonical:g}; freed: {shape.prior.low:g} to {shape.prior.high:g}", "",
+            shape.name,
+            shape.symbol,
+            f"{shape.canonical:g}; freed: {shape.prior.low:g} to {shape.prior.high:g}",
+            "",
             shape.description,
-        )  # fmt: skip
+        )
     console.print(table)
 
 

@@ -1,4 +1,4 @@
-"""Why this name: evidence, what the campaign separates, calibration of predictions and of the workflow itself."""
+"""Why this name: evidence, what the campaign separates, calibration of predictions and workflow."""
 
 from collections.abc import Mapping, Sequence
 
@@ -124,7 +124,7 @@ def separability_figure(found: Separability) -> Figure | None:
         side = figure.add_axes((box.x1 + 0.03, box.y0, 0.018, min(box.height, 2.2 / height)))
         bar = figure.colorbar(image, cax=side)
         bar.set_label("d², squared distance in noise deviations")
-        bar.outline.set_linewidth(0.5)  # type: ignore[operator]
+        bar.outline.set_linewidth(0.5)
         bar.ax.axhline(CONFUSED, color=PREDICTION, lw=1.2)
         bar.ax.axhline(DETECTED, color="white", lw=1.2)
     return figure

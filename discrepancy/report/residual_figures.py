@@ -165,8 +165,8 @@ def _draw_gauges(
         depth = _leading_edge(design, station) + fraction * form.chord(min(station / form.semi_span, 1.0))
         marker = "o" if channels[name].quantity is Quantity.STRAIN else "s"
         axes.scatter(
-            station, depth, c=[sizes[name]], cmap=LEVELS, norm=norm, s=46, marker=marker, edgecolors="#333333",
-            linewidths=0.6, zorder=3,
+            station, depth, c=[sizes[name]], cmap=LEVELS, norm=norm, s=46, marker=marker,
+            edgecolors="#333333", linewidths=0.6, zorder=3,
         )  # fmt: skip
         axes.annotate(
             name,
@@ -187,7 +187,7 @@ def _size_bar(figure: Figure, norm: Normalize, place: tuple[float, float, float,
     bar.ax.yaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0) if largest < 50.0 else (1.0,)))
     bar.ax.yaxis.set_minor_locator(NullLocator())
     bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    bar.outline.set_linewidth(0.5)  # type: ignore[operator]
+    bar.outline.set_linewidth(0.5)
 
 
 def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:

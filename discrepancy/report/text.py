@@ -10,15 +10,15 @@ from discrepancy.workflow import Investigation
 
 MEANING = {
     VerdictKind.NOTHING_MISSING: "No effect of the catalogue is needed: what the model leaves is noise.",
-    VerdictKind.NAMED: "The name has the probability, the evidence and the fit that a name needs: it passed both "
-    "gates.",
-    VerdictKind.FAMILY: "The kind of the effect is known, its exact law is not one of the catalogue: the shape "
-    "below was fitted.",
-    VerdictKind.GROUP: "Something is missing. Each member of the group fits the data; the figures after adding an "
-    "effect are those of its most probable member, which is no name.",
+    VerdictKind.NAMED: "The name has the probability, the evidence and the fit that a name needs: it passed "
+    "both gates.",
+    VerdictKind.FAMILY: "The kind of the effect is known, its exact law is not one of the catalogue: the "
+    "shape below was fitted.",
+    VerdictKind.GROUP: "Something is missing. Each member of the group fits the data; the figures after "
+    "adding an effect are those of its most probable member, which is no name.",
     VerdictKind.UNEXPLAINED: "There is a gap, and nothing in the catalogue fits it well enough to be named.",
-    VerdictKind.DATA_ERROR: "The data are at fault; nothing was fitted. Mend them, do not correct them to fit the "
-    "model.",
+    VerdictKind.DATA_ERROR: "The data are at fault; nothing was fitted. Mend them, do not correct them to "
+    "fit the model.",
     VerdictKind.BELOW_LIMIT: "The data do not decide between noise and a small effect.",
 }
 """What each kind of verdict means, in a sentence."""
@@ -142,7 +142,8 @@ def listing(words: Iterable[str]) -> str:
 
 
 _GREEK = {
-    "alpha": "α", "beta": "β", "chi": "χ", "delta": "δ", "eps": "ε", "eta": "η", "kappa": "κ", "mu": "μ", "nu": "ν",
+    "alpha": "α", "beta": "β", "chi": "χ", "delta": "δ", "eps": "ε", "eta": "η", "kappa": "κ", "mu": "μ",
+    "nu": "ν",
     "phi": "φ", "pi": "π", "rho": "ρ", "tau": "τ", "theta": "θ", "zeta": "ζ",
 }  # fmt: skip
 _GREEK_WORD = re.compile(rf"\b({'|'.join(_GREEK)})(?=\b|_)")
@@ -153,3 +154,9 @@ def formula(text: str) -> str:
     """Return an equation of the catalogue with Greek letters, powers and arrows as they are printed."""
     text = _GREEK_WORD.sub(lambda match: _GREEK[match.group(1)], text).replace("->", "→")
     return re.sub(r"\^(\d)(?!\w)", lambda match: match.group(1).translate(_POWERS), text)
+
+
+def percent(share: float) -> str:
+    """Return a share in percent; never 100 where a little is left."""
+    text = 100.0 * share
+    return "> 99.9" if 99.95 < text < 100.0 else f"{text:.1f}"
