@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from math import isfinite
 
+import numpy as np
+
 from discrepancy.campaign import Campaign, TrialKind
 from discrepancy.catalogue.entry import Effect
 from discrepancy.report.text import listing, number, unit_text
-from discrepancy.separability import DETECTED, Detectability, Separability
+from discrepancy.separability import CONFUSED, DETECTED, Detectability, Separability
 from reporting.page import Column, Table
 
 HEADINGS = (
@@ -35,7 +37,7 @@ def _row(found: Separability, item: Detectability) -> tuple[str, ...]:
     name = item.effect.identifier
     if item.reason:
         return (name, "no", "", "", item.reason.rstrip("."), "", "")
-    others = [other for other in found.group_of(name) if other != name]
+    others = neighbours(found, name)
     unit = f" {unit_text(item.unit)}".rstrip()
     visible = "yes" if item.distance >= DETECTED else "larger than usual only"
     if not item.parameter:
@@ -50,6 +52,15 @@ def _row(found: Separability, item: Detectability) -> tuple[str, ...]:
         f"{number(item.typical, 2)}{unit}",
         ", ".join(others),
     )
+
+
+def neighbours(found: Separability, name: str) -> list[str]:
+    """Return the effects that these data cannot tell from one, in either direction."""
+    if name not in found.identifiers:
+        return []
+    at = found.identifiers.index(name)
+    near = np.minimum(found.distance[at], found.distance[:, at]) < CONFUSED
+    return [other for place, other in enumerate(found.identifiers) if near[place] and place != at]
 
 
 def can_decide_table(found: Separability) -> Table:
@@ -68,14 +79,17 @@ def group_lines(found: Separability) -> list[str]:
     """Return one sentence for each confusion group, or one that there is none."""
     if not found.groups:
         return ["Every effect that can be tested here can be told from every other at its prior median."]
-    return [
-        f"These data cannot tell apart {listing(name.replace('_', ' ') for name in group)} (chained where "
-        "each is "
-        "close to the next): of such effects a group is what can be named."
-        if len(group) > 2
-        else f"These data cannot tell {group[0].replace('_', ' ')} from {group[1].replace('_', ' ')}."
-        for group in found.groups
-    ]
+    lines = []
+    for group in found.groups:
+        names = [name.replace("_", " ") for name in group]
+        if len(names) == 2:
+            lines.append(f"These data cannot tell {names[0]} from {names[1]}.")
+        else:
+            lines.append(
+                "Confusion group, each close to at least one other (the table says to which): "
+                f"{listing(names)}."
+            )
+    return lines
 
 
 def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) -> list[str]:

@@ -117,7 +117,7 @@ def separability_figure(found: Separability) -> Figure | None:
         axes.set_yticks(range(len(labels)), labels)
         axes.tick_params(length=0, labelsize=6.5)
         axes.spines[:].set_visible(False)
-        for row, column in zip(*np.nonzero(np.minimum(distance, distance.T) < CONFUSED), strict=True):
+        for row, column in zip(*np.nonzero(distance < CONFUSED), strict=True):
             if row != column:
                 axes.plot(column, row, "x", color=PREDICTION, ms=4.0, mew=1.1)
         box = axes.get_position()

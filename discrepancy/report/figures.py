@@ -137,7 +137,8 @@ def _add_evidence(content: ReportInput, add: Callable[[str, Figure | None, str, 
             "Squared distance, in noise deviations and with all nuisances adapted, of the effect of the "
             "row at its "
             "prior median from the nearest that the effect of the column can do. Crosses: closer than "
-            f"{CONFUSED:g} in either direction, a confusion group. Made before the data were looked at.",
+            f"{CONFUSED:g}, so that the column's effect can pass for the row's. Made before the data were "
+            "looked at.",
         )  # fmt: skip
     if content.self_calibration is not None:
         add(

@@ -140,8 +140,8 @@ def _add_highlights(page: Page, investigation: Investigation) -> None:
         if isfinite(proof.gap_closed):
             items.append((f"{percent(proof.gap_closed)} %", "of the gap closed on held-out trials"))
     elif verdict.gates and isfinite(verdict.gates[0].statistic):
-        items.append((number(verdict.gates[0].statistic), f"{verdict.gates[0].name}; limit "
-                      f"{number(verdict.gates[0].limit)}"))  # fmt: skip
+        gate = verdict.gates[0]
+        items.append((number(gate.statistic), f"p of the {gate.name}; limit {number(gate.limit)}"))
     if items:
         page.add_highlights(items)
 

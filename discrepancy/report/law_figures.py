@@ -12,7 +12,7 @@ from scipy.signal import butter, sosfiltfilt
 from discrepancy.backbone import Backbone, backbones, restoring_force_surface
 from discrepancy.campaign import TrialKind
 from discrepancy.errors import FitError
-from discrepancy.report.motion_figures import AFTER, BEFORE, mode_frequencies
+from discrepancy.report.motion_figures import AFTER, before_label, mode_frequencies
 from discrepancy.report.residual_figures import UNIT_OF
 from discrepancy.residuals import FittedTrial, ResidualSet
 from reporting.figures import (
@@ -100,7 +100,7 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
     channel = _clearest(items, frequencies[0])
     frequencies = _all_frequencies(items, channel, frequencies)
     measured = _backbones(items, channel, frequencies, None)
-    curves = [(_backbones(items, channel, frequencies, "prediction"), PREDICTION, "--", BEFORE)]
+    curves = [(_backbones(items, channel, frequencies, "prediction"), PREDICTION, "--", before_label(after))]
     if after is not None:
         curves.append((_backbones(_ringdowns(after), channel, frequencies, "prediction"), PAST, "-", AFTER))
     modes = [mode for mode in sorted(measured) if sum(len(c.time) for c in measured[mode]) >= LEAST_POINTS][
@@ -252,7 +252,7 @@ def force_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure
     design = np.column_stack((shown.displacement, shown.velocity, np.ones_like(shown.velocity)))
     line = np.linalg.lstsq(design, -shown.acceleration, rcond=None)[0]
     styles = {
-        "before": (PREDICTION, "--", BEFORE),
+        "before": (PREDICTION, "--", before_label(after)),
         "after": (PAST, "-", AFTER),
     }
     with publication_style():

@@ -22,9 +22,14 @@ from reporting.figures import (
 
 FloatArray = NDArray[np.float64]
 
-BEFORE, AFTER = "model as it was", "with the effect"
+AFTER = "with the effect"
 COMPARABLE = 6.0
 """Ratio of residuals before and after up to which they are drawn at one scale."""
+
+
+def before_label(after: ResidualSet | None) -> str:
+    """Return what the model is called that has no effect added."""
+    return "model" if after is None else "model as it was"
 
 
 @dataclass(frozen=True)
@@ -73,7 +78,14 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
             color=OBSERVED,
             label="measured",
         )
-        axes.plot(time, factor * item.prediction[:, column], "--", lw=0.9, color=PREDICTION, label=BEFORE)
+        axes.plot(
+            time,
+            factor * item.prediction[:, column],
+            "--",
+            lw=0.9,
+            color=PREDICTION,
+            label=before_label(after),
+        )
         if after is not None:
             other = after.trials[worst.trial]
             axes.plot(time, factor * other.prediction[:, column], lw=0.9, color=PAST, label=AFTER)
@@ -81,7 +93,7 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
         axes.set_title(f"a  {worst.channel} in {item.trial.name}", loc="left")
         axes.legend(ncol=3, loc="upper right")
         axes.margins(x=0.01)
-        panels = [(item, PREDICTION, f"b  residual, {BEFORE}")]
+        panels = [(item, PREDICTION, f"b  residual, {before_label(after)}")]
         if after is not None:
             alike = size(item, column) < COMPARABLE * size(after.trials[worst.trial], column)
             title = f"c  residual, {AFTER}" + ("" if alike else " (own scale)")
@@ -110,7 +122,9 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
 
 def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure | None:
     """Draw spectra of the residuals of the worst channel over all dynamic trials, with that of the noise."""
-    items = [(before, PREDICTION, "--", BEFORE)] + ([(after, PAST, "-", AFTER)] if after is not None else [])
+    items = [(before, PREDICTION, "--", before_label(after))] + (
+        [(after, PAST, "-", AFTER)] if after is not None else []
+    )
     drawn = []
     for residuals, colour, dashes, label in items:
         spectrum = _spectrum(residuals, worst.channel)
@@ -120,8 +134,8 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
         return None
     noise = before.channels[worst.channel].noise
     with publication_style():
-        figure = new_figure(2.6)
-        axes = figure.add_axes((0.095, 0.165, 0.885, 0.755))
+        figure = new_figure(2.7)
+        axes = figure.add_axes((0.095, 0.16, 0.885, 0.70))
         if noise is not None and noise.samples is not None and noise.interval and len(noise.samples) >= 32:
             count = min(len(noise.samples), 128)
             at, power = welch(noise.samples / noise.standard_deviation, 1.0 / noise.interval, nperseg=count)
@@ -147,7 +161,9 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
         axes.set_xlabel("frequency, Hz")
         axes.set_ylabel("power / white noise")
         axes.set_title(f"residuals of {worst.channel}, all dynamic trials", loc="left")
-        axes.legend(loc="upper right")
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(low, 0.1), max(high, 10.0))
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=2, borderaxespad=0.0)
     return figure
 
 

@@ -263,7 +263,16 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
         for number, (kind, label, quantity, names) in enumerate(panels):
             axes = figure.add_subplot(grid[number // columns, number % columns])
             factor, unit = UNIT_OF[quantity]
-            noise = _draw_loads(axes, before, kind, names, factor, PREDICTION, "o", "model as it was")
+            noise = _draw_loads(
+                axes,
+                before,
+                kind,
+                names,
+                factor,
+                PREDICTION,
+                "o",
+                "model" if after is None else "model as it was",
+            )
             if after is not None:
                 _draw_loads(axes, after, kind, names, factor, PAST, "D", "with the effect")
             axes.axhspan(

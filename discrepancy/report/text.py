@@ -92,6 +92,9 @@ def unit_text(unit: str) -> str:
 def headline(verdict: Verdict) -> str:
     """Return the verdict in one sentence that holds its probability."""
     text = verdict.sentence.rstrip(".")
+    known = [*verdict.effects, *(effect for item in verdict.hypotheses for effect in item.effects)]
+    for identifier, name in {effect.identifier: effect.name for effect in known}.items():
+        text = re.sub(rf"\b{identifier}\b", name, text)
     if isnan(verdict.probability) or "probability" in text:
         return text + "."
     about = {
