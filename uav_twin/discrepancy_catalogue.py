@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -123,12 +124,12 @@ def example(
             patch = patch + _hidden(text, choice.model, bare)
     campaign = write_example(choice.model, out, kind, seed, plan, patch)  # type: ignore[arg-type]
     hidden = ", ".join(effect) if effect else "nothing"
-    named = "" if model is None else f" --model {model}"
+    named = "" if model is None else f" --model {shlex.quote(model)}"
     typer.echo(
         f"Wrote {out}: {len(campaign.trials)} trials, {len(campaign.channels)} channels; hidden: {hidden}."
     )
-    typer.echo(f"Next: uav-twin discrepancy check {out}{named}")
-    typer.echo(f"Then: uav-twin discrepancy run {out}{named}")
+    typer.echo(f"Next: uav-twin discrepancy check {shlex.quote(str(out))}{named}")
+    typer.echo(f"Then: uav-twin discrepancy run {shlex.quote(str(out))}{named}")
 
 
 def _plan(choice: ModelChoice) -> ExamplePlan:

@@ -173,11 +173,12 @@ def _show(found: Investigation, tried: SelfCalibration | None, report: Path, con
     from rich.table import Table
 
     from discrepancy.report.text import estimate_text, headline, probability_text, unit_text
+    from discrepancy.verdict import VerdictKind
 
     verdict, proof = found.verdict, found.proof
     console.print(f"Verdict: {verdict.kind.value}", style="bold")
     console.print(headline(verdict), soft_wrap=True)
-    if isfinite(verdict.probability):
+    if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
         console.print(
             f"Probability {probability_text(verdict.probability)}, ln Bayes factor against nothing missing "
             f"{verdict.log_bayes_factor:.1f}."

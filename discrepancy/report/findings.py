@@ -123,7 +123,7 @@ def _add_primitives(page: Page, content: ReportInput) -> None:
 def _add_highlights(page: Page, investigation: Investigation) -> None:
     verdict, proof = investigation.verdict, investigation.proof
     items: list[tuple[str, str]] = []
-    if not isnan(verdict.probability):
+    if not isnan(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
         items.append((probability_text(verdict.probability), "probability of the verdict"))
     if isfinite(verdict.log_bayes_factor) and verdict.hypotheses and verdict.hypotheses[0].effects:
         items.append((f"{verdict.log_bayes_factor:,.1f} nat", "ln Bayes factor against nothing missing"))
