@@ -100,9 +100,10 @@ class ReleaseOf(Section):
     velocity : str, optional
         Parameter: velocity [m/s] at the start, for records that do not begin at rest.
     hold : str, optional
-        In place of a parameter: force input that holds the release point until the start ...
+        In place of a parameter: force input that holds the release point until the start.
     output : str, optional
-        ... and the displacement output that shows where it is.
+        Displacement output that shows where the release point is. Needed with `hold`; with a parameter it is
+        for one that is not the release point's own displacement.
     """
 
     displacement: Name | None = None
@@ -114,7 +115,7 @@ class ReleaseOf(Section):
     def _one_way(self) -> Self:
         if (self.displacement is None) == (self.hold is None):
             raise ValueError("give exactly one of displacement (a parameter) and hold (a force input)")
-        if (self.hold is None) != (self.output is None):
+        if self.hold is not None and self.output is None:
             raise ValueError("hold needs output, the displacement output of the release point")
         return self
 

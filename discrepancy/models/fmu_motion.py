@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from discrepancy.campaign import Trial
+from discrepancy.campaign import Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_runs import FmuRuns, is_affine
@@ -26,12 +26,12 @@ from fmu_asset.session import FmiAsset
 
 FloatArray = NDArray[np.float64]
 
-PHASE = 0.05
-"""Longest communication step: radians of the first mode."""
+PHASE = {TrialKind.RINGDOWN: 0.1, TrialKind.FORCED: 0.05}
+"""Longest communication step without laws: radians of the first mode."""
 LINEAR = 1e-6
 """Largest deviation from superposition, as a share of the motion, of an FMU that is taken as linear."""
 CONVERGED = 1e-4
-"""Largest change of a motion with laws when the steps are halved, as a share of the output's largest motion."""
+"""Largest rms change of a motion with laws when steps are halved, as a share of the output's largest motion."""
 MOST_REFINEMENT = 64
 """Steps that do not converge at this refinement are given up."""
 RECORD = 1500
@@ -103,6 +103,8 @@ class FmuMotion:
         self._refinements: dict[Hashable, tuple[int, float]] = {}
         self._frequency: float | None = None
         self._port_linear: bool | None = None
+        self._refinable: bool | None = None
+        self._silent: dict[Hashable, bool] = {}
         self._resting: State | None = None
 
     # ------------------------------------------------------------ rest
@@ -140,7 +142,7 @@ class FmuMotion:
         if self._description.motion.step is not None:
             return self._description.motion.step
         frequency = self.angular_frequency(trial, state)
-        return trial.interval / (ceil(frequency * trial.interval / PHASE) * refinement)
+        return trial.interval / (ceil(frequency * trial.interval / PHASE[trial.kind]) * refinement)
 
     def angular_frequency(self, trial: Trial, state: State) -> float:
         """Return that of the mode that is most flexible at the first port [rad/s]; without port, the loudest."""
@@ -205,11 +207,12 @@ class FmuMotion:
         way = self._description.release
         for part, value in loads:
             if part.kind in ("displacement", "velocity"):
-                parameters[self._runs.parameter(str(getattr(way, part.kind)))] = value
+                amount = value if part.kind == "velocity" else self._released(state, step, value)
+                parameters[self._runs.parameter(str(getattr(way, part.kind)))] = amount
             elif part.kind == "hold":
                 assert way is not None
                 name = self._runs.variable(str(way.hold))
-                held[name] = held.get(name, 0.0) + self._holding_force(state, step, name, value)
+                held[name] = held.get(name, 0.0) + self._released(state, step, value)
             else:
                 histories[part.name][: len(part.series)] += value * part.series[:steps]
                 held[part.name] = held.get(part.name, 0.0) + value * part.begin
@@ -220,42 +223,52 @@ class FmuMotion:
         asset, first = self._runs.started(step, parameters, inputs, settle=settle)
         return asset, first, histories
 
-    def _holding_force(self, state: State, step: float, name: str, displacement: float) -> float:
-        """Return the force [N] that holds the release point at a displacement [m]."""
+    def _released(self, state: State, step: float, displacement: float) -> float:
+        """Return force [N] or parameter [m] that puts the release point at a displacement [m].
+
+        Raises
+        ------
+        ModelError
+            If there is none.
+        """
+        way = self._description.release
+        assert way is not None
+        if way.output is None:
+            return displacement
         column = self._runs.columns["release"]
         inputs = self._zero_inputs | dict(state.inputs)
         parameters = dict(state.parameters)
 
-        def shown(force: float) -> float:
-            key = ("held", state, force)
-            return float(
-                self._runs.remembered(
-                    key,
-                    lambda: self._runs.started(
-                        step, parameters, inputs | {name: inputs[name] + force}, settle=True
-                    )[1],
-                )[column]
-            )
+        def shown(amount: float) -> float:
+            def start() -> FloatArray:
+                if way.hold is not None:
+                    name = self._runs.variable(way.hold)
+                    given = inputs | {name: inputs[name] + amount}
+                    return self._runs.started(step, parameters, given, settle=True)[1]
+                key = self._runs.parameter(str(way.displacement))
+                return self._runs.started(step, parameters | {key: amount}, inputs, settle=False)[1]
 
+            return float(self._runs.remembered(("released", state, amount), start)[column])
+
+        first = displacement if way.hold is None else min(1.0, 0.1 * self._runs.input_limit(way.hold))
+        if displacement == 0.0:
+            return 0.0
         zero = shown(0.0)
-        force, at = 0.0, zero
-        trial_force = min(1.0, 0.1 * self._runs.input_limit(name))
-        slope = (shown(trial_force) - zero) / trial_force
+        amount, reached = first, shown(first) - zero
+        slope = reached / first
         for _ in range(20):
-            if abs(at - zero - displacement) <= 1e-9 * abs(displacement):
-                return force
-            if slope == 0.0:
+            if abs(reached - displacement) <= 1e-9 * abs(displacement) or slope == 0.0:
                 break
-            new = force + (displacement - (at - zero)) / slope
-            reached = shown(new)
-            if new != force and reached != at:
-                slope = (reached - at) / (new - force)
-            force, at = new, reached
-        if abs(at - zero - displacement) <= 1e-6 * abs(displacement):
-            return force
+            new = amount + (displacement - reached) / slope
+            now = shown(new) - zero
+            if new != amount and now != reached:
+                slope = (now - reached) / (new - amount)
+            amount, reached = new, now
+        if abs(reached - displacement) <= 1e-6 * abs(displacement):
+            return amount
         raise ModelError(
-            f"No force at {name!r} holds the release point of the FMU model {self._description.name!r} at "
-            f"{displacement:g} m; correct hold or output in [release]."
+            f"Nothing that [release] names puts {way.output!r} of the FMU model {self._description.name!r} at "
+            f"{displacement:g} m; correct displacement, hold or output there."
         )
 
     def _superposed(
@@ -283,8 +296,12 @@ class FmuMotion:
                 full, lambda: answer([factor * units[k] * (k == number) for k in range(len(loads))])
             )
 
-        zero = self._runs.remembered((key, "zero"), lambda: answer([0.0] * len(loads)))
         parts = [unit(number) for number in range(len(loads))]
+        if self._silent.get(kind):  # an FMU that shows nothing without excitation, at any parameters
+            zero = np.zeros_like(parts[0])
+        else:
+            zero = self._runs.remembered((key, "zero"), lambda: answer([0.0] * len(loads)))
+            self._silent.setdefault(kind, not np.any(zero))
         if kind not in self._linear:
             half = answer([0.5 * size for size in units])
             self._linear[kind] = is_affine(zero, parts, half, LINEAR)
@@ -297,11 +314,22 @@ class FmuMotion:
 
     # ------------------------------------------------------------ ports
 
-    def system(self, state: State, step: float, steps: int) -> PortSystem | None:
-        """Return what forces at the ports do in a linear FMU; None if it is not linear."""
+    def system(self, state: State, step: float, steps: int, refinement: int = 1) -> PortSystem | None:
+        """Return what forces at the ports do in a linear FMU; None if it is not linear.
+
+        Where the FMU confirms it once, the system of a `refinement` is computed from that of the larger step.
+        """
         if not self._description.superposition or self._port_linear is False:
             return None
         key = (state, step)
+        if refinement > 1 and self._refinable is not False and key not in self._systems:
+            base = self.system(state, step * refinement, ceil(steps / refinement))
+            if base is not None:
+                self._systems[key] = finer = base.refined(refinement)
+                if self._refinable is None:
+                    self._refinable = self._confirmed(finer, state, step, max(min(steps, RECORD), 64))
+                    if not self._refinable:
+                        del self._systems[key]
         if key in self._systems:
             self._systems.move_to_end(key)
             return self._systems[key]
@@ -373,7 +401,7 @@ class FmuMotion:
     ) -> tuple[FloatArray, float]:
         """Return the outputs (K, C) of a dynamic trial with laws at ports, and the step [s].
 
-        Steps are halved until that changes no output by more than `CONVERGED` of its largest motion; what was
+        Steps are halved until that changes no output by more than `CONVERGED` of its largest motion (rms); what was
         enough is kept for laws of this kind up to twice as strong.
 
         Raises
@@ -390,20 +418,21 @@ class FmuMotion:
         if strength > 2.0 * tried:
             known = self._converged(laws, excite, state, known)
             self._refinements[key] = (known, strength)
-        step, steps, loads = excite(known * refinement)
-        return self._coupled(laws, state, step, steps, loads), step
+        refinement *= known
+        step, steps, loads = excite(refinement)
+        return self._coupled(laws, state, step, steps, loads, refinement), step
 
     def _converged(self, laws: Laws, excite: Excite, state: State, begin: int) -> int:
         refinement, change, coarse = begin, np.inf, None
         while refinement <= MOST_REFINEMENT:
             step, steps, loads = excite(refinement)
             if coarse is None:
-                coarse = self._coupled(laws, state, step, steps, loads)
+                coarse = self._coupled(laws, state, step, steps, loads, refinement)
             step, steps, loads = excite(2 * refinement)
-            fine = self._coupled(laws, state, step, steps, loads)
+            fine = self._coupled(laws, state, step, steps, loads, 2 * refinement)
             shared = fine[::2][: len(coarse)]
             size = np.max(np.abs(shared - shared.mean(axis=0)), axis=0)
-            difference = np.max(np.abs(coarse[: len(shared)] - shared), axis=0)
+            difference = np.sqrt(np.mean((coarse[: len(shared)] - shared) ** 2, axis=0))
             change = float(np.max(difference / np.where(size > 0.0, size, np.inf)))
             if not np.isfinite(difference).all():
                 change = np.inf
@@ -416,14 +445,16 @@ class FmuMotion:
             f"still changes the motion by {change:.1g} of its size; the force is too stiff for the port."
         )
 
-    def _coupled(self, laws: Laws, state: State, step: float, steps: int, loads: Loads) -> FloatArray:
+    def _coupled(
+        self, laws: Laws, state: State, step: float, steps: int, loads: Loads, refinement: int = 1
+    ) -> FloatArray:
         free = self.free(state, step, steps, loads)
         port_of = [[port.name for port in self._ports].index(name) for name in laws.ports]
-        system = self.system(state, step, steps)
+        system = self.system(state, step, steps, refinement)
         if system is None:
             return self._stepped(laws, port_of, state, step, steps, loads, free)
         x_rows, x_direct = system.outputs[self._x], system.direct[self._x]
-        v_rows, v_direct, velocity = system.rates(x_rows), np.zeros_like(x_direct), np.empty((steps + 1, 0))
+        v_rows, v_direct, velocity = x_rows @ system.generator, np.zeros_like(x_direct), np.empty((steps + 1, 0))
         grid = step * np.arange(steps + 1)
         velocity = CubicSpline(grid, free[:, self._x])(grid, 1)
         for number, column in enumerate(self._v):

@@ -8,13 +8,13 @@ beforehand, so that friction can stop it. Second order in the step. The laws are
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import logm
+from scipy.linalg import expm, logm
 
 from discrepancy.compiled_motion import MODULE, compiled_kernel
 from fe.motion import Laws
@@ -29,7 +29,7 @@ FIT = 1e-7
 """Largest error of a linear system against the record that it is made of, as a share of the record."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PortSystem:
     """What forces at P ports do to C outputs of a linear FMU, step by step, beside its free motion.
 
@@ -49,9 +49,21 @@ class PortSystem:
     direct: FloatArray
     step: float
 
-    def rates(self, rows: FloatArray) -> FloatArray:
-        """Return the rows (R, n) of the time derivatives of displacements with rows (R, n) of `outputs`."""
-        return np.asarray(rows @ np.real(logm(self.transition)) / self.step)
+    @cached_property
+    def generator(self) -> FloatArray:
+        """Matrix (n, n) of the motion in time, s' = G s without forces [1/s]."""
+        return np.asarray(np.real(logm(self.transition)) / self.step)
+
+    def refined(self, parts: int) -> "PortSystem":
+        """Return the same system with steps that are so many times smaller."""
+        order = len(self.transition)
+        block = np.zeros((2 * order, 2 * order))
+        block[:order, :order], block[:order, order:] = self.generator, np.eye(order)
+        whole, part = expm(block * self.step), expm(block * self.step / parts)
+        start = np.linalg.solve(whole[:order, order:], self.drive)
+        return PortSystem(
+            part[:order, :order], part[:order, order:] @ start, self.outputs, self.direct, self.step / parts
+        )
 
     def motion(self, forces: FloatArray) -> FloatArray:
         """Return the outputs (N + 1, C) under forces (N, P), from rest."""
@@ -195,10 +207,14 @@ def _held_forces(
         Speed that a unit force of each law (column) takes from the port of another over a step.
     """
     count = len(codes)
-    taken = gain @ before / h
+    for j in range(count):
+        forces[j] = 0.0
+        for i in range(count):
+            forces[j] += gain[j, i] * before[i]
+    taken = forces.copy()
     for j in range(count):
         if codes[j] != POWER_DAMPING:
-            middle = x[j] + 0.5 * h * v[j] + h * h / 6.0 * (push[j] - taken[j])
+            middle = x[j] + 0.5 * h * v[j] + h * h / 6.0 * (push[j] - taken[j] / h)
             if codes[j] == MICRO_SLIP or codes[j] == BOUC_WEN:
                 advance_memory(codes[j], values[j], slips[j], memory[j], middle, 1)
             forces[j] = displacement_force(codes[j], values[j], memory[j], middle)
@@ -208,7 +224,7 @@ def _held_forces(
             for i in range(count):
                 if i < j or codes[i] != POWER_DAMPING:
                     left -= gain[j, i] * forces[i] / h
-            middle = x[j] + 0.5 * h * v[j] + 0.125 * h * h * (push[j] - taken[j])
+            middle = x[j] + 0.5 * h * v[j] + 0.125 * h * h * (push[j] - taken[j] / h)
             strength = gain[j, j] / h * values[j, 0] / power(values[j, 3], values[j, 1])
             strength *= power(abs(middle / values[j, 4]), values[j, 2])
             forces[j] = held_damping(v[j], left, gain[j, j], strength, values[j, 1], h, damping_kick)
@@ -226,23 +242,29 @@ def _coupled(
     Rows of the ports (P, n), (P, P) and free motions (N + 1, P) are those of displacement and velocity.
     """
     count, laws = len(applied), len(codes)
+    order, ports = transition.shape[0], applied.shape[1]
     x, v, push, last = np.zeros(laws), np.zeros(laws), np.zeros(laws), np.zeros(laws)
     before, forces = np.zeros(laws), np.zeros(laws)
     for k in range(count):
-        px = free_x[k] + x_rows @ states[k]
-        pv = free_v[k] + v_rows @ states[k]
-        if k > 0:
-            px = px + x_direct @ applied[k - 1]
-            pv = pv + v_direct @ applied[k - 1]
-        taken = gain @ before
         for j in range(laws):
             p = port_of[j]
-            x[j], v[j] = px[p], pv[p]
+            place, speed = free_x[k, p], free_v[k, p]
+            for n in range(order):
+                place += x_rows[p, n] * states[k, n]
+                speed += v_rows[p, n] * states[k, n]
+            if k > 0:
+                for i in range(ports):
+                    place += x_direct[p, i] * applied[k - 1, i]
+                    speed += v_direct[p, i] * applied[k - 1, i]
+            x[j], v[j] = place, speed
             if k == 0:
                 push[j] = (free_v[1, p] - free_v[0, p]) / h
             else:
-                push[j] = (v[j] - last[j] + taken[j]) / h
-            last[j] = v[j]
+                push[j] = speed - last[j]
+                for i in range(laws):
+                    push[j] += gain[j, i] * before[i]
+                push[j] /= h
+            last[j] = speed
         held_forces(
             x, v, push, before, h, gain, codes, values, slips, memory, forces, power, displacement_force,
             advance_memory, damping_kick, held_damping,
@@ -250,7 +272,13 @@ def _coupled(
         for j in range(laws):
             before[j] = forces[j]
             applied[k, port_of[j]] -= forces[j]
-        states[k + 1] = transition @ states[k] + drive @ applied[k]
+        for n in range(order):
+            total = 0.0
+            for i in range(ports):
+                total += drive[n, i] * applied[k, i]
+            for i in range(order):
+                total += transition[n, i] * states[k, i]
+            states[k + 1, n] = total
 
 
 @cache
