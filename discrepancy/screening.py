@@ -33,6 +33,10 @@ LEVELS = {1: (-1.5, -0.5, 0.5, 1.5), 2: (-1.3, 0.0, 1.3), 3: (-1.2, 0.0, 1.2)}
 
 LARGEST_START = 2.5
 """Fits do not begin at larger magnitudes than this many prior deviations: far off, scales mean little."""
+LINEAR = 0.05
+"""Signed magnitudes are tried at one prior deviation and at this share of it: what moves phases (clock, drift)
+leaves the range of first order before its shared part is taken up by the nuisances."""
+
 PADDED, PEAKS = 4, 3
 """Zero padding of spectra, and peaks that are tried."""
 
@@ -223,7 +227,7 @@ def grid(term: Term, peaks: tuple[float, ...] = ()) -> Iterator[FloatArray]:
             if scaled:
                 axes.append((-1.0, 0.0, 1.0) if signed else (0.0,))
             else:
-                axes.append((1.0,) if signed else (0.0,))
+                axes.append((1.0, LINEAR) if signed else (0.0,))
                 scaled = True
         elif item.name == term.effect.spectral and peaks:
             axes.append(tuple(float(np.clip(item.prior.normal(peak), -3.0, 3.0)) for peak in peaks))
