@@ -5,6 +5,7 @@ not counted as evidence. Lines of the mains are taken out first: they are an eff
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf
 
 import numpy as np
@@ -69,7 +70,25 @@ class NoiseModel:
         """
         if not self.applies(interval):
             return columns
-        return np.asarray(lfilter(np.r_[1.0, -self.autoregression], [1.0], columns, axis=-1))
+        white = np.asarray(lfilter(np.r_[1.0, -self.autoregression], [1.0], columns, axis=-1))
+        for row, weights in enumerate(self._beginning[: columns.shape[-1]]):
+            white[..., row] = columns[..., : row + 1] @ weights
+        return white
+
+    @cached_property
+    def _beginning(self) -> tuple[FloatArray, ...]:
+        """Weights (t + 1,) of the samples up to t that make sample t < p white: it has no longer history.
+
+        The best predictors of lower order, by the Levinson-Durbin recursion backwards.
+        """
+        weights: list[FloatArray] = []
+        coefficients, share = self.autoregression, 1.0  # variance of the innovation over that of the prediction
+        while coefficients.size:
+            last = coefficients[-1]
+            share *= 1.0 - last**2
+            coefficients = (coefficients[:-1] + last * coefficients[-2::-1]) / (1.0 - last**2)
+            weights.append(np.sqrt(share) * np.r_[-coefficients[::-1], 1.0])
+        return tuple(reversed(weights))
 
     def applies(self, interval: float) -> bool:
         """Whether the autoregression belongs to this sampling interval."""

@@ -63,7 +63,7 @@ class TrialData:
         zeros = np.zeros((self.unknowns.zeros, *self.weight.shape))
         rows = np.arange(self.unknowns.zeros)
         zeros[rows, :, self.unknowns.zero_columns] = self.unknowns.zero_scale[:, np.newaxis]
-        return self.standardised(zeros).reshape(len(zeros), -1)
+        return self.standardised(zeros).reshape(len(zeros), self.weight.size)
 
     def standardised(self, columns: FloatArray) -> FloatArray:
         """Return columns (..., N, C) over s0, whitened in time, zero where a sample does not count."""
@@ -359,6 +359,7 @@ class Problem:
             columns.append(rates * unknowns.time_zero_scale)
         if len(unknowns.health_rows):
             at = unknowns.size - len(unknowns.health_rows)
+            by_entry = np.zeros((len(unknowns.health_rows), *response.shape))
             for region in range(2):
                 entries = np.flatnonzero(unknowns.health_columns == region)
                 if not len(entries):
@@ -368,14 +369,12 @@ class Problem:
                 sign = np.where(moved[at + entries] > 0.0, -1.0, 1.0)
                 moved[at + entries] += sign * PARAMETER_STEP
                 change = (self.response(number, shared, moved, patch)[0] - response) / PARAMETER_STEP
-                for entry, direction in zip(entries, sign, strict=True):
-                    row = unknowns.health_rows[entry]
-                    column = np.zeros_like(response)
-                    if data.trial.is_dynamic:
-                        column[:] = direction * change
-                    else:
-                        column[row] = direction * change[row]
-                    columns.append(column)
+                if data.trial.is_dynamic:
+                    by_entry[entries] = sign[:, np.newaxis, np.newaxis] * change
+                else:
+                    rows = unknowns.health_rows[entries]
+                    by_entry[entries, rows] = sign[:, np.newaxis] * change[rows]
+            columns.extend(by_entry)
         return np.stack(columns) if columns else np.zeros((0, *response.shape))
 
     def jacobian(

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.special import ndtri
 
 from .candidate import Candidate, Term
 from .catalogue.entry import EffectParameter
@@ -30,6 +31,8 @@ FloatArray = NDArray[np.float64]
 LEVELS = {1: (-1.5, -0.5, 0.5, 1.5), 2: (-1.3, 0.0, 1.3), 3: (-1.2, 0.0, 1.2)}
 """Grid of the scaled parameters that are not a mere scale, by their number; two levels from four on."""
 
+LARGEST_START = 2.5
+"""Fits do not begin at larger magnitudes than this many prior deviations: far off, scales mean little."""
 PADDED, PEAKS = 4, 3
 """Zero padding of spectra, and peaks that are tried."""
 
@@ -224,6 +227,8 @@ def grid(term: Term, peaks: tuple[float, ...] = ()) -> Iterator[FloatArray]:
                 scaled = True
         elif item.name == term.effect.spectral and peaks:
             axes.append(tuple(float(np.clip(item.prior.normal(peak), -3.0, 3.0)) for peak in peaks))
+        elif isinstance(item, EffectParameter) and item.levels:
+            axes.append(tuple(float(ndtri((k + 0.5) / item.levels)) for k in range(item.levels)))
         elif item in term.effect.shape:
             axes.append((item.prior.normal(item.canonical),))  # type: ignore[union-attr]
         else:
@@ -245,9 +250,9 @@ def rescaled(change: Change) -> FloatArray:
             continue
         prior = item.prior
         value = prior.value(float(start[number])) * factor
-        if prior.shape == "log_normal":
+        if prior.shape == "log_normal":  # it cannot change its sign
             value = max(value, prior.value(-0.7 * LARGEST_EFFECT))
-        start[number] = np.clip(prior.normal(value), -0.7 * LARGEST_EFFECT, 0.7 * LARGEST_EFFECT)
+        start[number] = np.clip(prior.normal(value), -0.7 * LARGEST_EFFECT, LARGEST_START)
     return start
 
 

@@ -27,23 +27,26 @@ STARTS, FAR_STARTS = 2, 3
 CHORD_STEPS = 8
 CLOSE = 12.0
 """Candidates within this log evidence of the best are fitted exactly [nat]."""
-EXACT_FITS = 5
+EXACT_FITS = 4
 WORTH_FITTING = 2.0
 """Screened gain below which an effect is not fitted at all: it could not win a name [nat]."""
 WORTH_ADDING = 4.0
 """The same for one more effect, whose prior is smaller."""
-PROMISING, LEAST_PROMISING = 0.25, 6
+PROMISING, LEAST_PROMISING = 0.3, 5
 """Far from the truth, effects are fitted whose screened gain is at least this share of the best one's, and at
 least so many; the others too if none of these fits."""
-PAIRS_FITTED = 10
+PAIRS_FITTED = 8
+RIDGES, RIDGE_STEPS, RIDGE_ITERATIONS, RIDGE_GAIN = 2, (-0.8, -0.3, 0.3, 0.8), 8, 1.0
+"""Candidates whose ridges are followed while they do not fit, steps along one in prior deviations, steps of each
+fit, and the gain [nat] that counts."""
 FAR = 1.5
 """Chi-square per sample above which a fit is far from the truth."""
 BEGINNING, LEAST_SAMPLES = 4.0, 60
 """The beginning of a record: this many periods of the first mode, at least that many samples."""
 SHORT_STEPS, FAR_STEPS = 12, 6
 """Steps on the beginnings, and then on whole records, before candidates are compared."""
-FAR_FITS = 8
-"""Candidates that go on from the beginnings to whole records."""
+FAR_FITS, FAR_EXTENSIONS = 6, 4
+"""Candidates that go on from the beginnings to whole records: single effects, and longer sets."""
 
 Key = tuple[tuple[str, str], ...]
 
@@ -134,6 +137,9 @@ class Search:
         return {effect.identifier: self._starts(screen, effect) for effect in effects}
 
     def _starts(self, screen: Screen, effect: Effect, count: int = STARTS) -> list[Change]:
+        """Return the most promising changes of an effect; more of them where its place is a parameter."""
+        if sum(not item.magnitude for item in effect.parameters) > 1:
+            count *= 3
         found: list[Change] = []
         for place in effect.places(self.problem.setting):
             best: list[Change] = []
@@ -220,7 +226,8 @@ class Search:
     def _whole(self, starts: list[Fit], least: float) -> list[Fit]:
         """Fit the most promising candidates to whole records from where the beginnings led."""
         found: list[Fit] = []
-        for item in sorted(starts, key=lambda start: start.objective)[:FAR_FITS]:
+        count = FAR_FITS if all(len(item.candidate.terms) == 1 for item in starts) else FAR_EXTENSIONS
+        for item in sorted(starts, key=lambda start: start.objective)[:count]:
             try:
                 whole = fit(self.problem, item.candidate, item.point, iterations=FAR_STEPS, give_up=least)
             except ModelError:
@@ -275,17 +282,48 @@ class Search:
     def run(self) -> None:
         """Search: singles, one more at a time, all pairs where a single one does not do, deletion."""
         floor = self.score(self.none) - 6.0
-        self.refine(self.scan(self.none, self.effects), floor)
+        ranked = self.refine(self.scan(self.none, self.effects), floor)
+        for item in ranked[:RIDGES]:
+            if not absolute_gate(self.problem, item).passed:
+                self._along_ridge(item)
         current = self.best()
         while current.candidate.terms and len(current.candidate.terms) < LARGEST_SET:
+            if len(current.candidate.terms) > 1 and self._far(current):
+                break  # a third effect is looked for only where two nearly do
             longer = self._extended(current)
             if longer is None:
                 break
             current = longer
         if not absolute_gate(self.problem, self.best()).passed and len(self.effects) > 1:
-            self._pairs()
-            self._extended(self.best())
+            self.fit_pairs()
         self._deletions()
+
+    def _along_ridge(self, found: Fit) -> Fit:
+        """Look for a better fit of the same candidate along the direction that its data tell least of.
+
+        Hysteresis of several elements has many local optima along such a ridge.
+        """
+        size = found.candidate.size
+        while size > 1:
+            _, directions = np.linalg.eigh(found.effect_covariance)
+            ridge = directions[:, -1]
+            better = found
+            for step in RIDGE_STEPS:
+                start = Point(found.point.shared, found.point.local, found.point.effect + step * ridge)
+                try:
+                    item = fit(
+                        self.problem, found.candidate, start,
+                        iterations=RIDGE_ITERATIONS, give_up=better.objective,
+                    )  # fmt: skip
+                except ModelError:
+                    continue
+                if item.objective < better.objective - RIDGE_GAIN:
+                    better = item
+            if better is found:
+                break
+            found = better
+            self.keep(found, exact=True)
+        return found
 
     def _extended(self, current: Fit) -> Fit | None:
         """Return a better set with one more effect, or None."""
@@ -297,7 +335,7 @@ class Search:
         fitted = self.refine(self.scan(current, others), before - 2.0)
         return fitted[0] if fitted and self.score(fitted[0]) > before else None
 
-    def _pairs(self) -> None:
+    def fit_pairs(self) -> None:
         """Fit the most promising of all pairs of effects, by their changes at the fit without effect."""
         far = self._far(self.none)
         near = self._near(self.none) if far else self.none

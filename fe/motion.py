@@ -196,17 +196,48 @@ class ModalSystem:
     damping : (M, M) ndarray
         D [1/s]; diagonal 2 zeta w for modal damping.
     ports : mapping of str to (M,) ndarray
-        Modal rows of the ports: the motion of a port is row . q.
+        Modal rows of the ports: the motion of a port is row . q, and what the flexibility adds.
+    flexibility : (P,) ndarray, optional
+        Position of each port, in their order, by a unit force there that these modes leave out; none if it is
+        left out [m/N, rad/(N m) and so on].
+    relaxation : float
+        What is left out follows a force with this lag, the factor of damping in proportion to the stiffness
+        [s].
     """
 
     angular_frequency: FloatArray
     damping: FloatArray
     ports: Mapping[str, FloatArray] = field(default_factory=dict)
+    flexibility: FloatArray | None = None
+    relaxation: float = 0.0
 
     @property
     def coupled(self) -> bool:
         """Whether damping couples the modes."""
         return bool(np.any(self.damping != np.diag(np.diag(self.damping))))
+
+
+LEAST_FLEXIBLE = 0.1
+"""Share of a port's flexibility that modes must leave out for damping there to act through it."""
+
+
+def port_flexibility(system: ModalSystem, laws: Laws) -> FloatArray:
+    """Return R (J,) of the laws' ports; what forces at other ports add is left out.
+
+    Zero for damping at ports where the modes hold nearly all of the flexibility: friction there acts on the
+    modes themselves, which takes no small steps.
+    """
+    result = np.zeros(len(laws))
+    if system.flexibility is None or not len(laws):
+        return result
+    names = list(system.ports)
+    index = [names.index(name) for name in laws.ports]
+    own = system.flexibility[index]
+    rows = laws.rows(system.ports, len(system.angular_frequency))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        held = np.nansum(rows**2 / system.angular_frequency**2, axis=1)
+    stiff = (laws.codes == POWER_DAMPING) & (own < LEAST_FLEXIBLE * (own + held))
+    return np.where(stiff | (own <= 0.0), 0.0, own)
 
 
 class LinearStep(NamedTuple):
@@ -303,12 +334,16 @@ def substeps_for(angular_frequency: FloatArray, laws: Laws, interval: float) -> 
 
 
 class ModalMotion(NamedTuple):
-    """Motion at samples: `q`, `v` (N, M), `port_forces` (N, J) of the laws, and their `memory` at the end."""
+    """Motion at samples: `q`, `v` (N, M), `port_forces` (N, J) of the laws, their `memory` at the end.
+
+    `lagged` (N, J) are the forces as what the modes leave out follows them.
+    """
 
     q: FloatArray
     v: FloatArray
     port_forces: FloatArray
     memory: FloatArray
+    lagged: FloatArray
 
 
 def simulate(
@@ -322,6 +357,7 @@ def simulate(
     shape: FloatArray | None = None,
     constant: FloatArray | None = None,
     memory: FloatArray | None = None,
+    feed: FloatArray | None = None,
     start: float = 0.0,
     refinement: int = 1,
     substeps: int | None = None,
@@ -346,6 +382,9 @@ def simulate(
     memory : (J, 2 + E) ndarray, optional
         Of the laws, as `static_solution` or an earlier call returned it. Left out: each law has been loaded
         from zero to its first position without turning back.
+    feed : (2, J) ndarray, optional
+        What the modes leave out of the positions of the laws' ports by a force of 1 N, and by the constant
+        force; zero if left out.
     start : float
         Time of the first sample since the beginning of the record, for stiffness drift [s].
     refinement : int
@@ -374,6 +413,7 @@ def simulate(
         np.empty((count, modes)),
         np.empty((count, len(laws))),
         laws.memory() if memory is None else memory.copy(),
+        np.empty((count, len(laws))),
     )
     (kernel or motion_kernel.kernel())["integrate"](
         step.transition,
@@ -389,6 +429,10 @@ def simulate(
         laws.codes,
         laws.values,
         laws.slips,
+        port_flexibility(system, laws),
+        float(system.relaxation),
+        np.zeros((2, len(laws))) if feed is None else np.ascontiguousarray(feed, dtype=np.float64),
+        memory is not None,
         laws.rate,
         start,
         h,
@@ -400,6 +444,7 @@ def simulate(
         result.q,
         result.v,
         result.port_forces,
+        result.lagged,
     )
     return result
 

@@ -7,6 +7,11 @@ Damping kicks have a closed form. Where friction turns over inside a step, the i
 are corrected for the moment of the turn; where it holds, the port is held in place by the impulses that this
 needs, as long as friction can give them.
 
+A port may lie on flexibility R that the modes leave out: x = p . q - R D + e, where D is the force of the laws
+there after a lag, beta D' + D = F (the lag of damping in proportion to the stiffness; backward Euler), and e
+what loads add. The force of a law on such a port is that at the step's end, where it obeys the law at its own
+position: a monotone equation in one unknown. Dry friction is then an elasto-plastic element of stiffness 1/R.
+
 Written in the subset of Python that numba compiles too. NumPy only: this file is copied into the FMU. Other
 code may take this file's functions by the names in `COMPILED`, in their order, and compile them.
 """
@@ -26,15 +31,18 @@ power damping: coefficient, velocity exponent, displacement exponent, reference 
 displacement; power stiffness: coefficient, exponent, side, reference displacement; free play: stiffness,
 half width; micro-slip: stiffness, element count; Bouc-Wen: stiffness, yield displacement, order.
 """
-HEAD = 2
-"""Columns of a memory before its hysteretic elements: 1 if friction holds the port; its last position."""
+HEAD = 5
+"""Columns of a memory before its hysteretic elements: 1 if friction holds the port; its last position; D; what
+loads that are gone still add to the position, which fades with beta; the last force of damping on a flexible
+port."""
 
 FIRST_PARTS = 400
 """Parts in which the way from a law's last position to the first one of a motion is followed."""
 
 COMPILED = (
-    "power", "displacement_force", "displacement_slope", "advance_memory", "damping_kick", "holding_limit",
-    "crossing", "integrate", "static_forces", "static_path",
+    "power", "displacement_force", "displacement_slope", "bouc_wen_path", "advance_memory", "damping_kick",
+    "holding_limit", "crossing", "damped_position", "sprung_position", "slipped_position", "yielded_position",
+    "law_position", "law_pull", "settle", "integrate", "static_forces", "static_path",
 )  # fmt: skip
 """Functions to compile, each after those that it calls."""
 
@@ -94,6 +102,26 @@ def displacement_slope(code: int, law: FloatArray, slip: FloatArray, memory: Flo
     return 0.0
 
 
+def bouc_wen_path(law: FloatArray, begin: float, change: float, least: int) -> float:
+    """Return the variable of Bouc and Wen after a way, from its value at the begin, in `least` parts or more."""
+    width, order = law[1], law[2]
+    z, rest = begin / width, change / width
+    if z * rest < 0.0:  # unloading: dz = dx until z is zero
+        part = rest if abs(rest) <= abs(z) else -z
+        z += part
+        rest -= part
+    if rest != 0.0:  # loading: dz/dx = 1 - |z|^order, by the midpoint rule
+        way = min(abs(rest), 2.0 + 40.0 / order)  # by then it yields to the last bit
+        count = max(int(way * order / 0.2) + 1, least)
+        h = way / count
+        size = abs(z)
+        for _ in range(count):
+            middle = min(size + 0.5 * h * (1.0 - power(size, order)), 1.0)
+            size = min(size + h * (1.0 - power(middle, order)), 1.0)
+        z = size if rest > 0.0 else -size
+    return float(z * width)
+
+
 def advance_memory(
     code: int, law: FloatArray, slip: FloatArray, memory: FloatArray, x: float, least: int
 ) -> None:
@@ -105,22 +133,7 @@ def advance_memory(
             stretch = memory[HEAD + i] + change
             memory[HEAD + i] = min(max(stretch, -slip[i]), slip[i])
     elif code == BOUC_WEN:
-        width, order = law[1], law[2]
-        z, rest = memory[HEAD] / width, change / width
-        if z * rest < 0.0:  # unloading: dz = dx until z is zero
-            part = rest if abs(rest) <= abs(z) else -z
-            z += part
-            rest -= part
-        if rest != 0.0:  # loading: dz/dx = 1 - |z|^order, by the midpoint rule
-            way = min(abs(rest), 2.0 + 40.0 / order)  # by then it yields to the last bit
-            count = max(int(way * order / 0.2) + 1, least)
-            h = way / count
-            size = abs(z)
-            for _ in range(count):
-                middle = min(size + 0.5 * h * (1.0 - power(size, order)), 1.0)
-                size = min(size + h * (1.0 - power(middle, order)), 1.0)
-            z = size if rest > 0.0 else -size
-        memory[HEAD] = z * width
+        memory[HEAD] = bouc_wen_path(law, memory[HEAD], change, least)
 
 
 def damping_kick(speed: float, strength: float, exponent: float, duration: float) -> float:
@@ -231,6 +244,273 @@ def crossing(
     return impulse + lost, moment + lost * h, 0.0
 
 
+def damped_position(law: FloatArray, last: float, y: float, r: float, h: float) -> float:
+    """Return x of x + r F(x, (x - `last`) / h) = y for damping: the root nearest to the last position."""
+    way = abs(y - last)
+    if way == 0.0:
+        return last
+    sign = 1.0 if y > last else -1.0
+    p, a = law[1], law[2]
+    if p == 0.0:
+        level = r * law[0] * power(abs(last / law[4]), a)
+        if way <= level:
+            return last  # it sticks
+        if a == 0.0:
+            return y - sign * level
+    # how far it moves, u; for 0 < p < 1 by w = u^p, in which the force has a slope everywhere
+    root = p if 0.0 < p < 1.0 else 1.0
+    low, high = 0.0, power(way, root)
+    w = high
+    for _ in range(60):
+        u = w if root == 1.0 else power(w, 1.0 / root)
+        x = last + sign * u
+        force = r * law[0] * power(u / (h * law[3]), p) * power(abs(x / law[4]), a)
+        rest = u + force - way
+        if abs(rest) <= 1e-13 * way or high - low <= 1e-15 * high:
+            break
+        if rest > 0.0:
+            high = w
+        else:
+            low = w
+        slope = 1.0
+        if x != 0.0:
+            slope += force * a * sign / x
+        if root == 1.0:
+            slope += force * p / u if u > 0.0 else 0.0
+        else:
+            slope = slope * u / (root * w) + force / w if w > 0.0 else 0.0
+        step = w - rest / slope if slope > 0.0 else low
+        w = step if low < step < high else 0.5 * (low + high)
+    return float(last + sign * (w if root == 1.0 else power(w, 1.0 / root)))
+
+
+def sprung_position(law: FloatArray, y: float, r: float) -> float:
+    """Return x of x + r F(x) = y for a power stiffness: the root of the same sign as y next to zero load."""
+    if y == 0.0 or law[2] * y < 0.0:
+        return y
+    n = law[1]
+    size, stiff = abs(y), r * law[0] / law[3]
+    sign = 1.0 if y > 0.0 else -1.0
+    if n == 1.0:
+        return y / (1.0 + stiff) if stiff > -1.0 else y
+    x = size
+    low, high = 0.0, size
+    if stiff < 0.0:
+        low, high = size, 1e300
+        if n < 1.0:  # beyond the root, from where Newton's steps come down to it
+            x = 2.0 * size + law[3] * (-2.0 * stiff) ** (1.0 / (1.0 - n))
+    for _ in range(60):
+        force = stiff * law[3] * power(x / law[3], n)
+        rest = x + force - size
+        if abs(rest) <= 1e-14 * (x + size):
+            break
+        if rest > 0.0:
+            high = x
+        else:
+            low = x
+        slope = 1.0 + n * force / x
+        if slope <= 0.0:
+            break  # softer than the flexibility beside it can hold
+        step = x - rest / slope
+        x = step if low < step < high else 0.5 * (low + min(high, 2.0 * x + size))
+    return sign * x
+
+
+def slipped_position(
+    law: FloatArray, slip: FloatArray, memory: FloatArray, y: float, r: float, force: float
+) -> float:
+    """Return x of x + r F(x) = y for micro-slip; F is linear between the positions where elements slip."""
+    count = int(law[1])
+    last, share = memory[1], r * law[0] / law[1]
+    slope = 1.0
+    x = y - r * force
+    for turn in range(24):
+        total = 0.0
+        moving = 0
+        change = x - last
+        for i in range(count):
+            stretch = memory[HEAD + i] + change
+            total += min(max(stretch, -slip[i]), slip[i])
+            if abs(stretch) >= slip[i]:
+                moving += 1
+        rest = x + share * (total - count * x) - y
+        if abs(rest) <= 1e-12 * (abs(x) + slip[0]):
+            break
+        slope = 1.0 - share * moving
+        # the largest slope never goes too far
+        x -= rest / (slope if slope > 1e-6 and turn < 12 else 1.0)
+    return x
+
+
+def yielded_position(
+    law: FloatArray, memory: FloatArray, y: float, r: float, force: float, least: int
+) -> float:
+    """Return x of x + r F(x) = y for the law of Bouc and Wen."""
+    last, share = memory[1], r * law[0]
+    x = y - r * force
+    for turn in range(24):
+        z = bouc_wen_path(law, memory[HEAD], x - last, least)
+        rest = x + share * (z - x) - y
+        if abs(rest) <= 1e-12 * (abs(x) + law[1]):
+            break
+        slope = 1.0
+        if z * (x - last) > 0.0:
+            slope -= share * power(min(abs(z) / law[1], 1.0), law[2])
+        x -= rest / (slope if slope > 1e-6 and turn < 12 else 1.0)
+    return x
+
+
+def law_position(
+    code: int,
+    law: FloatArray,
+    slip: FloatArray,
+    memory: FloatArray,
+    y: float,
+    r: float,
+    h: float,
+    force: float,
+    least: int,
+) -> float:
+    """Return the position x of a law's port, x + r F(x) = y, reached from the state of its memory.
+
+    Parameters
+    ----------
+    code, law, slip, memory
+        The law; its memory is left as it is.
+    y : float
+        Position without the force.
+    r : float
+        Flexibility, zero or positive.
+    h : float
+        Duration of the way, for damping [s].
+    force : float
+        About the force.
+    least : int
+        Parts of the way, see `advance_memory`.
+    """
+    if code == POWER_DAMPING:
+        return damped_position(law, memory[1], y, r, h)
+    if r == 0.0:
+        return y
+    if code == POWER_STIFFNESS:
+        return sprung_position(law, y, r)
+    if code == FREE_PLAY:
+        within = 1.0 - r * law[0]
+        if abs(y) < within * law[1]:
+            return y / within
+        return float(y + r * law[0] * (law[1] if y > 0.0 else -law[1]))
+    if code == MICRO_SLIP:
+        return slipped_position(law, slip, memory, y, r, force)
+    return yielded_position(law, memory, y, r, force, least)
+
+
+def law_pull(
+    code: int, law: FloatArray, slip: FloatArray, memory: FloatArray, x: float, h: float, least: int
+) -> tuple[float, float]:
+    """Return force and slope of a law at `x`, reached within `h` from the state of its memory.
+
+    Of dry friction the largest force, as if it moved forwards.
+    """
+    if code == POWER_DAMPING:
+        way = abs(x - memory[1])
+        size = law[0] * power(abs(x / law[4]), law[2])
+        if law[1] == 0.0:
+            return size, (size * law[2] / x if x != 0.0 else 0.0)
+        if way == 0.0:
+            return 0.0, (size / (h * law[3]) if law[1] == 1.0 else 0.0)
+        size *= power(way / (h * law[3]), law[1])
+        slope = size * law[1] / way
+        if x < memory[1]:
+            size = -size
+        return size, (slope + size * law[2] / x if x != 0.0 else slope)
+    if code == MICRO_SLIP:
+        count = int(law[1])
+        total = 0.0
+        moving = 0
+        for i in range(count):
+            stretch = memory[HEAD + i] + x - memory[1]
+            total += min(max(stretch, -slip[i]), slip[i])
+            if abs(stretch) >= slip[i]:
+                moving += 1
+        return law[0] * (total / count - x), -law[0] * moving / count
+    if code == BOUC_WEN:
+        z = bouc_wen_path(law, memory[HEAD], x - memory[1], least)
+        loading = z * (x - memory[1]) > 0.0
+        slope = -law[0] * power(min(abs(z) / law[1], 1.0), law[2]) if loading else 0.0
+        return law[0] * (z - x), slope
+    return displacement_force(code, law, memory, x), displacement_slope(code, law, slip, memory, x)
+
+
+def settle(
+    port: int,
+    leader: IntArray,
+    codes: IntArray,
+    laws: FloatArray,
+    slips: FloatArray,
+    memory: FloatArray,
+    y: float,
+    r: float,
+    h: float,
+    least: int,
+    current: FloatArray,
+) -> float:
+    """Return the position x of a port with laws, x + r sum F(x) = y; their forces go to `current`.
+
+    The laws are those whose `leader` is `port`.
+
+    Dry friction first: where it can hold the port, it does. The memories are left as they are.
+    """
+    count = len(codes)
+    last = memory[port, 1]
+    start, level = 0.0, 0.0
+    for j in range(count):
+        if leader[j] != port:
+            continue
+        force, _ = law_pull(codes[j], laws[j], slips[j], memory[j], last, h, least)
+        if codes[j] == POWER_DAMPING and laws[j, 1] == 0.0:
+            level += force
+        else:
+            current[j] = force
+            start += force
+    push = y - last - r * start
+    if level > 0.0 and abs(push) <= r * level:
+        for j in range(count):
+            if leader[j] == port and codes[j] == POWER_DAMPING and laws[j, 1] == 0.0:
+                own, _ = law_pull(codes[j], laws[j], slips[j], memory[j], last, h, least)
+                current[j] = push / r * own / level
+        return last
+    sign = 1.0 if push > 0.0 else -1.0
+    # the root lies that way from the last position, if the structure is stable
+    low, high = last, last + sign * 1e300
+    x = last + sign * max(abs(push) - r * level, 0.0)
+    for _ in range(80):
+        total, slope = 0.0, 1.0
+        for j in range(count):
+            if leader[j] != port:
+                continue
+            force, change = law_pull(codes[j], laws[j], slips[j], memory[j], x, h, least)
+            if codes[j] == POWER_DAMPING and laws[j, 1] == 0.0:
+                force, change = sign * force, sign * change
+            current[j] = force
+            total += force
+            slope += r * change
+        rest = x + r * total - y
+        if abs(rest) <= 1e-12 * (abs(x) + abs(y)) or abs(high - low) <= 1e-15 * abs(x):
+            break
+        if sign * rest > 0.0:
+            high = x
+        else:
+            low = x
+        step = x - rest / slope if slope > 1e-6 else high
+        if sign * (step - low) > 0.0 and sign * (high - step) > 0.0:
+            x = step
+        elif abs(high) < 1e299:
+            x = 0.5 * (low + high)
+        else:
+            x += sign * abs(rest)
+    return x
+
+
 def integrate(
     transition: FloatArray,
     coupled: bool,
@@ -245,6 +525,10 @@ def integrate(
     codes: IntArray,
     laws: FloatArray,
     slips: FloatArray,
+    flexibility: FloatArray,
+    relaxation: float,
+    feed: FloatArray,
+    known: bool,
     rate: float,
     start: float,
     h: float,
@@ -256,6 +540,7 @@ def integrate(
     q_out: FloatArray,
     v_out: FloatArray,
     force_out: FloatArray,
+    lagged_out: FloatArray,
 ) -> None:
     """Integrate over the samples of `force`; `q`, `v` and `memory` are changed in place.
 
@@ -280,6 +565,15 @@ def integrate(
         Their parameters.
     slips : (J, E) ndarray
         Slip displacements of the elements.
+    flexibility : (J,) ndarray
+        R: position of each law's port by a unit force there that the modes do not hold; laws with the same
+        `ports` have the same, or zero, which leaves a law to the modes.
+    relaxation : float
+        beta of that flexibility [s].
+    feed : (2, J) ndarray
+        What the modes do not hold of the ports' positions by the force f = 1, and by the constant force.
+    known : bool
+        Whether `memory` is that of a state; otherwise each law is loaded from zero to its first position.
     rate : float
         Stiffness drift [1/s].
     start : float
@@ -294,8 +588,8 @@ def integrate(
         State at the first sample; at the last one on return.
     memory : (J, 2 + E) ndarray
         Of the laws.
-    q_out, v_out, force_out : (N, M), (N, M), (N, J) ndarray
-        Results at the samples; forces of the laws F_j.
+    q_out, v_out, force_out, lagged_out : (N, M), (N, M), (N, J), (N, J) ndarray
+        Results at the samples; forces of the laws F_j, and D_j (F_j for a port without R).
     """
     count, modes, laws_count = len(force), len(q), len(codes)
     half = 0.5 * h
@@ -311,6 +605,26 @@ def integrate(
     fresh = np.zeros(laws_count)
     q_new, v_new = np.zeros(modes), np.zeros(modes)
     q_old, v_old = np.zeros(modes), np.zeros(modes)
+    flexible = np.zeros(laws_count, dtype=np.int64)
+    leader = np.full(laws_count, -1)  # the first law at the same flexible port
+    for j in range(laws_count):
+        moves = False
+        for m in range(modes):
+            moves = moves or ports[j, m] != 0.0
+        if moves and flexibility[j] > 0.0:
+            flexible[j] = 1
+            for k in range(j, -1, -1):
+                same = flexible[k] == 1
+                for m in range(modes):
+                    same = same and ports[j, m] == ports[k, m]
+                if same:
+                    leader[j] = k
+    soft = np.flatnonzero(leader == np.arange(laws_count))  # one law for each flexible port
+    soft_count = len(soft)
+    lone = laws_count == 1 and soft_count == 1
+    keep = relaxation / (relaxation + h)
+    ease = 1.0 - keep
+    at_once = 1.0 if relaxation == 0.0 or not known else 0.0
     for j in range(laws_count):
         x = 0.0
         speed = 0.0
@@ -322,7 +636,14 @@ def integrate(
             continue  # the port does not move
         for m in range(modes):
             pull[j, m] = ports[j, m] / weight[j]
-        if codes[j] == POWER_DAMPING:
+        if flexible[j] == 1:
+            if codes[j] == POWER_DAMPING and known:
+                current[j] = memory[j, 4]
+            elif codes[j] == POWER_DAMPING:  # moving steadily
+                current[j] = laws[j, 0] * power(abs(x / laws[j, 4]), laws[j, 2])
+                current[j] *= power(abs(speed) / laws[j, 3], laws[j, 1]) * np.sign(speed)
+                memory[j, 2] = current[j]
+        elif codes[j] == POWER_DAMPING:
             strength[j] = weight[j] * laws[j, 0] / power(laws[j, 3], laws[j, 1])
             for m in range(2 * modes):
                 for k in range(modes):
@@ -336,6 +657,35 @@ def integrate(
             if codes[j] == MICRO_SLIP or codes[j] == BOUC_WEN:
                 advance_memory(codes[j], laws[j], slips[j], memory[j], x, FIRST_PARTS)
             current[j] = displacement_force(codes[j], laws[j], memory[j], x)
+    for i in soft:
+        y = feed[0, i] * force[0] + feed[1, i] + memory[i, 3]
+        for m in range(modes):
+            y += ports[i, m] * q[m]
+        springs = -1
+        springy = np.full(laws_count, -1)
+        for j in range(laws_count):
+            if leader[j] != i:
+                continue
+            damped = codes[j] == POWER_DAMPING
+            y -= flexibility[i] * memory[j, 2] * (1.0 if damped else 1.0 - at_once)
+            if not damped:
+                springs = j if springs < 0 else springs
+                springy[j] = springs
+        x = y
+        if springs >= 0:
+            r = at_once * flexibility[i]
+            x = settle(springs, springy, codes, laws, slips, memory, y, r, h, FIRST_PARTS, current)
+        for j in range(laws_count):
+            if leader[j] != i:
+                continue
+            if codes[j] != POWER_DAMPING:
+                advance_memory(codes[j], laws[j], slips[j], memory[j], x, FIRST_PARTS)
+                current[j] = displacement_force(codes[j], laws[j], memory[j], x)
+                if at_once == 1.0:
+                    memory[j, 2] = current[j]
+            elif not known:
+                memory[j, 1] = x
+    lone_law, lone_slip, lone_memory = laws[0:1].ravel(), slips[0:1].ravel(), memory[0:1].reshape(-1)
     driven = False
     for sample in range(count):
         driven = driven or force[sample] != 0.0
@@ -352,7 +702,7 @@ def integrate(
                 q_old[m] = q[m]
                 v_old[m] = v[m]
             for j in range(laws_count):
-                if codes[j] != POWER_DAMPING or weight[j] == 0.0:
+                if codes[j] != POWER_DAMPING or weight[j] == 0.0 or flexible[j] == 1:
                     continue
                 fresh[j] = 0.0
                 lost[j] = 0.0
@@ -407,7 +757,7 @@ def integrate(
                     v[m] = total_v
             # ---- ports that friction holds: the impulse at the begin that keeps them in place
             for j in range(laws_count):
-                if codes[j] != POWER_DAMPING or memory[j, 0] != 1.0 or weight[j] == 0.0:
+                if codes[j] != POWER_DAMPING or memory[j, 0] != 1.0 or weight[j] == 0.0 or flexible[j] == 1:
                     continue
                 x = 0.0
                 for m in range(modes):
@@ -422,9 +772,58 @@ def integrate(
                 for m in range(modes):
                     q[m] += answer[j, m] * kick
                     v[m] += answer[j, modes + m] * kick
+            # ---- laws on flexible ports: forces at the step's end
+            if lone:  # without slices, which cost as much as the law itself
+                lone_memory[3] *= keep
+                y = feed[0, 0] * force_end + feed[1, 0] + lone_memory[3]
+                y -= flexibility[0] * keep * lone_memory[2]
+                for m in range(modes):
+                    y += ports[0, m] * q[m]
+                r = ease * flexibility[0]
+                code = codes[0]
+                x = law_position(code, lone_law, lone_slip, lone_memory, y, r, h, current[0], 1)
+                if code == POWER_DAMPING:
+                    if lone_law[1] == 0.0 and x != lone_memory[1]:
+                        level = lone_law[0] * power(abs(x / lone_law[4]), lone_law[2])
+                        current[0] = level if x > lone_memory[1] else -level
+                    else:
+                        current[0] = (y - x) / r
+                    lone_memory[1] = x
+                    lone_memory[4] = current[0]
+                else:
+                    if code == MICRO_SLIP or code == BOUC_WEN:
+                        advance_memory(code, lone_law, lone_slip, lone_memory, x, 1)
+                    current[0] = displacement_force(code, lone_law, lone_memory, x)
+                    lone_memory[1] = x
+                lone_memory[2] = keep * lone_memory[2] + ease * current[0]
+                for m in range(modes):
+                    v[m] -= ports[0, m] * current[0] * half
+            else:
+                for i in soft:
+                    y = feed[0, i] * force_end + feed[1, i] + keep * memory[i, 3]
+                    for m in range(modes):
+                        y += ports[i, m] * q[m]
+                    for j in range(laws_count):
+                        if leader[j] == i:
+                            y -= flexibility[i] * keep * memory[j, 2]
+                    r = ease * flexibility[i]
+                    x = settle(i, leader, codes, laws, slips, memory, y, r, h, 1, current)
+                    for j in range(laws_count):
+                        if leader[j] != i:
+                            continue
+                        if codes[j] == POWER_DAMPING:
+                            memory[j, 1] = x
+                            memory[j, 4] = current[j]
+                        else:
+                            advance_memory(codes[j], laws[j], slips[j], memory[j], x, 1)
+                            current[j] = displacement_force(codes[j], laws[j], memory[j], x)
+                        memory[j, 2] = keep * memory[j, 2] + ease * current[j]
+                        memory[j, 3] *= keep
+                        for m in range(modes):
+                            v[m] -= ports[j, m] * current[j] * half
             # ---- second half
             for j in range(laws_count):
-                if codes[j] == POWER_DAMPING or weight[j] == 0.0:
+                if codes[j] == POWER_DAMPING or weight[j] == 0.0 or flexible[j] == 1:
                     continue
                 x = 0.0
                 for m in range(modes):
@@ -438,7 +837,7 @@ def integrate(
                 for m in range(modes):
                     v[m] -= half * rate * (time + h) * stiffness[m] * q[m]
             for j in range(laws_count - 1, -1, -1):
-                if codes[j] != POWER_DAMPING or weight[j] == 0.0:
+                if codes[j] != POWER_DAMPING or weight[j] == 0.0 or flexible[j] == 1:
                     continue
                 x = 0.0
                 speed = 0.0
@@ -501,7 +900,8 @@ def integrate(
         time = start + sample * substeps * h
         for j in range(laws_count):
             force_out[sample, j] = current[j]
-            if codes[j] != POWER_DAMPING or weight[j] == 0.0:
+            lagged_out[sample, j] = memory[j, 2] if flexible[j] == 1 else current[j]
+            if codes[j] != POWER_DAMPING or weight[j] == 0.0 or flexible[j] == 1:
                 continue
             x = 0.0
             speed = 0.0
@@ -516,13 +916,14 @@ def integrate(
                     for k in range(modes):
                         push -= damping[m, k] * v[k]
                     for k in range(laws_count):
-                        if codes[k] != POWER_DAMPING:
+                        if codes[k] != POWER_DAMPING or flexible[k] == 1:
                             push -= ports[k, m] * current[k]
                     need += ports[j, m] * push / weight[j]
                 force_out[sample, j] = min(max(need, -most), most) if laws[j, 1] == 0.0 else need
             elif speed != 0.0:
                 size = most * power(abs(speed), laws[j, 1])
                 force_out[sample, j] = size if speed > 0.0 else -size
+            lagged_out[sample, j] = force_out[sample, j]
 
 
 def static_forces(
@@ -551,6 +952,9 @@ def static_forces(
                 reached[j, 1] = memory[j, 1]
             slope[j] = displacement_slope(codes[j], laws[j], slips[j], reached[j], x[j])
         reached[j, 1] = x[j]
+        reached[j, 2] = force[j]
+        reached[j, 3] = 0.0
+        reached[j, 4] = 0.0
     return reached
 
 

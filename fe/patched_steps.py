@@ -2,7 +2,7 @@
 
 Statics is that of the reduced model plus what the patch changes in `fe.patched_wing`, so that a patch without
 magnitude changes nothing. Motion is that of the first modes of the patched wing, integrated by `fe.motion`;
-omitted modes follow loads and internal forces without delay.
+omitted modes follow loads without delay, and internal forces with that of their damping.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .motion import Laws, ModalSystem, laws_of, simulate, static_solution
-from .patch import LOADS, LoadGain, ModelPatch
+from .patch import LOADS, LoadGain, ModelPatch, PointMass
 from .patched_wing import LOAD_PLACE, PORTS, PatchedStructure, PatchedWing, motion_basis
 from .reduced import ReducedModel
 from .transient import ModalIntegrator, TransientState
@@ -28,12 +28,14 @@ _LOADS = 2  # load factor and tip force, as they are recorded
 
 
 class _Moving(NamedTuple):
-    """State of a motion: modes, forces of the laws, loads, memory of the laws."""
+    """State of a motion: modes, forces of the laws as omitted modes follow them, loads, what omitted modes still
+    feel of a force that held the wing (1,), memory of the laws."""
 
     q: FloatArray
     v: FloatArray
     forces: FloatArray
     loads: FloatArray
+    holding: FloatArray
     memory: FloatArray
 
 
@@ -92,8 +94,13 @@ class PatchedSteps:
         self._laws: Laws = laws_of(patch, PORTS)
         self._patched = wing.structure(*self._state, patch, temperature)
         arrays = wing.arrays
-        self._rows = np.vstack((arrays.strain_rows[0], arrays.tip_row, arrays.load_tip))
-        self._units = np.vstack((wing.load_parts(self._loads), wing.force_row(LOAD_PLACE, self._loads)))
+        factors = wing.strain_factors(patch)
+        self._strain_rows = arrays.strain_rows if factors is None else factors[:, np.newaxis] * arrays.strain_rows
+        self._plain_rows = np.vstack((arrays.strain_rows[0], arrays.tip_row, arrays.load_tip))
+        self._rows = self._plain_rows
+        if factors is not None:
+            self._rows = np.vstack((self._strain_rows[0], arrays.tip_row, arrays.load_tip))
+        self._units = np.vstack((wing.load_parts(patch.of(*LOADS, PointMass)), wing.force_row(LOAD_PLACE, self._loads)))
         ports = {name: wing.port_row(name) for name in PORTS}
         self._port_rows = self._laws.rows(ports, wing.size)
 
@@ -195,8 +202,29 @@ class PatchedSteps:
     def _system(self) -> ModalSystem:
         alpha, beta = self._rayleigh
         omega = self._modes.frequency
-        ports = {name: self._wing.port_row(name) @ self._modes.shapes for name in PORTS}
-        return ModalSystem(omega, np.diag(alpha + beta * omega**2), ports)
+        rows = np.stack([self._wing.port_row(name) for name in PORTS])
+        modal = rows @ self._modes.shapes
+        whole = np.einsum("pn,np->p", rows, self._patched.static(rows.T))
+        left_out = whole - np.sum((modal / omega) ** 2, axis=1)
+        return ModalSystem(
+            omega,
+            np.diag(alpha + beta * omega**2),
+            dict(zip(PORTS, modal, strict=True)),
+            np.where(left_out > 1e-9 * whole, left_out, 0.0),
+            beta,
+        )
+
+    @cached_property
+    def _held_left_out(self) -> FloatArray:
+        """Part (n,) of the answer to a unit force at the release point that the modes leave out."""
+        holding, modes = self._wing.arrays.load_tip, self._modes
+        shape = modes.shapes @ (holding @ modes.shapes / modes.frequency**2)
+        return np.asarray(self._patched.static(holding) - shape)
+
+    def _feed(self, constant: FloatArray) -> FloatArray:
+        """Return what the modes leave out of the positions (2, J) of the laws' ports under acting loads (3,)."""
+        fed = self._port_rows @ (self._left_out[:, :3] @ constant)
+        return np.stack((np.zeros(len(self._laws)), fed))
 
     @cached_property
     def _participation(self) -> FloatArray:
@@ -235,47 +263,50 @@ class PatchedSteps:
         modes, laws = self._modes, self._laws
         omega2 = modes.frequency**2
         loads = self._acting(load_factor, tip_force)
-        resting = self._participation @ loads / omega2
         holding = self._wing.arrays.load_tip  # the release point: the holding force acts there
         flexible = self._patched.static(holding)
         compliance = float(holding @ flexible)
-        shape = holding @ modes.shapes
         goal = tip_displacement * compliance / float(self._wing.arrays.tip_row @ flexible)
-        ports = self._ports_of_modes
         memory, forces = laws.memory(), np.zeros(len(laws))
+        whole = self._port_rows @ self._answers[:, 3:]
+        resting = self._port_rows @ (self._answers[:, :3] @ loads)
         if len(laws) and np.any(loads):
-            settled = static_solution(laws, (ports @ resting)[np.newaxis], (ports / omega2) @ ports.T)
+            settled = static_solution(laws, resting[np.newaxis], whole)
             forces, memory = settled.forces[0], settled.memory
-        q = resting - forces @ (ports / omega2)
-        if goal != 0.0:
-            lever = self._port_rows @ flexible / compliance
-            # with the point held: x = x_linear - (C - a c^T / a_0) F
-            held = ports / omega2 - np.outer(lever, shape / omega2)
-            aside = resting + (goal / compliance - lever @ forces) * shape / omega2
-            if len(laws):
-                start = aside - goal / compliance * shape / omega2
-                moved = static_solution(
-                    laws,
-                    (ports @ aside)[np.newaxis],
-                    held @ ports.T,
-                    memory=memory if np.any(loads) else None,
-                    start=ports @ start if np.any(loads) else None,
-                )
-                forces, memory = moved.forces[0], moved.memory
-            q = aside - forces @ held
-        state = _Moving(q, np.zeros_like(q), forces, np.array((load_factor, tip_force)), memory)
+        force = goal / compliance
+        if goal != 0.0 and len(laws):
+            along = self._port_rows @ flexible
+            # with the point held where it is moved to: x = x_linear - (C - a a^T / a_0) F
+            before = along / compliance * (along @ forces)
+            moved = static_solution(
+                laws,
+                (resting + force * along - before)[np.newaxis],
+                whole - np.outer(along, along) / compliance,
+                memory=memory if np.any(loads) else None,
+                start=resting - before if np.any(loads) else None,
+            )
+            force += float(along @ (moved.forces[0] - forces)) / compliance
+            forces, memory = moved.forces[0], moved.memory
+            # of the ports' positions; fades after the release
+            memory[:, 3] = force * (self._port_rows @ self._held_left_out)
+        acts = self._participation @ loads + force * (holding @ modes.shapes) - forces @ self._ports_of_modes
+        q = acts / omega2
+        # without damping omitted modes let go at once
+        _, beta = self._rayleigh
+        last = np.array((load_factor, tip_force)), np.array((force if beta > 0.0 else 0.0,))
+        state = _Moving(q, np.zeros_like(q), forces, *last, memory)
         return self._packed(self._felt(state))
 
     def _felt(self, state: _Moving) -> _Moving:
         """Return a state with the forces of the laws at this moment."""
         if not len(self._laws):
             return state
-        constant = self._participation @ self._acting(*state.loads.tolist())
+        acting = self._acting(*state.loads.tolist())
         seen = simulate(
             self._system, self._laws, q=state.q, v=state.v, force=np.zeros(1), interval=1.0,
-            constant=constant, memory=state.memory,
+            constant=self._participation @ acting, feed=self._feed(acting), memory=state.memory,
         )  # fmt: skip
-        return state._replace(forces=seen.port_forces[0])
+        return state._replace(forces=seen.lagged[0])
 
     def advance(
         self, state: Sequence[float], duration: float, load_factor: float, tip_force: float, time: float
@@ -294,6 +325,7 @@ class PatchedSteps:
             Of the begin of the step since the start, for a stiffness that drifts [s].
         """
         before = self._unpacked(state)
+        acting = self._acting(load_factor, tip_force)
         moved = simulate(
             self._system,
             self._laws,
@@ -301,12 +333,16 @@ class PatchedSteps:
             v=before.v,
             force=np.zeros(2),
             interval=duration,
-            constant=self._participation @ self._acting(load_factor, tip_force),
+            constant=self._participation @ acting,
+            feed=self._feed(acting),
             memory=before.memory,
             start=time,
         )
         loads = np.array((load_factor, tip_force))
-        return self._packed(_Moving(moved.q[-1], moved.v[-1], moved.port_forces[-1], loads, moved.memory))
+        _, beta = self._rayleigh
+        holding = before.holding * (np.exp(-duration / beta) if beta > 0.0 else 0.0)
+        state = _Moving(moved.q[-1], moved.v[-1], moved.lagged[-1], loads, holding, moved.memory)
+        return self._packed(state)
 
     # ------------------------------------------------------------ what is seen
 
@@ -331,15 +367,21 @@ class PatchedSteps:
             acting = self._acting(load_factor, tip_force)
             still = np.concatenate((acting, -now.forces))
             displacement = self._modes.shapes @ now.q + self._left_out @ still
+            if now.holding[0] != 0.0:
+                displacement = displacement + now.holding[0] * self._held_left_out
         else:
             load_factor, tip_force = state[:_LOADS]
             acting = np.array(state[_LOADS : _LOADS + 3])
             forces = np.array(state[_LOADS + 3 : _LOADS + 3 + len(self._laws)])
             displacement = self._answers @ np.concatenate((acting, -forces))
         # the reduced model, and what the patch changes of the wing for patches
-        change = displacement - self._plain_answers @ np.array((load_factor, tip_force))
-        values = self._plain_outputs(load_factor, tip_force) + self._rows @ change
-        _, *components = self._wing.arrays.strain_rows
+        plain = self._plain_answers @ np.array((load_factor, tip_force))
+        if self._rows is self._plain_rows:
+            change = self._rows @ (displacement - plain)
+        else:
+            change = self._rows @ displacement - self._plain_rows @ plain
+        values = self._plain_outputs(load_factor, tip_force) + change
+        _, *components = self._strain_rows
         across, shear = (np.append(rows @ displacement, (0.0, 0.0)) for rows in components)
         return values, across, shear
 
@@ -401,7 +443,8 @@ class PatchedSteps:
     ) -> list[float]:
         """Return the state with displacement and velocity (n,) of the whole wing."""
         to_modes = self._modes.to_modes
-        state = _Moving(to_modes @ place, to_modes @ velocity, np.zeros(len(self._laws)), loads, memory)
+        none, held = np.zeros(len(self._laws)), np.zeros(1)
+        state = _Moving(to_modes @ place, to_modes @ velocity, none, loads, held, memory)
         return self._packed(self._felt(state))
 
     def _packed(self, state: _Moving) -> list[float]:
@@ -409,9 +452,9 @@ class PatchedSteps:
 
     def _unpacked(self, state: Sequence[float]) -> _Moving:
         values, memory = np.array(state, dtype=np.float64), self._laws.memory()
-        sizes = (len(self._modes.frequency),) * 2 + (len(self._laws), _LOADS)
-        q, v, forces, loads, rest = np.split(values, np.cumsum(sizes))
-        return _Moving(q, v, forces, loads, rest.reshape(memory.shape))
+        sizes = (len(self._modes.frequency),) * 2 + (len(self._laws), _LOADS, 1)
+        q, v, forces, loads, holding, rest = np.split(values, np.cumsum(sizes))
+        return _Moving(q, v, forces, loads, holding, rest.reshape(memory.shape))
 
 
 def _symmetric(matrix: FloatArray) -> FloatArray:

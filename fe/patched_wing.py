@@ -47,6 +47,8 @@ ITERATIONS = 3
 """Steps of the subspace iteration for the modes of a patched wing."""
 HELD = 1e-7
 """Part of a static shape, relative to it, below which a basis of motion holds it already."""
+STANDARD_GRAVITY = 9.80665
+"""[m/s^2]; that of `fe.turn_load`, which is not copied into the FMU."""
 EMPTY = ModelPatch()
 
 
@@ -354,7 +356,7 @@ class PatchedWing:
         return np.asarray(row + shift)
 
     def load(self, load_factor: float, patch: ModelPatch = EMPTY) -> FloatArray:
-        """Return the load (n,) [N] of a turn at a load factor under a patch (washout, inertia relief)."""
+        """Return the load (n,) [N] of a turn at a load factor under a patch: washout, relief by weight."""
         linear, square = self.load_parts(patch)
         return np.asarray(load_factor * linear + load_factor**2 * square)
 
@@ -372,6 +374,8 @@ class PatchedWing:
                 parts[1] -= item.coefficient * (eta @ arrays.lift_rows)
             elif isinstance(item, InertiaRelief):
                 parts[0] += item.fraction * arrays.weight
+            elif isinstance(item, PointMass):
+                parts[0] -= STANDARD_GRAVITY * item.mass * (self._along(item.station) @ arrays.line_rows[2])
         return parts
 
     def port_row(self, name: str) -> FloatArray:

@@ -8,6 +8,9 @@ losses give the equivalent viscous ratio zeta_eq = F_0 B / (pi k A):
 - structural, p = 0, a = 1, B = 1: zeta_eq = g / pi with F = g k |x| sgn v;
 - quadratic, p = 2, a = 0, B = 4/3: zeta_eq = 4 F_0 / (3 pi k A) = 4 c A w^2 / (3 pi k) with F = c |v| v.
 
+At a stiff port k is far above the stiffness at rest k_0, and a force of k_0 A holds it still: no more than 0.9 of
+it is built.
+
 Where the exponents are free, the loss at the amplitude A is kept, so that they change the shape alone.
 """
 
@@ -18,6 +21,7 @@ from scipy.special import beta
 
 from discrepancy.catalogue.building import (
     DYNAMIC,
+    LARGEST_SHARE,
     at_least_zero,
     at_ports,
     carried,
@@ -41,6 +45,8 @@ def _damping(setting: Setting, values: Mapping[str, float], port: str, equivalen
     scale = port_scale(setting, port)
     p, a = at_least_zero(values, "velocity_exponent"), at_least_zero(values, "displacement_exponent")
     force = pi * equivalent_ratio * scale.stiffness * scale.displacement / loss_integral(p, a)
+    if scale.static_stiffness is not None:  # a stronger one holds a stiff port still
+        force = min(force, LARGEST_SHARE * scale.static_stiffness * scale.displacement)
     speed = scale.displacement * scale.angular_frequency
     return ModelPatch((PowerDamping(port, force, p, a, speed, scale.displacement),))
 

@@ -63,6 +63,8 @@ class EffectParameter:
         In the unit.
     magnitude : bool
         Whether the effect vanishes with this parameter.
+    levels : int
+        Number of values, evenly over the prior, at which fits may begin; 0 leaves the choice to the search.
     """
 
     name: str
@@ -71,6 +73,7 @@ class EffectParameter:
     description: str
     prior: Prior
     magnitude: bool = False
+    levels: int = 0
 
 
 @dataclass(frozen=True)

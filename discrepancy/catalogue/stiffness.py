@@ -29,13 +29,15 @@ SKINS = {"lower skin": 1, "upper skin": -1}
 
 def _cubic(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
     scale = port_scale(setting, place)
-    force = values["stiffening"] * scale.stiffness * scale.displacement
+    # in all trials: a softening that a ring-down bears may leave nothing of the stiffness in flight
+    largest = scale.displacement if scale.largest_displacement is None else scale.largest_displacement
+    force = values["stiffening"] * scale.stiffness * largest
     exponent, asymmetry = values["exponent"], values["asymmetry"]
     if asymmetry == 0.0:
-        return ModelPatch((PowerStiffness(place, force, exponent, 0, scale.displacement),))
+        return ModelPatch((PowerStiffness(place, force, exponent, 0, largest),))
     return ModelPatch(
         tuple(
-            PowerStiffness(place, force * (1.0 + side * asymmetry), exponent, side, scale.displacement)
+            PowerStiffness(place, force * (1.0 + side * asymmetry), exponent, side, largest)
             for side in (1, -1)
         )
     )
@@ -91,7 +93,7 @@ CUBIC_STIFFNESS = Effect(
             "stiffening",
             "kappa",
             "1",
-            "cubic over linear force at the largest motion, k_3 A^2 / k",
+            "cubic over linear force at the largest motion in any trial, k_3 A^2 / k",
             Prior("normal", -0.24, 0.24),
             magnitude=True,
         ),

@@ -64,6 +64,7 @@ POINT_MASS = Effect(
             "1",
             "place, as a share of the modelled length from the root",
             Prior("uniform", 0.0, 1.0),
+            levels=6,
         ),
     ),
     build=_point_mass,
@@ -117,6 +118,7 @@ LOCAL_STIFFNESS_LOSS = Effect(
             "1",
             "inner end, as a share of the modelled length from the root",
             Prior("uniform", 0.0, 0.9),
+            levels=14,
         ),
         EffectParameter(
             "length_ratio",
@@ -124,6 +126,7 @@ LOCAL_STIFFNESS_LOSS = Effect(
             "1",
             "length, as a share of the modelled length (cut at the tip)",
             Prior("uniform", 0.03, 0.30),
+            levels=3,
         ),
     ),
     build=_local_stiffness_loss,

@@ -44,7 +44,8 @@ class PortScale:
     Attributes
     ----------
     displacement : float
-        A, the largest motion of the port in the campaign's trials by the unpatched model [m or rad].
+        A, the largest motion of the port by the unpatched model in the dynamic trials that are fitted; in the
+        other trials if there are none [m or rad].
     stiffness : float
         k, the stiffness of the first bending mode seen at the port, w1^2 / phi1(port)^2 [N/m or N m/rad].
     angular_frequency : float
@@ -52,12 +53,15 @@ class PortScale:
     static_stiffness : float or None
         1 / (p . K^-1 p), the stiffness at rest seen at the port [N/m or N m/rad]. At a stiff joint it is a
         small part of `stiffness`, and no effect can take away more. None: not known, taken as `stiffness`.
+    largest_displacement : float or None
+        The largest motion of the port in all trials, flights too [m or rad]. None: taken as `displacement`.
     """
 
     displacement: float
     stiffness: float
     angular_frequency: float
     static_stiffness: float | None = None
+    largest_displacement: float | None = None
 
 
 @dataclass(frozen=True)

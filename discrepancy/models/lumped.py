@@ -122,7 +122,8 @@ class LumpedModel:
         first = system.angular_frequency[0]
         participation = float(row @ system.shapes[:, 0]) ** 2
         flexible = float(row @ system.flexibility(row))
-        largest = dict.fromkeys(self._ports, 0.0)
+        largest, usual = dict.fromkeys(self._ports, 0.0), dict.fromkeys(self._ports, 0.0)
+        fitted = {trial.name for trial in campaign.fitted if trial.is_dynamic}
         port_rows = np.array(list(self._ports.values())).reshape(len(self._ports), self.description.size)
         for trial in campaign.trials if self._ports else ():
             if trial.kind is TrialKind.FLIGHT:
@@ -130,6 +131,8 @@ class LumpedModel:
             motion = self._still_or_moving(trial, system, conditions)
             for name, size in zip(self._ports, np.max(np.abs(motion @ port_rows.T), axis=0), strict=True):
                 largest[name] = max(largest[name], float(size))
+                if trial.name in fitted:
+                    usual[name] = max(usual[name], float(size))
         dynamic = [trial for trial in campaign.trials if trial.is_dynamic]
         moments = [
             trial.start + (trial.time if trial.is_dynamic else trial.time - trial.start)
@@ -147,7 +150,8 @@ class LumpedModel:
             duration=max((float(trial.time[-1] - trial.time[0]) for trial in dynamic), default=1.0),
             campaign_time=span if span > 0.0 else 1.0,
             ports={
-                name: self._port_scale(system, vector, largest[name]) for name, vector in self._ports.items()
+                name: self._port_scale(system, vector, usual[name] or largest[name], largest[name])
+                for name, vector in self._ports.items()
             },
         )
 
@@ -340,7 +344,8 @@ class LumpedModel:
             matrix = (weighted * (2.0 * np.array(damping.ratios) * whole.angular_frequency)) @ weighted.T
         else:
             matrix = (damping.alpha or 0.0) * mass + (damping.beta or 0.0) * stiffness
-        return replace(system, damping=factors.get("damping", 1.0) * matrix)
+        scale = factors.get("damping", 1.0)
+        return replace(system, damping=scale * matrix, relaxation=scale * (damping.beta or 0.0))
 
     def _place_row(self, station: float) -> FloatArray:
         """Return the row at a station, linear between the places."""
@@ -381,10 +386,12 @@ class LumpedModel:
         return (size / float(row @ shape) * shape)[None]
 
     @staticmethod
-    def _port_scale(system: SecondOrderSystem, vector: FloatArray, largest: float) -> PortScale:
+    def _port_scale(
+        system: SecondOrderSystem, vector: FloatArray, usual: float, largest: float
+    ) -> PortScale:
         first = float(system.angular_frequency[0])
         moved = float(vector @ system.shapes[:, 0])
         still = 1.0 / float(vector @ system.flexibility(vector))
         # A port that the first mode does not move has its static stiffness.
         stiffness = first**2 / moved**2 if moved**2 / first**2 * still > 1e-6 else still
-        return PortScale(largest or 1.0, stiffness, first, still)
+        return PortScale(usual or 1.0, stiffness, first, still, largest or 1.0)

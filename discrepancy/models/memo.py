@@ -22,7 +22,7 @@ class MemoModel:
 
     def __init__(self, model: Model) -> None:
         self.inner = model
-        self._kept: OrderedDict[object, Response] = OrderedDict()
+        self._kept: OrderedDict[object, tuple[Trial, Response]] = OrderedDict()
 
     @property
     def name(self) -> str:
@@ -69,14 +69,14 @@ class MemoModel:
             id(trial), outputs, patch.primitives, conditions.parameters.tobytes(),
             conditions.initial.tobytes(), conditions.clock, conditions.health.tobytes(), components, refinement,
         )  # fmt: skip
-        found = self._kept.get(key)
-        if found is not None:
+        kept = self._kept.get(key)
+        if kept is not None:
             self._kept.move_to_end(key)
-            return found
+            return kept[1]
         found = self.inner.respond(
             trial, outputs, patch, conditions, components=components, refinement=refinement
         )
-        self._kept[key] = found
+        self._kept[key] = (trial, found)  # the trial lives as long, so that its id stays its own
         if len(self._kept) > KEPT:
             self._kept.popitem(last=False)
         return found

@@ -55,10 +55,14 @@ class Motion:
         Where it acts.
     port_forces : (N, J) ndarray
         Internal forces.
+    lagged : (N, J) ndarray
+        Internal forces as omitted modes follow them.
     laws : Laws
         Their laws.
     held : int
         First samples that lie before the release, where the shape is held.
+    holding : float
+        Force that held the input point until the release [N].
     """
 
     system: "SecondOrderSystem"
@@ -68,8 +72,10 @@ class Motion:
     force: FloatArray
     input_row: FloatArray
     port_forces: FloatArray
+    lagged: FloatArray
     laws: Laws
     held: int = 0
+    holding: float = 0.0
 
     @cached_property
     def acceleration(self) -> FloatArray:
@@ -86,15 +92,30 @@ class Motion:
         acceleration[: self.held] = 0.0
         return np.asarray(acceleration)
 
+    @property
+    def _fading(self) -> FloatArray:
+        """What is left of a holding force in omitted modes (n,), at the first samples where any is."""
+        lag = self.system.relaxation
+        count = int(np.searchsorted(self.time, 40.0 * lag, side="right"))
+        return np.asarray(np.exp(-np.maximum(self.time[:count], 0.0) / lag))
+
     def values(self, rows: FloatArray) -> FloatArray:
-        """Return row . u (N, C) of rows (C, n); omitted modes follow the forces without delay."""
+        """Return row . u (N, C) of rows (C, n).
+
+        Omitted modes follow applied forces without delay, and internal ones and the end of a holding force
+        with that of their damping.
+        """
         values = self.q @ (rows @ self.system.shapes).T
         if self.system.truncated:
             if np.any(self.force):
                 values += np.outer(self.force, rows @ self.system.residual(self.input_row))
             if len(self.laws):
                 port_rows = self.system.port_rows(self.laws)
-                values -= self.port_forces @ (rows @ self.system.residual(port_rows.T)).T
+                values -= self.lagged @ (rows @ self.system.residual(port_rows.T)).T
+            if self.holding != 0.0 and self.system.relaxation > 0.0:
+                fading = self.holding * self._fading
+                count = len(fading)
+                values[:count] += np.outer(fading, rows @ self.system.residual(self.input_row))
         return np.asarray(values)
 
     def response(self, rows: FloatArray, quantities: Sequence[Quantity]) -> Response:
@@ -137,7 +158,9 @@ class SecondOrderSystem:
     ports : mapping of str to (n,) ndarray
         Rows of the ports where internal forces act: displacement [m] or rotation [rad] is row . u.
     mode_count : int
-        Modes that move; the others follow without delay.
+        Modes that move; the others follow without inertia.
+    relaxation : float
+        Factor of the part of the damping that goes with the stiffness, for the modes without inertia [s].
     """
 
     mass: FloatArray
@@ -145,6 +168,7 @@ class SecondOrderSystem:
     stiffness: FloatArray
     ports: Mapping[str, FloatArray]
     mode_count: int = 8
+    relaxation: float = 0.0
 
     @cached_property
     def _modes(self) -> tuple[FloatArray, FloatArray]:
@@ -185,7 +209,25 @@ class SecondOrderSystem:
             self.angular_frequency,
             damping,
             {name: np.asarray(row @ self.shapes) for name, row in self.ports.items()},
+            self._left_out,
+            self.relaxation,
         )
+
+    @cached_property
+    def _left_out(self) -> FloatArray | None:
+        """Flexibility (P,) of the ports that the modes leave out; None if there is none."""
+        if not (self.truncated and self.ports):
+            return None
+        rows = np.array(list(self.ports.values()))
+        left_out = np.einsum("pn,np->p", rows, self.residual(rows.T))
+        whole = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
+        return np.where(left_out > 1e-9 * whole, left_out, 0.0)  # less is rounding
+
+    def _feed(self, row: FloatArray, laws: Laws) -> FloatArray:
+        """Return positions (J,) of the laws' ports by a unit force at a row that the modes leave out."""
+        if not (self.truncated and len(laws)):
+            return np.zeros(len(laws))
+        return np.asarray(self.port_rows(laws) @ self.residual(row))
 
     @cached_property
     def _factor(self) -> tuple[FloatArray, bool]:
@@ -198,8 +240,13 @@ class SecondOrderSystem:
 
     def residual(self, loads: FloatArray) -> FloatArray:
         """Return the part of K^-1 loads, (n,) or (n, k), that the modes leave out."""
-        modal = (self.shapes.T @ loads).T / self.angular_frequency**2
-        return self.flexibility(loads) - self.shapes @ modal.T
+        return np.asarray(self._residual @ loads)
+
+    @cached_property
+    def _residual(self) -> FloatArray:
+        """Part (n, n) of K^-1 that the modes leave out."""
+        held = (self.shapes / self.angular_frequency**2) @ self.shapes.T
+        return self.flexibility(np.eye(len(self.mass))) - held
 
     def port_rows(self, laws: Laws) -> FloatArray:
         """Return the rows (J, n) of the laws' ports."""
@@ -275,7 +322,8 @@ class SecondOrderSystem:
             If the release point cannot be moved, or the static state has no solution.
         """
         times = (1.0 + clock[0]) * time + clock[1]
-        q, v, memory = self._released(release_row, release, initial, laws)
+        at_release = np.zeros(len(laws))
+        q, v, memory, holding = self._released(release_row, release, initial, laws)
         held = 0
         if release.at_rest:
             held = int(np.searchsorted(times, 0.0))  # samples before the release
@@ -285,12 +333,16 @@ class SecondOrderSystem:
             if held:
                 all_q[:held], all_v[:held] = q, 0.0
             none = np.zeros((len(times), 0))
-            return Motion(self, times, all_q, all_v, nothing, release_row, none, laws, held)
+            return Motion(
+                self, times, all_q, all_v, nothing, release_row, none, none, laws, held, holding
+            )
         count = len(times)
         all_q, all_v = np.tile(q, (count, 1)), np.tile(v, (count, 1))
-        forces = np.zeros((count, len(laws)))
+        forces, lagged = np.zeros((2, count, len(laws)))
         if held < count:
             lead = float(times[held])
+            if memory is not None:
+                at_release = memory[:, 2].copy()
             interval = float(times[-1] - times[0]) / (count - 1) if count > 1 else 0.0
             start = 0.0
             if lead < 0.0:
@@ -307,8 +359,11 @@ class SecondOrderSystem:
                 start=start, refinement=refinement, kernel=compiled_kernel(),
             )  # fmt: skip
             all_q[held:], all_v[held:], forces[held:] = moved.q, moved.v, moved.port_forces
-            forces[:held] = forces[held]
-        return Motion(self, times, all_q, all_v, nothing, release_row, forces, laws, held)
+            lagged[held:] = moved.lagged
+        if held and memory is not None:
+            lagged[:held] = at_release
+            forces[:held] = at_release
+        return Motion(self, times, all_q, all_v, nothing, release_row, forces, lagged, laws, held, holding)
 
     def forced(
         self,
@@ -334,30 +389,34 @@ class SecondOrderSystem:
         start, lead = float(time[0]), float(times[0] - time[0])
         # At rest before the record: under its first force where that is not zero.
         if force[0] != 0.0:
-            rows = laws.rows(modal.ports, modes)
-            flexible = rows / self.angular_frequency**2
-            linear = np.outer(force[:1], shape) / self.angular_frequency**2
-            solution = _solve(laws, linear @ rows.T, flexible @ rows.T)
-            q, memory = (linear - solution.forces @ flexible)[0], solution.memory
+            rows = self.port_rows(laws)
+            flexible = self.flexibility(rows.T)
+            linear = force[0] * (rows @ self.flexibility(input_row))
+            solution = _solve(laws, linear[None], rows @ flexible)
+            acts = force[0] * shape - solution.forces[0] @ laws.rows(modal.ports, modes)
+            q, memory = acts / self.angular_frequency**2, solution.memory
+        feed = np.stack((self._feed(input_row, laws), np.zeros(len(laws))))
         if lead > LEAST_LEAD * float(time[-1] - time[0]):
             first = simulate(
                 modal, laws, q=q, v=v, memory=memory, force=np.array([force[0], acting[0]]), interval=lead,
-                shape=shape, start=start, refinement=refinement, kernel=compiled_kernel(),
+                shape=shape, feed=feed, start=start, refinement=refinement, kernel=compiled_kernel(),
             )  # fmt: skip
             q, v, memory, start = first.q[-1], first.v[-1], first.memory, start + lead
         moved = simulate(
-            modal, laws, q=q, v=v, memory=memory, force=acting, shape=shape, start=start,
+            modal, laws, q=q, v=v, memory=memory, force=acting, shape=shape, feed=feed, start=start,
             interval=float(times[-1] - times[0]) / (len(times) - 1), refinement=refinement,
             kernel=compiled_kernel(),
         )  # fmt: skip
-        return Motion(self, times, moved.q, moved.v, acting, input_row, moved.port_forces, laws)
+        return Motion(
+            self, times, moved.q, moved.v, acting, input_row, moved.port_forces, moved.lagged, laws
+        )
 
     # ------------------------------------------------------------ parts
 
     def _released(
         self, row: FloatArray, release: Release, initial: FloatArray, laws: Laws
-    ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        """Return modal displacement, velocity and the laws' memory at the beginning of a ring-down."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray | None, float]:
+        """Return modal displacement, velocity, the laws' memory and the holding force at the begin."""
         modes = len(self.angular_frequency)
         shape = np.asarray(row @ self.shapes)
         largest = float(np.max(np.abs(shape)))
@@ -372,23 +431,25 @@ class SecondOrderSystem:
         given[: min(modes, len(initial))] = initial[:modes]
         size = release.displacement
         if not release.at_rest:
-            return given[:, 0] * size / safe, given[:, 1] * size * self.angular_frequency / safe, None
+            return given[:, 0] * size / safe, given[:, 1] * size * self.angular_frequency / safe, None, 0.0
         goal = size * (1.0 + given[0, 0])
         compliance = float(row @ self.flexibility(row))  # release point, all modes
-        q = goal / compliance * shape / self.angular_frequency**2
+        holding = goal / compliance
+        acts = holding * shape
         memory: FloatArray | None = None
         if len(laws):
-            # With the release point held at its displacement: x = x_linear - (C - a c^T / a_0) F.
-            rows = laws.rows(self.modal.ports, modes)
-            flexible = rows / self.angular_frequency**2  # (J, M): modal displacement by unit port forces
-            lever = self.port_rows(laws) @ self.flexibility(row) / compliance  # holding force by port forces
-            held = flexible - np.outer(lever, shape / self.angular_frequency**2)
-            solution = _solve(laws, (rows @ q)[None], rows @ held.T)
-            q = q - solution.forces[0] @ held
+            # With the release point held at its displacement: x = x_linear - (C - a a^T / a_0) F.
+            rows = self.port_rows(laws)
+            along = rows @ self.flexibility(row)
+            held = rows @ self.flexibility(rows.T) - np.outer(along, along) / compliance
+            solution = _solve(laws, (holding * along)[None], held)
+            holding += float(along @ solution.forces[0]) / compliance
+            acts = holding * shape - solution.forces[0] @ laws.rows(self.modal.ports, modes)
             memory = solution.memory
+            memory[:, 3] = holding * self._feed(row, laws)  # of the port's position, fades after the release
         deviation = given[:, 0] * size / safe
         deviation[0] = 0.0
-        return q + deviation, np.zeros(modes), memory
+        return acts / self.angular_frequency**2 + deviation, np.zeros(modes), memory, holding
 
     def _free(self, q: FloatArray, v: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return free motion (N, M), displacement and velocity, of uncoupled modes in closed form.

@@ -191,10 +191,14 @@ class WingModel:
         moved = self._moved(values, (0.0, 0.0), empty, 0.0, LOAD_PLACE)
         tip = self.wing.arrays.load_tip
         first, shape = float(moved.system.angular_frequency[0]), moved.basis @ moved.system.shapes[:, 0]
-        largest = np.zeros(len(PORTS))
-        for trial in campaign.trials:
-            motion = self._port_motion(trial, static, moved)
-            largest = np.maximum(largest, np.abs(motion).max(axis=0, initial=0.0))
+        motions = {
+            trial.name: np.abs(self._port_motion(trial, static, moved)).max(axis=0, initial=0.0)
+            for trial in campaign.trials
+        }
+        fitted = [motions[trial.name] for trial in campaign.fitted if trial.is_dynamic]
+        largest = np.max(list(motions.values()), axis=0, initial=0.0) * np.ones(len(PORTS))
+        usual = np.max(fitted, axis=0) if fitted else largest
+        at_rest = 1.0 / np.einsum("pn,np->p", self._port_rows, static.solve(self._port_rows.T))
         dynamic = [trial for trial in campaign.trials if trial.is_dynamic]
         begins = [
             trial.start if trial.is_dynamic else float(trial.time.min())
@@ -220,8 +224,16 @@ class WingModel:
             duration=max((float(t.time[-1] - t.time[0]) for t in dynamic), default=1.0),
             campaign_time=duration if duration > 0.0 else 1.0,
             ports={
-                port: PortScale(float(size) or 1.0, first**2 / float(by) ** 2, first)
-                for port, size, by in zip(PORTS, largest, by_first, strict=True)
+                port: PortScale(
+                    float(size) or float(most) or 1.0,
+                    first**2 / float(by) ** 2,
+                    first,
+                    float(still),
+                    float(most) or 1.0,
+                )
+                for port, size, by, still, most in zip(
+                    PORTS, usual, by_first, at_rest, largest, strict=True
+                )
             },
         )
 
@@ -274,7 +286,8 @@ class WingModel:
                 f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
             )
         structure = patch.of(*STRUCTURE)
-        loads = patch.of(*LOADS)
+        flight = trial.kind is TrialKind.FLIGHT  # where a mass has weight; other zeros are read with it in place
+        loads = patch.of(*LOADS, PointMass) if flight else patch.of(*LOADS)
         size = len(trial.time)
         health = np.broadcast_to(conditions.health, (size, 2))
         depends = any(isinstance(item, ModulusTemperature) for item in structure)
@@ -285,7 +298,7 @@ class WingModel:
         if components:
             blocks += [self._output_rows(outputs, number, patch.of(LocalStiffnessLoss)) for number in (1, 2)]
         values = np.empty((size, len(blocks) * len(outputs)))
-        place = None if trial.kind is TrialKind.FLIGHT else trial.load_place
+        place = None if flight else trial.load_place
         memory: FloatArray | None = None
         before = np.zeros(len(laws))
         start = 0
@@ -449,7 +462,9 @@ class WingModel:
             ports = {port: row @ basis for port, row in self._ports.items()}
             return _Moved(
                 basis,
-                SecondOrderSystem(small_mass, alpha * small_mass + beta * small, small, ports, MODE_COUNT),
+                SecondOrderSystem(
+                    small_mass, alpha * small_mass + beta * small, small, ports, MODE_COUNT, beta
+                ),
             )
 
         return self._systems.get((key, masses.primitives, parameters[1:].tobytes(), place), make)

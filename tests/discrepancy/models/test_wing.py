@@ -38,7 +38,7 @@ from fe.patch_cache import patch_cache_key
 
 NONE = ModelPatch()
 OUTPUTS = (
-    *((f"strain[{gauge}]", Quantity.STRAIN) for gauge in (0, 8, 20)),
+    *((f"strain[{gauge}]", Quantity.STRAIN) for gauge in (1, 9, 21)),
     ("tip_displacement", Quantity.DISPLACEMENT),
     ("load_point_displacement", Quantity.DISPLACEMENT),
     ("displacement[1.1, 0.6]", Quantity.DISPLACEMENT),
@@ -302,7 +302,7 @@ def test_the_posterior_of_a_calibration_is_the_prior(
     ("trial", "outputs", "patch", "message"),
     [
         (STATIC, (("strain[99]", Quantity.STRAIN),), NONE, "no output 'strain\\[99\\]'"),
-        (STATIC, (("strain[0]", Quantity.DISPLACEMENT),), NONE, "is a strain"),
+        (STATIC, (("strain[1]", Quantity.DISPLACEMENT),), NONE, "is a strain"),
         (STATIC, (("tip_displacement", Quantity.VELOCITY),), NONE, "is at rest"),
         (STATIC, OUTPUTS, ModelPatch((PowerStiffness("nose", 1.0, 3.0, 0, 1.0),)), "nose"),
         (STATIC, OUTPUTS, ModelPatch((LocalStiffnessLoss(1.2, 0.2, 0.5),)), "leave some stiffness"),

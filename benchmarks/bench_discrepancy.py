@@ -1,0 +1,89 @@
+"""Scans of the catalogue on a whole campaign of the wing, beside one ring-down of it."""
+
+from __future__ import annotations
+
+import resource
+import time
+
+from benchmarks.measurement import Measurement, median_seconds
+from discrepancy.campaign import TrialKind
+from discrepancy.candidate import Candidate
+from discrepancy.catalogue.entry import Setting
+from discrepancy.catalogue.library import library
+from discrepancy.examples import example_campaign, wing_plan
+from discrepancy.fitting import fit
+from discrepancy.held_out import choose_held_out
+from discrepancy.models.wing import WingModel
+from discrepancy.problem import Problem
+from discrepancy.search import Search, search
+from discrepancy.sensing import observe
+from fe.patch import ModelPatch, PowerDamping, RootCompliance
+
+SEED = 20210527
+ROUNDS = 3
+"""Campaigns of each kind; the median counts."""
+
+
+def run() -> list[Measurement]:
+    """Measure the scan of all effects near and far from the truth, all pairs, and the memory."""
+    model = WingModel.shipped()
+    cases = {
+        "nothing hidden": ModelPatch(),
+        "compliant root hidden": ModelPatch((RootCompliance(5e-6),)),
+        "quadratic drag hidden": ModelPatch((PowerDamping("span", 0.15, 2.0, 0.0, 1.0, 1.0),)),
+    }
+    _problem(model, ModelPatch(), SEED)  # compiles
+    search(_problem(model, cases["quadratic drag hidden"], SEED), library())
+    single = 1e-3 * _one_ringdown(model)
+    rows = []
+    for name, patch in cases.items():
+        seconds = []
+        for number in range(ROUNDS):
+            problem = _problem(model, patch, SEED + number)
+            begin = time.perf_counter()
+            search(problem, library())
+            seconds.append(time.perf_counter() - begin)
+        rows.append(
+            Measurement(
+                f"all effects, {name}", sorted(seconds)[ROUNDS // 2], "s", 10.0, "one ring-down", single
+            )
+        )
+    problem = _problem(model, cases["compliant root hidden"], SEED)
+    usable = tuple(effect for effect in library() if effect.unavailable(problem.setting) is None)
+    found = Search(problem, usable, fit(problem, Candidate(), problem.start(Candidate())))
+    begin = time.perf_counter()
+    found.fit_pairs()
+    pairs = len(usable) * (len(usable) - 1) // 2
+    rows.append(
+        Measurement(
+            f"all {pairs} pairs, compliant root hidden", time.perf_counter() - begin, "s", 60.0,
+            "one ring-down", single,
+        )
+    )  # fmt: skip
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2.0**20
+    return [*rows, Measurement("largest memory of the process", memory, "GiB", 2.0)]
+
+
+def _problem(model: WingModel, patch: ModelPatch, seed: int) -> Problem:
+    plan = wing_plan(tuple(range(1, 25)))
+    campaign = choose_held_out(example_campaign(model, "complete", seed, plan, patch))
+    setting = Setting(campaign, model, model.scales(campaign))
+    return Problem(campaign, model, setting)
+
+
+def _one_ringdown(model: WingModel) -> float:
+    """Return milliseconds of one ring-down with a force law, as the scan asks for it."""
+    problem = _problem(model, ModelPatch(), SEED)
+    number = next(n for n, data in enumerate(problem.trials) if data.trial.kind is TrialKind.RINGDOWN)
+    data = problem.trials[number]
+    patch = ModelPatch((PowerDamping("span", 0.15, 2.0, 0.0, 1.0, 1.0),))
+    point = problem.start(Candidate())
+    conditions = data.unknowns.conditions(
+        data.trial, problem.shared.parameters(point.shared), point.local[number]
+    )
+    return 1e3 * median_seconds(lambda: observe(model, problem.campaign, data.trial, patch, conditions))
+
+
+if __name__ == "__main__":
+    for row in run():
+        print(row.name, f"{row.value:.3g}", row.unit)

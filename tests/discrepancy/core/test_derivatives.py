@@ -1,0 +1,157 @@
+"""Every column of the Jacobian against central differences of the residual."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from discrepancy.campaign import NoiseRecord
+from discrepancy.candidate import Candidate, Term
+from discrepancy.catalogue.library import effect_by_identifier
+from discrepancy.problem import Problem
+from discrepancy.catalogue.entry import Setting
+
+STEP = 1e-4
+TOLERANCE = 0.03  # of the column's norm: the code's one-sided step is 1e-2 of a prior deviation
+
+
+def coloured_record(deviation: float, interval: float) -> NoiseRecord:
+    generator = np.random.default_rng(11)
+    samples, state = np.empty(3000), 0.0
+    for n in range(len(samples)):
+        state = 0.7 * state + generator.standard_normal()
+        samples[n] = deviation * np.sqrt(1.0 - 0.49) * state
+    return NoiseRecord(float(samples.std()), 2999.0, samples, interval, "pre-trigger")
+
+
+def check(kit, problem, candidate, effect=None, tolerance=TOLERANCE, spread=0.5):  # type: ignore[no-untyped-def]
+    linear = kit.Linear(problem, candidate)
+    x = spread * np.random.default_rng(1).standard_normal(linear.size)
+    if effect is not None:
+        x[problem.shared.size : problem.shared.size + candidate.size] = effect
+    point = linear.point(x)
+    numerical = np.stack(
+        [
+            (linear.residual(x - STEP * e) - linear.residual(x + STEP * e)) / (2.0 * STEP)
+            for e in np.eye(linear.size)
+        ]
+    )
+    columns = np.zeros_like(numerical)
+    at, first = 0, problem.shared.size + candidate.size
+    for number, data in enumerate(problem.trials):
+        parts = problem.linearise(number, point, candidate)
+        local, shared, index = problem.jacobian(number, point, parts, candidate)
+        counts = (data.weight > 0.0).ravel()
+        assert np.all(local[:, ~counts] == 0.0)
+        assert np.all(shared[:, ~counts] == 0.0)
+        stop = at + int(counts.sum())
+        columns[index, at:stop] = shared[:, counts]
+        columns[first : first + len(local), at:stop] = local[:, counts]
+        at, first = stop, first + len(local)
+    for number, (have, want) in enumerate(zip(columns, numerical, strict=True)):
+        error = np.linalg.norm(have - want)
+        assert error <= tolerance * np.linalg.norm(want) + 1e-9, f"unknown {number}: {error}"
+
+
+@pytest.mark.parametrize("at_rest", [True, False])
+@pytest.mark.parametrize("coloured", [True, False])
+def test_all_unknowns_of_the_closed_form(kit, at_rest: bool, coloured: bool) -> None:  # type: ignore[no-untyped-def]
+    """Parameters, gains, zeros, initial state, time zero, health of every load level, effect."""
+    noise = coloured_record(0.02, 0.01) if coloured else None
+    problem = kit.closed_problem(
+        bent=True, noise=noise, gain_deviation=0.1, health=True, at_rest=at_rest, time_zero=0.003,
+        left_out={0: ((2, 1),), 2: ((0, 0), (30, 2), (59, 1))}, samples=80,
+    )  # fmt: skip
+    if coloured:
+        assert all(problem.noise[name].applies(0.01) for name in problem.channel_names)
+    effects = (Term(kit.offset_effect(), "y1"), Term(kit.drift_effect(), "y2"))
+    check(kit, problem, Candidate(effects))
+
+
+def test_health_of_each_level_moves_its_own_row(kit) -> None:  # type: ignore[no-untyped-def]
+    """Entries come row by row, z1 before z2, in unknowns and derivatives alike."""
+    problem = kit.closed_problem(bent=True, health=True)
+    data = problem.trials[0]
+    candidate = Candidate()
+    point = problem.start(candidate)
+    local, _, _ = problem.jacobian(0, point, problem.linearise(0, point, candidate), candidate)
+    by_health = local[data.unknowns.size - len(data.unknowns.health_rows) :].reshape(-1, *data.weight.shape)
+    for entry, row in enumerate(data.unknowns.health_rows):
+        assert np.flatnonzero(np.any(by_health[entry] != 0.0, axis=1)).tolist() in ([row], [])
+
+
+EFFECTS = {
+    "coulomb_friction": ("joint", 0.1),  # sticking ends at a sample or the next: not smooth
+    "quadratic_damping": ("end", TOLERANCE),
+    "cubic_stiffness": ("joint", TOLERANCE),
+    "point_mass": ("", TOLERANCE),
+    "root_compliance": ("", TOLERANCE),
+    "gauge_gain": ("g1", TOLERANCE),
+    "clock_error": ("", TOLERANCE),
+}
+
+
+@pytest.mark.parametrize("identifier", EFFECTS)
+def test_effects_on_the_chain(kit, bench, catalogue, identifier: str) -> None:  # type: ignore[no-untyped-def]
+    problem = bench.problem(bench.measured(1))
+    place, tolerance = EFFECTS[identifier]
+    term = Term(effect_by_identifier(identifier, catalogue), place)
+    check(kit, problem, Candidate((term,)), effect=0.3, spread=0.3, tolerance=tolerance)
+
+
+def test_free_shape_has_its_own_columns(kit, bench, catalogue) -> None:  # type: ignore[no-untyped-def]
+    problem = bench.problem(bench.measured(1))
+    effect = effect_by_identifier("quadratic_damping", catalogue)
+    candidate = Candidate((Term(effect, "end", free_shape=True),))
+    assert candidate.size == len(effect.parameters) + len(effect.shape)
+    check(kit, problem, candidate, effect=candidate.start() + 0.1, spread=0.2, tolerance=0.06)
+
+
+def test_chord_steps_are_exact_at_the_base_and_second_order_away(kit, bench, catalogue) -> None:  # type: ignore[no-untyped-def]
+    """A chord response differs from the true one by the square of the distance from the base."""
+    from discrepancy.fitting import fit  # noqa: PLC0415
+
+    problem = bench.problem(bench.measured(1))
+    candidate = Candidate((Term(effect_by_identifier("gauge_gain", catalogue), "g1"),))
+    none = fit(problem, Candidate(), problem.start(Candidate()))
+    number = len(problem.trials) - 1
+    generator = np.random.default_rng(0)
+    away = generator.standard_normal(problem.shared.size), generator.standard_normal(none.point.local[number].size)
+    errors = []
+    for size in (0.0, 0.02, 0.04):
+        point = replace(
+            none.point,
+            shared=none.point.shared + size * away[0],
+            local=(*none.point.local[:number], none.point.local[number] + size * away[1]),
+            effect=np.array([0.3]),
+        )
+        chord = problem.linearise(number, point, candidate, none.base, derivatives=False).response
+        exact = problem.linearise(number, point, candidate, derivatives=False).response
+        errors.append(float(np.abs((chord - exact) / problem.trials[number].deviation).max()))
+    assert errors[0] < 1e-9
+    assert errors[1] < 0.05 * float(np.abs(away[0]).max())
+    assert errors[2] < 4.5 * errors[1]
+
+
+def test_samples_that_do_not_count_change_nothing(kit) -> None:  # type: ignore[no-untyped-def]
+    """Readings left out, and what the whitening filter smears of them, weigh zero whatever they are."""
+    noise = coloured_record(0.02, 0.01)
+    problem = kit.closed_problem(noise=noise, left_out={2: ((30, 1), (31, 1)), 0: ((3, 0),)})
+    wild = []
+    for trial in problem.campaign.trials:
+        values = trial.values.copy()
+        values[~trial.used] = 1e6
+        wild.append(replace(trial, values=values))
+    campaign = replace(problem.campaign, trials=tuple(wild))
+    other = Problem(campaign, problem.model, Setting(campaign, problem.model, problem.setting.scales))
+    linear = kit.Linear(problem, Candidate())
+    x = 0.3 * np.random.default_rng(0).standard_normal(linear.size)
+    point = linear.point(x)
+    for number in range(len(problem.trials)):
+        first, second = (
+            p.residual(number, point, p.linearise(number, point, Candidate(), derivatives=False).response)
+            for p in (problem, other)
+        )
+        np.testing.assert_allclose(first, second, atol=1e-9)

@@ -1,0 +1,152 @@
+"""What is read from noise records, against processes with known parameters."""
+
+from __future__ import annotations
+
+from math import inf
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import toeplitz
+from scipy.signal import lfilter
+from scipy.stats import binom, kstest
+
+from discrepancy.campaign import Channel, NoiseRecord, Quantity
+from discrepancy.noise import NoiseModel, aliased, autoregression, ljung_box, noise_model, without_lines
+
+INTERVAL = 0.002
+
+
+def coloured(generator, coefficients, count, burn=2000):  # type: ignore[no-untyped-def]
+    white = generator.standard_normal(count + burn)
+    return lfilter([1.0], np.r_[1.0, -np.asarray(coefficients)], white)[burn:]
+
+
+def channel(samples, interval=INTERVAL):  # type: ignore[no-untyped-def]
+    record = NoiseRecord(float(samples.std()), len(samples) - 1.0, samples, interval, "pre-trigger")
+    return Channel("g", Quantity.STRAIN, "g", record)
+
+
+@pytest.mark.parametrize("coefficients", [(0.8,), (1.2, -0.6), (0.5, 0.0, 0.3)])
+def test_autoregression_is_recovered(coefficients: tuple[float, ...]) -> None:
+    """Yule-Walker estimates have standard errors of about 1/sqrt(N)."""
+    found, innovation = autoregression(coloured(np.random.default_rng(1), coefficients, 8000))
+    padded = np.zeros(max(len(found), len(coefficients)))
+    padded[: len(found)] = found
+    padded[: len(coefficients)] -= coefficients
+    assert np.abs(padded).max() < 5.0 / np.sqrt(8000)
+    assert innovation == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / 8000))
+
+
+def test_model_of_a_coloured_record() -> None:
+    samples = 3.0 * coloured(np.random.default_rng(2), (0.8,), 4000)
+    noise = noise_model(channel(samples), 1.0)
+    assert noise.standard_deviation == pytest.approx(3.0, rel=0.05)  # of the innovation
+    assert noise.static_deviation == pytest.approx(3.0 / 0.6, rel=0.1)  # sigma / sqrt(1 - a^2)
+    assert noise.is_known
+    assert noise.applies(INTERVAL)
+    assert not noise.applies(2.0 * INTERVAL)
+    np.testing.assert_array_equal(noise.whiten(samples, 2.0 * INTERVAL), samples)
+
+
+def test_white_records_stay_white() -> None:
+    generator = np.random.default_rng(3)
+    orders = [len(noise_model(channel(generator.standard_normal(400)), 1.0).autoregression) for _ in range(300)]
+    # the Ljung-Box test of the record has level 1e-3
+    assert np.count_nonzero(orders) <= binom.isf(1e-4, 300, 1e-3)
+
+
+def test_ljung_box_has_its_level() -> None:
+    generator = np.random.default_rng(4)
+    values = [ljung_box(generator.standard_normal(400), 20) for _ in range(600)]
+    assert kstest(values, "uniform").pvalue > 1e-3
+    assert ljung_box(np.zeros(100), 20) == 1.0
+
+
+def test_whitened_noise_is_white() -> None:
+    """A new record of the same process, whitened by the autoregression of the first, is white at its level."""
+    generator = np.random.default_rng(5)
+    values = []
+    for _ in range(300):
+        noise = noise_model(channel(coloured(generator, (0.9, -0.3), 3000)), 1.0)
+        fresh = coloured(generator, (0.9, -0.3), 400)
+        values.append(ljung_box(noise.whiten(fresh, INTERVAL), 20))
+    # coefficients from a record of 3000 are not exact, which costs a little
+    assert np.mean(np.array(values) < 0.05) < 0.10
+    assert np.mean(np.array(values) < 1e-3) < 0.01
+
+
+def test_lines_are_found_where_they_are_and_taken_out() -> None:
+    generator = np.random.default_rng(6)
+    time = INTERVAL * np.arange(1000)
+    for frequency in (50.0, 60.0):
+        samples = generator.standard_normal(1000) + 0.5 * np.cos(2.0 * np.pi * frequency * time + 0.3)
+        rest, lines = without_lines(samples, INTERVAL)
+        assert lines == (frequency,)
+        assert rest.std() == pytest.approx(1.0, rel=0.1)
+    # 400 Hz is not below half the rate of 500 Hz: it shows at 100 Hz
+    samples = generator.standard_normal(1000) + np.cos(2.0 * np.pi * 100.0 * time)
+    assert without_lines(samples, INTERVAL)[1] == (400.0,)
+
+
+@pytest.mark.parametrize("coefficients", [(), (0.9,)])
+def test_lines_are_not_found_in_noise(coefficients: tuple[float, ...]) -> None:
+    """Level 1e-4 a line against a level known from 20 neighbours: (1 + 9.2 / 20)^-20 = 5e-4, three lines."""
+    generator = np.random.default_rng(7)
+    found = sum(
+        len(without_lines(coloured(generator, coefficients, 500, 200), INTERVAL)[1]) for _ in range(700)
+    )
+    assert found <= binom.isf(1e-3, 2100, 6e-4)
+
+
+@given(st.floats(0.0, 1e3), st.floats(1e-4, 1e-1))
+def test_aliases_agree_at_the_samples(frequency: float, interval: float) -> None:
+    shown = aliased(frequency, interval)
+    assert 0.0 <= shown <= 0.5 / interval * (1.0 + 1e-9)
+    time = interval * np.arange(6)
+    np.testing.assert_allclose(
+        np.cos(2.0 * np.pi * frequency * time), np.cos(2.0 * np.pi * shown * time), atol=1e-5
+    )
+
+
+def test_records_that_say_little() -> None:
+    """No record, a stated deviation, and a record too short for a spectrum."""
+    none = noise_model(Channel("g", Quantity.STRAIN, "g", None), 0.7)
+    assert not none.is_known
+    assert none.standard_deviation == none.static_deviation == 0.7
+    stated = noise_model(Channel("g", Quantity.STRAIN, "g", NoiseRecord(2.0, inf)), 0.7)
+    assert (stated.standard_deviation, stated.degrees_of_freedom) == (2.0, inf)
+    short = noise_model(channel(np.random.default_rng(0).standard_normal(30)), 0.7)
+    assert not short.autoregression.size
+
+
+@pytest.mark.parametrize("coefficient", [0.9, 0.99])
+def test_the_first_whitened_samples_weigh_what_they_are_worth(kit, coefficient: float) -> None:  # type: ignore[no-untyped-def]
+    """Without a history the first sample has the process's variance, 1 / (1 - a^2) of the innovation's: 50 at
+    0.99. Counted as one innovation it would be an outlier in every record."""
+    generator = np.random.default_rng(8)
+    samples = 0.02 * np.sqrt(1.0 - coefficient**2) * coloured(generator, (coefficient,), 20000)
+    record = NoiseRecord(float(samples.std()), 19999.0, samples, 0.01, "pre-trigger")
+    problem = kit.closed_problem(noise=record, kinds=("ringdown",))
+    data = problem.trials[0]
+    first = []
+    for _ in range(400):
+        noise = np.stack([0.02 * np.sqrt(1.0 - coefficient**2) * coloured(generator, (coefficient,), 8, 500)] * 3, 1)
+        padded = np.zeros(data.weight.shape)
+        padded[:8] = noise
+        first.append(data.standardised(padded)[0, 0])
+    assert np.mean(np.square(first)) < 1.3
+
+
+@pytest.mark.parametrize("coefficients", [(0.9,), (1.2, -0.6), (0.5, 0.0, 0.3)])
+def test_whitening_is_that_of_the_whole_covariance(coefficients: tuple[float, ...]) -> None:
+    """Sum of squares of whitened samples = x' C^-1 x with the Toeplitz covariance of the process."""
+    pulse = np.r_[1.0, np.zeros(3000)]
+    impulse = lfilter([1.0], np.r_[1.0, -np.asarray(coefficients)], pulse)
+    covariance = toeplitz([impulse[: len(impulse) - lag] @ impulse[lag:] for lag in range(40)])
+    noise = NoiseModel(1.0, float(np.sqrt(covariance[0, 0])), inf, np.array(coefficients), INTERVAL, ())
+    x = np.random.default_rng(0).standard_normal((2, 40))
+    white = noise.whiten(x, INTERVAL)
+    np.testing.assert_allclose(white @ white.T, x @ np.linalg.solve(covariance, x.T), rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(noise.whiten(x[:, :2], INTERVAL), white[:, :2], rtol=1e-12)
