@@ -77,9 +77,7 @@ class FmuModel:
         )
         self._keys = [self.runs.parameter(item.variable or item.name) for item in description.parameter]
         self._ports = tuple(port.name for port in description.port)
-        self._forces = {
-            place: self.runs.variable(name) for place, name in description.inputs.forces.items()
-        }
+        self._forces = {place: self.runs.variable(name) for place, name in description.inputs.forces.items()}
         self._check_settings()
         self.motion = FmuMotion(description, self.runs)
 
@@ -312,9 +310,7 @@ class FmuModel:
             (Excitation("velocity"), unit * speed * float(first[1])),
         ]
 
-    def _forced(
-        self, trial: Trial, patch: _Patch, step: float, steps: int
-    ) -> list[tuple[Excitation, float]]:
+    def _forced(self, trial: Trial, patch: _Patch, step: float, steps: int) -> list[tuple[Excitation, float]]:
         at_ends = np.interp(step * np.arange(steps + 1), trial.time, trial.force)
         held = 0.5 * (at_ends[1:] + at_ends[:-1])
         on = (at_ends[1:] != 0.0) | (at_ends[:-1] != 0.0)

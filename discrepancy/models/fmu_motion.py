@@ -460,7 +460,11 @@ class FmuMotion:
         if system is None:
             return self._stepped(laws, port_of, state, step, steps, loads, free)
         x_rows, x_direct = system.outputs[self._x], system.direct[self._x]
-        v_rows, v_direct, velocity = x_rows @ system.generator, np.zeros_like(x_direct), np.empty((steps + 1, 0))
+        v_rows, v_direct, velocity = (
+            x_rows @ system.generator,
+            np.zeros_like(x_direct),
+            np.empty((steps + 1, 0)),
+        )
         grid = step * np.arange(steps + 1)
         velocity = CubicSpline(grid, free[:, self._x])(grid, 1)
         for number, column in enumerate(self._v):
@@ -524,4 +528,3 @@ class FmuMotion:
             np.add.at(now, at, stepper.forces(values[k, self._x], values[k, self._v]))
             values[k + 1] = self._runs.stepped(asset, dict(zip(names, now.tolist(), strict=True)))
         return values
-
