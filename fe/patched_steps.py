@@ -94,7 +94,12 @@ class PatchedSteps:
         self._laws: Laws = laws_of(patch, PORTS)
         self._patched = wing.structure(*self._state, patch, temperature)
         arrays = wing.arrays
-        self._rows = np.vstack((arrays.strain_rows[0], arrays.tip_row, arrays.load_tip))
+        factors = wing.strain_factors(patch)
+        self._strain_rows = arrays.strain_rows if factors is None else factors[:, np.newaxis] * arrays.strain_rows
+        self._plain_rows = np.vstack((arrays.strain_rows[0], arrays.tip_row, arrays.load_tip))
+        self._rows = self._plain_rows
+        if factors is not None:
+            self._rows = np.vstack((self._strain_rows[0], arrays.tip_row, arrays.load_tip))
         self._units = np.vstack((wing.load_parts(patch.of(*LOADS, PointMass)), wing.force_row(LOAD_PLACE, self._loads)))
         ports = {name: wing.port_row(name) for name in PORTS}
         self._port_rows = self._laws.rows(ports, wing.size)
@@ -286,7 +291,9 @@ class PatchedSteps:
             memory[:, 3] = force * (self._port_rows @ self._held_left_out)
         acts = self._participation @ loads + force * (holding @ modes.shapes) - forces @ self._ports_of_modes
         q = acts / omega2
-        last = np.array((load_factor, tip_force)), np.array((force,))
+        # without damping omitted modes let go at once
+        _, beta = self._rayleigh
+        last = np.array((load_factor, tip_force)), np.array((force if beta > 0.0 else 0.0,))
         state = _Moving(q, np.zeros_like(q), forces, *last, memory)
         return self._packed(self._felt(state))
 
@@ -333,7 +340,7 @@ class PatchedSteps:
         )
         loads = np.array((load_factor, tip_force))
         _, beta = self._rayleigh
-        holding = before.holding * (np.exp(-duration / beta) if beta > 0.0 else float(duration == 0.0))
+        holding = before.holding * (np.exp(-duration / beta) if beta > 0.0 else 0.0)
         state = _Moving(moved.q[-1], moved.v[-1], moved.lagged[-1], loads, holding, moved.memory)
         return self._packed(state)
 
@@ -368,9 +375,13 @@ class PatchedSteps:
             forces = np.array(state[_LOADS + 3 : _LOADS + 3 + len(self._laws)])
             displacement = self._answers @ np.concatenate((acting, -forces))
         # the reduced model, and what the patch changes of the wing for patches
-        change = displacement - self._plain_answers @ np.array((load_factor, tip_force))
-        values = self._plain_outputs(load_factor, tip_force) + self._rows @ change
-        _, *components = self._wing.arrays.strain_rows
+        plain = self._plain_answers @ np.array((load_factor, tip_force))
+        if self._rows is self._plain_rows:
+            change = self._rows @ (displacement - plain)
+        else:
+            change = self._rows @ displacement - self._plain_rows @ plain
+        values = self._plain_outputs(load_factor, tip_force) + change
+        _, *components = self._strain_rows
         across, shear = (np.append(rows @ displacement, (0.0, 0.0)) for rows in components)
         return values, across, shear
 

@@ -38,6 +38,7 @@ STRUCTURE_FILES = (
     "motion_kernel.py",
     "local_loss.py",
     "patch_arrays.py",
+    "local_loss.py",
     "patched_wing.py",
     "patched_steps.py",
 )

@@ -97,8 +97,7 @@ class Motion:
         """What is left of a holding force in omitted modes (n,), at the first samples where any is."""
         lag = self.system.relaxation
         count = int(np.searchsorted(self.time, 40.0 * lag, side="right"))
-        since = np.maximum(self.time[:count], 0.0)
-        return np.exp(-since / lag) if lag > 0.0 else np.ones(count)
+        return np.asarray(np.exp(-np.maximum(self.time[:count], 0.0) / lag))
 
     def values(self, rows: FloatArray) -> FloatArray:
         """Return row . u (N, C) of rows (C, n).
@@ -113,7 +112,7 @@ class Motion:
             if len(self.laws):
                 port_rows = self.system.port_rows(self.laws)
                 values -= self.lagged @ (rows @ self.system.residual(port_rows.T)).T
-            if self.holding != 0.0:
+            if self.holding != 0.0 and self.system.relaxation > 0.0:
                 fading = self.holding * self._fading
                 count = len(fading)
                 values[:count] += np.outer(fading, rows @ self.system.residual(self.input_row))
@@ -334,9 +333,7 @@ class SecondOrderSystem:
             if held:
                 all_q[:held], all_v[:held] = q, 0.0
             none = np.zeros((len(times), 0))
-            return Motion(
-                self, times, all_q, all_v, nothing, release_row, none, none, laws, held, holding
-            )
+            return Motion(self, times, all_q, all_v, nothing, release_row, none, none, laws, held, holding)
         count = len(times)
         all_q, all_v = np.tile(q, (count, 1)), np.tile(v, (count, 1))
         forces, lagged = np.zeros((2, count, len(laws)))
@@ -408,9 +405,7 @@ class SecondOrderSystem:
             interval=float(times[-1] - times[0]) / (len(times) - 1), refinement=refinement,
             kernel=compiled_kernel(),
         )  # fmt: skip
-        return Motion(
-            self, times, moved.q, moved.v, acting, input_row, moved.port_forces, moved.lagged, laws
-        )
+        return Motion(self, times, moved.q, moved.v, acting, input_row, moved.port_forces, moved.lagged, laws)
 
     # ------------------------------------------------------------ parts
 

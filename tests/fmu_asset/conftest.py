@@ -167,6 +167,8 @@ def chain_arrays(model: ReducedModel, span: float = 1.6) -> PatchArrays:
         lift_rows=place * (model.static_load[0] - weight),
         weight=weight,
         strain_rows=np.stack((gauges, -0.3 * gauges, bending)),
+        gauge_stations=span * np.abs(gauges).argmax(axis=1) / NODES,
+        gauge_length=0.0,
         tip_row=model.static_output[-1],
         start_shapes=np.linalg.eigh(model.static_stiffness.sum(axis=0))[1][:, :8].copy(),
     )
