@@ -28,9 +28,11 @@ SIGNAL, TIP = "spanwise", "tip"
 ROOT_GAUGE = "strain[16]"
 """Where the model's strain is read for the signal; its place only sets the scale, which is unknown."""
 READING_ERROR = 33e-6 / 3.0**0.5
-"""Deviation of a value read off the plot [V]: evenly within +-33 microvolt (a pixel is 66). The five plots
-show the same motion on the same grid of pixels, so that its error is common to the trials, and no average makes
-it less."""
+"""Deviation of a value read off the plot [V]: evenly within +-33 microvolt (a pixel is 66).
+
+The plots show the same motion on the same grid, so that its error is common to the trials, and no average makes
+it less.
+"""
 TREND = 67
 """Columns of the moving average that is the slow zero: 0.54 s, three periods of the first mode."""
 PARAMETERS = {

@@ -335,8 +335,8 @@ def mode_shares(
 def predicted_frequencies(items: Sequence[FittedTrial]) -> tuple[float, ...]:
     """Return the frequencies [Hz] of the peaks of the predictions' spectra, lowest first, at most four.
 
-    A peak is a largest ordinate within a factor 1.4 on both sides, above a thousandth of the greatest, of four
-    periods or more in the record: below, a zero or a slow decay looks like one.
+    A peak is a largest ordinate within a factor 1.4 on both sides, above a thousandth of the greatest, of
+    four periods or more in the record: below, a zero or a slow decay looks like one.
     """
     longest = max(items, key=lambda item: len(item.trial.time))
     power = np.zeros((len(longest.trial.time) - 1) // 2)

@@ -67,7 +67,7 @@ def test_the_scatter_between_trials_is_the_noise(tmp_path: Path) -> None:
     time = 0.03 * np.arange(400)
     # a motion of no law that a model could have, the same in all trials but for size, delay and zero
     motion = np.sin(30.0 * np.sqrt(1.0 + time)) / (1.0 + time)
-    windows: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = [
+    windows: list[tuple[FloatArray, FloatArray]] = [
         (
             time,
             (1.0 + 0.02 * k) * motion
