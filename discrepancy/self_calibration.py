@@ -119,7 +119,7 @@ class SelfCalibration:
     cases : tuple of CalibrationCase
         In the order of their simulation.
     not_detectable : tuple of str
-        Effects that can be tested here, but were never detectable in `simulated_campaigns.TRIES` draws of their prior.
+        Effects that can be tested here, but were in no draw of their prior detectable.
     seed : int
         Of the `SeedSequence`.
     """
