@@ -796,7 +796,7 @@ def integrate(
                     lone_memory[HEAD] = x + current[0] / lone_law[0]
                     lone_memory[1] = x
                 else:
-                    if code == MICRO_SLIP or code == BOUC_WEN:  # noqa: PLR1714
+                    if code in (MICRO_SLIP, BOUC_WEN):
                         advance_memory(code, lone_law, lone_slip, lone_memory, x, 1)
                     if code == MICRO_SLIP and r * lone_law[0] > 0.01:
                         current[0] = (y - x) / r

@@ -155,7 +155,7 @@ def joint_speed(push: float, damper: float, x: float, items: tuple[Primitive, ..
 
 
 def integrated(items: tuple[Primitive, ...], time: FloatArray) -> FloatArray:
-    """Displacements (N, 2) of tip and joint after the release, by a general integrator; a joint without mass."""
+    """Displacements (N, 2) of tip and joint after the release, by a general integrator; no mass there."""
     system = chain(3, BETA)
     stiffness, damping = system.stiffness, BETA * system.stiffness + 0.3 * system.mass
     inverse = np.linalg.inv(stiffness)
