@@ -30,6 +30,14 @@ lint: $(VENV)/.dev ## Check style, docstrings, types and the direction of import
 bench: $(VENV)/.dev ## Measure speed and memory, as ratios within one run
 	$(BIN)/python -m benchmarks
 
+BLIND ?= runs/blind
+
+.PHONY: blind
+blind: $(VENV)/.dev ## Hide effects in campaigns, name them, and score the names (half an hour)
+	$(BIN)/python -m benchmarks.blind generate --out $(BLIND) --count-per-effect 8 --nulls 300 --pairs 40 --outside 2 --traps 3 --seed 1
+	$(BIN)/python -m benchmarks.blind_naming $(BLIND)
+	$(BIN)/python -m benchmarks.blind score --out $(BLIND)
+
 .PHONY: fmu
 fmu: $(VENV)/.runtime ## Build the wing as an FMU into runs/wing.fmu
 	@mkdir -p runs

@@ -1,7 +1,7 @@
 """Name what is hidden in blind campaigns: `python -m benchmarks.blind_naming DIR [--jobs 2]`.
 
-DIR is what `python -m benchmarks.blind generate --out DIR` wrote. Only DIR/campaigns and DIR/leave_out.json are
-read; a verdict for each campaign goes to DIR/verdicts.
+DIR is what `python -m benchmarks.blind generate --out DIR` wrote. Only DIR/campaigns and DIR/leave_out.json
+are read; a verdict for each campaign goes to DIR/verdicts.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import json
 import math
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from discrepancy.models.wing import WingModel
 from discrepancy.patch_file import primitive_intervals
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import Investigation, investigate, patch_draws
+from fe.patch import ModelPatch, PowerDamping, PowerStiffness
 
 NAMING = (VerdictKind.NAMED, VerdictKind.FAMILY)
 _models: dict[str, Model] = {}
@@ -85,7 +87,7 @@ def verdict_row(found: Investigation) -> dict[str, Any]:
             row["parameters"][effect.identifier] = {
                 item.name: [item.low, item.value, item.high] for item in effect.parameters
             }
-            for item in primitive_intervals(effect.patch, patches):
+            for item in primitive_intervals(at_unit(effect.patch), [at_unit(patch) for patch in patches]):
                 if math.isfinite(item.low) and item.low < item.high:
                     row["estimates"][f"{effect.identifier}.{item.parameter}"] = [
                         item.low,
@@ -93,6 +95,28 @@ def verdict_row(found: Investigation) -> dict[str, Any]:
                         item.high,
                     ]
     return row
+
+
+def at_unit(patch: ModelPatch) -> ModelPatch:
+    """Return the patch with coefficients of power laws at unit speed and displacement, as the truth is."""
+    primitives = []
+    for item in patch:
+        if isinstance(item, PowerDamping):
+            scale = (
+                item.reference_velocity**item.velocity_exponent
+                * item.reference_displacement**item.displacement_exponent
+            )
+            item = replace(
+                item, coefficient=item.coefficient / scale, reference_velocity=1.0, reference_displacement=1.0
+            )
+        elif isinstance(item, PowerStiffness):
+            item = replace(
+                item,
+                coefficient=item.coefficient / item.reference_displacement**item.exponent,
+                reference_displacement=1.0,
+            )
+        primitives.append(item)
+    return ModelPatch(tuple(primitives))
 
 
 def _finite(value: float) -> float | None:

@@ -236,6 +236,10 @@ class PatchDocument(_Document):
     """The file patch.json."""
 
     schema_: Literal["uav-twin patch 1"] = Field(alias="schema")
+    verdict: Literal["named", "family", "group"] = Field(
+        description="What the patch rests on; of a group it is the most probable member, which is no name."
+    )
+    sentence: str
     effects: list[PatchEffectModel]
     channels: dict[str, str] = Field(
         default_factory=dict, description="Outputs of the wing FMU by the names of channels."

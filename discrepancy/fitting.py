@@ -21,6 +21,9 @@ LARGEST_EFFECT = 8.0
 """Effect parameters stay within this many prior deviations of their median."""
 CONVERGED = 1e-2
 """A step that promises less than this [nat] ends a fit."""
+CREEPING, NEAR_END = 0.2, 30.0
+"""Derivatives are renewed where a step promises less than `NEAR_END` [nat], but more than this share of what the
+one before it promised: close to the end, promises should fall fast."""
 
 
 @dataclass(frozen=True)
@@ -168,9 +171,14 @@ def fit(
             f"The model gives values that are not finite for {candidate.identifiers or ('no effect',)}; "
             "check the ranges of its parameters."
         )
-    converged, fresh = False, True
+    converged, fresh, before = False, True, np.inf
     for _ in range(iterations):
         step, promised = _step(problem, candidate, state, damping, local_only=local_only)
+        if not fresh and CREEPING * before < promised < NEAR_END:
+            # old derivatives turn a long valley into a row of short steps, each of which keeps its promise
+            state, fresh = _evaluate(problem, candidate, state.point, base), True
+            step, promised = _step(problem, candidate, state, damping, local_only=local_only)
+        before = promised
         if promised < CONVERGED and fresh:
             converged = True
             break

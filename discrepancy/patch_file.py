@@ -21,7 +21,7 @@ from discrepancy.document_file import (
 )
 from discrepancy.errors import VerdictFileError
 from discrepancy.file_models import PATCH_SCHEMA, PRIMITIVE_UNITS, PatchDocument
-from discrepancy.verdict import NamedEffect
+from discrepancy.verdict import NamedEffect, VerdictKind
 from fe.patch import ModelPatch
 
 PATCH_NAME = "patch.json"
@@ -48,12 +48,13 @@ class PrimitiveInterval:
 
 @dataclass(frozen=True)
 class StoredPatch:
-    """Content of patch.json: effects, intervals of their primitives, origin, FMU outputs by channel."""
+    """Content of patch.json: effects, intervals of their primitives, origin, outputs by channel, verdict."""
 
     effects: tuple[NamedEffect, ...]
     intervals: tuple[tuple[PrimitiveInterval, ...], ...]
     origin: Origin
     channels: Mapping[str, str] = field(default_factory=dict)
+    verdict: VerdictKind = VerdictKind.NAMED
 
     @property
     def patch(self) -> ModelPatch:
@@ -99,6 +100,9 @@ def write_patch(
     origin: Origin,
     draws: Sequence[Sequence[ModelPatch]] = (),
     channels: Mapping[str, str] | None = None,
+    *,
+    verdict: VerdictKind = VerdictKind.NAMED,
+    sentence: str = "",
 ) -> Path:
     """Write patch.json, whole or not at all.
 
@@ -115,6 +119,10 @@ def write_patch(
     channels : mapping of str to str, optional
         Outputs of the wing FMU by the names of channels, as `fmu_outputs` returns them: by it the FMU knows
         what the patch's sensors are.
+    verdict : VerdictKind
+        On what the patch rests: a name, a family, or a group of which it is the most probable member.
+    sentence : str
+        The verdict in words.
 
     Raises
     ------
@@ -132,6 +140,8 @@ def write_patch(
     content = {
         "schema": PATCH_SCHEMA,
         **origin_rows(origin),
+        "verdict": verdict.value,
+        "sentence": sentence,
         "effects": rows,
         "channels": dict(channels or {}),
     }
@@ -172,4 +182,10 @@ def read_patch(path: Path) -> StoredPatch:
         )
         for row in content["effects"]
     )  # fmt: skip
-    return StoredPatch(effects, intervals, origin_of(content), content.get("channels", {}))
+    return StoredPatch(
+        effects,
+        intervals,
+        origin_of(content),
+        content.get("channels", {}),
+        VerdictKind(content["verdict"]),
+    )

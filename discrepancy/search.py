@@ -27,23 +27,30 @@ STARTS, FAR_STARTS = 2, 3
 CHORD_STEPS = 8
 CLOSE = 12.0
 """Candidates within this log evidence of the best are fitted exactly [nat]."""
-EXACT_FITS = 5
+EXACT_FITS = 4
 WORTH_FITTING = 2.0
 """Screened gain below which an effect is not fitted at all: it could not win a name [nat]."""
 WORTH_ADDING = 4.0
 """The same for one more effect, whose prior is smaller."""
-PROMISING, LEAST_PROMISING = 0.25, 6
+PROMISING, LEAST_PROMISING = 0.3, 5
 """Far from the truth, effects are fitted whose screened gain is at least this share of the best one's, and at
 least so many; the others too if none of these fits."""
-PAIRS_FITTED = 10
+PAIRS_FITTED = 8
+RIDGES, RIDGE_STEPS, RIDGE_ITERATIONS, RIDGE_GAIN = 2, (-0.8, -0.3, 0.3, 0.8), 8, 1.0
+"""Candidates whose ridges are followed while they do not fit, steps along one in prior deviations, steps of each
+fit, and the gain [nat] that counts."""
+FEW_PLACES = 3
+"""Effects with more places than this are those of single channels, which are linear in their size."""
+DELIVERED = 0.7
+"""Share of the screened gain that chord steps must reach."""
 FAR = 1.5
 """Chi-square per sample above which a fit is far from the truth."""
 BEGINNING, LEAST_SAMPLES = 4.0, 60
 """The beginning of a record: this many periods of the first mode, at least that many samples."""
 SHORT_STEPS, FAR_STEPS = 12, 6
 """Steps on the beginnings, and then on whole records, before candidates are compared."""
-FAR_FITS = 8
-"""Candidates that go on from the beginnings to whole records."""
+FAR_FITS, FAR_EXTENSIONS = 6, 4
+"""Candidates that go on from the beginnings to whole records: single effects, and longer sets."""
 
 Key = tuple[tuple[str, str], ...]
 
@@ -138,9 +145,10 @@ class Search:
         if sum(not item.magnitude for item in effect.parameters) > 1:
             count *= 3
         found: list[Change] = []
-        for place in effect.places(self.problem.setting):
+        places = effect.places(self.problem.setting)
+        for place in places:
             best: list[Change] = []
-            for change in screen.changes(Term(effect, place)):
+            for change in screen.changes(Term(effect, place), fine=len(places) <= FEW_PLACES):
                 if change.size > 0.0:
                     best = sorted([*best, change], key=_worth)[:count]
             found.extend(best)
@@ -163,7 +171,11 @@ class Search:
     def _scan_near(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
         found = []
         least = WORTH_ADDING if base.candidate.terms else WORTH_FITTING
-        for changes in self.screened(base, effects).values():
+        screened = self.screened(base, effects)
+        enough = PROMISING * max(
+            (change.gain for changes in screened.values() for change in changes), default=0.0
+        )
+        for changes in screened.values():
             fits = []
             for change in changes:
                 if change.gain < least:
@@ -173,8 +185,21 @@ class Search:
                 except ModelError:  # the best scale is more than the structure can carry
                     continue
             if fits:
-                found.append(max(fits, key=self.score))
+                best = max(fits, key=self.score)
+                gain = max(change.gain for change in changes)
+                if gain >= enough and base.objective - best.objective < DELIVERED * gain:
+                    best = self._followed(best)
+                found.append(best)
         return found
+
+    def _followed(self, rough: Fit) -> Fit:
+        """Fit on from chord steps that did not reach what the screen promised: shared unknowns move far."""
+        try:
+            return max(
+                rough, fit(self.problem, rough.candidate, rough.point, iterations=SHORT_STEPS), key=self.score
+            )
+        except ModelError:
+            return rough
 
     def _scan_far(self, base: Fit, effects: tuple[Effect, ...]) -> list[Fit]:
         near = self._near(base)
@@ -223,7 +248,8 @@ class Search:
     def _whole(self, starts: list[Fit], least: float) -> list[Fit]:
         """Fit the most promising candidates to whole records from where the beginnings led."""
         found: list[Fit] = []
-        for item in sorted(starts, key=lambda start: start.objective)[:FAR_FITS]:
+        count = FAR_FITS if all(len(item.candidate.terms) == 1 for item in starts) else FAR_EXTENSIONS
+        for item in sorted(starts, key=lambda start: start.objective)[:count]:
             try:
                 whole = fit(self.problem, item.candidate, item.point, iterations=FAR_STEPS, give_up=least)
             except ModelError:
@@ -278,17 +304,48 @@ class Search:
     def run(self) -> None:
         """Search: singles, one more at a time, all pairs where a single one does not do, deletion."""
         floor = self.score(self.none) - 6.0
-        self.refine(self.scan(self.none, self.effects), floor)
+        ranked = self.refine(self.scan(self.none, self.effects), floor)
+        for item in ranked[:RIDGES]:
+            if not absolute_gate(self.problem, item).passed:
+                self._along_ridge(item)
         current = self.best()
         while current.candidate.terms and len(current.candidate.terms) < LARGEST_SET:
+            if len(current.candidate.terms) > 1 and self._far(current):
+                break  # a third effect is looked for only where two nearly do
             longer = self._extended(current)
             if longer is None:
                 break
             current = longer
         if not absolute_gate(self.problem, self.best()).passed and len(self.effects) > 1:
             self.fit_pairs()
-            self._extended(self.best())
         self._deletions()
+
+    def _along_ridge(self, found: Fit) -> Fit:
+        """Look for a better fit of the same candidate along the direction that its data tell least of.
+
+        Hysteresis of several elements has many local optima along such a ridge.
+        """
+        size = found.candidate.size
+        while size > 1:
+            _, directions = np.linalg.eigh(found.effect_covariance)
+            ridge = directions[:, -1]
+            better = found
+            for step in RIDGE_STEPS:
+                start = Point(found.point.shared, found.point.local, found.point.effect + step * ridge)
+                try:
+                    item = fit(
+                        self.problem, found.candidate, start,
+                        iterations=RIDGE_ITERATIONS, give_up=better.objective,
+                    )  # fmt: skip
+                except ModelError:
+                    continue
+                if item.objective < better.objective - RIDGE_GAIN:
+                    better = item
+            if better is found:
+                break
+            found = better
+            self.keep(found, exact=True)
+        return found
 
     def _extended(self, current: Fit) -> Fit | None:
         """Return a better set with one more effect, or None."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .campaign import Campaign, Trial
 from .candidate import Candidate, Term
 from .catalogue.entry import Effect, EffectParameter, Setting
-from .errors import DiscrepancyError
+from .errors import DiscrepancyError, ModelError
 from .fitting import fit
 from .models.interface import Model
 from .problem import PARAMETER_STEP, Problem
@@ -139,7 +139,10 @@ def separability(
         options = [
             change for place in effect.places(setting) for change in screen.changes(Term(effect, place))
         ]
-        central = [_reference(screen, effect, place) for place in effect.places(setting)]
+        central = _references(screen, effect, effect.places(setting)) or options
+        if not central:
+            rows.append(Detectability(effect, "The structure cannot carry it at any size that was tried."))
+            continue
         best = max(central, key=lambda change: change.size)
         rows.append(_detectability(effect, best))
         if best.size > 1e-6:
@@ -149,6 +152,17 @@ def separability(
         [[_distance(screen, changes[i][0], changes[j]) if i != j else 0.0 for j in names] for i in names]
     )
     return Separability(tuple(rows), names, distance, _groups(names, distance))
+
+
+def _references(screen: Screen, effect: Effect, places: Sequence[str]) -> list[Change]:
+    """Return the changes of an effect at its prior median, at the places where the structure can carry it."""
+    found = []
+    for place in places:
+        try:
+            found.append(_reference(screen, effect, place))
+        except ModelError:
+            continue
+    return found
 
 
 def _reference(screen: Screen, effect: Effect, place: str) -> Change:

@@ -19,7 +19,9 @@ IntArray = NDArray[np.int64]
 
 FREE_MOTION = 3.0
 """Prior deviation of a free initial state, in units of the release displacement."""
-LARGEST_LOSS = 0.95
+LEAST_LOSS, LARGEST_LOSS = -0.5, 0.95
+"""Limits of an uncertain stiffness loss. A loss below zero means nothing, but a limit at zero, where most of a flight
+is, would stop fits: half of the readings of a healthy wing pull below it."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class LocalUnknowns:
     time_zero_scale : float
         Zero if it is known.
     health_rows, health_columns : (H,) ndarray of int
-        Uncertain entries of the health.
+        Uncertain entries of the health, those of the first region first.
     """
 
     zero_columns: IntArray
@@ -142,7 +144,9 @@ class LocalUnknowns:
         if len(self.health_rows):
             health = health.copy()
             entry = (self.health_rows, self.health_columns)
-            health[entry] = np.clip(health[entry] + trial.health_deviation[entry] * u[at:], 0.0, LARGEST_LOSS)
+            health[entry] = np.clip(
+                health[entry] + trial.health_deviation[entry] * u[at:], LEAST_LOSS, LARGEST_LOSS
+            )
         return Conditions(parameters, initial, (0.0, time_zero), health)
 
 
@@ -206,7 +210,8 @@ def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray) -> L
         shape = (release.mode_count, 1 if release.at_rest else 2)
         scale = release.deviation if release.at_rest else FREE_MOTION
         time_zero = release.time_zero_deviation
-    rows, of_health = np.nonzero(trial.health_deviation[:1] if trial.is_dynamic else trial.health_deviation)
+    uncertain = trial.health_deviation[:1] if trial.is_dynamic else trial.health_deviation
+    of_health, rows = np.nonzero(uncertain.T)  # region by region, as their derivatives are taken
     return LocalUnknowns(
         zero_columns=columns,
         zero_scale=np.where(free, deviation[columns], zero_scale[columns]),

@@ -36,6 +36,7 @@ SENSOR_FILES = ("patch.py", "sensors.py", "sensor_stream.py")
 STRUCTURE_FILES = (
     "motion.py",
     "motion_kernel.py",
+    "local_loss.py",
     "patch_arrays.py",
     "local_loss.py",
     "patched_wing.py",

@@ -152,12 +152,15 @@ def _shown(value: float | int | str | None, unit: str, missing: str = "") -> str
     return f"{value:.5g} {unit}".strip()
 
 
-def guarded(application: Callable[[], None]) -> None:
-    """Run a command line; an error of this project's packages becomes one sentence and exit code 1."""
+def guarded(application: Callable[[], None], *others: type[Exception]) -> None:
+    """Run a command line; an error of this project's packages becomes one sentence and exit code 1.
+
+    `others` are base classes of errors of packages that this one may not import.
+    """
     try:
         application()
     except Exception as error:
-        if not _is_ours(error):
+        if not (_is_ours(error) or isinstance(error, others)):
             raise
         sentence = str(error)
         if isinstance(error, OSError):

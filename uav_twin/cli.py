@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import typer
 
+from discrepancy.errors import DiscrepancyError
 from twin_master.command import guarded
 from twin_master.command import run as run_command
 from uav_twin.calibrate import calibrate_app
+from uav_twin.discrepancy import discrepancy_app
 from uav_twin.fmu import fmu_app
 from uav_twin.library import library_app
 from uav_twin.scenarios import list_scenarios
@@ -23,6 +25,7 @@ app.command("run")(run_command)
 app.command("scenarios")(list_scenarios)
 app.add_typer(wing_app, name="wing")
 app.add_typer(calibrate_app, name="calibrate")
+app.add_typer(discrepancy_app, name="discrepancy")
 app.add_typer(fmu_app, name="fmu")
 app.add_typer(library_app, name="library")
 app.add_typer(ssp_app, name="ssp")
@@ -30,4 +33,4 @@ app.add_typer(ssp_app, name="ssp")
 
 def main() -> None:
     """Run `uav-twin`."""
-    guarded(lambda: app(prog_name="uav-twin"))
+    guarded(lambda: app(prog_name="uav-twin"), DiscrepancyError)

@@ -65,7 +65,7 @@ JOINT_MICRO_SLIP = Effect(
             "chi", "chi", "exponent of the density of slip displacements", -0.5, Prior("uniform", -0.95, 0.0)
         ),
     ),
-    places=at_ports("root"),
+    places=at_ports("root", "tip"),
     unavailable=needs(carried(MicroSlip), has_port),
     confusable=(
         "bouc_wen_hysteresis",
@@ -103,7 +103,7 @@ BOUC_WEN_HYSTERESIS = Effect(
     ),
     build=_bouc_wen,
     shape=(ShapeParameter("order", "n", "sharpness of the yield", 1.0, Prior("uniform", 0.5, 4.0)),),
-    places=at_ports("root"),
+    places=at_ports("root", "tip"),
     unavailable=needs(carried(BoucWen), has_port),
     confusable=("joint_micro_slip", "quadratic_damping", "coulomb_friction", "cubic_stiffness"),
 )

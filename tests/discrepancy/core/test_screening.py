@@ -7,7 +7,7 @@ import pytest
 
 from discrepancy.candidate import Candidate, Term
 from discrepancy.fitting import fit
-from discrepancy.screening import Screen, cosine, grid, rescaled, separation
+from discrepancy.screening import LINEAR, Screen, cosine, grid, rescaled, separation
 from discrepancy.search import _pairs
 
 
@@ -111,7 +111,8 @@ def test_grids_hold_one_scale_and_every_level(catalogue) -> None:  # type: ignor
         assert all(point.shape == (len(term.parameters),) for point in points)
         magnitudes = [n for n, item in enumerate(effect.parameters) if item.magnitude]
         if magnitudes:
-            assert len({float(point[magnitudes[0]]) for point in points}) == 1
+            signed = effect.parameters[magnitudes[0]].prior.value(0.0) == 0.0
+            assert {float(point[magnitudes[0]]) for point in points} == ({1.0, LINEAR} if signed else {0.0})
         # none of them is the model as it was
         for point in points:
             values = term.values(point)

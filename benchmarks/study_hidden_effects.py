@@ -1,0 +1,316 @@
+"""Missions with an effect that the twin does not know: found from the run, added to its model, flown again.
+
+`python -m benchmarks.study_hidden_effects --seeds 5` flies the scenario growing_damage with each of several
+hidden effects in the FMU of the wing. The run folder alone is then read as a campaign and investigated. What is
+named goes into the twin's model, and the mission is flown again with the same seed. Effects that depend on time or
+temperature cannot stand in a table of predicted strains; there the readings are corrected before the twin sees them.
+Written: the verdict of each mission; rms error of the health estimate and the share of turns whose 90 % set of states
+holds the truth, for all turns, before and after, and with no hidden effect at all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from discrepancy.from_run import run_campaign, run_model
+from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
+from discrepancy.workflow import investigate
+from fe.patch import (
+    InertiaRelief,
+    LocalStiffnessLoss,
+    ModelPatch,
+    Primitive,
+    SensorDrift,
+    SensorGain,
+    ThermalStrain,
+    Washout,
+)
+from fmu_asset.patch_file import SCHEMA
+from reporting.files import atomic_write_text
+from reporting.progress import SilentProgress
+from scenarios import scenario_files
+from twin_master.crew import prepare_knowledge
+from twin_master.mission import fly
+from twin_master.resolution import (
+    Overrides,
+    asset_source,
+    located_scenario,
+    portable_scenario,
+    resolve_scenario,
+)
+from twin_master.results import MissionResult
+from twin_master.run_folder import create_run_folder
+from twin_master.scenario_file import load_scenario
+from twin_master.store import store_mission
+from twin_master.study import in_credible_set
+
+TURNS = 50
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """An effect that a mission hides.
+
+    Attributes
+    ----------
+    identifier : str
+        Of the catalogue; empty: nothing is hidden.
+    place : str
+        Channel that it acts on; empty where there is no choice.
+    primitives : tuple of Primitive
+        What the FMU carries.
+    text : str
+        For people.
+    """
+
+    identifier: str
+    place: str
+    primitives: tuple[Primitive, ...]
+    text: str
+
+
+HIDDEN = (
+    Hidden("", "", (), "nothing"),
+    Hidden(
+        "gauge_zero_drift", "g17", (SensorDrift("strain[17]", -8e-4, float(TURNS)),),
+        "gauge 17 drifts to -800 microstrain",
+    ),
+    Hidden("gauge_gain", "g17", (SensorGain("strain[17]", -0.12),), "gauge 17 shows 12 % too little"),
+    Hidden("washout", "", (Washout(0.08, 1.0),), "washout of 8 % per g at the tip"),
+    Hidden(
+        "local_stiffness_loss", "", (LocalStiffnessLoss(0.15, 0.45, 0.4),),
+        "skin from 0.45 to 0.85 m has lost 15 %",
+    ),
+    Hidden("inertia_relief", "", (InertiaRelief(0.25),), "structure's weight relieves the lift by 25 % more"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Flown:
+    """How well a twin knew its wing in one mission.
+
+    Attributes
+    ----------
+    rms : (2,) ndarray
+        Of the mean of z1, z2 less the truth [1].
+    coverage : float
+        Share of turns whose 90 % set of states holds the truth.
+    """
+
+    rms: NDArray[np.float64]
+    coverage: float
+
+
+@dataclass(frozen=True)
+class Case:
+    """One mission with one hidden effect."""
+
+    hidden: Hidden
+    seed: int
+    verdict: Verdict
+    before: Flown
+    after: Flown | None
+    seconds: float
+
+
+def patch_text(primitives: Sequence[Primitive], channels: dict[str, str] | None = None) -> str:
+    """Return a patch file of one effect."""
+    effects = [{"id": "hidden", "primitives": ModelPatch(tuple(primitives)).to_list()}]
+    return json.dumps({"schema": SCHEMA, "effects": effects, "channels": channels or {}})
+
+
+def fly_mission(
+    folder: Path,
+    seed: int,
+    hidden: Sequence[Primitive] = (),
+    known: Sequence[Primitive] = (),
+    scenario: str = "growing_damage",
+    turns: int = TURNS,
+) -> Flown:
+    """Fly a mission into a run folder, without its report.
+
+    Parameters
+    ----------
+    folder : Path
+        Made; the scenario is written beside it.
+    seed : int
+        Of the run.
+    hidden : sequence of Primitive
+        What the wing has and its readings show; channels are outputs of the FMU.
+    known : sequence of Primitive
+        What the twin's model has.
+    scenario : str
+        A shipped one.
+    turns : int
+        Length of the mission.
+    """
+    lines = ""
+    for name, primitives in (("patch", hidden), ("model_patch", known)):
+        if primitives:
+            file = atomic_write_text(folder.with_name(f"{folder.name}_{name}.json"), patch_text(primitives))
+            lines += f'{name} = "{file.name}"\n'
+    text = scenario_files()[scenario].read_text(encoding="utf-8")
+    text = text.replace("steps = 50", f"steps = {turns}", 1)
+    text = text.replace('binding = "uav_wing"\n', f'binding = "uav_wing"\n{lines}', 1)
+    loaded = load_scenario(atomic_write_text(folder.with_name(f"{folder.name}.toml"), text))
+    resolved = resolve_scenario(loaded, Overrides(seed=seed, in_process=True))
+    source = asset_source(resolved)
+    source.check()
+    portable = portable_scenario(resolved)
+    config = {
+        "kind": "uav-twin run", "format": 1, "scenario": portable.to_dict(),
+        "scenario_file": {"name": loaded.path.name, "sha256": loaded.content_hash},
+    }  # fmt: skip
+    create_run_folder(folder, config, source.files())
+    source.prepare(folder, SilentProgress())
+    return _fly(folder, located_scenario(portable, folder), source, seed)
+
+
+def _fly(folder, scenario, source, seed):  # type: ignore[no-untyped-def]
+    knowledge = prepare_knowledge(scenario, source, seed)
+    truth = knowledge.truth(seed)
+    asset = source.open()
+    try:
+        flight = fly(scenario, knowledge.twin(), knowledge.plant(truth, asset))
+        units = asset.units
+    finally:
+        asset.close()
+    result = MissionResult(
+        scenario=scenario, model=knowledge.model, sensor_model=knowledge.sensor_model,
+        draws=knowledge.draws.values, rewards=knowledge.rewards, plan=knowledge.plan, truth=truth,
+        flight=flight, units=units,
+    )  # fmt: skip
+    attributes = {
+        "title": scenario.mission.title, "scenario": scenario.mission.name, "seed": seed,
+        "parameter": knowledge.draws.name,
+    }  # fmt: skip
+    store_mission(folder, result, attributes)
+    state = flight.truth.state
+    error = flight.filtered @ knowledge.model.states.coordinates - state
+    held = in_credible_set(knowledge.model, flight.filtered, state, 0.9)
+    return Flown(np.sqrt(np.mean(error**2, axis=0)), float(np.mean(held)))
+
+
+def outputs_of(patch: ModelPatch) -> tuple[Primitive, ...]:
+    """Return primitives whose channels g1, g2, ... are the outputs strain[1], strain[2], ... of the FMU."""
+    found = []
+    for item in patch:
+        channel = getattr(item, "channel", "")
+        if channel.startswith("g"):
+            item = replace(item, channel=f"strain[{channel[1:]}]")  # type: ignore[call-arg]
+        found.append(item)
+    return tuple(found)
+
+
+def undone(item: Primitive) -> Primitive | None:
+    """Return what takes the effect of a sensor off the readings that it changed with time; None for others."""
+    if isinstance(item, SensorDrift):
+        return replace(item, amplitude=-item.amplitude)
+    if isinstance(item, ThermalStrain):
+        return replace(item, coefficient=-item.coefficient)
+    return None
+
+
+def investigated(folder: Path, seed: int) -> Verdict:
+    """Return the verdict on the run in a folder."""
+    return investigate(run_campaign(folder), run_model(folder), seed=seed, thorough=False).verdict
+
+
+def believed(verdict: Verdict) -> tuple[NamedEffect, ...]:
+    """Return the effects that the twin is given: those named, or of a group the most probable member."""
+    if verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY):
+        return verdict.effects
+    if verdict.kind is VerdictKind.GROUP and verdict.hypotheses:
+        return verdict.hypotheses[0].effects
+    return ()
+
+
+def study(hidden: Hidden, seed: int, work: Path) -> Case:
+    """Fly with a hidden effect, find it, and fly again with what was found."""
+    began = perf_counter()
+    place = work / f"{hidden.identifier or 'none'}_{seed}"
+    before = fly_mission(place.with_name(place.name + "_before"), seed, hidden.primitives)
+    verdict = investigated(place.with_name(place.name + "_before"), seed)
+    after = None
+    chosen = believed(verdict)
+    if chosen:
+        found = outputs_of(sum((effect.patch for effect in chosen), ModelPatch()))
+        corrections = tuple(item for item in map(undone, found) if item is not None)
+        known = tuple(item for item in found if undone(item) is None)
+        after = fly_mission(
+            place.with_name(place.name + "_after"), seed, (*hidden.primitives, *corrections), known
+        )
+    return Case(hidden, seed, verdict, before, after, perf_counter() - began)
+
+
+def outcome(hidden: Hidden, verdict: Verdict) -> str:
+    """Return "named", "in the group", "wrong" (another one was named), or the kind of an open verdict."""
+    if not hidden.identifier:
+        return "none" if verdict.kind is VerdictKind.NOTHING_MISSING else verdict.kind.value
+    if verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY):
+        names = [(effect.identifier, effect.place) for effect in verdict.effects]
+        return "named" if names == [(hidden.identifier, hidden.place)] else f"wrong: {names}"
+    if verdict.kind is VerdictKind.GROUP:
+        return "in the group" if hidden.identifier in verdict.group else f"wrong group: {verdict.group}"
+    return verdict.kind.value
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--first-seed", type=int, default=2021)
+    parser.add_argument("--only", help="identifiers of hidden effects, with commas")
+    given = parser.parse_args()
+    console = Console(width=150)
+    table = Table("hidden", "verdicts", "rms z1, z2 before", "90 % sets", "rms after", "90 % sets")
+    chosen = [item for item in HIDDEN if given.only is None or item.identifier in given.only.split(",")]
+    with tempfile.TemporaryDirectory() as folder:
+        for hidden in chosen:
+            cases = []
+            for seed in range(given.first_seed, given.first_seed + given.seeds):
+                case = study(hidden, seed, Path(folder))
+                cases.append(case)
+                after = "" if case.after is None else f"{100 * case.after.rms} {case.after.coverage:.2f}"
+                console.print(
+                    f"{hidden.text}, seed {seed}: {case.verdict.kind.value}: {case.verdict.sentence} "
+                    f"rms {100 * case.before.rms} {case.before.coverage:.2f}; after {after} ({case.seconds:.1f} s)"
+                )
+            table.add_row(*_row(hidden, cases))
+    console.print(table)
+    return 0
+
+
+def _row(hidden: Hidden, cases: Sequence[Case]) -> tuple[str, ...]:
+    counts = Counter(outcome(hidden, case.verdict) for case in cases)
+    again = [case for case in cases if case.after is not None]
+    return (
+        hidden.text,
+        ", ".join(f"{name} {count}" for name, count in counts.most_common()),
+        _rms([case.before for case in cases]),
+        f"{np.mean([case.before.coverage for case in cases]):.2f}",
+        _rms([case.after for case in again if case.after is not None]),
+        f"{np.mean([case.after.coverage for case in again if case.after is not None]):.2f}" if again else "",
+    )
+
+
+def _rms(flown: Sequence[Flown]) -> str:
+    if not flown:
+        return ""
+    values = 100.0 * np.sqrt(np.mean([item.rms**2 for item in flown], axis=0))
+    return f"{values[0]:.1f}, {values[1]:.1f} points"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,139 @@
+"""Which model a campaign is compared with: a wing (shipped, calibrated, designed), a lumped model, an FMU."""
+
+import tomllib
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from calibration.errors import CalibrationError
+from calibration.result import CalibrationResult
+from discrepancy.errors import ModelError
+from discrepancy.models.fmu import FmuModel
+from discrepancy.models.interface import Model
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.lumped_file import SHIPPED_MODELS
+from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
+from fe.design import SHIPPED_DESIGN, WingDesign, load_design
+from fe.errors import FiniteElementError
+from fe.reduction import Progress
+from reporting.provenance import hash_file, hash_record
+
+
+class ModelKind(StrEnum):
+    """Where a model comes from."""
+
+    WING = "wing"
+    CALIBRATION = "calibrated wing"
+    LUMPED = "lumped model"
+    FMU = "FMU"
+
+
+@dataclass(frozen=True)
+class ModelChoice:
+    """A model with where it comes from.
+
+    Attributes
+    ----------
+    model : Model
+        Ready to be asked.
+    kind : ModelKind
+        What it is.
+    label : str
+        What the command line names it by, without its folder; empty for the shipped wing.
+    source_hash : str
+        SHA-256 of the file that it was read from (with the prior, for a wing without calibration).
+    design : WingDesign or None
+        Of a wing.
+    path : Path or None
+        Of its file; None for what is shipped.
+    """
+
+    model: Model
+    kind: ModelKind
+    label: str
+    source_hash: str
+    design: WingDesign | None = None
+    path: Path | None = None
+
+
+def choose_model(name: str | Path | None, progress: Progress | None = None) -> ModelChoice:
+    """Return the model that a command line asks for.
+
+    Parameters
+    ----------
+    name : str or Path, optional
+        A calibration (.nc), a wing design, a lumped model or the description of an FMU (.toml), or the name
+        of a shipped lumped model; the shipped wing if left out.
+    progress : Progress, optional
+        Where the modelling of a wing reports.
+
+    Raises
+    ------
+    ModelError
+        If there is no such model, or its file cannot be used.
+    """
+    if name is None:
+        return _wing(None, progress)
+    path = Path(name)
+    if path.suffix == ".fmu":
+        raise ModelError(
+            f"{path} is an FMU: give a TOML file that says which of its variables are load, outputs and "
+            "ports "
+            '(kind = "fmu", docs/foreign_fmus.md), or for the wing its calibration.nc or design.'
+        )
+    if path.suffix and not path.is_file():
+        raise ModelError(f"There is no model file {path}; give a calibration (.nc) or a model (.toml).")
+    if path.suffix == ".nc":
+        return _calibrated(path, progress)
+    if path.suffix not in ("", ".toml"):
+        raise ModelError(
+            f"{path} is no model: a calibration (.nc), a wing design or a lumped model (.toml), or the "
+            "name of a "
+            f"shipped lumped model ({', '.join(shipped_lumped_models())}) is expected."
+        )
+    if path.suffix == ".toml":
+        content = _content(path)
+        if content.get("kind") == "fmu":
+            described = FmuModel.load(path)
+            file = path.parent / described.description.fmu
+            source = hash_record({"description": hash_file(path), "fmu": hash_file(file)})
+            return ModelChoice(described, ModelKind.FMU, path.name, source, path=path)
+        if "format" not in content:  # a wing design has none
+            return _wing(path, progress)
+    model = LumpedModel.load(path)
+    shipped = not path.suffix and not path.exists()
+    file = SHIPPED_MODELS / f"{path}.toml" if shipped else path
+    return ModelChoice(model, ModelKind.LUMPED, path.name, hash_file(file), path=None if shipped else path)
+
+
+def shipped_lumped_models() -> tuple[str, ...]:
+    """Return the names of the lumped models that come with the package."""
+    return tuple(sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml")))
+
+
+def _content(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as cause:
+        raise ModelError(f"The model {path} cannot be read: {cause}.") from cause
+
+
+def _wing(path: Path | None, progress: Progress | None) -> ModelChoice:
+    model = WingModel.of_design(path, progress)
+    file = SHIPPED_DESIGN if path is None else path
+    source = hash_record({"design": hash_file(file), "prior": {k: list(v) for k, v in SHIPPED_PRIOR.items()}})
+    try:
+        design = load_design(path)
+    except FiniteElementError as cause:
+        raise ModelError(str(cause)) from cause
+    return ModelChoice(model, ModelKind.WING, "" if path is None else path.name, source, design, path)
+
+
+def _calibrated(path: Path, progress: Progress | None) -> ModelChoice:
+    model = WingModel.of_calibration(path, progress)
+    try:
+        design = CalibrationResult.load(path).design
+    except (CalibrationError, OSError) as cause:
+        raise ModelError(f"The calibration {path} cannot be used: {cause}") from cause
+    return ModelChoice(model, ModelKind.CALIBRATION, path.name, hash_file(path), design, path)

@@ -1,0 +1,266 @@
+"""An FMU as a model, described by a TOML file: which variables are parameters, inputs, outputs and ports."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from discrepancy.errors import ModelError
+from fe.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0)]
+Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0)]
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+
+CARRIED = tuple(item.kind for item in (*STRUCTURE, *LOADS, StiffnessDrift))
+"""Kinds of primitives that an FMU can carry as its own parameters."""
+
+
+class Section(BaseModel):
+    """A table of the file; unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Inputs(Section):
+    """`[inputs]`: what a trial sets; each name is one of the binding's, or a variable of the FMU.
+
+    Attributes
+    ----------
+    force : str or table
+        Applied force [N]; a table by the load places of the campaign.
+    load_factor, z1, z2 : str, optional
+        Load factor and stiffness losses [1].
+    temperature : str, optional
+        Temperature less the reference [K], or the temperature itself [degC] with `temperature_reference`.
+    temperature_reference : float, optional
+        Temperature at which the FMU's model holds [degC].
+    bending_moment, torque : str, optional
+        Moment [N m] that a force gives when it acts a metre further outboard, or aft.
+    """
+
+    force: Name | dict[Name, Name] | None = None
+    load_factor: Name | None = None
+    temperature: Name | None = None
+    temperature_reference: Number | None = None
+    z1: Name | None = None
+    z2: Name | None = None
+    bending_moment: Name | None = None
+    torque: Name | None = None
+
+    @property
+    def forces(self) -> dict[str, str]:
+        """Force inputs by load place."""
+        if self.force is None:
+            return {}
+        return {"tip_load": self.force} if isinstance(self.force, str) else dict(self.force)
+
+
+class Rest(Section):
+    """`[static]`: how a state at rest is reached.
+
+    Attributes
+    ----------
+    settle : bool
+        False: the FMU is quasi-static, and a step gives the equilibrium. True: its motion is followed until
+        it rests.
+    step : float
+        Communication step [s].
+    limit : float
+        Longest motion that is waited for [s].
+    tolerance : float
+        At rest, no output moves by more than this share of its largest value.
+    parameters : table
+        Parameters of the FMU in such trials, in its units.
+    """
+
+    settle: bool = False
+    step: Positive = 1.0
+    limit: Positive = 600.0
+    tolerance: Positive = 1e-9
+    parameters: dict[Name, Number] = Field(default_factory=dict)
+
+
+class Moving(Section):
+    """`[motion]`: ring-downs and forced trials; `step` [s] only if the FMU has one step size, `parameters` too."""
+
+    step: Positive | None = None
+    parameters: dict[Name, Number] = Field(default_factory=dict)
+
+
+class ReleaseOf(Section):
+    """`[release]`: how a ring-down starts.
+
+    Attributes
+    ----------
+    displacement : str, optional
+        Parameter: displacement [m] from which the FMU is released at its start.
+    velocity : str, optional
+        Parameter: velocity [m/s] at the start, for records that do not begin at rest.
+    hold : str, optional
+        In place of a parameter: force input that holds the release point until the start.
+    output : str, optional
+        Displacement output that shows where the release point is. Needed with `hold`; with a parameter it is
+        for one that is not the release point's own displacement.
+    """
+
+    displacement: Name | None = None
+    velocity: Name | None = None
+    hold: Name | None = None
+    output: Name | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if (self.displacement is None) == (self.hold is None):
+            raise ValueError("give exactly one of displacement (a parameter) and hold (a force input)")
+        if self.hold is not None and self.output is None:
+            raise ValueError("hold needs output, the displacement output of the release point")
+        return self
+
+
+class Output(Section):
+    """`[[output]]`: what a channel's `output` names; `{a..b}` in both names stands for all numbers from a to b."""
+
+    name: Name
+    variable: Name | None = None
+    quantity: Literal["strain", "displacement", "velocity", "acceleration", "signal"] = "displacement"
+
+
+class PortOf(Section):
+    """`[[port]]`: where an internal force can act; `rotation`: a moment and an angle."""
+
+    name: Name
+    force: Name
+    displacement: Name
+    velocity: Name | None = None
+    rotation: bool = False
+
+
+class ParameterOf(Section):
+    """`[[parameter]]`: a calibrated parameter with its posterior as prior."""
+
+    name: Name
+    variable: Name | None = None
+    mean: Number
+    deviation: NotNegative
+    low: Number
+    high: Number
+    unit: str = "1"
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Self:
+        if not self.low <= self.mean <= self.high:
+            raise ValueError(f"the mean {self.mean:g} is not between low {self.low:g} and high {self.high:g}")
+        return self
+
+
+class ScalesOf(Section):
+    """`[scales]`: natural scales that the FMU cannot say, see `discrepancy.models.interface.Scales`; all SI."""
+
+    length: Positive | None = None
+    tip_stiffness: Positive | None = None
+    modal_mass: Positive | None = None
+    angular_frequency: Positive | None = None
+
+
+class FmuModelDescription(Section):
+    """Content of the file.
+
+    Attributes
+    ----------
+    format, kind : 1, "fmu"
+        What it is.
+    name : str
+        For people.
+    fmu : str
+        The FMU, seen from the file's folder.
+    binding : str, optional
+        A binding file, seen from the file's folder, or a shipped binding by name. Without one, names here are
+        variables of the FMU.
+    inputs, static, motion, release, output, port, parameter, scales
+        See there.
+    effects : table
+        Kind of a primitive to the id of the FMU's effect (`effect.<id>.active`, `effect.<id>.<number>`).
+    superposition : bool
+        Whether motions are superposed where the FMU proves to be linear; False: every motion is stepped.
+    isolated : bool
+        Whether the FMU runs in a process of its own.
+    """
+
+    format: Literal[1]
+    kind: Literal["fmu"]
+    name: Name
+    fmu: Name
+    binding: Name | None = None
+    inputs: Inputs = Field(default_factory=Inputs)
+    static: Rest = Field(default_factory=Rest)
+    motion: Moving = Field(default_factory=Moving)
+    release: ReleaseOf | None = None
+    output: tuple[Output, ...] = Field(min_length=1)
+    port: tuple[PortOf, ...] = ()
+    parameter: tuple[ParameterOf, ...] = ()
+    effects: dict[Name, Name] = Field(default_factory=dict)
+    scales: ScalesOf = Field(default_factory=ScalesOf)
+    superposition: bool = True
+    isolated: bool = True
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        for kind, items in (("port", self.port), ("parameter", self.parameter), ("output", self.output)):
+            names = [item.name for item in items]  # type: ignore[attr-defined]
+            for name in names:
+                if names.count(name) > 1:
+                    raise ValueError(f"there are two of {kind} {name!r}")
+        for kind in self.effects:
+            if kind not in CARRIED:
+                raise ValueError(
+                    f"effects.{kind} is not a primitive that an FMU can carry itself"
+                    + (" (internal forces act at ports)" if kind in PRIMITIVES else "")
+                    + f"; known are {', '.join(CARRIED)}"
+                )
+        if self.inputs.temperature_reference is not None and self.inputs.temperature is None:
+            raise ValueError("temperature_reference needs the input temperature")
+        return self
+
+
+def parse_fmu_model(content: dict[str, Any], source: str = "the FMU model") -> FmuModelDescription:
+    """Check the content of an FMU model's file.
+
+    Raises
+    ------
+    ModelError
+        One sentence that names `source`, the place, what came and what was expected.
+    """
+    try:
+        return FmuModelDescription.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            sentence = f"{source}: {place!r} is not a key of an FMU model; remove it or correct its spelling"
+        elif first["type"] == "missing":
+            sentence = f"{source}: {place!r} is missing"
+        else:
+            message = first["msg"].removeprefix("Value error, ")
+            sentence = f"{source}: {place + ': ' if place else ''}{message[0].lower() + message[1:]}"
+        raise ModelError(f"{sentence}.") from None
+
+
+def load_fmu_model(path: Path | str) -> FmuModelDescription:
+    """Read an FMU model's file.
+
+    Raises
+    ------
+    ModelError
+        If there is no such file, it is not TOML, or its content is no FMU model.
+    """
+    file = Path(path)
+    try:
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ModelError(f"The FMU model {file} cannot be read: {error.strerror}.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ModelError(f"The FMU model {file} is not valid TOML: {error}.") from None
+    return parse_fmu_model(content, str(file))

@@ -1,0 +1,293 @@
+"""Runs of an FMU for a model: one instance for each step size, kept and reset; what was asked once is remembered."""
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.errors import ModelError
+from discrepancy.models.fmu_file import FmuModelDescription
+from fmu_asset.binding import Binding, Input, Parameter, Vector, expand, load_binding
+from fmu_asset.errors import FmuError
+from fmu_asset.session import FmiAsset
+from scenarios import binding_files
+
+FloatArray = NDArray[np.float64]
+
+MOST_INSTANCES = 8
+"""Instances (step sizes) that are open at the same time."""
+KEPT_BYTES = 256 * 2**20
+"""Results that are remembered."""
+SETTLE_CHUNK = 200
+"""Steps after which it is asked whether the motion has come to rest."""
+
+_UNITS = {"strain": "1", "displacement": "m", "velocity": "m/s", "acceleration": "m/s2"}
+
+
+class FmuRuns:
+    """An FMU with the variables that a model needs, in SI units.
+
+    Parameters
+    ----------
+    description : FmuModelDescription
+        The model's file.
+    folder : Path
+        Its folder, where relative names begin.
+
+    Attributes
+    ----------
+    columns : dict of str to int
+        Column of each output of the description, and of `port.NAME.displacement` and `.velocity`.
+    run_count, step_count : int
+        What has been asked of the FMU so far.
+
+    Raises
+    ------
+    ModelError
+        If FMU or binding are missing, or a variable is missing or of another causality or unit.
+    """
+
+    def __init__(self, description: FmuModelDescription, folder: Path) -> None:
+        self._description = description
+        self._path = folder / description.fmu
+        self._assets: OrderedDict[float, FmiAsset] = OrderedDict()
+        self._kept: OrderedDict[Hashable, FloatArray] = OrderedDict()
+        self._kept_bytes = 0
+        self.run_count = self.step_count = 0
+        try:
+            self._base = self._base_binding(folder)
+            self._binding = self._made_binding()
+            self._first = FmiAsset(self._path, self._binding, isolated=description.isolated)
+        except FmuError as cause:
+            raise ModelError(f"The FMU model {description.name!r}: {cause}") from cause
+
+    # ------------------------------------------------------------ names
+
+    def _base_binding(self, folder: Path) -> Binding | None:
+        given = self._description.binding
+        if given is None:
+            return None
+        shipped = binding_files()
+        return load_binding(shipped[given] if given in shipped else folder / given)
+
+    def variable(self, name: str) -> str:
+        """Return the FMU's name of an input or output that the description names."""
+        if self._base is None:
+            return name
+        plain = name.rpartition(".")[2] if name.partition(".")[0] in ("control", "health", "load") else name
+        for role in ("control", "health", "load", "monitor"):
+            table: Mapping[str, Any] = getattr(self._base, role)
+            if plain in table and (plain == name or name.startswith(role)):
+                return str(table[plain].variable)
+        return name
+
+    def parameter(self, name: str) -> str:
+        """Return the key under which a parameter is set: that of the binding, or the FMU's own name."""
+        if self._base is None or name in self._base.parameter:
+            return name
+        return next((key for key, item in self._base.parameter.items() if item.variable == name), name)
+
+    def _made_binding(self) -> Binding:
+        given, base = self._description, self._base
+        wanted = given.inputs
+        inputs: dict[str, Input] = {}
+        units = {
+            **dict.fromkeys(wanted.forces.values(), "N"),
+            wanted.load_factor: "1", wanted.z1: "1", wanted.z2: "1",
+            wanted.temperature: "K" if wanted.temperature_reference is None else "degC",
+            wanted.bending_moment: "N.m", wanted.torque: "N.m",
+            given.release.hold if given.release else None: "N",
+        }  # fmt: skip
+        units |= {port.force: "N.m" if port.rotation else "N" for port in given.port}
+        for name, unit in units.items():
+            if name is not None:
+                variable = self.variable(name)
+                inputs[variable] = Input(variable=variable, unit=unit)
+        parameters: dict[str, Parameter] = {}
+        if base is not None:
+            parameters = {
+                key: Parameter(variable=item.variable, unit=item.unit, value=item.value)
+                for key, item in base.parameter.items()
+            }
+        own = [(item.variable or item.name, item.unit) for item in given.parameter]
+        if given.release is not None and given.release.displacement is not None:
+            own.append((given.release.displacement, "m"))
+        if given.release is not None and given.release.velocity is not None:
+            own.append((given.release.velocity, "m/s"))
+        for name, unit in own:
+            key = self.parameter(name)
+            known = parameters.get(key)
+            parameters[key] = Parameter(
+                variable=key if known is None else known.variable,
+                unit=unit,
+                value=None if known is None or known.unit != unit else known.value,
+            )
+        columns: dict[tuple[str, str], int] = {}
+        self.columns = {}
+        self.quantities = {}
+        for item in given.output:
+            names = expand(item.name)
+            variables = expand(item.variable or item.name)
+            if len(names) != len(variables):
+                raise ModelError(
+                    f"The FMU model {given.name!r}: the output {item.name!r} stands for {len(names)} names, "
+                    f"but its variable for {len(variables)}; give as many."
+                )
+            for name, variable in zip(names, variables, strict=True):
+                unit = _UNITS.get(item.quantity, "")
+                at = columns.setdefault((self.variable(variable), unit), len(columns))
+                self.columns[name], self.quantities[name] = at, item.quantity
+        for port in given.port:
+            for quantity, name, unit in (
+                ("displacement", port.displacement, "rad" if port.rotation else "m"),
+                ("velocity", port.velocity, "rad/s" if port.rotation else "m/s"),
+            ):
+                if name is not None:
+                    at = columns.setdefault((self.variable(name), unit), len(columns))
+                    self.columns[f"port.{port.name}.{quantity}"] = at
+        if given.release is not None and given.release.output is not None:
+            at = columns.setdefault((self.variable(given.release.output), "m"), len(columns))
+            self.columns["release"] = at
+        header: dict[str, Any] = {} if base is None else base.binding.model_dump(exclude={"decimation"})
+        header |= {"name": given.name, "step_size": given.motion.step or given.static.step}
+        content: dict[str, Any] = {"binding": header, "load": inputs, "parameter": parameters}
+        if base is not None:
+            content["limits"] = base.limits
+        # A signal has whatever unit the FMU gives it.
+        content["observation"] = {
+            f"y{at}": Vector(variables=(variable,), unit=unit or self._own_unit(variable))
+            for (variable, unit), at in columns.items()
+        }
+        return Binding.model_validate(content)
+
+    def _own_unit(self, variable: str) -> str:
+        from fmu_asset.archive import read_fmu
+
+        found = read_fmu(self._path).variable(variable)
+        return (found.unit if found is not None else None) or "1"
+
+    @property
+    def asset(self) -> FmiAsset:
+        """The door to the FMU, for what it declares."""
+        return self._first
+
+    # ------------------------------------------------------------ running
+
+    def remembered(self, key: Hashable, make: Callable[[], FloatArray]) -> FloatArray:
+        """Return what `make` returned for `key`; the oldest results are forgotten."""
+        found = self._kept.get(key)
+        if found is not None:
+            self._kept.move_to_end(key)
+            return found
+        found = make()
+        found.setflags(write=False)
+        self._kept[key] = found
+        self._kept_bytes += found.nbytes
+        while self._kept_bytes > KEPT_BYTES and len(self._kept) > 1:
+            self._kept_bytes -= self._kept.popitem(last=False)[1].nbytes
+        return found
+
+    def open(self, step: float) -> FmiAsset:
+        """Return the instance of a step size [s], as it was left."""
+        asset = self._assets.get(step)
+        if asset is not None:
+            self._assets.move_to_end(step)
+            return asset
+        header = self._binding.binding.model_copy(update={"step_size": step})
+        binding = self._binding.model_copy(update={"binding": header})
+        asset = self._assets[step] = FmiAsset(self._path, binding, isolated=self._description.isolated)
+        if len(self._assets) > MOST_INSTANCES:
+            self._assets.popitem(last=False)[1].close()
+        return asset
+
+    def close(self) -> None:
+        """End all instances; they are opened again when they are needed."""
+        while self._assets:
+            self._assets.popitem()[1].close()
+
+    def started(
+        self, step: float, parameters: Mapping[str, float], inputs: Mapping[str, float], *, settle: bool
+    ) -> tuple[FmiAsset, FloatArray]:
+        """Return an instance at its start, at rest under its inputs if wanted, and its outputs (C,).
+
+        Parameters
+        ----------
+        step : float
+            Communication step [s].
+        parameters, inputs : mapping of str to float
+            By the keys of `parameter` and the FMU's names.
+        settle : bool
+            Whether to follow the motion until it rests.
+
+        Raises
+        ------
+        ModelError
+            If the FMU refuses, or does not come to rest.
+        """
+        self.run_count += 1
+        try:
+            asset = self.open(step)
+            asset.reset(parameters, load=inputs or None)
+            values = np.array(asset.observe().values)
+        except FmuError as cause:
+            raise ModelError(f"The FMU model {self._description.name!r}: {cause}") from cause
+        return asset, self._settled(asset, step) if settle else values
+
+    def _settled(self, asset: FmiAsset, step: float) -> FloatArray:
+        rest = self._description.static
+        largest = np.zeros(0)
+        waited = 0.0
+        while True:
+            block = self.advanced(asset, {}, SETTLE_CHUNK)
+            waited += SETTLE_CHUNK * step
+            high, low = block.max(axis=0), block.min(axis=0)
+            now = np.maximum(np.abs(high), np.abs(low))
+            largest = np.maximum(largest, now) if len(largest) else now
+            if np.all(high - low <= rest.tolerance * largest):
+                return np.asarray(0.5 * (high + low))
+            if waited >= rest.limit:
+                worst = int(np.argmax((high - low) / np.where(largest > 0.0, largest, 1.0)))
+                raise ModelError(
+                    f"The FMU {self._path} did not come to rest within {rest.limit:g} s: the output "
+                    f"{self._name(worst)!r} still moves by {high[worst] - low[worst]:.2g}; raise `limit` or "
+                    f"`tolerance` in [static], or give the FMU's parameters for a state at rest there."
+                )
+
+    def _name(self, column: int) -> str:
+        return self._binding.observation_variables[column]
+
+    def advanced(
+        self, asset: FmiAsset, histories: Mapping[str, FloatArray | float], steps: int
+    ) -> FloatArray:
+        """Return the outputs (steps, C) at the ends of steps under inputs that are held in each; `ModelError`."""
+        self.step_count += steps
+        try:
+            return asset.simulate(load=histories, steps=steps).values
+        except FmuError as cause:
+            raise ModelError(f"The FMU model {self._description.name!r}: {cause}") from cause
+
+    def stepped(self, asset: FmiAsset, inputs: Mapping[str, float]) -> FloatArray:
+        """Return the outputs (C,) after one step; `ModelError` if the FMU refuses."""
+        self.step_count += 1
+        try:
+            return asset.step(load=inputs).values
+        except FmuError as cause:
+            raise ModelError(f"The FMU model {self._description.name!r}: {cause}") from cause
+
+    def input_limit(self, name: str) -> float:
+        """Return the largest size that an input may have, both signs."""
+        low, high = self._first.input_range("load", self.variable(name))
+        return min(abs(low), abs(high))
+
+
+def is_affine(zero: FloatArray, parts: Sequence[FloatArray], half: FloatArray, tolerance: float) -> bool:
+    """Whether half of all excitations gives half of the sum of what each gives; columns by their size."""
+    expected = zero + 0.5 * sum((part - zero for part in parts), np.zeros_like(zero))
+    size = sum((np.abs(part - zero) for part in parts), np.zeros_like(zero))
+    if size.ndim == 2:
+        size = size.max(axis=0)
+    allowed = tolerance * size + 1e-12 * np.max(np.abs(zero), axis=0 if zero.ndim == 2 else None)
+    return bool(np.all(np.abs(half - expected) <= allowed))

@@ -1,0 +1,143 @@
+"""What a campaign can decide, in rows for the page and for the terminal."""
+
+from collections.abc import Sequence
+from math import isfinite
+
+import numpy as np
+
+from discrepancy.campaign import Campaign, TrialKind
+from discrepancy.catalogue.entry import Effect
+from discrepancy.report.text import listing, number, unit_text
+from discrepancy.separability import CONFUSED, DETECTED, Detectability, Separability
+from reporting.page import Column, Table
+
+HEADINGS = (
+    "effect",
+    "testable",
+    "shows best at",
+    "parameter",
+    "detectable from",
+    "prior median",
+    "confused with",
+)
+_KIND_WORDS = {
+    TrialKind.STATIC: "a static loading",
+    TrialKind.RINGDOWN: "a ring-down",
+    TrialKind.FORCED: "a forced vibration",
+    TrialKind.FLIGHT: "a flight",
+}
+
+
+def rows_of(found: Separability) -> list[tuple[str, ...]]:
+    """Return one row for each effect of the catalogue under `HEADINGS`."""
+    return [_row(found, item) for item in found.detectability]
+
+
+def _row(found: Separability, item: Detectability) -> tuple[str, ...]:
+    name = item.effect.identifier
+    if item.reason:
+        return (name, "no", "", "", item.reason.rstrip("."), "", "")
+    others = neighbours(found, name)
+    unit = f" {unit_text(item.unit)}".rstrip()
+    visible = "yes" if item.distance >= DETECTED else "larger than usual only"
+    if not item.parameter:
+        size = "at once" if item.distance >= DETECTED else "not at its prior median"
+        return (name, visible, item.place, "", size, "", ", ".join(others))
+    return (
+        name,
+        visible if isfinite(item.detectable) else "not visible",
+        item.place,
+        item.parameter.replace("_", " "),
+        f"{number(item.detectable, 2)}{unit}" if isfinite(item.detectable) else "never",
+        f"{number(item.typical, 2)}{unit}",
+        ", ".join(others),
+    )
+
+
+def neighbours(found: Separability, name: str) -> list[str]:
+    """Return the effects that these data cannot tell from one, in either direction."""
+    if name not in found.identifiers:
+        return []
+    at = found.identifiers.index(name)
+    near = np.minimum(found.distance[at], found.distance[:, at]) < CONFUSED
+    return [other for place, other in enumerate(found.identifiers) if near[place] and place != at]
+
+
+def can_decide_table(found: Separability) -> Table:
+    """Return the rows as a table of the page, those that can be tested."""
+    return Table(
+        tuple(Column(title, numeric=title in ("prior median", "detectable from")) for title in HEADINGS),
+        [
+            tuple(cell.replace("_", " ") for cell in row)
+            for row, item in zip(rows_of(found), found.detectability, strict=True)
+            if not item.reason
+        ],
+    )
+
+
+def group_lines(found: Separability) -> list[str]:
+    """Return one sentence for each confusion group, or one that there is none."""
+    if not found.groups:
+        return ["Every effect that can be tested here can be told from every other at its prior median."]
+    lines = []
+    for group in found.groups:
+        names = [name.replace("_", " ") for name in group]
+        if len(names) == 2:
+            lines.append(f"These data cannot tell {names[0]} from {names[1]}.")
+        else:
+            lines.append(
+                "Confusion group, each close to at least one other (the table says to which): "
+                f"{listing(names)}."
+            )
+    return lines
+
+
+def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) -> list[str]:
+    """Return sentences on what the campaign would need to decide more."""
+    known = {effect.identifier: effect for effect in effects}
+    there = {trial.kind for trial in campaign.trials}
+    lines = []
+    for group in found.groups:
+        acts = [known[name].acts_on for name in group if name in known]
+        union: frozenset[TrialKind] = frozenset().union(*acts)
+        common = frozenset(TrialKind).intersection(*acts)
+        apart = [kind for kind in TrialKind if kind in union - common and kind not in there]
+        names = listing(name.replace("_", " ") for name in group)
+        if apart:
+            lines.append(
+                f"To tell {names} apart, add {' or '.join(_KIND_WORDS[kind] for kind in apart)}: some of "
+                "them "
+                "act there and others do not."
+            )
+        else:
+            lines.append(
+                f"To tell {names} apart, vary what was held: another amplitude, sign or place of the "
+                "load, a known "
+                "added mass, another temperature, strain beside displacement."
+            )
+    hidden = [
+        item
+        for item in found.detectability
+        if not item.reason and item.parameter and isfinite(item.detectable) and item.distance < DETECTED
+    ]
+    if hidden:
+        worst = max(hidden, key=lambda item: item.distance)
+        factor = (DETECTED / worst.distance) ** 0.5 if worst.distance > 0.0 else float("inf")
+        lines.append(
+            f"At their prior medians {listing(i.effect.identifier.replace('_', ' ') for i in hidden)} "
+            "would not be "
+            f"seen; the nearest to it, {worst.effect.identifier.replace('_', ' ')}, would be with noise "
+            f"{factor:.2g} times smaller or {factor**2:.2g} times as many trials."
+        )
+    unknown = [name for name, channel in campaign.channels.items() if channel.noise is None]
+    if unknown:
+        lines.append(
+            f"Give a noise record for {', '.join(unknown)} (samples at rest, or a standard deviation with "
+            "its degrees "
+            "of freedom): without it the absolute gate cannot be applied."
+        )
+    if not campaign.held_out:
+        lines.append(
+            "Hold out a trial, or measure one more at another level: without it nothing can be proved."
+        )
+    return lines

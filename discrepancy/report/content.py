@@ -1,0 +1,54 @@
+"""What the report shows, and a figure with its words."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+
+from discrepancy.document_file import Origin
+from discrepancy.patch_file import PrimitiveInterval
+from discrepancy.self_calibration import SelfCalibration
+from discrepancy.separability import Separability
+from discrepancy.workflow import Investigation
+from fe.design import WingDesign
+
+
+@dataclass(frozen=True)
+class ReportInput:
+    """All that the report shows.
+
+    Attributes
+    ----------
+    investigation : Investigation
+        What came out.
+    origin : Origin
+        What it came from.
+    separability : Separability or None
+        What the campaign can decide.
+    intervals : sequence of sequence of PrimitiveInterval
+        Of the patch, by effect; empty without a patch.
+    design : WingDesign or None
+        Of a wing, for the map.
+    self_calibration : SelfCalibration or None
+        Where it was asked for.
+    fmu : str
+        Name of the patched FMU, or why there is none; empty if none is due.
+    """
+
+    investigation: Investigation
+    origin: Origin
+    separability: Separability | None = None
+    intervals: Sequence[Sequence[PrimitiveInterval]] = ()
+    design: WingDesign | None = None
+    self_calibration: SelfCalibration | None = None
+    fmu: str = ""
+
+
+@dataclass(frozen=True)
+class ReportFigure:
+    """A figure with its words; `name` is that of its file."""
+
+    name: str
+    figure: Figure
+    title: str
+    caption: str

@@ -1,0 +1,216 @@
+"""Sections on what was found: verdict, next experiment, where the gap is."""
+
+from collections.abc import Sequence
+from math import isfinite, isnan
+
+from discrepancy.report.content import ReportInput
+from discrepancy.report.text import (
+    MEANING,
+    added_label,
+    catalogue_of,
+    estimate_text,
+    formula,
+    headline,
+    listing,
+    number,
+    p_value_text,
+    percent,
+    probability_text,
+    rounded,
+    unit_text,
+)
+from discrepancy.verdict import NamedEffect, VerdictKind
+from discrepancy.workflow import Investigation
+from reporting.page import Column, Page, Table
+
+LEAST_SHARE = 0.05
+"""Findings in words that explain less of the excess variance are left to the file."""
+SHOWN_FINDINGS = 8
+
+
+def add_verdict(page: Page, content: ReportInput) -> None:
+    """Add the verdict: its sentence, what is added, in what sizes."""
+    investigation = content.investigation
+    verdict = investigation.verdict
+    page.add_notice(headline(verdict))
+    page.add_paragraph(MEANING[verdict.kind])
+    _add_highlights(page, investigation)
+    catalogue = catalogue_of(investigation)
+    if verdict.kind is VerdictKind.UNEXPLAINED and verdict.resembles:
+        names = [catalogue[name].name if name in catalogue else name for name in verdict.resembles]
+        page.add_paragraph(
+            f"The nearest in the catalogue is {listing(names)}; this is a resemblance, no name."
+        )
+    if not verdict.effects:
+        return
+    for effect in _distinct(verdict.effects):
+        entry = catalogue.get(effect.identifier)
+        if entry is not None:
+            page.add_paragraph(
+                f"{effect.name[0].upper()}{effect.name[1:]}: {formula(entry.equation)}. Its signature: "
+                f"{_sentence(formula(entry.signature))} Source: {_sentence(entry.reference)}"
+            )
+    rows = []
+    for effect in verdict.effects:
+        for item in (*effect.parameters, *effect.shape):
+            value, interval = estimate_text(item)
+            rows.append(
+                (
+                    effect.name, effect.place or "\N{EN DASH}",
+                    formula(item.description or item.name.replace("_", " ")),
+                    value, interval, unit_text(item.unit),
+                )
+            )  # fmt: skip
+    page.add_table(
+        Table(
+            (
+                Column("effect"), Column("place"), Column("parameter"), Column("value", numeric=True),
+                Column("90 % interval", numeric=True), Column("unit"),
+            ),
+            rows,
+        ),
+        {
+            VerdictKind.NAMED: "Posterior medians and 90 % intervals.",
+            VerdictKind.FAMILY: "Posterior medians and 90 % intervals; the shape was fitted.",
+        }.get(verdict.kind, "Posterior medians and 90 % intervals of each candidate, were it there alone."),
+        title="What is added" if verdict.kind is VerdictKind.NAMED else "What could be added",
+    )  # fmt: skip
+    _add_primitives(page, content)
+
+
+def _sentence(text: str) -> str:
+    return text.rstrip(".") + "."
+
+
+def _distinct(effects: Sequence[NamedEffect]) -> list[NamedEffect]:
+    return list({effect.identifier: effect for effect in effects}.values())
+
+
+def _add_primitives(page: Page, content: ReportInput) -> None:
+    rows = []
+    for effect in content.intervals:
+        for item in effect:
+            if item.parameter in ("velocity_exponent", "displacement_exponent", "reference_velocity",
+                                  "reference_displacement", "element_count"):  # fmt: skip
+                continue
+            if isnan(item.low) or item.low == item.high:
+                interval, value = "fixed", f"{item.value:.4g}"
+            else:
+                form = rounded(item.value, 0.5 * (item.high - item.low))
+                value, interval = form(item.value), f"{form(item.low)} to {form(item.high)}"
+            rows.append((item.parameter.replace("_", " "), value, interval, unit_text(item.unit)))
+    if not rows:
+        return
+    marked = "" if content.investigation.verdict.kind is VerdictKind.NAMED else (
+        f" It is that of {added_label(content.investigation)}, which is not named."
+    )  # fmt: skip
+    fmu = f" {content.fmu}" if content.fmu else ""
+    page.add_table(
+        Table(
+            (
+                Column("number"),
+                Column("value", numeric=True),
+                Column("90 % interval", numeric=True),
+                Column("unit"),
+            ),
+            rows,
+        ),
+        f"patch.json holds it in SI units, ready for the model and its FMU.{marked}{fmu}",
+        title="The change of the model",
+    )
+
+
+def _add_highlights(page: Page, investigation: Investigation) -> None:
+    verdict, proof = investigation.verdict, investigation.proof
+    items: list[tuple[str, str]] = []
+    if not isnan(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
+        items.append((probability_text(verdict.probability), "probability of the verdict"))
+    if isfinite(verdict.log_bayes_factor) and verdict.hypotheses and verdict.hypotheses[0].effects:
+        items.append((f"{verdict.log_bayes_factor:,.1f} nat", "ln Bayes factor against nothing missing"))
+    if proof is not None:
+        first, second, where = proof.fitted_before, proof.fitted_after, "fitted"
+        if proof.held_out_before is not None and proof.held_out_after is not None:
+            first, second, where = proof.held_out_before, proof.held_out_after, "held-out"
+        items.append(
+            (
+                f"{number(first.chi_square_per_dof)} → {number(second.chi_square_per_dof)}",
+                f"χ²/dof on {where} trials, before and after",
+            )
+        )
+        if isfinite(proof.gap_closed):
+            items.append((f"{percent(proof.gap_closed)} %", "of the gap closed on held-out trials"))
+    elif verdict.gates and isfinite(verdict.gates[0].statistic):
+        gate = verdict.gates[0]
+        items.append((number(gate.statistic), f"p of the {gate.name}; limit {number(gate.limit)}"))
+    if items:
+        page.add_highlights(items)
+
+
+def add_next(page: Page, investigation: Investigation) -> None:
+    """Add the proposed experiments."""
+    page.add_paragraph(
+        "What would decide most between the hypotheses that are still open, for its cost. Information is "
+        "the mutual "
+        "information of hypothesis and data, by simulation; ln 2 = 0.69 nat decides between two equals."
+    )
+    page.add_table(
+        Table(
+            (
+                Column("test"), Column("why"), Column("information", "nat", numeric=True),
+                Column("cost", "trials", numeric=True),
+            ),
+            [
+                (item.description, item.reason, f"{item.information:.2f}", f"{item.cost:g}")
+                for item in investigation.verdict.next_experiments
+            ],
+        ),
+        "Cost is relative to one more trial of a kind that was done already.",
+        title="Proposed tests, best first",
+    )  # fmt: skip
+
+
+def add_location(page: Page, investigation: Investigation) -> None:
+    """Add where the model as it was disagrees."""
+    location = investigation.location
+    if location is None:
+        page.add_paragraph("The residuals were not searched for patterns.")
+        return
+    if not location.disagrees:
+        page.add_paragraph(
+            "No global test finds a disagreement between the model as it was and the fitted trials."
+        )
+    else:
+        significant = sum(cell.significant for cell in location.cells)
+        page.add_paragraph(
+            f"The model as it was disagrees with the fitted trials; {significant} of "
+            f"{len(location.cells)} cells of "
+            "the map (channel, trial, and bin of time, amplitude, frequency or load) are discoveries at a "
+            "false "
+            "discovery rate of 5 %."
+        )
+    findings = [item for item in location.disagreements if item.share >= LEAST_SHARE][:SHOWN_FINDINGS]
+    for item in findings:
+        page.add_paragraph(f"• {item.sentence}")
+    page.add_table(
+        Table(
+            (
+                Column("test"),
+                Column("statistic", numeric=True),
+                Column("p", numeric=True),
+                Column("disagrees"),
+            ),
+            [
+                (
+                    test.name,
+                    number(test.statistic, 4),
+                    p_value_text(test.p_value),
+                    "yes" if test.rejected else "no",
+                )
+                for test in location.tests
+            ],
+        ),
+        "Residuals of the model as it was on fitted trials, each against what noise would leave after the "
+        "fit; "
+        "Holm's rule at 1 % over the tests.",
+        title="Global tests",
+    )

@@ -1,0 +1,225 @@
+"""Sections on what it rests on: gates, proof, what the campaign can decide, data, provenance."""
+
+from collections.abc import Callable, Sequence
+from math import isfinite
+
+from discrepancy.document_file import Origin
+from discrepancy.report.check_tables import can_decide_table, group_lines
+from discrepancy.report.content import ReportInput
+from discrepancy.report.residual_figures import UNIT_OF
+from discrepancy.report.text import (
+    added_label,
+    listing,
+    number,
+    p_value_text,
+    percent,
+    probability_text,
+)
+from discrepancy.self_calibration import Share, outcomes
+from discrepancy.verdict import Proof, Scores, VerdictKind
+from discrepancy.workflow import Investigation
+from reporting.page import Column, Page, Table
+
+
+def add_gates(page: Page, investigation: Investigation) -> None:
+    """Add the outcomes of the gates."""
+    gates = investigation.verdict.gates
+    if not gates:
+        return
+    page.add_table(
+        Table(
+            (
+                Column("gate"), Column("passed"), Column("statistic", numeric=True),
+                Column("limit", numeric=True),
+                Column("reason"),
+            ),
+            [
+                (
+                    gate.name,
+                    "not applied" if gate.passed is None else "yes" if gate.passed else "no",
+                    number(gate.statistic), number(gate.limit), gate.reason,
+                )
+                for gate in gates
+            ],
+        ),
+        "A name must fit the noise record (absolute fit), and freeing its shape must not gain more than "
+        "two nats.",
+        title="Gates",
+    )  # fmt: skip
+
+
+def add_inclusion(page: Page, investigation: Investigation) -> None:
+    """Add the probabilities that effects take part."""
+    inclusion = sorted(investigation.verdict.inclusion.items(), key=lambda row: -row[1])
+    shown = [row for row in inclusion if row[1] >= 1e-3][:6]
+    if len(shown) < 2:
+        return
+    page.add_paragraph(
+        "Probability that an effect takes part: "
+        + listing(f"{name.replace('_', ' ')} {probability_text(p)}" for name, p in shown)
+        + "."
+    )
+
+
+def add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
+    """Add scores before and after."""
+    if investigation.verdict.kind is not VerdictKind.NAMED:
+        page.add_notice(
+            f'The model "with the effect" has {added_label(investigation)} here, which is not named: '
+            "the figures "
+            "say how well it does, not that it is there."
+        )
+    page.add_paragraph(proof.remaining)
+    held = [item.trial.name for item in investigation.before.trials if item.trial.held_out] if (
+        investigation.before is not None
+    ) else []  # fmt: skip
+    columns = [Column("score")]
+    pairs: list[tuple[Scores, Scores]] = []
+    if proof.held_out_before is not None and proof.held_out_after is not None:
+        columns += [Column("held out, before", numeric=True), Column("held out, after", numeric=True)]
+        pairs.append((proof.held_out_before, proof.held_out_after))
+    columns += [Column("fitted, before", numeric=True), Column("fitted, after", numeric=True)]
+    pairs.append((proof.fitted_before, proof.fitted_after))
+    rows: list[tuple[str, ...]] = []
+
+    def add(title: str, show: Callable[[Scores], str]) -> None:
+        rows.append((title, *(show(item) for pair in pairs for item in pair)))
+
+    add("χ²/dof (1 is noise)", lambda s: number(s.chi_square_per_dof, 4))
+    add("its deviation if the model is right", lambda s: number(s.chi_square_deviation, 2))
+    add("mean log score, nat per sample (best −1.42)", lambda s: number(s.log_score, 4))
+    add("coverage of 50 % intervals, %", lambda s: f"{100.0 * s.coverage_50:.1f}")
+    add("coverage of 90 % intervals, %", lambda s: f"{100.0 * s.coverage_90:.1f}")
+    add("whiteness, p", lambda s: p_value_text(s.whiteness))
+    add("flat histogram of transforms, p", lambda s: p_value_text(s.pit_p_value))
+    add("samples", lambda s: str(s.sample_count))
+    channels = investigation.before.channels if investigation.before is not None else {}
+    for name in dict.fromkeys(name for pair in pairs for name in pair[0].rms):
+        factor, unit = UNIT_OF[channels[name].quantity] if name in channels else (1.0, "")
+        add(
+            f"rms of {name}, {unit}",
+            lambda s, name=name, factor=factor: (
+                number(factor * s.rms[name]) if name in s.rms else "\N{EN DASH}"
+            ),  # type: ignore[misc]
+        )
+    gain = "Nothing is held out, so that nothing is proved." if proof.held_out_after is None else (
+        f"Gain in log score on held-out trials {number(proof.log_score_gain, 4)} "
+        f"± {number(proof.log_score_gain_error, 2)} nat per sample. "
+    )  # fmt: skip
+    closed = f"Gap closed: {percent(proof.gap_closed)} %." if isfinite(proof.gap_closed) else proof.gap_reason
+    trials = f" Held out: {', '.join(held)}; only their own releases and zeros were adapted." if held else ""
+    page.add_table(
+        Table(columns, rows), f"{gain}{closed}{trials}", title="Before and after, at the same scale"
+    )
+
+
+def add_separability(page: Page, content: ReportInput) -> None:
+    """Add detectable sizes and confusion groups."""
+    found = content.separability
+    if found is None:
+        return
+    for line in group_lines(found):
+        page.add_paragraph(line)
+    untested = [(i.effect.name, i.reason) for i in found.detectability if i.reason]
+    if untested:
+        page.add_table(
+            Table((Column("effect"), Column("why not")), untested),
+            "These can be neither named nor excluded by this campaign and model.",
+            title="Effects that cannot be tested here",
+        )
+    page.add_table(
+        can_decide_table(found),
+        "From the model, the inputs and the noise alone. Detectable from: the size at which d² reaches "
+        "25, with "
+        "all nuisances adapted.",
+        title="Detectable sizes",
+    )
+
+
+def _share(share: Share) -> str:
+    return (
+        f"{share.count} of {share.total}: {100.0 * share.value:.0f} % "
+        f"({100.0 * share.low:.0f} to {100.0 * share.high:.0f} %)"
+    )
+
+
+def add_self_calibration(page: Page, content: ReportInput) -> None:
+    """Add verdicts on simulated campaigns."""
+    found = content.self_calibration
+    if found is None:
+        return
+    rows = [
+        (title, outcome, _share(found.share(outcome, null=null)))
+        for title, null in (("an effect was hidden", False), ("nothing was hidden", True))
+        for outcome in outcomes(found, null=null)
+    ]
+    rows.append(("named rightly", "90 % intervals that hold the true value", _share(found.coverage())))
+    absent = (
+        f" Never detectable in draws of their priors, so not hidden: {', '.join(found.not_detectable)}."
+        if found.not_detectable
+        else ""
+    )
+    page.add_table(
+        Table((Column("campaigns"), Column("outcome"), Column("share, 90 % Wilson interval")), rows),
+        "Simulated by the model that looks for the effect, with half its time step: this says what the "
+        "campaign and "
+        f"the workflow can do, not that the model is right.{absent} self_calibration.json has every case.",
+        title="Verdicts on simulated campaigns of this geometry",
+    )
+
+
+def add_data(page: Page, investigation: Investigation) -> None:
+    """Add faults, remarks and trials."""
+    page.add_section("Data")
+    for fault in investigation.faults:
+        page.add_notice(fault.sentence)
+    told = {fault.sentence for fault in investigation.faults}
+    remarks = [text for text in investigation.verdict.remarks if text not in told]
+    for text in remarks:
+        page.add_paragraph(f"• {text}")
+    if not told and not remarks:
+        page.add_paragraph("No fault was found.")
+    campaign = investigation.campaign
+    page.add_table(
+        Table(
+            (
+                Column("trial"), Column("kind"), Column("run"), Column("rows", numeric=True),
+                Column("channels"),
+                Column("role"), Column("left out", numeric=True),
+            ),
+            [
+                (
+                    trial.name, trial.kind.value, trial.run or "\N{EN DASH}", str(len(trial.time)),
+                    _few(trial.channels), "held out" if trial.held_out else "fitted",
+                    str(int((~trial.used).sum())),
+                )
+                for trial in campaign.trials
+            ],
+        ),
+        "Left out: single samples that were marked as outliers or empty.",
+        title="Trials",
+    )  # fmt: skip
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:6])} and {len(names) - 6} more"
+
+
+def add_origin(page: Page, origin: Origin) -> None:
+    """Add provenance."""
+    page.add_section("Where it comes from")
+    provenance = origin.provenance
+    rows = [
+        ("campaign", f"{origin.campaign}, SHA-256 {origin.data_hash}"),
+        ("model", f"{origin.model}, SHA-256 {origin.model_hash}"),
+        ("command", origin.command),
+        ("seed", str(provenance.seed)),
+        *((f"input {name}", f"SHA-256 {value}") for name, value in provenance.input_hashes.items()),
+        ("software", ", ".join(f"{name} {version}" for name, version in provenance.versions.items())),
+        ("sources", ", ".join(f"{name} {value[:12]}" for name, value in provenance.source_hashes.items())),
+    ]
+    page.add_table(
+        Table((Column("item"), Column("value")), rows),
+        "verdict.json, patch.json and residuals.nc beside this page hold every figure.",
+        title="Provenance",
+    )

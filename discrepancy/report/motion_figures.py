@@ -1,0 +1,191 @@
+"""Motion before and after: time histories and spectra of residuals."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.signal import welch
+
+from discrepancy.report.residual_figures import UNIT_OF, size
+from discrepancy.residual_dependence import predicted_frequencies
+from discrepancy.residuals import ResidualSet
+from reporting.figures import (
+    OBSERVED,
+    PAST,
+    PREDICTION,
+    REFERENCE,
+    TRUTH,
+    new_figure,
+    publication_style,
+)
+
+FloatArray = NDArray[np.float64]
+
+AFTER = "with the effect"
+COMPARABLE = 6.0
+"""Ratio of residuals before and after up to which they are drawn at one scale."""
+
+
+def before_label(after: ResidualSet | None) -> str:
+    """Return what the model is called that has no effect added."""
+    return "model" if after is None else "model as it was"
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The record with the largest gap: index of the trial in its set, name of the channel."""
+
+    trial: int
+    channel: str
+
+
+def worst_record(before: ResidualSet) -> Worst | None:
+    """Return the dynamic record whose residuals exceed the noise most; None without one."""
+    found = [
+        (size(item, column), number, name)
+        for number, item in enumerate(before.trials)
+        if item.trial.is_dynamic
+        for column, name in enumerate(item.trial.channels)
+        if item.used[:, column].any()
+    ]
+    found = [row for row in found if np.isfinite(row[0])]
+    if not found:
+        return None
+    _, number, name = max(found)
+    return Worst(number, name)
+
+
+def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure:
+    """Draw the worst record: measured and predicted values, and the residuals against the noise."""
+    item = before.trials[worst.trial]
+    column = item.column(worst.channel)
+    factor, unit = UNIT_OF[before.channels[worst.channel].quantity]
+    time, used = item.trial.time, item.used[:, column]
+    with publication_style():
+        rows = 3 if after is not None else 2
+        figure = new_figure(1.45 * rows + 0.35)
+        grid = figure.add_gridspec(
+            rows, 1, left=0.095, right=0.985, bottom=0.38 / (1.45 * rows), top=1.0 - 0.2 / (1.45 * rows),
+            hspace=0.34, height_ratios=[1.25, *([1.0] * (rows - 1))],
+        )  # fmt: skip
+        axes = figure.add_subplot(grid[0, 0])
+        axes.plot(
+            time[used],
+            factor * item.trial.values[used, column],
+            ".",
+            ms=1.8,
+            color=OBSERVED,
+            label="measured",
+        )
+        axes.plot(
+            time,
+            factor * item.prediction[:, column],
+            "--",
+            lw=0.9,
+            color=PREDICTION,
+            label=before_label(after),
+        )
+        if after is not None:
+            other = after.trials[worst.trial]
+            axes.plot(time, factor * other.prediction[:, column], lw=0.9, color=PAST, label=AFTER)
+        axes.set_ylabel(f"{worst.channel}, {unit}")
+        axes.set_title(f"a  {worst.channel} in {item.trial.name}", loc="left")
+        axes.legend(ncol=3, loc="upper right")
+        axes.margins(x=0.01)
+        panels = [(item, PREDICTION, f"b  residual, {before_label(after)}")]
+        if after is not None:
+            alike = size(item, column) < COMPARABLE * size(after.trials[worst.trial], column)
+            title = f"c  residual, {AFTER}" + ("" if alike else " (own scale)")
+            panels.append((after.trials[worst.trial], PAST, title))
+        for number, (each, colour, title) in enumerate(panels, start=1):
+            below = figure.add_subplot(grid[number, 0], sharex=axes)
+            noise = factor * float(each.noise_deviation[column])
+            below.axhspan(
+                -2.0 * noise, 2.0 * noise, color=REFERENCE, alpha=0.3, lw=0.0, label="noise, ± 2 s0"
+            )
+            below.plot(time[used], factor * each.residual[used, column], lw=0.6, color=colour)
+            below.set_ylabel(f"residual, {unit}")
+            below.set_title(title, loc="left")
+            below.margins(x=0.01)
+            if number == 1:
+                below.legend(loc="upper right")
+        if after is not None and alike:
+            limits = [limit for below in figure.axes[1:] for limit in below.get_ylim()]
+            for below in figure.axes[1:]:
+                below.set_ylim(min(limits), max(limits))
+        figure.axes[-1].set_xlabel("time, s")
+        for above in figure.axes[:-1]:
+            above.tick_params(labelbottom=False)
+    return figure
+
+
+def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure | None:
+    """Draw spectra of the residuals of the worst channel over all dynamic trials, with that of the noise."""
+    items = [(before, PREDICTION, "--", before_label(after))] + (
+        [(after, PAST, "-", AFTER)] if after is not None else []
+    )
+    drawn = []
+    for residuals, colour, dashes, label in items:
+        spectrum = _spectrum(residuals, worst.channel)
+        if spectrum is not None:
+            drawn.append((*spectrum, colour, dashes, label))
+    if not drawn:
+        return None
+    noise = before.channels[worst.channel].noise
+    with publication_style():
+        figure = new_figure(2.7)
+        axes = figure.add_axes((0.095, 0.16, 0.885, 0.70))
+        if noise is not None and noise.samples is not None and noise.interval and len(noise.samples) >= 32:
+            count = min(len(noise.samples), 128)
+            at, power = welch(noise.samples / noise.standard_deviation, 1.0 / noise.interval, nperseg=count)
+            axes.plot(
+                at[1:],
+                power[1:] * 0.5 / noise.interval,
+                color=OBSERVED,
+                lw=0.8,
+                alpha=0.6,
+                label="noise record",
+            )
+        axes.axhline(1.0, color=TRUTH, lw=0.7, ls="-.", label="white noise of the stated size")
+        for at, power, colour, dashes, label in drawn:
+            axes.plot(at, power, dashes, color=colour, lw=1.1, label=label)
+        for number, frequency in enumerate(mode_frequencies(before)[:4], start=1):
+            axes.axvline(frequency, color=REFERENCE, lw=0.6, ls=":")
+            axes.annotate(
+                f"mode {number}", (frequency, 1.0), (2.0, -2.0), xycoords=("data", "axes fraction"),
+                textcoords="offset points", rotation=90, va="top", fontsize=6.5, color=OBSERVED,
+            )  # fmt: skip
+        axes.set_yscale("log")
+        axes.set_xlim(0.0, float(drawn[0][0][-1]))
+        axes.set_xlabel("frequency, Hz")
+        axes.set_ylabel("power / white noise")
+        axes.set_title(f"residuals of {worst.channel}, all dynamic trials", loc="left")
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(low, 0.1), max(high, 10.0))
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=2, borderaxespad=0.0)
+    return figure
+
+
+def _spectrum(residuals: ResidualSet, channel: str) -> tuple[FloatArray, FloatArray] | None:
+    """Return frequency [Hz] and power over that of the stated white noise, mean of the trials."""
+    found: dict[float, list[tuple[FloatArray, FloatArray]]] = {}
+    for item in residuals.trials:
+        if not item.trial.is_dynamic or channel not in item.trial.channels or len(item.trial.time) < 32:
+            continue
+        series = np.nan_to_num(item.standardised[:, item.column(channel)])
+        count = min(len(series), 512)
+        at, power = welch(series, 1.0 / item.trial.interval, nperseg=count, detrend="constant")
+        found.setdefault(round(item.trial.interval * len(at), 9), []).append(
+            (at[1:], power[1:] * 0.5 / item.trial.interval)
+        )
+    if not found:
+        return None
+    most = max(found.values(), key=len)
+    return most[0][0], np.mean([power for _, power in most], axis=0)
+
+
+def mode_frequencies(residuals: ResidualSet) -> tuple[float, ...]:
+    """Return the frequencies [Hz] at which predictions ring, lowest first."""
+    items = [item for item in residuals.trials if item.trial.is_dynamic]
+    return predicted_frequencies(items) if items else ()

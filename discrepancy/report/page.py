@@ -1,0 +1,77 @@
+"""The page: verdict first, then where the gap is, why this name, the proof, and the limits."""
+
+from discrepancy.report.content import ReportFigure, ReportInput
+from discrepancy.report.findings import add_location, add_next, add_verdict
+from discrepancy.report.grounds import (
+    add_data,
+    add_gates,
+    add_inclusion,
+    add_origin,
+    add_proof,
+    add_self_calibration,
+    add_separability,
+)
+from discrepancy.verdict import VerdictKind
+from reporting.page import Page
+
+
+def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dict[str, ReportFigure]) -> str:
+    """Return the page.
+
+    Parameters
+    ----------
+    content : ReportInput
+        What is shown.
+    drawings : dict of str to bytes
+        SVG of each of `figures`.
+    figures : dict of str to ReportFigure
+        What `report_figures` returned.
+    """
+    investigation, origin = content.investigation, content.origin
+    verdict = investigation.verdict
+    page = Page(
+        origin.campaign,
+        f"What the model “{origin.model}” lacks beside these data: located, named, added, proved",
+        footer=(
+            f"Repeat it: {origin.command}",
+            f"Data {origin.data_hash[:16]}, model {origin.model_hash[:16]}, seed {origin.provenance.seed}.",
+        ),
+    )
+
+    def show(*names: str) -> None:
+        for name in names:
+            if name in figures:
+                item = figures[name]
+                page.add_figure(drawings[name], item.caption, title=item.title)
+
+    page.add_section("Verdict")
+    add_verdict(page, content)
+    if verdict.kind is VerdictKind.DATA_ERROR:
+        add_data(page, investigation)
+        add_origin(page, origin)
+        return page.render()
+    if verdict.next_experiments:
+        page.add_section("Next experiment")
+        add_next(page, investigation)
+    page.add_section("Where the gap is")
+    add_location(page, investigation)
+    show("residual_map", "residual_table")
+    page.add_section("What it looks like")
+    show("history", "backbone", "restoring_force", "spectrum", "load")
+    page.add_section("Why this verdict")
+    add_gates(page, investigation)
+    show("evidence")
+    add_inclusion(page, investigation)
+    if investigation.proof is not None:
+        page.add_section("Proof on held-out trials")
+        add_proof(page, investigation, investigation.proof)
+        show("pit")
+    if content.separability is not None or content.self_calibration is not None:
+        page.add_section("What this campaign can decide")
+        add_separability(page, content)
+        show("separability")
+        add_self_calibration(page, content)
+        show("self_calibration")
+    add_data(page, investigation)
+    add_origin(page, origin)
+    return page.render()

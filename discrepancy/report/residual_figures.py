@@ -1,0 +1,320 @@
+"""Where the gap is: residuals on the wing, by channel and trial, and over the load."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from numpy.typing import NDArray
+
+from discrepancy.campaign import Channel, Quantity, TrialKind
+from discrepancy.residuals import FittedTrial, ResidualSet
+from fe.design import WingDesign
+from reporting.figures import (
+    LEVELS,
+    OBSERVED,
+    PAST,
+    PREDICTION,
+    REFERENCE,
+    new_figure,
+    publication_style,
+)
+
+FloatArray = NDArray[np.float64]
+
+MOST_CELLS = 12
+"""Rows or columns up to which a heat map has its numbers written in."""
+_STRAIN = re.compile(r"strain\[(\d+)\]")
+UNIT_OF = {
+    Quantity.STRAIN: (1e6, "µε"),
+    Quantity.DISPLACEMENT: (1e3, "mm"),
+    Quantity.VELOCITY: (1.0, "m/s"),
+    Quantity.ACCELERATION: (1.0, "m/s²"),
+    Quantity.SIGNAL: (1.0, "signal"),
+}
+"""Factor from SI, and unit, in which a quantity is drawn."""
+
+
+def size(item: FittedTrial, column: int) -> float:
+    """Return the rms residual of a channel in a trial over what noise would leave; nan without samples."""
+    used = item.used[:, column]
+    expected = float(item.expected_variance[used, column].sum())
+    if expected < 0.5:  # the fit has absorbed all that there was
+        return float("nan")
+    return float(np.sqrt(np.sum(item.standardised[used, column] ** 2) / expected))
+
+
+def size_by_channel(residuals: ResidualSet) -> dict[str, float]:
+    """Return the rms residual of each channel over what noise would leave, all trials together."""
+    squares: dict[str, list[float]] = {}
+    for item in residuals.trials:
+        for column, name in enumerate(item.trial.channels):
+            used = item.used[:, column]
+            row = squares.setdefault(name, [0.0, 0.0])
+            row[0] += float(np.sum(item.standardised[used, column] ** 2))
+            row[1] += float(item.expected_variance[used, column].sum())
+    return {name: float(np.sqrt(s / e)) for name, (s, e) in squares.items() if e > 0.5}
+
+
+def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray]:
+    """Return channels (C), trials (T), and the sizes (C, T) of the residuals; nan where there is none."""
+    channels = [
+        name for name in residuals.channels if any(name in i.trial.channels for i in residuals.trials)
+    ]
+    table = np.full((len(channels), len(residuals.trials)), np.nan)
+    for place, item in enumerate(residuals.trials):
+        for column, name in enumerate(item.trial.channels):
+            table[channels.index(name), place] = size(item, column)
+    trials = [item.trial.name + (" *" if item.trial.held_out else "") for item in residuals.trials]
+    return channels, trials, table
+
+
+def scale_of(values: Sequence[float] | FloatArray) -> Normalize:
+    """Return the colour scale of sizes of residuals: logarithmic, with 1 (noise) near its dark end."""
+    found = np.asarray(values, dtype=float)
+    largest = float(np.nanmax(found, initial=1.0))
+    return LogNorm(0.7, max(largest, 3.0))
+
+
+def gauge_places(channels: Sequence[Channel], design: WingDesign) -> dict[str, tuple[float, float]]:
+    """Return (distance from the root [m], chord fraction) of the channels that have a place on the wing."""
+    places: dict[str, tuple[float, float]] = {}
+    positions = design.gauges.positions
+    for channel in channels:
+        gauge = _STRAIN.fullmatch(channel.output)
+        if channel.station is not None:
+            places[channel.name] = (channel.station, 0.4 if channel.chord is None else channel.chord)
+        elif gauge is not None and 1 <= int(gauge.group(1)) <= len(positions):
+            places[channel.name] = positions[int(gauge.group(1)) - 1]
+        elif channel.output == "tip_displacement":
+            places[channel.name] = (design.planform.semi_span, design.planform.straight_chord_line)
+    return places
+
+
+def planform_figure(before: ResidualSet, after: ResidualSet | None, design: WingDesign) -> Figure | None:
+    """Draw the sizes of the residuals on the planform, before and after at one scale; None without places."""
+    places = gauge_places(list(before.channels.values()), design)
+    sizes = [size_by_channel(item) for item in (before, after) if item is not None]
+    if not places:
+        return None
+    norm = scale_of([value for row in sizes for value in row.values()])
+    titles = ("a  model as it was", "b  with the effect") if after is not None else ("model as it is",)
+    with publication_style():
+        figure = new_figure(1.62 * len(sizes) + 0.35)
+        grid = figure.add_gridspec(
+            len(sizes), 1, left=0.07, right=0.86, top=0.94 if len(sizes) > 1 else 0.88,
+            bottom=0.20 / len(sizes) + 0.04, hspace=0.30,
+        )  # fmt: skip
+        for number, (row, title) in enumerate(zip(sizes, titles, strict=True)):
+            axes = figure.add_subplot(grid[number, 0])
+            _draw_planform(axes, design)
+            _draw_gauges(axes, before.channels, places, row, norm, design)
+            axes.set_title(title, loc="left")
+            if number == len(sizes) - 1:
+                axes.set_xlabel("distance from the root, m")
+            else:
+                axes.tick_params(labelbottom=False)
+            axes.set_ylabel("chord, m")
+        _size_bar(figure, norm, (0.885, 0.2, 0.016, 0.66))
+    return figure
+
+
+def _leading_edge(design: WingDesign, station: float) -> float:
+    """Return where the leading edge lies, behind that of the root [m]."""
+    form = design.planform
+    line = form.straight_chord_line
+    return line * (form.root_chord - form.chord(station / form.semi_span))
+
+
+def _draw_planform(axes: Axes, design: WingDesign) -> None:
+    form = design.planform
+    tip = _leading_edge(design, form.semi_span)
+    corners = np.array([
+        (0.0, 0.0), (form.semi_span, tip), (form.semi_span, tip + form.tip_chord), (0.0, form.root_chord)
+    ])  # fmt: skip
+    axes.fill(*corners.T, facecolor="#f4f5f6", edgecolor="#8a939c", lw=0.8)
+    for defect in design.defects:
+        stations = np.array([defect.span_start, defect.span_end, defect.span_end, defect.span_start])
+        fractions = (defect.chord_start, defect.chord_start, defect.chord_end, defect.chord_end)
+        depth = [
+            _leading_edge(design, s) + c * form.chord(s / form.semi_span)
+            for s, c in zip(stations, fractions, strict=True)
+        ]
+        axes.fill(stations, depth, facecolor="none", edgecolor="#b8bec4", lw=0.6, ls="--")
+    axes.set_aspect("equal")
+    axes.set_xlim(-0.03 * form.semi_span, 1.06 * form.semi_span)
+    axes.set_ylim(1.12 * form.root_chord, -0.12 * form.root_chord)
+    axes.yaxis.set_major_locator(MaxNLocator(3))
+
+
+def _draw_gauges(
+    axes: Axes,
+    channels: dict[str, Channel] | object,
+    places: dict[str, tuple[float, float]],
+    sizes: dict[str, float],
+    norm: Normalize,
+    design: WingDesign,
+) -> None:
+    form = design.planform
+    assert hasattr(channels, "__getitem__")
+    for name, (station, fraction) in places.items():
+        if name not in sizes:
+            continue
+        depth = _leading_edge(design, station) + fraction * form.chord(min(station / form.semi_span, 1.0))
+        marker = "o" if channels[name].quantity is Quantity.STRAIN else "s"
+        axes.scatter(
+            station, depth, c=[sizes[name]], cmap=LEVELS, norm=norm, s=46, marker=marker,
+            edgecolors="#333333", linewidths=0.6, zorder=3,
+        )  # fmt: skip
+        axes.annotate(
+            name,
+            (station, depth),
+            (0.0, -6.5),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            fontsize=6.5,
+        )
+
+
+def _size_bar(figure: Figure, norm: Normalize, place: tuple[float, float, float, float]) -> None:
+    axes = figure.add_axes(place)
+    bar = figure.colorbar(ScalarMappable(norm, LEVELS), cax=axes)
+    bar.set_label("rms residual / noise")
+    largest = float(norm.vmax or 1.0)
+    bar.ax.yaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0) if largest < 50.0 else (1.0,)))
+    bar.ax.yaxis.set_minor_locator(NullLocator())
+    bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    bar.outline.set_linewidth(0.5)
+
+
+def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
+    """Draw the sizes of the residuals by channel and trial, before and after at one scale."""
+    tables = [size_table(item) for item in (before, after) if item is not None]
+    channels, trials, _ = tables[0]
+    norm = scale_of(np.concatenate([table.ravel() for _, _, table in tables]))
+    titles = ("a  model as it was", "b  with the effect") if after is not None else ("model as it is",)
+    longest = max(len(name) for name in trials)
+    below = min(0.22 + 0.042 * longest, 1.5)
+    height = max(0.22 * len(channels), 0.9) + below + 0.35
+    with publication_style():
+        figure = new_figure(height)
+        grid = figure.add_gridspec(
+            1, len(tables), left=0.11, right=0.885 if len(tables) > 1 else 0.60, bottom=below / height,
+            top=1.0 - 0.28 / height, wspace=0.06,
+        )  # fmt: skip
+        for number, ((_, _, table), title) in enumerate(zip(tables, titles, strict=True)):
+            axes = figure.add_subplot(grid[0, number])
+            axes.imshow(np.ma.masked_invalid(table), cmap=LEVELS, norm=norm, aspect="auto")
+            _heat_axes(axes, channels if number == 0 else [""] * len(channels), trials, title)
+            if len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS:
+                _write_cells(axes, table, norm)
+        right = 0.905 if len(tables) > 1 else 0.62
+        _size_bar(figure, norm, (right, below / height, 0.016, 1.0 - (below + 0.28) / height))
+    return figure
+
+
+def _heat_axes(axes: Axes, rows: Sequence[str], columns: Sequence[str], title: str) -> None:
+    axes.set_yticks(range(len(rows)), list(rows))
+    axes.set_xticks(range(len(columns)), list(columns), rotation=40, ha="right", rotation_mode="anchor")
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    axes.set_title(title, loc="left")
+    axes.set_facecolor("#f0f1f2")
+
+
+def _write_cells(axes: Axes, table: FloatArray, norm: Normalize) -> None:
+    for (row, column), value in np.ndenumerate(table):
+        if np.isfinite(value):
+            text = f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
+            dark = float(norm(value)) < 0.6
+            axes.text(
+                column, row, text, ha="center", va="center", fontsize=6.0, color="white" if dark else "black"
+            )
+
+
+def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None:
+    """Draw residuals of static trials and flights over the load, by quantity; None without such trials."""
+    kinds = [(TrialKind.STATIC, "force, N"), (TrialKind.FLIGHT, "load factor")]
+    panels = []
+    for kind, label in kinds:
+        for quantity in Quantity:
+            names = [
+                name
+                for name, channel in before.channels.items()
+                if channel.quantity is quantity
+                and any(name in i.trial.channels for i in before.trials if i.trial.kind is kind)
+            ]
+            if names:
+                panels.append((kind, label, quantity, names))
+    if not panels:
+        return None
+    panels = panels[:4]
+    columns = min(len(panels), 2)
+    rows = (len(panels) + columns - 1) // columns
+    with publication_style():
+        figure = new_figure(2.25 * rows + 0.3)
+        grid = figure.add_gridspec(
+            rows, columns, left=0.085, right=0.985, bottom=0.2 / rows + 0.02, top=1.0 - 0.24 / (2.25 * rows),
+            hspace=0.42, wspace=0.24,
+        )  # fmt: skip
+        for number, (kind, label, quantity, names) in enumerate(panels):
+            axes = figure.add_subplot(grid[number // columns, number % columns])
+            factor, unit = UNIT_OF[quantity]
+            noise = _draw_loads(
+                axes,
+                before,
+                kind,
+                names,
+                factor,
+                PREDICTION,
+                "o",
+                "model" if after is None else "model as it was",
+            )
+            if after is not None:
+                _draw_loads(axes, after, kind, names, factor, PAST, "D", "with the effect")
+            axes.axhspan(
+                -2.0 * noise, 2.0 * noise, color=REFERENCE, alpha=0.25, lw=0.0, label="noise, ± 2 s0"
+            )
+            axes.axhline(0.0, color=OBSERVED, lw=0.6)
+            axes.set_xlabel(label)
+            axes.set_ylabel(f"residual, {unit}")
+            axes.set_title(f"{'abcd'[number]}  {kind.value}, {quantity.value}", loc="left")
+            if number == 0:
+                axes.legend(loc="best", fontsize=6.8)
+    return figure
+
+
+def _draw_loads(
+    axes: Axes,
+    residuals: ResidualSet,
+    kind: TrialKind,
+    names: Sequence[str],
+    factor: float,
+    colour: str,
+    marker: str,
+    label: str,
+) -> float:
+    noise = 0.0
+    shift = 0.0 if marker == "o" else 0.006
+    for item in residuals.trials:
+        if item.trial.kind is not kind:
+            continue
+        load = item.trial.force if kind is TrialKind.STATIC else item.trial.load_factor
+        wide = float(np.ptp(load)) or 1.0
+        for name in names:
+            if name not in item.trial.channels:
+                continue
+            column = item.column(name)
+            used = item.used[:, column]
+            noise = max(noise, factor * float(item.noise_deviation[column]))
+            axes.plot(
+                load[used] + shift * wide, factor * item.residual[used, column], marker, ms=2.8, lw=0.0,
+                mfc="none" if item.trial.held_out else colour, mec=colour, mew=0.7, alpha=0.8, label=label,
+            )  # fmt: skip
+            label = "_nolegend_"
+    return noise

@@ -1,0 +1,165 @@
+"""Numbers and sentences of the report and of the summary on the terminal."""
+
+import re
+from collections.abc import Iterable, Sequence
+from math import floor, isfinite, isnan, log10
+
+from discrepancy.catalogue.entry import Effect
+from discrepancy.verdict import Estimate, Hypothesis, Verdict, VerdictKind
+from discrepancy.workflow import Investigation
+
+MEANING = {
+    VerdictKind.NOTHING_MISSING: "No effect of the catalogue is needed: what the model leaves is noise.",
+    VerdictKind.NAMED: "The name has the probability, the evidence and the fit that a name needs: it passed "
+    "both gates.",
+    VerdictKind.FAMILY: "The kind of the effect is known, its exact law is not one of the catalogue: the "
+    "shape below was fitted.",
+    VerdictKind.GROUP: "Something is missing. Each member of the group fits the data; the figures after "
+    "adding an effect are those of its most probable member, which is no name.",
+    VerdictKind.UNEXPLAINED: "There is a gap, and nothing in the catalogue fits it well enough to be named.",
+    VerdictKind.DATA_ERROR: "The data are at fault; nothing was fitted. Mend them, do not correct them to "
+    "fit the model.",
+    VerdictKind.BELOW_LIMIT: "The data do not decide between noise and a small effect.",
+}
+"""What each kind of verdict means, in a sentence."""
+
+SHORT_UNITS = {"1": "", "m/s2": "m/s²"}
+
+
+def estimate_text(estimate: Estimate) -> tuple[str, str]:
+    """Return a value, and its 90 % interval, with two digits of the half-width."""
+    if not (isfinite(estimate.low) and isfinite(estimate.high)):
+        return f"{estimate.value:.4g}", "not known"
+    show = rounded(estimate.value, 0.5 * (estimate.high - estimate.low))
+    return show(estimate.value), f"{show(estimate.low)} to {show(estimate.high)}"
+
+
+class rounded:  # noqa: N801 - used as a function
+    """Format numbers alike: two significant digits of a spread.
+
+    Parameters
+    ----------
+    value, spread : float
+        Typical value and its uncertainty.
+    """
+
+    def __init__(self, value: float, spread: float) -> None:
+        largest = max(abs(value), abs(spread))
+        self._power = 0
+        if largest > 0.0 and not 1e-3 <= largest < 1e5:
+            self._power = floor(log10(largest))
+        if spread > 0.0 and isfinite(spread):
+            self._decimals = min(max(1 - floor(log10(spread)) + self._power, 0), 9)
+        else:
+            self._decimals = 3
+
+    def __call__(self, value: float) -> str:
+        """Return the number as text."""
+        if not isfinite(value):
+            return "not known" if isnan(value) else "unbounded"
+        text = f"{value / 10.0**self._power:.{self._decimals}f}".replace("-", "\N{MINUS SIGN}")
+        return text + (f"e{self._power}" if self._power else "")
+
+
+def probability_text(probability: float) -> str:
+    """Return a probability that is neither rounded to one nor to zero."""
+    if isnan(probability):
+        return "not known"
+    if probability > 0.9995:
+        return "> 0.999"
+    if probability < 5e-4:
+        return f"{probability:.0e}" if probability > 1e-99 else "< 1e-99"
+    return f"{probability:.3f}"
+
+
+def p_value_text(p: float) -> str:
+    """Return a p-value."""
+    if isnan(p):
+        return "not known"
+    return "< 1e-6" if p < 1e-6 else f"{p:.2g}"
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number with significant digits, or a dash where it is not known."""
+    return "\N{EN DASH}" if isnan(value) else f"{value:.{digits}g}".replace("-", "\N{MINUS SIGN}")
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit for people; empty for plain numbers."""
+    return SHORT_UNITS.get(unit, unit)
+
+
+def headline(verdict: Verdict) -> str:
+    """Return the verdict in one sentence that holds its probability."""
+    text = verdict.sentence.rstrip(".")
+    known = [*verdict.effects, *(effect for item in verdict.hypotheses for effect in item.effects)]
+    for identifier, name in {effect.identifier: effect.name for effect in known}.items():
+        text = re.sub(rf"\b{identifier}\b", name, text)
+    if isnan(verdict.probability) or "probability" in text:
+        return text + "."
+    about = {
+        VerdictKind.NOTHING_MISSING: "probability that nothing is missing",
+        VerdictKind.GROUP: "together they have the probability",
+        VerdictKind.FAMILY: "probability",
+        VerdictKind.BELOW_LIMIT: "together with none they have the probability",
+    }.get(verdict.kind)
+    if about is None:
+        return text + "."
+    return f"{text} ({about} {probability_text(verdict.probability)})."
+
+
+def hypothesis_name(hypothesis: Hypothesis) -> str:
+    """Return the effects of a hypothesis in words."""
+    if not hypothesis.effects:
+        return "nothing missing"
+    return " + ".join(
+        effect.name + (f" ({effect.place})" if effect.place else "") for effect in hypothesis.effects
+    )
+
+
+def added_label(investigation: Investigation) -> str:
+    """Return what the model "after" has more than the model "before"; empty if nothing."""
+    fit = investigation.fit
+    if fit is None or not fit.candidate.terms:
+        return ""
+    return " + ".join(
+        term.effect.name + (f" ({term.place})" if term.place else "") for term in fit.candidate.terms
+    )
+
+
+def catalogue_of(investigation: Investigation) -> dict[str, Effect]:
+    """Return the effects that could be tested, by identifier."""
+    return (
+        {}
+        if investigation.search is None
+        else {item.identifier: item for item in investigation.search.effects}
+    )
+
+
+def listing(words: Iterable[str]) -> str:
+    """Return words as "a, b and c"."""
+    found: Sequence[str] = list(words)
+    if len(found) < 2:
+        return "".join(found)
+    return f"{', '.join(found[:-1])} and {found[-1]}"
+
+
+_GREEK = {
+    "alpha": "α", "beta": "β", "chi": "χ", "delta": "δ", "eps": "ε", "eta": "η", "kappa": "κ", "mu": "μ",
+    "nu": "ν",
+    "phi": "φ", "pi": "π", "rho": "ρ", "tau": "τ", "theta": "θ", "zeta": "ζ",
+}  # fmt: skip
+_GREEK_WORD = re.compile(rf"\b({'|'.join(_GREEK)})(?=\b|_)")
+_POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def formula(text: str) -> str:
+    """Return an equation of the catalogue with Greek letters, powers and arrows as they are printed."""
+    text = _GREEK_WORD.sub(lambda match: _GREEK[match.group(1)], text).replace("->", "→")
+    return re.sub(r"\^(\d)(?!\w)", lambda match: match.group(1).translate(_POWERS), text)
+
+
+def percent(share: float) -> str:
+    """Return a share in percent; never 100 where a little is left."""
+    text = 100.0 * share
+    return "> 99.9" if 99.95 < text < 100.0 else f"{text:.1f}"

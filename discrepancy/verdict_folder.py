@@ -1,0 +1,167 @@
+"""The folder that an investigation leaves: verdict, patch, residuals, figures, report; whole or not."""
+
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from discrepancy.document_file import Origin
+from discrepancy.naming import named_effects
+from discrepancy.patch_file import PATCH_NAME, fmu_outputs, primitive_intervals, write_patch
+from discrepancy.report.content import ReportInput
+from discrepancy.report.figures import draw, report_figures
+from discrepancy.report.page import render_report
+from discrepancy.report.text import added_label
+from discrepancy.residual_file import RESIDUALS_NAME, write_residuals
+from discrepancy.self_calibration import SELF_CALIBRATION_NAME, SelfCalibration, write_self_calibration
+from discrepancy.separability import Separability
+from discrepancy.verdict import VerdictKind
+from discrepancy.verdict_file import VERDICT_NAME, write_verdict
+from discrepancy.workflow import Investigation, patch_draws
+from fe.design import WingDesign
+from reporting.errors import FileNotWrittenError
+from reporting.figures import to_png
+from reporting.files import atomic_write_bytes, atomic_write_text, write_error
+
+REPORT_NAME = "report.html"
+FMU_NAME = "patched.fmu"
+FIGURES = "figures"
+PATCHED = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.GROUP)
+"""Verdicts that leave a patch."""
+
+Pack = Callable[[Path, Path], str]
+"""(patch.json, FMU to be written) -> what to say about it."""
+
+
+@dataclass(frozen=True)
+class VerdictContent:
+    """What is written.
+
+    Attributes
+    ----------
+    investigation : Investigation
+        What came out.
+    origin : Origin
+        What it came from.
+    separability : Separability, optional
+        What the campaign can decide.
+    self_calibration : SelfCalibration, optional
+        Where it was asked for.
+    design : WingDesign, optional
+        Of a wing, for the map.
+    pack : callable, optional
+        Makes the patched FMU; called where an effect is named.
+    """
+
+    investigation: Investigation
+    origin: Origin
+    separability: Separability | None = None
+    self_calibration: SelfCalibration | None = None
+    design: WingDesign | None = None
+    pack: Pack | None = None
+
+
+def check_folder(folder: Path, *, replace_it: bool) -> None:
+    """Look at the place before the work begins.
+
+    Raises
+    ------
+    FileNotWrittenError
+        If it is no folder, holds something else than a verdict, or a verdict that is not to be replaced.
+    """
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise FileNotWrittenError(f"{folder} exists and is no folder: choose another --out.")
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if not (folder / VERDICT_NAME).is_file():
+        raise FileNotWrittenError(
+            f"{folder} exists and holds no {VERDICT_NAME}, so it is not touched: choose another --out."
+        )
+    if not replace_it:
+        raise FileNotWrittenError(
+            f"{folder} holds a verdict already: choose another --out or give --replace."
+        )
+
+
+def write_verdict_folder(folder: Path, content: VerdictContent, *, replace_it: bool = False) -> Path:
+    """Write everything beside the folder first, and move it into place when it is complete.
+
+    Parameters
+    ----------
+    folder : Path
+        Where; an empty folder is as good as none.
+    content : VerdictContent
+        What is written.
+    replace_it : bool
+        Put it in the place of an existing folder of a verdict. Anything else is never replaced.
+
+    Returns
+    -------
+    Path
+        Of the report.
+
+    Raises
+    ------
+    FileNotWrittenError
+        As `check_folder`, or if the disk is full or the place not writable; the folder is as it was.
+    """
+    check_folder(folder, replace_it=replace_it)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
+    except OSError as error:
+        raise write_error(error, folder) from error
+    try:
+        fresh = scratch / folder.name
+        fresh.mkdir()
+        _write(fresh, content)
+        if folder.is_dir():
+            folder.rename(scratch / "old")
+        try:
+            fresh.rename(folder)
+        except OSError:
+            if (scratch / "old").is_dir():
+                (scratch / "old").rename(folder)
+            raise
+    except OSError as error:
+        raise write_error(error, folder) from error
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return folder / REPORT_NAME
+
+
+def _write(folder: Path, content: VerdictContent) -> None:
+    found = content.investigation
+    verdict, origin = found.verdict, content.origin
+    write_verdict(folder / VERDICT_NAME, verdict, found.proof, origin)
+    page = ReportInput(found, origin, content.separability, (), content.design, content.self_calibration)
+    if found.problem is not None and found.fit is not None and found.fit.candidate.terms:
+        effects = named_effects(found.problem, found.fit)
+        draws = patch_draws(found.problem, found.fit, origin.provenance.seed or 0)
+        if verdict.kind in PATCHED:
+            page = replace(
+                page,
+                intervals=[primitive_intervals(e.patch, d) for e, d in zip(effects, draws, strict=True)],
+            )
+            write_patch(
+                folder / PATCH_NAME, effects, origin, draws, fmu_outputs(found.campaign),
+                verdict=verdict.kind, sentence=verdict.sentence,
+            )  # fmt: skip
+        if verdict.kind is VerdictKind.NAMED and content.pack is not None:
+            page = replace(page, fmu=content.pack(folder / PATCH_NAME, folder / FMU_NAME))
+    if found.after is not None:
+        label = added_label(found) or "nothing added"
+        write_residuals(
+            folder / RESIDUALS_NAME, found.after,
+            {"hypothesis": label, "verdict": verdict.sentence, "data_hash": origin.data_hash,
+             "command": origin.command},
+        )  # fmt: skip
+    if content.self_calibration is not None:
+        write_self_calibration(folder / SELF_CALIBRATION_NAME, content.self_calibration, origin)
+    figures = report_figures(page)
+    drawings = draw(figures)
+    for name, item in figures.items():
+        atomic_write_bytes(folder / FIGURES / f"{name}.svg", drawings[name])
+        atomic_write_bytes(folder / FIGURES / f"{name}.png", to_png(item.figure))
+    atomic_write_text(folder / REPORT_NAME, render_report(page, drawings, figures))

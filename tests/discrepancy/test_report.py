@@ -1,0 +1,394 @@
+"""The report, its folder, the choice of a model, and the workflow tried on simulated campaigns."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import norm
+
+from discrepancy.campaign import Campaign
+from discrepancy.catalogue.entry import Setting
+from discrepancy.catalogue.library import effect_by_identifier, library
+from discrepancy.document_file import Origin
+from discrepancy.errors import FitError, ModelError
+from discrepancy.examples import example_campaign, plan_for
+from discrepancy.model_choice import ModelKind, choose_model
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.patch_file import read_patch
+from discrepancy.report.check_tables import group_lines, needs, neighbours, rows_of
+from discrepancy.report.content import ReportInput
+from discrepancy.report.figures import draw, report_figures
+from discrepancy.report.page import render_report
+from discrepancy.report.residual_figures import (
+    gauge_places,
+    planform_figure,
+    size,
+    size_by_channel,
+    size_table,
+)
+from discrepancy.report.text import formula, headline, listing, probability_text, rounded
+from discrepancy.residual_file import read_residuals
+from discrepancy.residuals import ResidualSet
+from discrepancy.self_calibration import (
+    NOTHING,
+    Simulator,
+    outcome_of,
+    self_calibrate,
+    wilson,
+    write_self_calibration,
+)
+from discrepancy.separability import CONFUSED, Separability, separability
+from discrepancy.verdict import Verdict, VerdictKind
+from discrepancy.verdict_file import read_verdict
+from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
+from discrepancy.workflow import Investigation, investigate
+from fe.design import load_design
+from fe.patch import ModelPatch
+from reporting.errors import FileNotWrittenError
+from reporting.provenance import collect_provenance
+
+MODEL = "single_mass_rig"
+ORIGIN = Origin("Rig", MODEL, "ab" * 32, "cd" * 32, "uav-twin discrepancy run rig", collect_provenance(0))
+
+
+def measured(hidden: str = "", value: float = 0.0, kind: str = "laboratory") -> tuple[Campaign, LumpedModel]:
+    """A simulated campaign of the single-mass rig."""
+    model = LumpedModel.load(MODEL)
+    outputs = tuple(item.name for item in model.description.output)
+    plan = plan_for(model, outputs, model.description.input[0].name)
+    plan = replace(plan, duration=0.5 * plan.duration)
+    patch = ModelPatch()
+    if hidden:
+        effect = effect_by_identifier(hidden, library())
+        bare = example_campaign(model, kind, 4, plan)  # type: ignore[arg-type]
+        setting = Setting(bare, model, model.scales(bare))
+        values = {item.name: item.prior.value(0.0) for item in effect.parameters}
+        values[effect.parameters[0].name] = value
+        patch = effect.patch(setting, values, effect.places(setting)[0])
+    return example_campaign(model, kind, 4, plan, patch), model  # type: ignore[arg-type]
+
+
+FEW = tuple(
+    effect
+    for effect in library()
+    if effect.identifier
+    in ("quadratic_damping", "coulomb_friction", "structural_damping", "gauge_gain", "load_cell", "washout")
+)
+"""Part of the catalogue, where the whole one would only take time."""
+
+
+@pytest.fixture(scope="module")
+def drag() -> Investigation:
+    """Quadratic damping, hidden in ring-downs and static trials, and found."""
+    campaign, model = measured("quadratic_damping", 0.01)
+    return investigate(campaign, model, FEW)
+
+
+@pytest.fixture(scope="module")
+def able(drag: Investigation) -> Separability:
+    assert drag.problem is not None
+    return separability(drag.campaign, drag.model, drag.problem.setting, FEW)
+
+
+# ---------------------------------------------------------------- text
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-9, 1e3))
+def test_rounding_keeps_values_within_a_twentieth_of_their_spread(value: float, spread: float) -> None:
+    text = rounded(value, spread)(value).replace("\N{MINUS SIGN}", "-")
+    assert abs(float(text) - value) <= 0.051 * spread + 1e-9 * abs(value)
+
+
+def test_numbers_that_nobody_should_read_as_certain() -> None:
+    assert probability_text(1.0 - 1e-6) == "> 0.999"
+    assert probability_text(1e-200) == "< 1e-99"
+    assert probability_text(float("nan")) == "not known"
+    assert rounded(float("nan"), 1.0)(float("nan")) == "not known"
+
+
+def test_formulas_and_lists() -> None:
+    assert formula("zeta_eq = 4 c A w^2 / (3 pi k) -> zeta") == "ζ_eq = 4 c A w² / (3 π k) → ζ"
+    assert formula("x^n, beta2, multiplier mu") == "x^n, beta2, multiplier μ"
+    assert listing(["a"]) == "a"
+    assert listing(["a", "b", "c"]) == "a, b and c"
+
+
+def test_a_headline_has_one_probability() -> None:
+    named = Verdict(VerdictKind.NAMED, "The model lacks drag (probability 0.998).", 0.998, 12.0)
+    assert headline(named).count("probability") == 1
+    group = Verdict(VerdictKind.GROUP, "One of a, b is missing.", 0.97, 12.0)
+    assert headline(group) == "One of a, b is missing (together they have the probability 0.970)."
+    broken = Verdict(VerdictKind.DATA_ERROR, "Channel x is clipped.", float("nan"), float("nan"))
+    assert headline(broken) == "Channel x is clipped."
+
+
+# ---------------------------------------------------------------- sizes of residuals
+
+
+def test_sizes_are_one_for_noise_and_follow_what_is_added(make_bench: Callable[..., object]) -> None:
+    bench = make_bench(amplitudes=(200.0, 150.0))  # type: ignore[call-arg]
+    residuals: ResidualSet = bench.fit(np.random.default_rng(3))  # type: ignore[attr-defined]
+    channels, _, table = size_table(residuals)
+    assert table.shape == (4, 3)
+    assert channels == ["g1", "g2", "g3", "g4"]
+    assert np.all(np.abs(table[:, :2] - 1.0) < 0.25)
+    item = residuals.trials[0]
+    louder = replace(item, residual=3.0 * item.residual)
+    assert size(louder, 2) == pytest.approx(3.0 * size(item, 2), rel=1e-12)
+    alone = ResidualSet(residuals.channels, (item,))
+    assert size_by_channel(alone)["g3"] == pytest.approx(size(item, 2), rel=1e-12)
+
+
+def test_gauges_lie_where_the_design_has_them(make_bench: Callable[..., object]) -> None:
+    bench = make_bench()  # type: ignore[call-arg]
+    residuals: ResidualSet = bench.fit(np.random.default_rng(3))  # type: ignore[attr-defined]
+    design = load_design()
+    channels = {
+        name: replace(channel, output=f"strain[{number}]")
+        for number, (name, channel) in enumerate(residuals.channels.items(), start=1)
+    }
+    places = gauge_places(list(channels.values()), design)
+    assert list(places.values()) == list(design.gauges.positions[:4])  # gauges count from one
+    own = {"g1": replace(channels["g1"], station=0.5, chord=0.2)}
+    assert gauge_places(list(own.values()), design) == {"g1": (0.5, 0.2)}
+    figure = planform_figure(replace(residuals, channels=channels), None, design)
+    assert figure is not None
+    labels = [text.get_text() for text in figure.axes[0].texts]
+    assert labels == ["g1", "g2", "g3", "g4"]
+    nowhere = {name: replace(channel, output="x") for name, channel in channels.items()}
+    assert planform_figure(replace(residuals, channels=nowhere), None, design) is None
+
+
+# ---------------------------------------------------------------- page and folder
+
+
+def test_the_folder_of_a_named_effect(drag: Investigation, able: Separability, tmp_path: Path) -> None:
+    assert drag.verdict.kind is VerdictKind.NAMED
+    folder = tmp_path / "verdict"
+    report = write_verdict_folder(folder, VerdictContent(drag, ORIGIN, able))
+    page = report.read_text(encoding="utf-8")
+    assert "quadratic aerodynamic damping" in page
+    assert "F = c |v| v" in page  # the equation of the catalogue
+    assert "<script" not in page
+    assert not re.search(r'(?:src|href)="(?!#|data:)', page)  # self-contained
+    assert str(tmp_path) not in page
+    for title in ("Verdict", "Where the gap is", "Proof on held-out trials", "What this campaign can decide"):
+        assert f">{title}<" in page
+    assert len(set(re.findall(r'\bid="([^"]+)"', page))) == len(re.findall(r'\bid="([^"]+)"', page))
+    stored = read_verdict(folder / "verdict.json")
+    assert stored.verdict.sentence == drag.verdict.sentence
+    patch = read_patch(folder / "patch.json")
+    assert patch.patch == drag.verdict.effects[0].patch
+    assert patch.verdict is VerdictKind.NAMED
+    row = patch.intervals[0][0]
+    assert row.low < row.value < row.high
+    residuals = read_residuals(folder / "residuals.nc")
+    assert len(residuals.trials) == len(drag.campaign.trials)
+    pictures = {path.name for path in (folder / "figures").iterdir()}
+    assert {"history.svg", "history.png", "evidence.svg", "backbone.svg", "separability.png"} <= pictures
+    assert not list(tmp_path.glob(".*"))  # nothing half-written is left
+
+
+def test_a_report_repeats_bit_for_bit(drag: Investigation, able: Separability) -> None:
+    content = ReportInput(drag, ORIGIN, able)
+    pages = []
+    for _ in range(2):
+        figures = report_figures(content)
+        pages.append(render_report(content, draw(figures), figures))
+    assert pages[0] == pages[1]
+
+
+def test_a_null_has_no_patch_and_no_model_after(tmp_path: Path) -> None:
+    campaign, model = measured(kind="static")
+    found = investigate(campaign, model, library())
+    assert found.verdict.kind is VerdictKind.NOTHING_MISSING
+    report = write_verdict_folder(tmp_path / "v", VerdictContent(found, ORIGIN))
+    assert not (tmp_path / "v" / "patch.json").exists()
+    page = report.read_text(encoding="utf-8")
+    assert "with the effect" not in page
+    assert "nothing is missing" in page
+
+
+def test_faults_of_the_data_are_reported_and_nothing_else(tmp_path: Path) -> None:
+    campaign, model = measured(kind="static")
+    wrong = tuple(replace(trial, values=1e6 * trial.values) for trial in campaign.trials)
+    found = investigate(replace(campaign, trials=wrong), model, library())
+    assert found.verdict.kind is VerdictKind.DATA_ERROR
+    report = write_verdict_folder(tmp_path / "v", VerdictContent(found, ORIGIN))
+    page = report.read_text(encoding="utf-8")
+    assert found.verdict.sentence.split(",")[0] in page
+    assert "Proof" not in page
+    assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["report.html", "verdict.json"]
+
+
+def test_a_folder_is_replaced_on_demand_only_and_only_if_it_is_a_verdict(tmp_path: Path) -> None:
+    campaign, model = measured(kind="static")
+    content = VerdictContent(investigate(campaign, model, library()), ORIGIN)
+    folder = tmp_path / "v"
+    write_verdict_folder(folder, content)
+    (folder / "stray.txt").write_text("x", encoding="utf-8")
+    with pytest.raises(FileNotWrittenError, match="--replace"):
+        write_verdict_folder(folder, content)
+    write_verdict_folder(folder, content, replace_it=True)
+    assert not (folder / "stray.txt").exists()
+    other = tmp_path / "thesis"
+    other.mkdir()
+    (other / "chapter.tex").write_text("x", encoding="utf-8")
+    with pytest.raises(FileNotWrittenError, match="not touched"):
+        check_folder(other, replace_it=True)
+    with pytest.raises(FileNotWrittenError, match="no folder"):
+        check_folder(other / "chapter.tex", replace_it=True)
+
+
+def test_a_failure_while_writing_leaves_the_old_folder(
+    drag: Investigation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "v"
+    folder.mkdir()
+    (folder / "verdict.json").write_text("old", encoding="utf-8")
+
+    def refuse(patch: Path, target: Path) -> str:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(FileNotWrittenError, match="No space"):
+        write_verdict_folder(folder, VerdictContent(drag, ORIGIN, pack=refuse), replace_it=True)
+    assert (folder / "verdict.json").read_text(encoding="utf-8") == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["v"]
+
+
+# ---------------------------------------------------------------- what a campaign can decide
+
+
+def test_rows_of_what_can_be_decided(drag: Investigation, able: Separability) -> None:
+    rows = {row[0]: row for row in rows_of(able)}
+    assert set(rows) == {effect.identifier for effect in FEW}
+    assert rows["washout"][1] == "no"
+    assert rows["quadratic_damping"][1] == "yes"
+    for number, name in enumerate(able.identifiers):
+        near = np.minimum(able.distance[number], able.distance[:, number]) < CONFUSED
+        near[number] = False
+        assert neighbours(able, name) == [able.identifiers[place] for place in np.flatnonzero(near)]
+    assert group_lines(able)
+    text = " ".join(needs(able, drag.campaign, FEW))
+    for group in able.groups:
+        assert group[0].replace("_", " ") in text
+
+
+# ---------------------------------------------------------------- the workflow tried
+
+
+@pytest.mark.parametrize(
+    ("hidden", "kind", "named", "group", "outcome"),
+    [
+        (NOTHING, VerdictKind.NOTHING_MISSING, (), (), "right"),
+        (NOTHING, VerdictKind.NAMED, ("a",), (), "wrong"),
+        ("a", VerdictKind.NAMED, ("a",), (), "right"),
+        ("a", VerdictKind.NAMED, ("b",), (), "wrong"),
+        ("a", VerdictKind.NAMED, ("a", "b"), (), "wrong"),
+        ("a", VerdictKind.GROUP, ("b", "a"), ("b", "a"), "group"),
+        ("a", VerdictKind.GROUP, ("b", "c"), ("b", "c"), "wrong"),
+        ("a", VerdictKind.GROUP, ("a", "b"), ("a + b",), "group"),
+        ("a", VerdictKind.FAMILY, ("a",), (), "family"),
+        ("a", VerdictKind.FAMILY, ("b",), (), "wrong"),
+        ("a", VerdictKind.NOTHING_MISSING, (), (), "missed"),
+        ("a", VerdictKind.UNEXPLAINED, (), (), "unexplained"),
+    ],
+)
+def test_how_verdicts_count(
+    hidden: str, kind: VerdictKind, named: tuple[str, ...], group: tuple[str, ...], outcome: str
+) -> None:
+    assert outcome_of(hidden, kind, named, group) == outcome
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 60), st.integers(1, 60))
+def test_wilson_intervals_solve_their_equation(count: int, total: int) -> None:
+    count = min(count, total)
+    found = wilson(count, total)
+    z = norm.ppf(0.95)
+    for end in (found.low, found.high):
+        if 0.0 < end < 1.0:  # Wilson 1927: |p - end| = z sqrt(end (1 - end) / n)
+            assert abs(found.value - end) == pytest.approx(z * np.sqrt(end * (1.0 - end) / total), rel=1e-6)
+    assert wilson(0, 0).total == 0
+
+
+def test_simulated_campaigns_have_the_noise_and_the_nuisances_of_the_real_one() -> None:
+    campaign, model = measured()
+    simulator = Simulator(campaign, model)
+    squares: list[float] = []
+    for seed in range(12):
+        drawn = simulator.simulate(None, np.random.default_rng(seed))
+        assert [trial.name for trial in drawn.trials] == [trial.name for trial in campaign.trials]
+        found = investigate(drawn, model, (), thorough=False) if seed < 2 else None
+        assert found is None or found.verdict.kind is VerdictKind.NOTHING_MISSING
+        again = simulator.simulate(None, np.random.default_rng(seed)).trials[-1].values
+        assert np.array_equal(again, drawn.trials[-1].values)
+        # sixth differences of a slow motion hold noise alone: variance times the sum of squared binomials
+        sixth = np.diff(drawn.trials[-1].values[:, 0], 6)
+        noise = simulator.problem.noise[drawn.trials[-1].channels[0]].standard_deviation
+        squares.append(float(np.mean(sixth**2)) / 924.0 / noise**2)
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.12)
+
+
+def test_the_workflow_tried_on_its_own_geometry(tmp_path: Path) -> None:
+    campaign, model = measured(kind="static")
+    steps: list[int] = []
+    found = self_calibrate(campaign, model, FEW, 9, seed=2, workers=1, advance=lambda: steps.append(1))
+    assert len(steps) == len(found.cases) == 9
+    assert [case.hidden == NOTHING for case in found.cases] == [True, False, False] * 3
+    assert all(case.distance >= 25.0 for case in found.cases if case.hidden != NOTHING)
+    assert sum(found.confusion()[2].ravel()) == 9
+    assert found.share("right", null=True).total == 3
+    again = self_calibrate(campaign, model, FEW, 9, seed=2, workers=1)
+    assert again == found
+    path = write_self_calibration(tmp_path / "self_calibration.json", found, ORIGIN)
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    assert stored["schema"] == "uav-twin self calibration 1"
+    assert len(stored["cases"]) == 9
+    with pytest.raises(FitError, match="at least one"):
+        self_calibrate(campaign, model, library(), 0)
+
+
+# ---------------------------------------------------------------- choice of the model
+
+
+def test_models_by_name_and_file(tmp_path: Path) -> None:
+    shipped = choose_model(MODEL)
+    assert shipped.kind is ModelKind.LUMPED
+    assert shipped.path is None
+    text = (Path(__file__).parents[2] / "discrepancy" / "lumped_models" / f"{MODEL}.toml").read_text(
+        encoding="utf-8"
+    )
+    file = tmp_path / "rig.toml"
+    file.write_text(text, encoding="utf-8")
+    own = choose_model(file)
+    assert own.source_hash == shipped.source_hash
+    assert own.label == "rig.toml"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("no_such_rig", "three_mass_chain"),
+        ("missing.toml", "no model file"),
+        ("missing.nc", "no model file"),
+        ("wing.fmu", "is an FMU"),
+        ("table.csv", "is no model"),
+        ("broken.toml", "cannot be read"),
+        ("design.toml", "design"),
+    ],
+)
+def test_models_that_cannot_be_used(name: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "table.csv").write_text("a,b\n", encoding="utf-8")
+    (tmp_path / "broken.toml").write_text("mass = [", encoding="utf-8")
+    (tmp_path / "design.toml").write_text("name = 'half a wing'\n", encoding="utf-8")
+    with pytest.raises(ModelError, match=message):
+        choose_model(tmp_path / name if "." in name else name)

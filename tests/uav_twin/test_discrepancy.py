@@ -1,0 +1,136 @@
+"""`uav-twin discrepancy` as a user calls it: example, check, run, and what goes wrong."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from discrepancy.patch_file import read_patch
+from discrepancy.verdict_file import read_verdict
+from uav_twin import cli
+
+RIG = ("--model", "single_mass_rig")
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Run the command line in this process and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["uav-twin", "discrepancy", *arguments])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    code = caught.value.code
+    return 0 if code is None else int(code)
+
+
+@pytest.fixture
+def campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A static campaign of the single-mass rig with a seating offset."""
+    folder = tmp_path / "rig test"
+    given = ("static", str(folder), *RIG, "--seed", "3", "--effect", "seating_offset@A:offset_ratio=0.08")
+    assert call(monkeypatch, "example", *given) == 0
+    return folder
+
+
+def test_from_an_example_to_a_verdict(
+    campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = (campaign / "campaign.toml").read_text(encoding="utf-8")
+    (campaign / "campaign.toml").write_text(table.replace("held_out = true", "held_out = false"), "utf-8")
+    capsys.readouterr()
+    assert call(monkeypatch, "check", str(campaign), *RIG) == 0
+    shown = capsys.readouterr().out
+    assert "seating_offset" in shown
+    assert "Not testable: washout. The campaign has no flight trial to fit." in shown
+    assert "Hold out a trial" in shown or "held out" in shown
+    out = tmp_path / "verdict"
+    assert call(monkeypatch, "run", str(campaign), *RIG, "--out", str(out), "--calibrate", "1") == 0
+    shown = capsys.readouterr().out
+    stored = read_verdict(out / "verdict.json")
+    assert f"Verdict: {stored.verdict.kind.value}" in shown
+    assert "seating_offset" in stored.verdict.inclusion
+    assert stored.origin.command == (
+        "uav-twin discrepancy run 'rig test' --model single_mass_rig --seed 0 --calibrate 1"
+    )
+    assert "seating_offset" in {effect.identifier for effect in read_patch(out / "patch.json").effects}
+    tried = json.loads((out / "self_calibration.json").read_text(encoding="utf-8"))
+    assert len(tried["cases"]) == 1
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "seating offset" in page
+    assert str(tmp_path) not in page
+    # a second time: only on demand, and then with the same conclusion
+    assert call(monkeypatch, "run", str(campaign), *RIG, "--out", str(out)) == 1
+    assert "--replace" in capsys.readouterr().err
+    before = (out / "verdict.json").read_bytes()
+    again = ("--out", str(out), "--calibrate", "1", "--replace")
+    assert call(monkeypatch, "run", str(campaign), *RIG, *again) == 0
+    assert (out / "verdict.json").read_bytes() == before
+
+
+def test_faults_of_the_data_end_with_a_sentence_and_a_report(
+    campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (campaign / "campaign.toml").read_text(encoding="utf-8")
+    assert 'unit = "mm"' in text
+    (campaign / "campaign.toml").write_text(text.replace('unit = "mm"', 'unit = "m"', 1), encoding="utf-8")
+    capsys.readouterr()
+    assert call(monkeypatch, "check", str(campaign), *RIG) == 1
+    assert "Fault:" in capsys.readouterr().out
+    assert call(monkeypatch, "run", str(campaign), *RIG, "--out", str(tmp_path / "v")) == 1
+    caught = capsys.readouterr()
+    assert "1000" in caught.err or "10^" in caught.err or "unit" in caught.err
+    assert "Traceback" not in caught.err
+    assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["report.html", "verdict.json"]
+
+
+def test_the_catalogue(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(monkeypatch, "effects") == 0
+    shown = capsys.readouterr().out
+    assert "coulomb_friction" in shown
+    assert "ζ_eq(A)" in shown
+    assert call(monkeypatch, "effects", "--show", "coulomb_friction") == 0
+    shown = capsys.readouterr().out
+    assert "friction_ratio" in shown
+    assert "Den Hartog" in shown
+    assert call(monkeypatch, "effects", "--show", "gremlins") == 1
+    assert "coulomb_friction" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", "nowhere", *RIG), "nowhere"),
+        (("run", "{campaign}", "--model", "no_such_rig"), "three_mass_chain"),
+        (("run", "{campaign}", "--model", "wing.fmu"), "FMU"),
+        (("run", "{campaign}", *RIG, "--effects", "none.toml"), "none.toml"),
+        (("run", "{campaign}", *RIG, "--out", "{campaign}"), "not touched"),
+        (("check", "nowhere", *RIG), "nowhere"),
+        (("example", "dance", "{new}", *RIG), "the kinds are"),
+        (("example", "static", "{campaign}", *RIG), "not empty"),
+        (("example", "static", "{new}", *RIG, "--effect", "gremlins=1"), "gremlins"),
+        (("example", "static", "{new}", *RIG, "--effect", "load_cell=much"), "must end with numbers"),
+        (("example", "static", "{new}", *RIG, "--effect", "load_cell=1,2,3"), "2 parameters"),
+        (("example", "static", "{new}", *RIG, "--effect", "load_cell:tara=1"), "no parameter 'tara'"),
+        (("example", "static", "{new}", *RIG, "--effect", "seating_offset@Z"), "its places are"),
+        (("example", "static", "{new}", *RIG, "--effect", "washout"), "cannot be hidden"),
+    ],
+)
+def test_bad_input_is_one_sentence(
+    arguments: tuple[str, ...],
+    message: str,
+    campaign: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+    before = sorted(path.name for path in tmp_path.iterdir())
+    filled = [word.format(campaign=campaign, new=tmp_path / "new") for word in arguments]
+    assert call(monkeypatch, *filled) == 1
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert "Traceback" not in error
+    assert sorted(path.name for path in tmp_path.iterdir()) == before  # nothing half-written

@@ -1,0 +1,17 @@
+"""`uav-twin discrepancy ...`: what a model lacks beside measured data."""
+
+from __future__ import annotations
+
+import typer
+
+from uav_twin.discrepancy_catalogue import effects, example
+from uav_twin.discrepancy_check import check
+from uav_twin.discrepancy_run import run
+
+discrepancy_app = typer.Typer(
+    no_args_is_help=True, help="Find, name, add and prove what a model lacks beside measured data."
+)
+discrepancy_app.command("run")(run)
+discrepancy_app.command("check")(check)
+discrepancy_app.command("effects")(effects)
+discrepancy_app.command("example")(example)

@@ -1,0 +1,200 @@
+"""`uav-twin discrepancy effects` and `example`: the catalogue, and a campaign to try."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from discrepancy.campaign import Campaign
+    from discrepancy.catalogue.entry import Effect
+    from discrepancy.examples import ExamplePlan
+    from discrepancy.model_choice import ModelChoice
+    from discrepancy.models.interface import Model
+    from fe.patch import ModelPatch
+
+
+def effects(
+    show: Annotated[str | None, typer.Option(metavar="ID", help="Everything about one effect.")] = None,
+    add: Annotated[
+        list[Path] | None,
+        typer.Option("--effects", help="A TOML file of further effects; may be given several times."),
+    ] = None,
+) -> None:
+    """List the effects that can be named."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
+    from discrepancy.report.text import formula
+
+    catalogue = load_catalogue(add or ())
+    console = Console(highlight=False, markup=False)
+    if show is not None:
+        _show(effect_by_identifier(show, catalogue), console)
+        return
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("id", "name", "family", "equation"):
+        table.add_column(heading, overflow="fold")
+    for effect in catalogue:
+        table.add_row(effect.identifier, effect.name, effect.family, formula(effect.equation))
+    console.print(table)
+    console.print(f"{len(catalogue)} effects; --show ID tells everything about one.")
+
+
+def _show(effect: Effect, console: object) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from discrepancy.report.text import formula, unit_text
+
+    assert isinstance(console, Console)
+    facts = Table(box=None, show_header=False)
+    facts.add_column(no_wrap=True)
+    facts.add_column(overflow="fold")
+    for name, value in (
+        ("id", effect.identifier),
+        ("name", effect.name),
+        ("family", effect.family),
+        ("equation", formula(effect.equation)),
+        ("signature", formula(effect.signature)),
+        ("acts on", ", ".join(sorted(kind.value for kind in effect.acts_on))),
+        ("confusable with", ", ".join(effect.confusable) or "nothing in general"),
+        ("reference", effect.reference),
+    ):
+        facts.add_row(name, value)
+    console.print(facts)
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("parameter", "symbol", "prior (90 %)", "unit", "meaning"):
+        table.add_column(heading, overflow="fold")
+    for item in effect.parameters:
+        prior = f"{item.prior.low:g} to {item.prior.high:g}, {item.prior.shape.replace('_', '-')}"
+        table.add_row(item.name, item.symbol, prior, unit_text(item.unit), item.description)
+    for shape in effect.shape:
+        table.add_row(
+            shape.name,
+            shape.symbol,
+            f"{shape.canonical:g}; freed: {shape.prior.low:g} to {shape.prior.high:g}",
+            "",
+            shape.description,
+        )
+    console.print(table)
+
+
+def example(
+    kind: Annotated[
+        str, typer.Argument(help="static, ringdown, flight, laboratory or complete.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Argument(help="The folder to write.", show_default=False)],
+    model: Annotated[
+        str | None,
+        typer.Option(help="As of `discrepancy run`.", show_default="the shipped wing"),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of noise, zeros, gains and releases.")] = 0,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ID[@PLACE][:NAME=VALUE,...]",
+            help="Hide an effect; values of its parameters in the catalogue's order, else their prior "
+            "medians. May "
+            "be given several times.",
+        ),
+    ] = None,
+) -> None:
+    """Write a simulated campaign, with an effect hidden in it if asked for."""
+    from discrepancy.examples import write_example
+    from discrepancy.model_choice import choose_model
+    from fe.patch import ModelPatch
+    from reporting.errors import FileNotWrittenError
+    from reporting.progress import RichProgress
+
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FileNotWrittenError(f"{out} exists and is not empty: choose another folder.")
+    choice = choose_model(model, RichProgress())
+    plan = _plan(choice)
+    patch = ModelPatch()
+    if effect:
+        bare = _bare(choice.model, kind, seed, plan)
+        for text in effect:
+            patch = patch + _hidden(text, choice.model, bare)
+    campaign = write_example(choice.model, out, kind, seed, plan, patch)  # type: ignore[arg-type]
+    hidden = ", ".join(effect) if effect else "nothing"
+    named = "" if model is None else f" --model {shlex.quote(model)}"
+    typer.echo(
+        f"Wrote {out}: {len(campaign.trials)} trials, {len(campaign.channels)} channels; hidden: {hidden}."
+    )
+    typer.echo(f"Next: uav-twin discrepancy check {shlex.quote(str(out))}{named}")
+    typer.echo(f"Then: uav-twin discrepancy run {shlex.quote(str(out))}{named}")
+
+
+def _plan(choice: ModelChoice) -> ExamplePlan:
+    """Return what an example measures: gauges and tip of a wing, every output of a lumped model."""
+    from discrepancy.examples import plan_for, wing_plan
+    from discrepancy.models.lumped import LumpedModel
+
+    if not isinstance(choice.model, LumpedModel):
+        return wing_plan()
+    description = choice.model.description
+    outputs = tuple(item.name for item in description.output)
+    return plan_for(choice.model, outputs, description.input[0].name)
+
+
+def _bare(model: Model, kind: str, seed: int, plan: ExamplePlan) -> Campaign:
+    from discrepancy.examples import example_campaign
+
+    return example_campaign(model, kind, seed, plan)  # type: ignore[arg-type]
+
+
+def _hidden(text: str, model: Model, campaign: Campaign) -> ModelPatch:
+    """Return the patch of ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,..; raises `CatalogueError`."""
+    from discrepancy.catalogue.entry import Setting
+    from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
+    from discrepancy.errors import CatalogueError
+
+    head, named, numbers = text.partition(":")
+    if not named:
+        head, _, numbers = text.partition("=")
+    identifier, at, place = head.partition("@")
+    found = effect_by_identifier(identifier, load_catalogue())
+    setting = Setting(campaign, model, model.scales(campaign))
+    reason = found.unavailable(setting)
+    if reason is not None:
+        raise CatalogueError(f"{identifier} cannot be hidden in this example: {reason}")
+    places = found.places(setting)
+    if at and place not in places:
+        known = ", ".join(repr(name) for name in places)
+        raise CatalogueError(f"{identifier} cannot act at {place!r} here; its places are {known}.")
+    values = {item.name: item.prior.value(0.0) for item in found.parameters}
+    for item in found.parameters:
+        if item.magnitude and values[item.name] == 0.0:
+            values[item.name] = item.prior.value(1.0)  # the median of a signed size would hide nothing
+    if numbers or named:
+        values |= _values(text, identifier, numbers.split(","), list(values))
+    return found.patch(setting, values, place if at else places[0])
+
+
+def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> dict[str, float]:
+    """Return the values that `parts` give, "VALUE" in the order of `names` or "NAME=VALUE"."""
+    from discrepancy.errors import CatalogueError
+
+    if len(parts) > len(names):
+        raise CatalogueError(
+            f"{identifier} has {len(names)} parameters ({', '.join(names)}), but {len(parts)} values came."
+        )
+    values = {}
+    for position, part in enumerate(parts):
+        name, equals, number = part.rpartition("=")
+        if equals and name not in names:
+            raise CatalogueError(f"{identifier} has no parameter {name!r}; it has {', '.join(names)}.")
+        try:
+            values[name or names[position]] = float(number)
+        except ValueError:
+            raise CatalogueError(
+                f"{text!r} must end with numbers, such as {identifier}:{names[0]}=0.1."
+            ) from None
+    return values

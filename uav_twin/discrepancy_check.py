@@ -1,0 +1,69 @@
+"""`uav-twin discrepancy check`: what a campaign can decide, before anything is fitted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def check(
+    campaign: Annotated[Path, typer.Argument(help="Folder with campaign.toml.", show_default=False)],
+    model: Annotated[
+        str | None,
+        typer.Option(help="As of `discrepancy run`.", show_default="the shipped wing"),
+    ] = None,
+    effects: Annotated[
+        list[Path] | None, typer.Option(help="A TOML file of further effects; may be given several times.")
+    ] = None,
+) -> None:
+    """Say what is wrong with the data, which effects they can show, and which they cannot tell apart."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from discrepancy.campaign_file import read_campaign
+    from discrepancy.catalogue.entry import Setting
+    from discrepancy.catalogue.library import load_catalogue
+    from discrepancy.model_choice import choose_model
+    from discrepancy.report.check_tables import HEADINGS, group_lines, needs, rows_of
+    from discrepancy.separability import separability
+    from discrepancy.workflow import checked
+    from reporting.progress import RichProgress
+
+    data = read_campaign(campaign)
+    catalogue = load_catalogue(effects or ())
+    progress = RichProgress()
+    choice = choose_model(model, progress)
+    data, faults = checked(data, choice.model)
+    console = Console(highlight=False, markup=False)
+    held = [trial.name for trial in data.trials if trial.held_out]
+    console.print(
+        f"{data.name}: {len(data.trials)} trials, {len(data.channels)} channels, beside {choice.model.name}; "
+        f"held out: {', '.join(held) or 'none'}.",
+        soft_wrap=True,
+    )
+    for fault in faults:
+        console.print(f"{'Fault' if fault.fatal else 'Limit'}: {fault.sentence}", soft_wrap=True)
+    if any(fault.fatal for fault in faults):
+        typer.secho("Mend the faults first: conclusions from these data would be wrong.", fg="red", err=True)
+        raise typer.Exit(1)
+    with progress.stage("What this campaign can decide"):
+        able = separability(
+            data, choice.model, Setting(data, choice.model, choice.model.scales(data)), catalogue
+        )
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in (heading for heading in HEADINGS if heading != "testable"):
+        table.add_column(heading, overflow="fold")
+    for row, item in zip(rows_of(able), able.detectability, strict=True):
+        if not item.reason:
+            table.add_row(
+                *(cell for heading, cell in zip(HEADINGS, row, strict=True) if heading != "testable")
+            )
+    console.print(table)
+    for item in able.detectability:
+        if item.reason:
+            console.print(f"Not testable: {item.effect.identifier}. {item.reason}", soft_wrap=True)
+    for line in (*group_lines(able), *needs(able, data, catalogue)):
+        console.print(line, soft_wrap=True)

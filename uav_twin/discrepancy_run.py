@@ -1,0 +1,228 @@
+"""`uav-twin discrepancy run`: from a campaign to a verdict, with report, patch and patched FMU."""
+
+from __future__ import annotations
+
+import shlex
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from discrepancy.model_choice import ModelChoice
+    from discrepancy.self_calibration import SelfCalibration
+    from discrepancy.verdict_folder import Pack
+    from discrepancy.workflow import Investigation
+    from reporting.progress import Progress
+
+SHOWN_EXPERIMENTS = 3
+
+
+def run(
+    campaign: Annotated[Path, typer.Argument(help="Folder with campaign.toml.", show_default=False)],
+    model: Annotated[
+        str | None,
+        typer.Option(
+            help="A calibration.nc, a wing design, a lumped model or a description of an FMU (.toml), or "
+            "the name of a shipped "
+            "lumped model.",
+            show_default="the shipped wing",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the verdict.", show_default="verdicts/CAMPAIGN")
+    ] = None,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace the folder of an earlier verdict.")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all draws.")] = 0,
+    effects: Annotated[
+        list[Path] | None, typer.Option(help="A TOML file of further effects; may be given several times.")
+    ] = None,
+    calibrate: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Try the workflow on N simulated campaigns of this geometry; takes minutes.",
+        ),
+    ] = None,
+) -> None:
+    """Find out what the model lacks: verdict, report, patch, residuals."""
+    from rich.console import Console
+
+    from discrepancy.campaign_file import read_campaign
+    from discrepancy.catalogue.library import load_catalogue
+    from discrepancy.document_file import Origin
+    from discrepancy.model_choice import choose_model
+    from discrepancy.separability import separability
+    from discrepancy.verdict import VerdictKind
+    from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
+    from discrepancy.workflow import investigate
+    from reporting.progress import RichProgress
+    from reporting.provenance import collect_provenance
+
+    folder = out if out is not None else Path("verdicts") / campaign.resolve().name
+    check_folder(folder, replace_it=replace)
+    data = read_campaign(campaign)
+    catalogue = load_catalogue(effects or ())
+    progress = RichProgress()
+    choice = choose_model(model, progress)
+    found = investigate(data, choice.model, catalogue, seed=seed, progress=progress)
+    able, tried = None, None
+    if found.problem is not None:
+        with progress.stage("What this campaign can decide"):
+            able = separability(found.campaign, choice.model, found.problem.setting, catalogue)
+        if calibrate is not None:
+            tried = _calibrated(found, choice, catalogue, calibrate, seed, progress)
+    origin = Origin(
+        data.name,
+        choice.model.name,
+        data.data_hash,
+        choice.source_hash,
+        _command(campaign, model, seed, effects or [], calibrate),
+        collect_provenance(seed, input_hashes=_inputs(data.data_hash, choice, effects or [])),
+    )
+    pack = None if choice.design is None else _packing(choice, progress)
+    content = VerdictContent(found, origin, able, tried, choice.design, pack)
+    with progress.stage("Writing the report"):
+        report = write_verdict_folder(folder, content, replace_it=replace)
+    if found.verdict.kind is VerdictKind.DATA_ERROR:
+        typer.secho(found.verdict.sentence, fg="red", err=True)
+        for fault in found.faults[1:]:
+            typer.secho(fault.sentence, fg="red", err=True)
+        typer.echo(f"Report: {report}")
+        raise typer.Exit(1)
+    _show(found, tried, report, Console(highlight=False, markup=False))
+
+
+def _calibrated(
+    found: Investigation,
+    choice: ModelChoice,
+    catalogue: tuple[object, ...],
+    count: int,
+    seed: int,
+    progress: Progress,
+) -> SelfCalibration:
+    from discrepancy.model_choice import ModelKind
+    from discrepancy.self_calibration import self_calibrate
+
+    workers = 1 if choice.kind is ModelKind.FMU else 2  # an FMU is a process of its own
+    with progress.stage("Trying the workflow on simulated campaigns", total=count, unit="campaigns") as stage:
+        return self_calibrate(
+            found.campaign, choice.model, catalogue, count, seed=seed, workers=workers, advance=stage.advance,  # type: ignore[arg-type]
+        )  # fmt: skip
+
+
+def _command(campaign: Path, model: str | None, seed: int, effects: list[Path], calibrate: int | None) -> str:
+    """Return the command without the folders of this machine."""
+    words = ["uav-twin", "discrepancy", "run", campaign.resolve().name]
+    if model is not None:
+        words += ["--model", Path(model).name]
+    words += ["--seed", str(seed)]
+    for path in effects:
+        words += ["--effects", path.name]
+    if calibrate is not None:
+        words += ["--calibrate", str(calibrate)]
+    return shlex.join(words)
+
+
+def _inputs(data_hash: str, choice: ModelChoice, effects: list[Path]) -> dict[str, str]:
+    from reporting.provenance import hash_file
+
+    found = {"campaign": data_hash, "model": choice.source_hash}
+    return found | {f"effects {path.name}": hash_file(path) for path in effects}
+
+
+def _packing(choice: ModelChoice, progress: Progress) -> Pack:
+    """Return what makes the FMU of a wing that carries a patch, its effects off."""
+
+    def pack(patch_file: Path, target: Path) -> str:
+        from calibration.result import CalibrationResult
+        from discrepancy.model_choice import ModelKind
+        from fe.cache import reduced_model
+        from fe.patch_cache import patch_arrays
+        from fmu_asset.build import build_fmu
+        from fmu_asset.errors import PatchFileError
+        from fmu_asset.patch_file import load_patch
+        from twin_master.calibrated_asset import pack_calibrated_wing
+
+        try:
+            patch = load_patch(patch_file)
+            model = reduced_model(choice.design, progress=progress)
+            arrays = patch_arrays(choice.design, progress) if patch.needs_arrays else None
+            if choice.kind is ModelKind.CALIBRATION:
+                assert choice.path is not None
+                wing = CalibrationResult.load(choice.path)
+                pack_calibrated_wing(model, wing, target, patch=patch, arrays=arrays)
+            else:
+                build_fmu(model, target, patch=patch, arrays=arrays)
+        except PatchFileError as cause:
+            return f"There is no patched FMU: {str(cause).replace(str(patch_file), patch_file.name)}"
+        names = ", ".join(f"effect.{effect.id}.active" for effect in patch.effects)
+        return f"{target.name} carries it, off until {names} is set to 1."
+
+    return pack
+
+
+# ---------------------------------------------------------------- summary
+
+
+def _show(found: Investigation, tried: SelfCalibration | None, report: Path, console: Console) -> None:
+    from rich import box
+    from rich.table import Table
+
+    from discrepancy.report.text import estimate_text, headline, probability_text, unit_text
+    from discrepancy.verdict import VerdictKind
+
+    verdict, proof = found.verdict, found.proof
+    console.print(f"Verdict: {verdict.kind.value}", style="bold")
+    console.print(headline(verdict), soft_wrap=True)
+    if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
+        console.print(
+            f"Probability {probability_text(verdict.probability)}, ln Bayes factor against nothing missing "
+            f"{verdict.log_bayes_factor:.1f}."
+        )
+    if verdict.effects:
+        table = Table(box=box.SIMPLE_HEAD)
+        for heading in ("effect", "place", "parameter", "value", "90 % interval", "unit"):
+            table.add_column(heading, overflow="fold")
+        for effect in verdict.effects:
+            for item in (*effect.parameters, *effect.shape):
+                value, interval = estimate_text(item)
+                table.add_row(
+                    effect.identifier,
+                    effect.place,
+                    item.name.replace("_", " "),
+                    value,
+                    interval,
+                    unit_text(item.unit),
+                )
+        console.print(table)
+    if proof is not None:
+        first, second, where = proof.fitted_before, proof.fitted_after, "fitted trials (none is held out)"
+        if proof.held_out_before is not None and proof.held_out_after is not None:
+            first, second, where = proof.held_out_before, proof.held_out_after, "held-out trials"
+        closed = f", {100.0 * proof.gap_closed:.1f} % of the gap closed" if isfinite(proof.gap_closed) else ""
+        console.print(
+            f"χ²/dof on {where}: {first.chi_square_per_dof:.3g} before, {second.chi_square_per_dof:.3g} "
+            "with the "
+            f"effect{closed}.",
+            soft_wrap=True,
+        )
+    for experiment in verdict.next_experiments[:SHOWN_EXPERIMENTS]:
+        console.print(f"Next: {experiment.description} ({experiment.information:.2f} nat)", soft_wrap=True)
+    for fault in found.faults:
+        console.print(f"Data: {fault.sentence}", soft_wrap=True)
+    if tried is not None:
+        right, wrong = tried.share("right"), tried.share("wrong")
+        false = tried.share("wrong", null=True)
+        console.print(
+            f"Simulated campaigns: {right.count} of {right.total} hidden effects named, {wrong.count} "
+            "wrongly; "
+            f"{false.count} false names where nothing was hidden ({false.total})."
+        )
+    console.print(f"Report: {report}", soft_wrap=True)
