@@ -88,7 +88,7 @@ HIDDEN = (
         "gauge 17 drifts to -800 microstrain",
     ),
     Hidden("gauge_gain", "g17", (SensorGain("strain[17]", -0.12),), "gauge 17 shows 12 % too little"),
-    Hidden("washout", "", (Washout(0.04, 2.0),), "washout of 4 % per g at the tip"),
+    Hidden("washout", "", (Washout(0.08, 1.0),), "washout of 8 % per g at the tip"),
     Hidden(
         "local_stiffness_loss", "", (LocalStiffnessLoss(0.15, 0.45, 0.4),),
         "skin from 0.45 to 0.85 m has lost 15 %",

@@ -29,7 +29,11 @@ from .models.wing import WingModel
 FloatArray = NDArray[np.float64]
 
 RUN_FILE, CONFIG_FILE = "run.nc", "config.json"
-DESIGN_FILE, CALIBRATION_FILE, BINDING_FILE = "asset/design.toml", "asset/calibration.nc", "asset/binding.toml"
+DESIGN_FILE, CALIBRATION_FILE, BINDING_FILE = (
+    "asset/design.toml",
+    "asset/calibration.nc",
+    "asset/binding.toml",
+)
 MODEL_PATCH_FILE = "asset/model_patch.json"
 STRAIN = "strain"
 TEMPERATURE = ("temperature_difference", "temperature")
@@ -91,7 +95,10 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
     folder, plan = Path(folder), plan or RunPlan()
     config = _config(folder)
     scenario = config["scenario"]
-    if scenario["observation"].get("role") != STRAIN or {item["name"] for item in scenario["state"]} != {"z1", "z2"}:
+    if scenario["observation"].get("role") != STRAIN or {item["name"] for item in scenario["state"]} != {
+        "z1",
+        "z2",
+    }:
         raise CampaignFileError(
             f"{folder} is the run of another asset than the wing: strains under the damage states z1 and z2 are needed."
         )
@@ -184,7 +191,9 @@ def held_out_turns(count: int, block: int, share: float) -> NDArray[np.bool_]:
     wanted = round(share * count / block)
     if blocks < 2 or wanted < 1:
         return held
-    for number in np.unique(np.round(np.linspace(1, blocks - 1, min(wanted, blocks - 1) + 1)[:-1]).astype(int)).tolist():
+    for number in np.unique(
+        np.round(np.linspace(1, blocks - 1, min(wanted, blocks - 1) + 1)[:-1]).astype(int)
+    ).tolist():
         held[number * block : (number + 1) * block] = True
     return held
 
@@ -196,7 +205,9 @@ def _config(folder: Path) -> dict[str, Any]:
     try:
         config = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError) as cause:
-        raise CampaignFileError(f"{folder} is no run folder: {CONFIG_FILE} cannot be read ({cause}).") from cause
+        raise CampaignFileError(
+            f"{folder} is no run folder: {CONFIG_FILE} cannot be read ({cause})."
+        ) from cause
     if not isinstance(config, dict) or not isinstance(config.get("scenario"), dict):
         raise CampaignFileError(f"{folder / CONFIG_FILE} is not that of a run: it has no `scenario`.")
     return config
@@ -211,7 +222,9 @@ def _run(folder: Path) -> xr.DataTree:
         raise CampaignFileError(f"{path} is not a whole run ({cause}): resume it or fly it again.") from cause
     missing = {"observed", "smoothed", "calibration"} - {*run.children}
     if missing:
-        raise CampaignFileError(f"{path} lacks the groups {', '.join(sorted(missing))}: it is no run of a twin.")
+        raise CampaignFileError(
+            f"{path} lacks the groups {', '.join(sorted(missing))}: it is no run of a twin."
+        )
     for name in (STRAIN, "load_factor"):
         if name not in run["observed"]:
             raise CampaignFileError(f"{path} lacks the observed {name!r}: it is no run of a wing.")
@@ -263,4 +276,6 @@ def _outputs(folder: Path) -> dict[str, str]:
 
 def _rows(trial: Trial, rows: NDArray[np.bool_], name: str, *, held_out: bool) -> Trial:
     parts = ("values", "used", "time", "force", "load_factor", "temperature", "health", "health_deviation")
-    return replace(trial, name=name, held_out=held_out, **{part: getattr(trial, part)[rows] for part in parts})
+    return replace(
+        trial, name=name, held_out=held_out, **{part: getattr(trial, part)[rows] for part in parts}
+    )

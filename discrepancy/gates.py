@@ -74,7 +74,9 @@ def absolute_tests(problem: Problem, fit: Fit) -> list[tuple[str, float]]:
         p = float(chi2.sf(sums, freedom) if isinf(n0) else f.sf(sums / freedom, freedom, n0))
         tests.append((f"variance of {name}", p))
         # of a gap that raises all variances alike, in deviations of this channel's sum
-        scores.append((float(np.sqrt(freedom / (1.0 + freedom / n0))), float(np.clip(p, 1e-300, 1.0 - 1e-16))))
+        scores.append(
+            (float(np.sqrt(freedom / (1.0 + freedom / n0))), float(np.clip(p, 1e-300, 1.0 - 1e-16)))
+        )
     if len(scores) > 1:
         weights, values = np.array(scores).T
         # Stouffer's weighted sum of normal scores: exact, while the sum of squares has a heavy tail at small n0

@@ -1,13 +1,15 @@
-"""Which model a campaign is compared with: the shipped wing, a calibrated or another wing, a lumped model."""
+"""Which model a campaign is compared with: a wing (shipped, calibrated, designed), a lumped model, an FMU."""
 
 import tomllib
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 from calibration.errors import CalibrationError
 from calibration.result import CalibrationResult
 from discrepancy.errors import ModelError
+from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
@@ -24,6 +26,7 @@ class ModelKind(StrEnum):
     WING = "wing"
     CALIBRATION = "calibrated wing"
     LUMPED = "lumped model"
+    FMU = "FMU"
 
 
 @dataclass(frozen=True)
@@ -60,8 +63,8 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
     Parameters
     ----------
     name : str or Path, optional
-        A calibration (.nc), a wing design or a lumped model (.toml), or the name of a shipped lumped model;
-        the shipped wing if left out.
+        A calibration (.nc), a wing design, a lumped model or the description of an FMU (.toml), or the name
+        of a shipped lumped model; the shipped wing if left out.
     progress : Progress, optional
         Where the modelling of a wing reports.
 
@@ -75,8 +78,9 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
     path = Path(name)
     if path.suffix == ".fmu":
         raise ModelError(
-            f"{path} is an FMU, and campaigns are not compared with FMUs: give the wing's calibration.nc or "
-            "design, or describe the structure as a lumped model in TOML."
+            f"{path} is an FMU: give a TOML file that says which of its variables are load, outputs and "
+            "ports "
+            '(kind = "fmu", docs/foreign_fmus.md), or for the wing its calibration.nc or design.'
         )
     if path.suffix and not path.is_file():
         raise ModelError(f"There is no model file {path}; give a calibration (.nc) or a model (.toml).")
@@ -88,8 +92,15 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
             "name of a "
             f"shipped lumped model ({', '.join(shipped_lumped_models())}) is expected."
         )
-    if path.suffix == ".toml" and not _is_lumped(path):
-        return _wing(path, progress)
+    if path.suffix == ".toml":
+        content = _content(path)
+        if content.get("kind") == "fmu":
+            described = FmuModel.load(path)
+            file = path.parent / described.description.fmu
+            source = hash_record({"description": hash_file(path), "fmu": hash_file(file)})
+            return ModelChoice(described, ModelKind.FMU, path.name, source, path=path)
+        if "format" not in content:  # a wing design has none
+            return _wing(path, progress)
     model = LumpedModel.load(path)
     shipped = not path.suffix and not path.exists()
     file = SHIPPED_MODELS / f"{path}.toml" if shipped else path
@@ -101,10 +112,9 @@ def shipped_lumped_models() -> tuple[str, ...]:
     return tuple(sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml")))
 
 
-def _is_lumped(path: Path) -> bool:
-    """Return whether a TOML file describes a lumped model: it has a `format`, a wing design has none."""
+def _content(path: Path) -> dict[str, Any]:
     try:
-        return "format" in tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as cause:
         raise ModelError(f"The model {path} cannot be read: {cause}.") from cause
 

@@ -128,7 +128,12 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
             pairs.displacement_standard_deviation,
             pairs.load_standard_deviation * float(np.median(pairs.displacement / pairs.load)),
         )
-        channels[TIP] = Channel(TIP, Quantity.DISPLACEMENT, "load_point_displacement", NoiseRecord(float(displacement_deviation), inf))
+        channels[TIP] = Channel(
+            TIP,
+            Quantity.DISPLACEMENT,
+            "load_point_displacement",
+            NoiseRecord(float(displacement_deviation), inf),
+        )
         trials += _loading_runs(pairs)
     for number, (time, signal) in enumerate(windows, start=1):
         trials.append(
@@ -213,7 +218,9 @@ def _interval(windows: list[tuple[FloatArray, FloatArray]]) -> float:
 
 
 def _has_pairs(data: Path) -> bool:
-    return any((data / above / "step2").is_dir() for above in (Path(), Path("datafiles"), Path("src") / "datafiles"))
+    return any(
+        (data / above / "step2").is_dir() for above in (Path(), Path("datafiles"), Path("src") / "datafiles")
+    )
 
 
 def _loading_runs(pairs: LoadDisplacementData) -> list[Trial]:
@@ -221,13 +228,19 @@ def _loading_runs(pairs: LoadDisplacementData) -> list[Trial]:
     for number in np.unique(pairs.run).tolist():
         rows = pairs.run == number
         trial = _trial(
-            f"loading run {number + 1}", TrialKind.STATIC, (TIP,), pairs.displacement[rows][:, None], np.zeros(rows.sum())
+            f"loading run {number + 1}",
+            TrialKind.STATIC,
+            (TIP,),
+            pairs.displacement[rows][:, None],
+            np.zeros(rows.sum()),
         )
         trials.append(replace(trial, force=pairs.load[rows], run=f"run {number + 1}"))
     return trials
 
 
-def _trial(name: str, kind: TrialKind, channels: tuple[str, ...], values: FloatArray, time: FloatArray) -> Trial:
+def _trial(
+    name: str, kind: TrialKind, channels: tuple[str, ...], values: FloatArray, time: FloatArray
+) -> Trial:
     size = len(values)
     zeros = np.zeros(size)
     return Trial(

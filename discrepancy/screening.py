@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.special import ndtri
 
+from fe.patch import EVERY_CHANNEL, SENSORS, ModelPatch
+
 from .candidate import Candidate, Term
 from .catalogue.entry import EffectParameter
 from .errors import ModelError
@@ -145,11 +147,14 @@ class Screen:
         candidate = fit.candidate.plus(term)
         acting = term.effect.acts_on
         effect = np.concatenate((fit.point.effect, start))
+        channels = _channels_of(
+            candidate.terms[-1].effect.patch(problem.setting, term.values(start), term.place)
+        )
         total = np.zeros(self._size)
         parts, fits, square = [], 0.0, 0.0
         tail = []
         for number, (data, piece) in enumerate(zip(problem.trials, self._pieces, strict=True)):
-            if data.trial.kind not in acting:
+            if data.trial.kind not in acting or (channels and channels.isdisjoint(data.trial.channels)):
                 parts.append(np.zeros(len(piece.root)))
                 tail.append(np.zeros(len(piece.local)))
                 continue
@@ -203,16 +208,27 @@ class Screen:
         rest = sum(len(piece.local) for piece in self._pieces) + self._size
         return np.concatenate((np.ones(samples), -np.ones(rest)))
 
-    def changes(self, term: Term) -> Iterator[Change]:
-        """Yield the changes of a term over the grid of its parameters, where the model can follow."""
-        for start in grid(term, self._peaks(term)):
+    def changes(self, term: Term, *, fine: bool = True) -> Iterator[Change]:
+        """Yield the changes of a term over the grid of its parameters, where the model can follow.
+
+        Without `fine`, signed magnitudes are tried at one size only: enough for what is linear in them.
+        """
+        for start in grid(term, self._peaks(term), fine=fine):
             try:
                 yield self.change(term, start)
             except ModelError:  # such as a spring softer than what is taken from it
                 continue
 
 
-def grid(term: Term, peaks: tuple[float, ...] = ()) -> Iterator[FloatArray]:
+def _channels_of(patch: ModelPatch) -> frozenset[str]:
+    """Return the channels that a patch touches if it touches named ones only, else nothing."""
+    names = [getattr(item, "channel", EVERY_CHANNEL) for item in patch if isinstance(item, SENSORS)]
+    if len(names) < len(patch) or EVERY_CHANNEL in names or not names:
+        return frozenset()
+    return frozenset(names)
+
+
+def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Iterator[FloatArray]:
     """Yield scaled parameters to try: magnitudes at one value, since changes scale with them.
 
     A spectral parameter is tried at the given peaks.
@@ -227,7 +243,7 @@ def grid(term: Term, peaks: tuple[float, ...] = ()) -> Iterator[FloatArray]:
             if scaled:
                 axes.append((-1.0, 0.0, 1.0) if signed else (0.0,))
             else:
-                axes.append((1.0, LINEAR) if signed else (0.0,))
+                axes.append((1.0, *((LINEAR,) if fine else ())) if signed else (0.0,))
                 scaled = True
         elif item.name == term.effect.spectral and peaks:
             axes.append(tuple(float(np.clip(item.prior.normal(peak), -3.0, 3.0)) for peak in peaks))

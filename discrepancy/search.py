@@ -39,6 +39,8 @@ PAIRS_FITTED = 8
 RIDGES, RIDGE_STEPS, RIDGE_ITERATIONS, RIDGE_GAIN = 2, (-0.8, -0.3, 0.3, 0.8), 8, 1.0
 """Candidates whose ridges are followed while they do not fit, steps along one in prior deviations, steps of each
 fit, and the gain [nat] that counts."""
+FEW_PLACES = 3
+"""Effects with more places than this are those of single channels, which are linear in their size."""
 DELIVERED = 0.7
 """Share of the screened gain that chord steps must reach."""
 FAR = 1.5
@@ -143,9 +145,10 @@ class Search:
         if sum(not item.magnitude for item in effect.parameters) > 1:
             count *= 3
         found: list[Change] = []
-        for place in effect.places(self.problem.setting):
+        places = effect.places(self.problem.setting)
+        for place in places:
             best: list[Change] = []
-            for change in screen.changes(Term(effect, place)):
+            for change in screen.changes(Term(effect, place), fine=len(places) <= FEW_PLACES):
                 if change.size > 0.0:
                     best = sorted([*best, change], key=_worth)[:count]
             found.extend(best)
@@ -169,7 +172,9 @@ class Search:
         found = []
         least = WORTH_ADDING if base.candidate.terms else WORTH_FITTING
         screened = self.screened(base, effects)
-        enough = PROMISING * max((change.gain for changes in screened.values() for change in changes), default=0.0)
+        enough = PROMISING * max(
+            (change.gain for changes in screened.values() for change in changes), default=0.0
+        )
         for changes in screened.values():
             fits = []
             for change in changes:
@@ -190,7 +195,9 @@ class Search:
     def _followed(self, rough: Fit) -> Fit:
         """Fit on from chord steps that did not reach what the screen promised: shared unknowns move far."""
         try:
-            return max(rough, fit(self.problem, rough.candidate, rough.point, iterations=SHORT_STEPS), key=self.score)
+            return max(
+                rough, fit(self.problem, rough.candidate, rough.point, iterations=SHORT_STEPS), key=self.score
+            )
         except ModelError:
             return rough
 

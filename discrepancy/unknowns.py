@@ -144,7 +144,9 @@ class LocalUnknowns:
         if len(self.health_rows):
             health = health.copy()
             entry = (self.health_rows, self.health_columns)
-            health[entry] = np.clip(health[entry] + trial.health_deviation[entry] * u[at:], LEAST_LOSS, LARGEST_LOSS)
+            health[entry] = np.clip(
+                health[entry] + trial.health_deviation[entry] * u[at:], LEAST_LOSS, LARGEST_LOSS
+            )
         return Conditions(parameters, initial, (0.0, time_zero), health)
 
 

@@ -99,7 +99,7 @@ def example(
     effect: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="ID[@PLACE][=VALUE,...]",
+            metavar="ID[@PLACE][:NAME=VALUE,...]",
             help="Hide an effect; values of its parameters in the catalogue's order, else their prior "
             "medians. May "
             "be given several times.",
@@ -151,12 +151,14 @@ def _bare(model: Model, kind: str, seed: int, plan: ExamplePlan) -> Campaign:
 
 
 def _hidden(text: str, model: Model, campaign: Campaign) -> ModelPatch:
-    """Return the patch of ID[@PLACE][=VALUE,...]; raises `CatalogueError` with what was expected."""
+    """Return the patch of ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,..; raises `CatalogueError`."""
     from discrepancy.catalogue.entry import Setting
     from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
     from discrepancy.errors import CatalogueError
 
-    head, given, numbers = text.partition("=")
+    head, named, numbers = text.partition(":")
+    if not named:
+        head, _, numbers = text.partition("=")
     identifier, at, place = head.partition("@")
     found = effect_by_identifier(identifier, load_catalogue())
     setting = Setting(campaign, model, model.scales(campaign))
@@ -171,18 +173,28 @@ def _hidden(text: str, model: Model, campaign: Campaign) -> ModelPatch:
     for item in found.parameters:
         if item.magnitude and values[item.name] == 0.0:
             values[item.name] = item.prior.value(1.0)  # the median of a signed size would hide nothing
-    if given:
+    if numbers or named:
+        values |= _values(text, identifier, numbers.split(","), list(values))
+    return found.patch(setting, values, place if at else places[0])
+
+
+def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> dict[str, float]:
+    """Return the values that `parts` give, "VALUE" in the order of `names` or "NAME=VALUE"."""
+    from discrepancy.errors import CatalogueError
+
+    if len(parts) > len(names):
+        raise CatalogueError(
+            f"{identifier} has {len(names)} parameters ({', '.join(names)}), but {len(parts)} values came."
+        )
+    values = {}
+    for position, part in enumerate(parts):
+        name, equals, number = part.rpartition("=")
+        if equals and name not in names:
+            raise CatalogueError(f"{identifier} has no parameter {name!r}; it has {', '.join(names)}.")
         try:
-            numbers_given = [float(number) for number in numbers.split(",")]
+            values[name or names[position]] = float(number)
         except ValueError:
             raise CatalogueError(
-                f"{text!r} must end with numbers, such as {identifier}={next(iter(values.values())):g}."
+                f"{text!r} must end with numbers, such as {identifier}:{names[0]}=0.1."
             ) from None
-        if len(numbers_given) > len(values):
-            raise CatalogueError(
-                f"{identifier} has {len(values)} parameters ({', '.join(values)}), but "
-                f"{len(numbers_given)} values "
-                "came."
-            )
-        values.update(zip(values, numbers_given, strict=False))
-    return found.patch(setting, values, place if at else places[0])
+    return values

@@ -26,7 +26,8 @@ def run(
     model: Annotated[
         str | None,
         typer.Option(
-            help="A calibration.nc, a wing design or a lumped model (.toml), or the name of a shipped "
+            help="A calibration.nc, a wing design, a lumped model or a description of an FMU (.toml), or "
+            "the name of a shipped "
             "lumped model.",
             show_default="the shipped wing",
         ),
@@ -56,7 +57,7 @@ def run(
     from discrepancy.campaign_file import read_campaign
     from discrepancy.catalogue.library import load_catalogue
     from discrepancy.document_file import Origin
-    from discrepancy.model_choice import ModelKind, choose_model
+    from discrepancy.model_choice import choose_model
     from discrepancy.separability import separability
     from discrepancy.verdict import VerdictKind
     from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
@@ -85,7 +86,7 @@ def run(
         _command(campaign, model, seed, effects or [], calibrate),
         collect_provenance(seed, input_hashes=_inputs(data.data_hash, choice, effects or [])),
     )
-    pack = None if choice.kind is ModelKind.LUMPED else _packing(choice, progress)
+    pack = None if choice.design is None else _packing(choice, progress)
     content = VerdictContent(found, origin, able, tried, choice.design, pack)
     with progress.stage("Writing the report"):
         report = write_verdict_folder(folder, content, replace_it=replace)
@@ -106,11 +107,13 @@ def _calibrated(
     seed: int,
     progress: Progress,
 ) -> SelfCalibration:
+    from discrepancy.model_choice import ModelKind
     from discrepancy.self_calibration import self_calibrate
 
+    workers = 1 if choice.kind is ModelKind.FMU else 2  # an FMU is a process of its own
     with progress.stage("Trying the workflow on simulated campaigns", total=count, unit="campaigns") as stage:
         return self_calibrate(
-            found.campaign, choice.model, catalogue, count, seed=seed, advance=stage.advance,  # type: ignore[arg-type]
+            found.campaign, choice.model, catalogue, count, seed=seed, workers=workers, advance=stage.advance,  # type: ignore[arg-type]
         )  # fmt: skip
 
 

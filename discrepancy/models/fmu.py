@@ -77,9 +77,7 @@ class FmuModel:
         )
         self._keys = [self.runs.parameter(item.variable or item.name) for item in description.parameter]
         self._ports = tuple(port.name for port in description.port)
-        self._forces = {
-            place: self.runs.variable(name) for place, name in description.inputs.forces.items()
-        }
+        self._forces = {place: self.runs.variable(name) for place, name in description.inputs.forces.items()}
         self._check_settings()
         self.motion = FmuMotion(description, self.runs)
 
@@ -178,11 +176,20 @@ class FmuModel:
                 port: self.motion.stiffness(number, state, step) for number, port in enumerate(self._ports)
             }
             frequency = frequency or self.motion.angular_frequency(trial, state)
-        elif still:
-            state = self._state(still[0], Conditions(values, health=still[0].health), (), 0)
+        else:
+            some = still[0] if still else _any_trial(TrialKind.STATIC, 1.0)
+            state = self._state(some, Conditions(values, health=some.health), (), 0)
             for number, port in enumerate(self._ports):
                 flexible = float(self._flexibility(state)[number, number])
                 seen[port] = (1.0 / flexible, 1.0 / flexible)
+            if not still and frequency is None:
+                interval = 0.01
+                for _ in range(3):  # until the interval suits the frequency
+                    trial = _any_trial(TrialKind.RINGDOWN, interval)
+                    frequency = self.motion.measured_frequency(
+                        trial, self._state(trial, Conditions(values), (), 0)
+                    )
+                    interval = 0.3 / frequency
         frequency = frequency or 1.0
         at_force = next(
             (
@@ -303,9 +310,7 @@ class FmuModel:
             (Excitation("velocity"), unit * speed * float(first[1])),
         ]
 
-    def _forced(
-        self, trial: Trial, patch: _Patch, step: float, steps: int
-    ) -> list[tuple[Excitation, float]]:
+    def _forced(self, trial: Trial, patch: _Patch, step: float, steps: int) -> list[tuple[Excitation, float]]:
         at_ends = np.interp(step * np.arange(steps + 1), trial.time, trial.force)
         held = 0.5 * (at_ends[1:] + at_ends[:-1])
         on = (at_ends[1:] != 0.0) | (at_ends[:-1] != 0.0)
@@ -544,6 +549,16 @@ class FmuModel:
         except InvalidPatchError as cause:
             raise ModelError(str(cause)) from cause
         return _Patch(laws, tuple(sorted(settings.items())), gain, tare, along_span, along_chord)
+
+
+def _any_trial(kind: TrialKind, interval: float) -> Trial:
+    """Return a trial that asks for nothing, for scales without a campaign."""
+    count = 1 if kind is TrialKind.STATIC else 400
+    zeros, empty = np.zeros(count), np.zeros((count, 0))
+    return Trial(
+        "", kind, (), empty, empty.astype(bool), interval * np.arange(count), zeros, zeros, DEFAULT_PLACE, zeros,
+        0.0, "", np.zeros((1, 2)), np.zeros((1, 2)),
+    )  # fmt: skip
 
 
 _NOTHING = _Patch(NO_LAWS, (), 0.0, 0.0, 0.0, 0.0)

@@ -239,9 +239,7 @@ def parse_fmu_model(content: dict[str, Any], source: str = "the FMU model") -> F
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            sentence = (
-                f"{source}: {place!r} is not a key of an FMU model; remove it or correct its spelling"
-            )
+            sentence = f"{source}: {place!r} is not a key of an FMU model; remove it or correct its spelling"
         elif first["type"] == "missing":
             sentence = f"{source}: {place!r} is missing"
         else:

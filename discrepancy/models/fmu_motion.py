@@ -34,7 +34,7 @@ CONVERGED = 1e-4
 """Largest rms change of a motion with laws when steps are halved, as a share of the output's largest motion."""
 MOST_REFINEMENT = 64
 """Steps that do not converge at this refinement are given up."""
-RECORD = 1500
+RECORD = 600
 """Steps of the answer to a port's force that are recorded."""
 KEPT_SYSTEMS = 64
 
@@ -105,6 +105,8 @@ class FmuMotion:
         self._port_linear: bool | None = None
         self._refinable: bool | None = None
         self._silent: dict[Hashable, bool] = {}
+        self._quiet = False
+        self._free_linear: dict[Hashable, bool] = {}
         self._resting: State | None = None
 
     # ------------------------------------------------------------ rest
@@ -149,14 +151,15 @@ class FmuMotion:
         if self._description.scales.angular_frequency is not None:
             return self._description.scales.angular_frequency
         if self._frequency is None:
-            self._frequency = self._measured_frequency(trial, state)
+            self._frequency = self.measured_frequency(trial, state)
         return self._frequency
 
     def rate_unit(self) -> float:
         """Return the angular frequency [rad/s] by which initial velocities are measured."""
         return self._description.scales.angular_frequency or self._frequency or 1.0
 
-    def _measured_frequency(self, trial: Trial, state: State) -> float:
+    def measured_frequency(self, trial: Trial, state: State) -> float:
+        """Return what `angular_frequency` returns, measured at the sampling interval of a trial."""
         step = self._description.motion.step or trial.interval
         system = self.system(state, step, len(trial.time)) if self._ports else None
         if system is not None:
@@ -349,7 +352,10 @@ class FmuMotion:
 
     def _records(self, state: State, step: float, count: int) -> FloatArray:
         """Return the outputs (count, C, P) after unit forces over the first step, less those without."""
-        zero = self._run(state, step, count, [])
+        zero: FloatArray | float = 0.0
+        if not self._quiet:
+            zero = self._run(state, step, count, [])
+            self._quiet = not np.any(zero)
         pulse = np.eye(1, count).ravel()
         parts = []
         for number, name in enumerate(self._forces):
@@ -448,13 +454,17 @@ class FmuMotion:
     def _coupled(
         self, laws: Laws, state: State, step: float, steps: int, loads: Loads, refinement: int = 1
     ) -> FloatArray:
-        free = self.free(state, step, steps, loads)
+        free = self._refined_free(state, step, steps, loads, refinement)
         port_of = [[port.name for port in self._ports].index(name) for name in laws.ports]
         system = self.system(state, step, steps, refinement)
         if system is None:
             return self._stepped(laws, port_of, state, step, steps, loads, free)
         x_rows, x_direct = system.outputs[self._x], system.direct[self._x]
-        v_rows, v_direct, velocity = x_rows @ system.generator, np.zeros_like(x_direct), np.empty((steps + 1, 0))
+        v_rows, v_direct, velocity = (
+            x_rows @ system.generator,
+            np.zeros_like(x_direct),
+            np.empty((steps + 1, 0)),
+        )
         grid = step * np.arange(steps + 1)
         velocity = CubicSpline(grid, free[:, self._x])(grid, 1)
         for number, column in enumerate(self._v):
@@ -468,6 +478,23 @@ class FmuMotion:
                 system, motion, x_rows, x_direct, v_rows, v_direct, laws, port_of
             )
             return free + system.seen(states, applied)
+
+    def _refined_free(
+        self, state: State, step: float, steps: int, loads: Loads, refinement: int
+    ) -> FloatArray:
+        """Return the free motion with small steps; of a release by the ports' system, where it shows it all."""
+        kind = tuple(part.kind for part, _ in loads)
+        released = all(name in ("displacement", "velocity", "hold") for name in kind)
+        if refinement > 1 and released and self._quiet and self._free_linear.get(kind, True):
+            base = self.system(state, step * refinement, ceil(steps / refinement))
+            fine = self.system(state, step, steps, refinement)
+            if base is not None and fine is not None and self._refinable:
+                coarse = self.free(state, step * refinement, ceil(steps / refinement), loads)
+                start = base.start_of(coarse, LINEAR)
+                if start is not None:
+                    return fine.free(start, steps)
+                self._free_linear[kind] = False
+        return self.free(state, step, steps, loads)
 
     def _stepped(
         self,
@@ -501,4 +528,3 @@ class FmuMotion:
             np.add.at(now, at, stepper.forces(values[k, self._x], values[k, self._v]))
             values[k + 1] = self._runs.stepped(asset, dict(zip(names, now.tolist(), strict=True)))
         return values
-

@@ -386,9 +386,7 @@ class LumpedModel:
         return (size / float(row @ shape) * shape)[None]
 
     @staticmethod
-    def _port_scale(
-        system: SecondOrderSystem, vector: FloatArray, usual: float, largest: float
-    ) -> PortScale:
+    def _port_scale(system: SecondOrderSystem, vector: FloatArray, usual: float, largest: float) -> PortScale:
         first = float(system.angular_frequency[0])
         moved = float(vector @ system.shapes[:, 0])
         still = 1.0 / float(vector @ system.flexibility(vector))

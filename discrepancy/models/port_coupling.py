@@ -78,6 +78,38 @@ class PortSystem:
         values[1:] += forces @ self.direct.T
         return np.asarray(values)
 
+    def start_of(self, free: FloatArray, tolerance: float) -> FloatArray | None:
+        """Return the state (n,) from which the system moves as `free` (K, C), None if it does not."""
+        rows = np.empty((*free.shape, len(self.transition)))
+        rows[0] = self.outputs
+        for k in range(1, len(free)):
+            rows[k] = rows[k - 1] @ self.transition
+        size = np.max(np.abs(free), axis=0)
+        weight = 1.0 / np.where(size > 0.0, size, 1.0)
+        flat = (rows * weight[:, None]).reshape(-1, len(self.transition))
+        unit = np.max(np.abs(flat), axis=0)
+        unit[unit == 0.0] = 1.0
+        goal = (free * weight).ravel()
+        start = np.linalg.lstsq(flat / unit, goal, rcond=1e-14)[0]
+        if np.max(np.abs(flat / unit @ start - goal)) > tolerance:
+            return None
+        return np.asarray(start / unit)
+
+    def free(self, start: FloatArray, steps: int) -> FloatArray:
+        """Return the free motion (steps + 1, C) from a state (n,)."""
+        states = np.empty((steps + 1, len(start)))
+        states[0] = start
+        block = [np.eye(len(start))]
+        for _ in range(min(64, steps + 1)):
+            block.append(self.transition @ block[-1])
+        jump, powers = block.pop(), np.stack(block)
+        now = start
+        for k in range(0, steps + 1, len(powers)):
+            part = powers @ now
+            states[k : k + len(powers)] = part[: steps + 1 - k]
+            now = jump @ now
+        return np.asarray(states @ self.outputs.T)
+
     def gain(self) -> FloatArray:
         """Return the outputs (C, P) at rest under constant unit forces."""
         still = np.linalg.solve(np.eye(len(self.transition)) - self.transition, self.drive)

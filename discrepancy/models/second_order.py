@@ -333,9 +333,7 @@ class SecondOrderSystem:
             if held:
                 all_q[:held], all_v[:held] = q, 0.0
             none = np.zeros((len(times), 0))
-            return Motion(
-                self, times, all_q, all_v, nothing, release_row, none, none, laws, held, holding
-            )
+            return Motion(self, times, all_q, all_v, nothing, release_row, none, none, laws, held, holding)
         count = len(times)
         all_q, all_v = np.tile(q, (count, 1)), np.tile(v, (count, 1))
         forces, lagged = np.zeros((2, count, len(laws)))
@@ -407,9 +405,7 @@ class SecondOrderSystem:
             interval=float(times[-1] - times[0]) / (len(times) - 1), refinement=refinement,
             kernel=compiled_kernel(),
         )  # fmt: skip
-        return Motion(
-            self, times, moved.q, moved.v, acting, input_row, moved.port_forces, moved.lagged, laws
-        )
+        return Motion(self, times, moved.q, moved.v, acting, input_row, moved.port_forces, moved.lagged, laws)
 
     # ------------------------------------------------------------ parts
 

@@ -231,9 +231,7 @@ class WingModel:
                     float(still),
                     float(most) or 1.0,
                 )
-                for port, size, by, still, most in zip(
-                    PORTS, usual, by_first, at_rest, largest, strict=True
-                )
+                for port, size, by, still, most in zip(PORTS, usual, by_first, at_rest, largest, strict=True)
             },
         )
 
@@ -286,7 +284,9 @@ class WingModel:
                 f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
             )
         structure = patch.of(*STRUCTURE)
-        flight = trial.kind is TrialKind.FLIGHT  # where a mass has weight; other zeros are read with it in place
+        flight = (
+            trial.kind is TrialKind.FLIGHT
+        )  # where a mass has weight; other zeros are read with it in place
         loads = patch.of(*LOADS, PointMass) if flight else patch.of(*LOADS)
         size = len(trial.time)
         health = np.broadcast_to(conditions.health, (size, 2))

@@ -94,7 +94,7 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
     None where no record is long enough or no mode rings long enough.
     """
     items = _ringdowns(before)
-    frequencies = mode_frequencies(before)
+    frequencies = mode_frequencies(before if after is None else after)
     if not items or not frequencies:
         return None
     channel = _clearest(items, frequencies[0])
@@ -219,7 +219,7 @@ def force_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure
     coarse, or where noise hides what there is to see.
     """
     items = _ringdowns(before)
-    frequencies = mode_frequencies(before)
+    frequencies = mode_frequencies(before if after is None else after)
     if not items or not frequencies:
         return None
     channel = _clearest(items, frequencies[0])

@@ -116,6 +116,8 @@ def planform_figure(before: ResidualSet, after: ResidualSet | None, design: Wing
             axes.set_title(title, loc="left")
             if number == len(sizes) - 1:
                 axes.set_xlabel("distance from the root, m")
+            else:
+                axes.tick_params(labelbottom=False)
             axes.set_ylabel("chord, m")
         _size_bar(figure, norm, (0.885, 0.2, 0.016, 0.66))
     return figure

@@ -29,7 +29,7 @@ def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 def campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A static campaign of the single-mass rig with a seating offset."""
     folder = tmp_path / "rig test"
-    given = ("static", str(folder), *RIG, "--seed", "3", "--effect", "seating_offset@A=0.08")
+    given = ("static", str(folder), *RIG, "--seed", "3", "--effect", "seating_offset@A:offset_ratio=0.08")
     assert call(monkeypatch, "example", *given) == 0
     return folder
 
@@ -112,6 +112,7 @@ def test_the_catalogue(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
         (("example", "static", "{new}", *RIG, "--effect", "gremlins=1"), "gremlins"),
         (("example", "static", "{new}", *RIG, "--effect", "load_cell=much"), "must end with numbers"),
         (("example", "static", "{new}", *RIG, "--effect", "load_cell=1,2,3"), "2 parameters"),
+        (("example", "static", "{new}", *RIG, "--effect", "load_cell:tara=1"), "no parameter 'tara'"),
         (("example", "static", "{new}", *RIG, "--effect", "seating_offset@Z"), "its places are"),
         (("example", "static", "{new}", *RIG, "--effect", "washout"), "cannot be hidden"),
     ],
