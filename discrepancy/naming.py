@@ -197,8 +197,7 @@ def _shape(found: Search, best: Fit) -> tuple[Gate, Fit | None]:
         parts[index] = np.concatenate((parts[index], shape))
         start = Point(best.point.shared, best.point.local, np.concatenate(parts))
         freed = Candidate(tuple(terms))
-        rough = fit(found.problem, freed, start, base=best.base, evidence=False)
-        family = fit(found.problem, freed, rough.point)
+        family = fit(found.problem, freed, start)
         gate = shape_gate(best, family)
         if kept is None or gate.statistic > outcome.statistic:
             outcome, kept = gate, family

@@ -163,6 +163,7 @@ class Problem:
                 f"The campaign {campaign.name!r} has no trial to fit: all are held out; mark fewer."
             )
         self.channel_names = tuple(campaign.channels)
+        self.refinement = 1 if like is None else like.refinement
         self.noise = like.noise if like is not None else _noise(campaign, chosen)
         self.trials = tuple(self._trial_data(trial) for trial in chosen)
         counts = np.zeros(len(self.channel_names))
@@ -235,10 +236,14 @@ class Problem:
         )
 
     def response(
-        self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch, refinement: int = 1
+        self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch, finer: int = 1
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Return the response (N, C) of a trial without gain and zero, and its rates; kept while it is used."""
+        """Return the response (N, C) of a trial without gain and zero, and its rates; kept while it is used.
+
+        Time steps are `refinement` times `finer` smaller than the model's own.
+        """
         data = self.trials[number]
+        refinement = self.refinement * finer
         conditions = data.unknowns.conditions(data.trial, self.shared.parameters(shared), local)
         key = (
             number, refinement, patch.primitives, conditions.parameters.tobytes(), conditions.initial.tobytes(),
