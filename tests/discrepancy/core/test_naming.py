@@ -1,4 +1,4 @@
-"""Names on simulated campaigns of the chain; data from half the time steps, nuisances and parameters drawn."""
+"""Names on simulated campaigns of the chain: half the time steps, nuisances and parameters drawn."""
 
 from __future__ import annotations
 
@@ -85,7 +85,8 @@ def test_two_effects_are_found_together(small, effects) -> None:  # type: ignore
     assert verdict.kind is VerdictKind.NAMED, verdict.sentence
     assert sorted(item.identifier for item in verdict.effects) == ["gauge_gain", "quadratic_damping"]
     # both were tried alone as well: deletion has its comparison
-    assert {("gauge_gain",), ("quadratic_damping",)} <= {item.candidate.identifiers for item in found.all().values()}
+    tried = {item.candidate.identifiers for item in found.all().values()}
+    assert {("gauge_gain",), ("quadratic_damping",)} <= tried
 
 
 def test_clock_and_load_cell_are_a_group(bench, effects) -> None:  # type: ignore[no-untyped-def]
@@ -123,7 +124,8 @@ def test_the_same_campaign_gives_the_same_verdict(small, effects) -> None:  # ty
     runs = []
     for _ in range(2):
         verdict, found, fit = name(small.problem(small.measured(11, patch)), effects)
-        runs.append((verdict.probability, verdict.log_bayes_factor, verdict.sentence, fit.point.effect.tobytes(),
+        runs.append((verdict.probability, verdict.log_bayes_factor, verdict.sentence,
+                     fit.point.effect.tobytes(),
                      [(key_of(f.candidate), f.log_evidence) for f in found.all().values()]))  # fmt: skip
     assert runs[0] == runs[1]
 
@@ -153,7 +155,9 @@ def test_wrong_noise_makes_no_name(small, effects, how, seed: int) -> None:  # t
     assert verdict.kind in NO_NAME, verdict.sentence
 
 
-@pytest.mark.parametrize("how", [{"noise_scale": 2.0}, {"noise": coloured}], ids=["understated", "correlated"])
+@pytest.mark.parametrize(
+    "how", [{"noise_scale": 2.0}, {"noise": coloured}], ids=["understated", "correlated"]
+)
 def test_wrong_noise_makes_no_wrong_name(small, effects, how) -> None:  # type: ignore[no-untyped-def]
     patch = small.patch("gauge_gain", {"gain_error": 0.10}, "g1")
     verdict, _, _ = name(small.problem(small.measured(3, patch, **how)), effects)

@@ -22,7 +22,7 @@ TIGHT = {"slope": (1.0, 1e-9), "curvature": (0.5, 1e-9)}
 
 
 def one_reading(kit, shift):  # type: ignore[no-untyped-def]
-    """One reading of unit noise, two hypotheses: nothing, and an offset known to be `shift` noise deviations."""
+    """One reading of unit noise; two hypotheses: nothing, or an offset of `shift` noise deviations."""
     channel = Channel("y1", Quantity.DISPLACEMENT, "y1", NoiseRecord(0.02, inf))
     trial = kit.blank_trial("one", TrialKind.STATIC, ("y1",), np.array([1.0]))
     trial = replace(trial, values=np.full((1, 1), 1.5))

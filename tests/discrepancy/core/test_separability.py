@@ -118,7 +118,9 @@ def test_one_gauge_cannot_tell_gain_misalignment_and_local_damage(catalogue) -> 
 def test_flight_at_one_load_factor_cannot_tell_relief_and_lift(catalogue) -> None:  # type: ignore[no-untyped-def]
     given = campaign()
     flight = next(trial for trial in given.trials if trial.kind is TrialKind.FLIGHT)
-    strain = next(n for n, name in enumerate(flight.channels) if given.channels[name].quantity is Quantity.STRAIN)
+    strain = next(
+        n for n, name in enumerate(flight.channels) if given.channels[name].quantity is Quantity.STRAIN
+    )
     name = flight.channels[strain]
     one = replace(
         flight, channels=(name,), values=flight.values[:, [strain]], used=flight.used[:, [strain]],
@@ -163,8 +165,13 @@ def test_what_cannot_be_tested_says_why(bench, catalogue) -> None:  # type: igno
 
 @pytest.mark.parametrize(
     ("near", "groups"),
-    [((), ()), (((0, 1),), (("a", "b"),)), (((0, 1), (1, 3)), (("a", "b", "d"),)), (((0, 2), (1, 3)), (("a", "c"), ("b", "d")))],
-)  # fmt: skip
+    [
+        ((), ()),
+        (((0, 1),), (("a", "b"),)),
+        (((0, 1), (1, 3)), (("a", "b", "d"),)),
+        (((0, 2), (1, 3)), (("a", "c"), ("b", "d"))),
+    ],
+)
 def test_groups_are_connected_sets(near, groups) -> None:  # type: ignore[no-untyped-def]
     distance = np.full((4, 4), 100.0)
     for i, j in near:
