@@ -30,6 +30,8 @@ IntArray = NDArray[np.int64]
 
 PARAMETER_STEP = 1e-2
 """Step of the forward differences in scaled variables."""
+SHARED_STEP = 1e-3
+"""The same for calibrated parameters: what an effect shares with the stiffness must cancel to a thousandth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,7 +336,7 @@ class Problem:
         self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch, response: FloatArray
     ) -> FloatArray:
         columns = [
-            (self.response(number, _moved(shared, k), local, patch)[0] - response) / PARAMETER_STEP
+            (self.response(number, _moved(shared, k, SHARED_STEP), local, patch)[0] - response) / SHARED_STEP
             for k in range(len(self.shared.parameter_mean))
         ]
         return np.stack(columns) if columns else np.zeros((0, *response.shape))
@@ -466,9 +468,9 @@ class Problem:
         return Problem(self.campaign, self.model, self.setting, trials, like=self)
 
 
-def _moved(values: FloatArray, index: int) -> FloatArray:
+def _moved(values: FloatArray, index: int, step: float = PARAMETER_STEP) -> FloatArray:
     moved = values.copy()
-    moved[index] += PARAMETER_STEP
+    moved[index] += step
     return moved
 
 
