@@ -30,8 +30,8 @@ ROOT_GAUGE = "strain[16]"
 READING_ERROR = 33e-6 / 3.0**0.5
 """Deviation of a value read off the plot [V]: evenly within +-33 microvolt (a pixel is 66).
 
-The plots show the same motion on the same grid, so that its error is common to the trials, and no average makes
-it less.
+The plots show the same motion on the same grid, so that its error is common to the trials, and no average
+makes it less.
 """
 TREND = 67
 """Columns of the moving average that is the slow zero: 0.54 s, three periods of the first mode."""

@@ -490,7 +490,9 @@ class FmuMotion:
         kind = tuple(part.kind for part, _ in loads)
         kind_names = tuple((part.kind, part.name) for part, _ in loads)
         released = all(name in ("displacement", "velocity", "hold") for name in kind)
-        possible = refinement > 1 and released and self._quiet and self._linear.get(("free", kind_names)) is True
+        possible = (
+            refinement > 1 and released and self._quiet and self._linear.get(("free", kind_names)) is True
+        )
         if not possible or not self._free_linear.get(kind, True):
             return self.free(state, step, steps, loads)
         result = np.zeros(0)

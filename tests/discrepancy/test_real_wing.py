@@ -21,6 +21,8 @@ from discrepancy.real_wing import (
     write_wing_campaign,
 )
 
+FloatArray = NDArray[np.float64]
+
 PUBLISHED = Path(__file__).parents[2].parent / "shared" / "reference" / "uav_experimental_calibration"
 STEP = 8.1112e-3
 NOISE = 5e-5

@@ -44,7 +44,9 @@ LAWS: dict[str, Primitive] = {
     "coulomb": PowerDamping("slide", 0.02 * STIFFNESS * AMPLITUDE, 0.0, 0.0, 1.0, 1.0),
     "quadratic": PowerDamping("slide", 0.05 * STIFFNESS * AMPLITUDE, 2.0, 0.0, FREQUENCY * AMPLITUDE, 1.0),
     "structural": PowerDamping("slide", 0.03 * STIFFNESS * AMPLITUDE, 0.0, 1.0, 1.0, AMPLITUDE),
-    "root of speed": PowerDamping("slide", 0.02 * STIFFNESS * AMPLITUDE, 0.5, 0.0, FREQUENCY * AMPLITUDE, 1.0),
+    "root of speed": PowerDamping(
+        "slide", 0.02 * STIFFNESS * AMPLITUDE, 0.5, 0.0, FREQUENCY * AMPLITUDE, 1.0
+    ),
     "cubic": PowerStiffness("slide", 0.05 * STIFFNESS * AMPLITUDE, 3.0, 0, AMPLITUDE),
     "crack": PowerStiffness("slide", -0.05 * STIFFNESS * AMPLITUDE, 1.0, -1, AMPLITUDE),
     "free play": FreePlay("slide", 0.1 * STIFFNESS, 0.1 * AMPLITUDE),
@@ -239,7 +241,9 @@ def test_forced_motion_converges(rig: FmuModel, lumped: LumpedModel) -> None:
 def test_stepping_the_fmu_gives_what_superposition_gives(
     rig: FmuModel, foreign_fmu: Any, tmp_path: Path
 ) -> None:
-    path = write(tmp_path, foreign_fmu("rig2"), ("isolated = false", "isolated = false\nsuperposition = false"))
+    path = write(
+        tmp_path, foreign_fmu("rig2"), ("isolated = false", "isolated = false\nsuperposition = false")
+    )
     stepped = FmuModel.load(path)
     short = trial(TrialKind.RINGDOWN, 120, release=Release(AMPLITUDE))
     for name in ("coulomb", "quadratic", "bouc-wen"):
@@ -269,9 +273,7 @@ def test_an_fmu_that_is_not_linear_is_noticed_and_stepped(foreign_fmu: Any, tmp_
         viscous = 2.0 * 0.01 * np.sqrt(STIFFNESS * 2.0) * v
         return [v, -(STIFFNESS * x + cubic * x**3 + viscous + drag) / 2.0]
 
-    exact = solve_ivp(
-        slope, (0.0, case.time[-1]), [AMPLITUDE, 0.0], t_eval=case.time, rtol=1e-10, atol=1e-12
-    )
+    exact = solve_ivp(slope, (0.0, case.time[-1]), [AMPLITUDE, 0.0], t_eval=case.time, rtol=1e-10, atol=1e-12)
     mine = model.respond(case, OUTPUTS, patch(law), ones).values
     assert np.max(np.abs(mine[:, 0] - exact.y[0])) < 5e-4 * AMPLITUDE
     model.close()
