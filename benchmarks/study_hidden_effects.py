@@ -1,11 +1,11 @@
 """Missions with an effect that the twin does not know: found from the run, added to its model, flown again.
 
 `python -m benchmarks.study_hidden_effects --seeds 5` flies the scenario growing_damage with each of several
-hidden effects in the FMU of the wing. The run folder alone is then read as a campaign and investigated. What is
-named goes into the twin's model, and the mission is flown again with the same seed. Effects that depend on time or
-temperature cannot stand in a table of predicted strains; there the readings are corrected before the twin sees them.
-Written: the verdict of each mission; rms error of the health estimate and the share of turns whose 90 % set of states
-holds the truth, for all turns, before and after, and with no hidden effect at all.
+hidden effects in the FMU of the wing. The run folder alone is then read as a campaign and investigated. What
+is named, or the most probable member of a group, goes into the twin's model, and the mission is flown again
+with the same seed. A drift cannot stand in a table of predicted strains; there the readings are corrected
+before the twin sees them. Printed: the verdict of each mission; rms error of the health estimate in points,
+and the share of turns whose 90 % set of states holds the truth, before and after.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from fmu_asset.patch_file import SCHEMA
 from reporting.files import atomic_write_text
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
+from twin_master.asset_source import AssetSource
 from twin_master.crew import prepare_knowledge
 from twin_master.mission import fly
 from twin_master.resolution import (
@@ -52,6 +53,7 @@ from twin_master.resolution import (
 )
 from twin_master.results import MissionResult
 from twin_master.run_folder import create_run_folder
+from twin_master.scenario import Scenario
 from twin_master.scenario_file import load_scenario
 from twin_master.store import store_mission
 from twin_master.study import in_credible_set
@@ -178,7 +180,7 @@ def fly_mission(
     return _fly(folder, located_scenario(portable, folder), source, seed)
 
 
-def _fly(folder, scenario, source, seed):  # type: ignore[no-untyped-def]
+def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> Flown:
     knowledge = prepare_knowledge(scenario, source, seed)
     truth = knowledge.truth(seed)
     asset = source.open()
@@ -215,7 +217,7 @@ def outputs_of(patch: ModelPatch) -> tuple[Primitive, ...]:
 
 
 def undone(item: Primitive) -> Primitive | None:
-    """Return what takes the effect of a sensor off the readings that it changed with time; None for others."""
+    """Return what takes an effect that changes with time off the readings; None for other effects."""
     if isinstance(item, SensorDrift):
         return replace(item, amplitude=-item.amplitude)
     if isinstance(item, ThermalStrain):
@@ -285,7 +287,8 @@ def main() -> int:
                 after = "" if case.after is None else f"{100 * case.after.rms} {case.after.coverage:.2f}"
                 console.print(
                     f"{hidden.text}, seed {seed}: {case.verdict.kind.value}: {case.verdict.sentence} "
-                    f"rms {100 * case.before.rms} {case.before.coverage:.2f}; after {after} ({case.seconds:.1f} s)"
+                    f"rms {100 * case.before.rms} {case.before.coverage:.2f}; after {after} "
+                    f"({case.seconds:.1f} s)"
                 )
             table.add_row(*_row(hidden, cases))
     console.print(table)

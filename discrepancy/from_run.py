@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from fmu_asset.errors import FmuError
 from fmu_asset.patch_file import load_patch
+from fmu_asset.patched_runtime import output_channels
 from reporting.provenance import hash_file
 
 from .campaign import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
@@ -50,10 +52,10 @@ class RunPlan:
     Attributes
     ----------
     health : {"belief", "broad"}
-        Mean of the health in a turn: the smoothed belief, or the same in all turns.
+        Mean of the health in a turn: the smoothed belief, or the same in all.
     health_deviation : float
-        Least prior deviation of a stiffness loss in a turn. The belief was led astray by what is looked for, and is
-        much surer than it is right; 24 gauges tell the health of a turn anyway.
+        Least prior deviation of a stiffness loss in a turn. The belief was led astray by what is looked for,
+        and is much surer than it is right; 24 gauges tell the health of a turn anyway.
     block : int
         Turns of a block that is held out.
     held_out_share : float
@@ -82,8 +84,9 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
     Returns
     -------
     Campaign
-        Strain channels g1, g2, ...; flight trials whose rows are turns, some of them held out. The time of a turn
-        is that at its end, as the FMU has it. Health is uncertain in every turn. The truth of the run is not read.
+        Strain channels g1, g2, ...; flight trials whose rows are turns, some of them held out. The time of a
+        turn is that at its end, as the FMU has it. Health is uncertain in every turn. The truth of the run is
+        not read.
 
     Raises
     ------
@@ -100,12 +103,14 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
         "z2",
     }:
         raise CampaignFileError(
-            f"{folder} is the run of another asset than the wing: strains under the damage states z1 and z2 are needed."
+            f"{folder} is the run of another asset than the wing: strains under the damage states z1 and z2 "
+            "are needed."
         )
     force = (scenario["asset"].get("load") or {}).get("tip_force", 0.0)
     if force:
         raise CampaignDataError(
-            f"A force of {force:g} N at the tip acts in all turns of {folder}; only flights without it can be read."
+            f"A force of {force:g} N at the tip acts in all turns of {folder}; only flights without it can "
+            "be read."
         )
     run = _run(folder)
     observed, smoothed = run["observed"], run["smoothed"]
@@ -114,7 +119,7 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
     if not used.any():
         raise CampaignDataError(f"No strain reached the twin in {folder}: there is nothing to compare.")
     size, gauges = strain.shape
-    names = tuple(f"g{number}" for number in observed["sensor"].values.tolist())
+    names = tuple(f"g{number}" for number in np.asarray(observed["sensor"].values).tolist())
     mean = np.asarray(smoothed["mean"].values, dtype=np.float64)
     deviation = np.asarray(smoothed["standard_deviation"].values, dtype=np.float64)
     if plan.health == "broad":
@@ -127,7 +132,8 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
         name: Channel(name, Quantity.STRAIN, f"strain[{name[1:]}]", NoiseRecord(noise, inf)) for name in names
     }
     whole = Trial(
-        name="turns", kind=TrialKind.FLIGHT, channels=names, values=np.where(used, strain, 0.0), used=used, time=time,
+        name="turns", kind=TrialKind.FLIGHT, channels=names,
+        values=np.where(used, strain, 0.0), used=used, time=time,
         force=np.zeros(size), load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64),
         load_place="tip_load", temperature=temperature, start=0.0, run=str(run.attrs.get("scenario", "run")),
         health=mean, health_deviation=deviation,
@@ -145,8 +151,8 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
         parameters=_calibrated(run),
         data_hash=hash_file(folder / RUN_FILE),
         remarks=(
-            f"Flight of {size} turns read from a run folder; health in each turn: {plan.health} with a deviation of "
-            f"{plan.health_deviation:g} or more.",
+            f"Flight of {size} turns read from a run folder; health in each turn: {plan.health} with a "
+            f"deviation of {plan.health_deviation:g} or more.",
             f"Noise of a gauge: {1e6 * noise:.4g} microstrain, {source}.",
             *((f"{lost} of {size * gauges} readings were lost.",) if lost else ()),
         ),
@@ -154,7 +160,7 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
 
 
 def run_model(folder: Path | str) -> Model:
-    """Return the model that the twin of a run believed: the wing of its design, or of its calibration, with its patch.
+    """Return the model that the twin of a run believed: the wing of its design or calibration, patched.
 
     Raises
     ------
@@ -172,7 +178,8 @@ def run_model(folder: Path | str) -> Model:
         model = WingModel.of_design(folder / DESIGN_FILE)
     else:
         raise CampaignFileError(
-            f"{folder} holds no design (`{DESIGN_FILE}`): its twin believed no model of a wing that could be patched."
+            f"{folder} holds no design (`{DESIGN_FILE}`): its twin believed no model of a wing that could be "
+            "patched."
         )
     if (folder / MODEL_PATCH_FILE).is_file():
         try:
@@ -185,7 +192,7 @@ def run_model(folder: Path | str) -> Model:
 
 
 def held_out_turns(count: int, block: int, share: float) -> NDArray[np.bool_]:
-    """Return which of `count` turns are held out (count,): whole blocks, evenly spread, the first block never."""
+    """Return which of `count` turns are held out (count,): whole blocks, evenly spread, never the first."""
     held = np.zeros(count, dtype=bool)
     blocks = count // block
     wanted = round(share * count / block)
@@ -268,9 +275,7 @@ def _calibrated(run: xr.DataTree) -> dict[str, tuple[float, float]]:
     return {name: (float(draws.mean()), spread)} if name and spread > 0.0 else {}
 
 
-def _outputs(folder: Path) -> dict[str, str]:
-    from fmu_asset.patched_runtime import output_channels
-
+def _outputs(folder: Path) -> Sequence[tuple[str, str]]:
     return output_channels(len(_run(folder)["observed"]["sensor"]))
 
 

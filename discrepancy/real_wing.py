@@ -28,8 +28,11 @@ SIGNAL, TIP = "spanwise", "tip"
 ROOT_GAUGE = "strain[16]"
 """Where the model's strain is read for the signal; its place only sets the scale, which is unknown."""
 READING_ERROR = 33e-6 / 3.0**0.5
-"""Deviation of a value read off the plot: evenly within +-33 microvolt (a pixel is 66). The five plots show the same
-motion on the same grid of pixels, so that its error is common to the trials, and no average makes it less [V]."""
+"""Deviation of a value read off the plot [V]: evenly within +-33 microvolt (a pixel is 66).
+
+The plots show the same motion on the same grid, so that its error is common to the trials, and no average makes
+it less.
+"""
 TREND = 67
 """Columns of the moving average that is the slow zero: 0.54 s, three periods of the first mode."""
 PARAMETERS = {
@@ -39,8 +42,8 @@ PARAMETERS = {
     "damping_alpha": (1.03, 0.37),
     "damping_beta": (7.56e-4, 1.84e-4),
 }
-"""Mean and deviation of the calibrated parameters: the joint posterior (docs/calibration.md), which allows for
-what the amplitude does to the frequency and the damping ratio that were calibrated to."""
+"""Mean and deviation of the calibrated parameters: the joint posterior (docs/calibration.md), which allows
+for what the amplitude does to the frequency and the damping ratio that were calibrated to."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +59,11 @@ class RecordPlan:
         response at 30.8 Hz, where the second bending mode rings.
     detrended : bool
         Whether the slow zero that the trials share is taken off: the moving average over three periods (Hann
-        weights), averaged over the trials. It moves by a third of a millivolt and is no motion of the wing. What
-        moves slowly in one trial alone is noise and stays.
+        weights), averaged over the trials. It moves by a third of a millivolt and is no motion of the wing.
+        What moves slowly in one trial alone is noise and stays.
     release : float
-        Nominal displacement of the tip at the window's begin [m]; the unknown scale of the signal makes any value
-        as good.
+        Nominal displacement of the tip at the window's begin [m]; the unknown scale of the signal makes any
+        value as good.
     mode_count : int
         Modes whose state at the begin is free.
     loading_runs : bool
@@ -151,8 +154,9 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
         PARAMETERS,
         hash_record([[*trial.values.ravel().tolist()] for trial in trials]),
         (
-            f"Ring-downs: {records[0].source} to {records[-1].source}, from {plan.begin:g} s after the release; "
-            f"{plan.columns} columns of the plot averaged into a sample of {1e3 * _interval(windows):.3g} ms.",
+            f"Ring-downs: {records[0].source} to {records[-1].source}, from {plan.begin:g} s after the "
+            f"release; {plan.columns} columns of the plot averaged into a sample of "
+            f"{1e3 * _interval(windows):.3g} ms.",
             f"Noise of the signal: scatter between the trials, {1e6 * spread:.3g} microvolt, and "
             f"the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
         ),
@@ -160,7 +164,7 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
 
 
 def write_wing_campaign(data: Path | str, out: Path | str, plan: RecordPlan | None = None) -> Campaign:
-    """Write `wing_campaign` as a folder and return it as read from there; errors as there and of the writer."""
+    """Write `wing_campaign` as a folder and return it as read from there; errors as there and of writing."""
     return read_campaign(write_campaign(wing_campaign(data, plan), out))
 
 
@@ -169,9 +173,9 @@ def trial_scatter(windows: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
 
     All trials are releases of one kind, so that what they share is the motion, whatever its law; what differs
     beside amplitude, delay and zero is noise. Each trial is fitted by the mean of all, its rate, its second
-    derivative and a constant; the R - 1 orthonormal contrasts of what is left (Helmert) are independent of each
-    other and have the variance of a single trial. Four degrees of freedom of each contrast went into the fit, and the
-    variance allows for it.
+    derivative and a constant; the R - 1 orthonormal contrasts of what is left (Helmert) are independent of
+    each other and have the variance of a single trial. Four degrees of freedom of each contrast went into the
+    fit, and the variance allows for it.
 
     Raises
     ------
@@ -190,7 +194,7 @@ def trial_scatter(windows: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
 
 
 def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
-    """Return the slow zero (N,) that all records share, NaN at the ends where the moving average has no value."""
+    """Return the slow zero (N,) that all records share, NaN at the ends, where no average is known."""
     weights = np.hanning(TREND + 2)[1:-1]
     mean = np.mean([record.signal for record in records], axis=0)
     zero = np.full(len(mean), np.nan)
@@ -205,12 +209,15 @@ def _windowed(record: RingDownRecord, zero: FloatArray, plan: RecordPlan) -> tup
     count = len(inside) // plan.columns
     if count < 60:
         raise CampaignDataError(
-            f"{record.source}: {count} samples are left between {plan.begin:g} and {plan.end:g} s; 60 are needed."
+            f"{record.source}: {count} samples are left between {plan.begin:g} and {plan.end:g} s; 60 are "
+            "needed."
         )
     kept = inside[: count * plan.columns].reshape(count, plan.columns)
     time = record.time[kept].mean(axis=1)
     interval = float(time[-1] - time[0]) / (count - 1)
-    return interval * np.arange(count), (record.signal - zero)[kept].mean(axis=1)
+    return np.asarray(interval * np.arange(count), dtype=np.float64), np.asarray(
+        (record.signal - zero)[kept].mean(axis=1)
+    )
 
 
 def _interval(windows: list[tuple[FloatArray, FloatArray]]) -> float:
@@ -244,7 +251,8 @@ def _trial(
     size = len(values)
     zeros = np.zeros(size)
     return Trial(
-        name=name, kind=kind, channels=channels, values=values, used=np.ones(values.shape, dtype=bool), time=time,
+        name=name, kind=kind, channels=channels, values=values,
+        used=np.ones(values.shape, dtype=bool), time=time,
         force=zeros, load_factor=zeros, load_place="tip_load", temperature=zeros, start=0.0, run="",
         health=np.zeros((size, 2)), health_deviation=np.zeros((size, 2)),
     )  # fmt: skip

@@ -335,7 +335,8 @@ def mode_shares(
 def predicted_frequencies(items: Sequence[FittedTrial]) -> tuple[float, ...]:
     """Return the frequencies [Hz] of the peaks of the predictions' spectra, lowest first, at most four.
 
-    A peak is a largest ordinate within a factor 1.4 on both sides, above a thousandth of the greatest.
+    A peak is a largest ordinate within a factor 1.4 on both sides, above a thousandth of the greatest, of
+    four periods or more in the record: below, a zero or a slow decay looks like one.
     """
     longest = max(items, key=lambda item: len(item.trial.time))
     power = np.zeros((len(longest.trial.time) - 1) // 2)
@@ -348,7 +349,7 @@ def predicted_frequencies(items: Sequence[FittedTrial]) -> tuple[float, ...]:
         power += table[1 : power.size + 1].sum(axis=1)
     at = np.arange(1, power.size + 1) / (len(longest.trial.time) * longest.trial.interval)
     peaks = []
-    for number in range(1, power.size - 1):
+    for number in range(3, power.size - 1):
         near = (at > at[number] / 1.4) & (at < at[number] * 1.4)
         if power[number] >= power[near].max() and power[number] > 1e-3 * power.max():
             peaks.append((float(power[number]), float(at[number])))

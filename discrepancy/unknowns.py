@@ -20,8 +20,8 @@ IntArray = NDArray[np.int64]
 FREE_MOTION = 3.0
 """Prior deviation of a free initial state, in units of the release displacement."""
 LEAST_LOSS, LARGEST_LOSS = -0.5, 0.95
-"""Limits of an uncertain stiffness loss. A loss below zero means nothing, but a limit at zero, where most of a flight
-is, would stop fits: half of the readings of a healthy wing pull below it."""
+"""Limits of an uncertain stiffness loss. A loss below zero means nothing, but a limit at zero, where most of
+a flight is, would stop fits: half of the readings of a healthy wing pull below it."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,100 @@
+"""What the published ring-downs and loading runs of the real wing say about the wing model.
+
+`python -m benchmarks.study_real_wing DATA --pictures DIR` investigates them with several windows of the
+ring-downs, and the loading runs alone, and draws the picture of docs/real_wing.md. DATA is the authors'
+calibration folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib as mpl
+from rich.console import Console
+from rich.table import Table
+
+from discrepancy.models.wing import WingModel
+from discrepancy.problem import Problem
+from discrepancy.real_wing import SIGNAL, RecordPlan, wing_campaign
+from discrepancy.workflow import Investigation, investigate
+
+BEGINS = (0.8, 1.0, 1.25)
+
+
+def report(found: Investigation, table: Table, label: str) -> None:
+    proof = found.proof
+    scores = [] if proof is None else [item for item in (proof.held_out_before, proof.held_out_after) if item]
+    rms = " to ".join(f"{1e3 * score.rms[SIGNAL]:.3f}" for score in scores if SIGNAL in score.rms)
+    chi = " to ".join(f"{score.chi_square_per_dof:.2f}" for score in scores)
+    table.add_row(label, found.verdict.kind.value, found.verdict.sentence, rms, chi)
+
+
+def draw(found: Investigation, folder: Path) -> None:
+    """Draw residuals of the first trial, and of the held-out ones, before and after."""
+    mpl.use("agg")
+    import matplotlib.pyplot as plt
+
+    problem, search, fit = found.problem, found.search, found.fit
+    if not isinstance(problem, Problem) or search is None or fit is None:
+        return
+    number = next(n for n, data in enumerate(problem.trials) if data.trial.is_dynamic)
+    trial = problem.trials[number].trial
+    time = trial.time + BEGINS[0]
+    figure, axes = plt.subplots(3, 1, figsize=(6.4, 5.2), sharex=True, layout="constrained")
+    axes[0].plot(time, 1e3 * trial.values[:, 0], lw=0.8, color="black")
+    axes[0].set_ylabel("signal, mV")
+    for axis, item, label in (
+        (axes[1], search.none, "wing model, refitted"),
+        (axes[2], fit, "with the effect"),
+    ):
+        prediction = problem.prediction(number, item.point, item.responses[number])
+        axis.plot(time, 1e6 * (trial.values - prediction)[:, 0], lw=0.8)
+        axis.set_ylabel("residual, $\\mu$V")
+        axis.set_title(label, fontsize=9)
+    axes[2].set_xlabel("time since the release, s")
+    figure.savefig(folder / "real_wing_residuals.png", dpi=60)
+    plt.close(figure)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--pictures", type=Path)
+    given = parser.parse_args()
+    model = WingModel.shipped()
+    table = Table("records", "verdict", "", "held out: rms, mV", "chi^2 / dof")
+    first: Investigation | None = None
+    for begin in BEGINS:
+        found = investigate(wing_campaign(given.data, RecordPlan(begin=begin)), model)
+        first = first or found
+        report(found, table, f"all, ring-downs from {begin:g} s")
+    whole = wing_campaign(given.data)
+    still = replace(
+        whole,
+        channels={name: channel for name, channel in whole.channels.items() if name != SIGNAL},
+        trials=tuple(trial for trial in whole.trials if not trial.is_dynamic),
+    )
+    static = investigate(still, model)
+    report(static, table, "loading runs alone")
+    console = Console(width=160)
+    console.print(table)
+    console.print("Loading runs alone:", static.verdict.probability)
+    for row in static.verdict.hypotheses[:6]:
+        console.print(
+            [effect.identifier for effect in row.effects], f"{row.probability:.3f}", f"{row.chi_square:.1f}"
+        )
+    if first is not None:
+        if first.location is not None:
+            for item in first.location.explanations:
+                console.print(item)
+        for experiment in first.verdict.next_experiments:
+            console.print(experiment.description, f"{float(experiment.information):.3f}")
+        if given.pictures is not None:
+            draw(first, given.pictures)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
