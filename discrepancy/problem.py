@@ -1,7 +1,7 @@
 """Campaign and model brought together: standardised residuals of every trial and their derivatives.
 
-A residual is (measured - (1 + gain) model - zero) / s0, whitened in time where the noise record is coloured. The
-variance of each channel's noise is marginalised under the inverse gamma distribution that its noise record
+A residual is (measured - (1 + gain) model - zero) / s0, whitened in time where the noise record is coloured.
+The variance of each channel's noise is marginalised under the inverse gamma distribution that its record
 leaves: -ln L = sum over channels of (n0 + n) / 2 ln(1 + RSS / n0) + constant, RSS in units of s0^2.
 """
 
@@ -31,7 +31,7 @@ IntArray = NDArray[np.int64]
 PARAMETER_STEP = 1e-2
 """Step of the forward differences in scaled variables."""
 SHARED_STEP = 1e-3
-"""The same for calibrated parameters: what an effect shares with the stiffness must cancel to a thousandth."""
+"""The same for calibrated parameters: what effects share with the stiffness must cancel to a thousandth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +163,8 @@ class Problem:
                 f"The campaign {campaign.name!r} has no trial to fit: all are held out; mark fewer."
             )
         self.channel_names = tuple(campaign.channels)
-        self.refinement = 1 if like is None else like.refinement
-        self.noise = like.noise if like is not None else _noise(campaign, chosen)
+        self.refinement: int = 1 if like is None else like.refinement
+        self.noise: dict[str, NoiseModel] = like.noise if like is not None else _noise(campaign, chosen)
         self.trials = tuple(self._trial_data(trial) for trial in chosen)
         counts = np.zeros(len(self.channel_names))
         for data in self.trials:
@@ -173,6 +173,7 @@ class Problem:
         self.freedom = np.array([self.noise[name].degrees_of_freedom for name in self.channel_names])
         self._responses: dict[object, tuple[FloatArray, FloatArray | None]] = {}
         self._gains: dict[tuple[str, ...], tuple[IntArray, IntArray]] = {}
+        self.shared: GlobalUnknowns
         if like is not None:
             self.shared = like.shared
         else:
@@ -246,8 +247,8 @@ class Problem:
         refinement = self.refinement * finer
         conditions = data.unknowns.conditions(data.trial, self.shared.parameters(shared), local)
         key = (
-            number, refinement, patch.primitives, conditions.parameters.tobytes(), conditions.initial.tobytes(),
-            conditions.clock, conditions.health.tobytes(),
+            number, refinement, patch.primitives, conditions.parameters.tobytes(),
+            conditions.initial.tobytes(), conditions.clock, conditions.health.tobytes(),
         )  # fmt: skip
         kept = self._responses.get(key)
         if kept is None:
@@ -295,8 +296,8 @@ class Problem:
         candidate : Candidate
             Effects that act.
         base : Base, optional
-            With it, only the effect is evaluated, at the base's shared and local unknowns; their own steps are
-            added to first order (chord).
+            With it, only the effect is evaluated, at the base's shared and local unknowns; their own steps
+            are added to first order (chord).
         derivatives : bool
             False: the response only.
         known : Linearisation, optional

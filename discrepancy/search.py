@@ -1,4 +1,4 @@
-"""The search for the set of effects that explains a campaign: screen, fit, add one, take one away, try pairs."""
+"""The search for the set of effects that explains a campaign: screen, fit, add, take away, try pairs."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -39,11 +39,11 @@ PROMISING, LEAST_PROMISING = 0.3, 5
 least so many; the others too if none of these fits."""
 PAIRS_FITTED = 8
 RIDGES, RIDGE_STEPS, RIDGE_ITERATIONS, RIDGE_GAIN = 2, (-0.8, -0.3, 0.3, 0.8), 8, 1.0
-"""Candidates whose ridges are followed while they do not fit, steps along one in prior deviations, steps of each
-fit, and the gain [nat] that counts."""
+"""Candidates whose ridges are followed while they do not fit, steps along one in prior deviations, steps of
+each fit, and the gain [nat] that counts."""
 SOLVER_SHARE, FINEST = 0.1, 8
-"""Largest share of the noise that the time steps may cost (rms over a channel of a trial), and how much smaller
-than the model's own they may become for it."""
+"""Largest share of the noise that the time steps may cost (rms over a channel of a trial), and how much
+smaller than the model's own they may become for it."""
 REFITTED = 3
 """Candidates that are fitted again with smaller steps."""
 FEW_PLACES = 3
@@ -164,8 +164,8 @@ class Search:
     def scan(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
         """Fit every effect roughly in addition to those of `base`; return the best of each, best first.
 
-        Close to the truth one linearisation serves all (chord steps). Far from it phases slip over a long record,
-        so that the beginnings of the records are fitted first, and the whole ones from there.
+        Close to the truth one linearisation serves all (chord steps). Far from it phases slip over a long
+        record, so that the beginnings of the records are fitted first, and the whole ones from there.
         """
         found = self._scan_far(base, tuple(effects)) if self._far(base) else self._scan_near(base, effects)
         for item in found:

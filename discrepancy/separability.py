@@ -1,7 +1,7 @@
 """What a campaign can decide, before its data are looked at: detectable sizes and confusion groups.
 
-Every effect is put on the model at its prior median; the change it makes, with all nuisances projected out, is
-compared with the noise (can it be seen?) and with what every other effect can do (can it be told apart?).
+Every effect is put on the model at its prior median; the change it makes, with all nuisances projected out,
+is compared with the noise (can it be seen?) and with what every other effect can do (can it be told apart?).
 """
 
 from collections.abc import Sequence
@@ -25,8 +25,8 @@ FloatArray = NDArray[np.float64]
 CONFUSED = 9.0
 """Squared distance [sigma^2] below which two effects form a confusion group."""
 DETECTED = 25.0
-"""Squared distance from the model [sigma^2] at which an effect is found: 3 nats of Bayes factor, the cost of its
-parameters and of its place in the catalogue."""
+"""Squared distance from the model [sigma^2] at which an effect is found: 3 nats of Bayes factor, the cost of
+its parameters and of its place in the catalogue."""
 
 FIRST_ORDER = 25.0
 """Squared distance from the model [sigma^2] to which effects are shrunk to compare their directions."""
@@ -228,7 +228,7 @@ def _detectability(effect: Effect, change: Change, distance: float) -> Detectabi
 
 
 def _distance(screen: Screen, target: Change, options: list[Change]) -> float:
-    """Return d^2 of a change from what an effect can do: its nearest grid point, moved along its parameters."""
+    """Return d^2 of a change from what an effect can do: its nearest grid point, moved by its parameters."""
     sign = screen.sign
     if target.size <= 0.0:
         return 0.0
@@ -280,7 +280,7 @@ def usable(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
     found = tuple(effect for effect in effects if effect.unavailable(setting) is None)
     if not found:
         raise DiscrepancyError(
-            "No effect of the catalogue can be tested with this campaign and model: the campaign needs static, "
-            "ring-down, forced or flight trials whose channels are outputs of the model."
+            "No effect of the catalogue can be tested with this campaign and model: the campaign needs "
+            "static, ring-down, forced or flight trials whose channels are outputs of the model."
         )
     return found

@@ -27,7 +27,7 @@ from .problem import Problem
 from .proof import prove
 from .residuals import ResidualSet
 from .search import SOLVER_SHARE, Search, solver_share
-from .verdict import Proof, Verdict, VerdictKind
+from .verdict import Experiment, Proof, Verdict, VerdictKind
 
 DRAWS = 400
 OPEN_KINDS = (VerdictKind.GROUP, VerdictKind.UNEXPLAINED, VerdictKind.FAMILY, VerdictKind.BELOW_LIMIT)
@@ -144,8 +144,8 @@ def investigate(
         share = solver_share(problem, fit)
         if share > SOLVER_SHARE:
             remarks.append(
-                f"The time steps cost up to {share:.2g} of the noise (rms), more than the {SOLVER_SHARE:g} that is "
-                "wanted: probabilities may be too sharp."
+                f"The time steps cost up to {share:.2g} of the noise (rms), more than the {SOLVER_SHARE:g} "
+                "that is wanted: probabilities may be too sharp."
             )
     with stage("Residuals", "residuals"):
         before = residual_set(problem, search.none, sensitivities=thorough)
@@ -159,7 +159,7 @@ def investigate(
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
             proof = prove(before, after, seed=seed)
-    experiments: tuple = ()
+    experiments: tuple[Experiment, ...] = ()
     if thorough and verdict.kind in OPEN_KINDS:
         with stage("Looking for the next experiment", "next"):
             experiments = next_experiments(problem, open_hypotheses(search))

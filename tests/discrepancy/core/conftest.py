@@ -426,8 +426,9 @@ def chain_bench(
         trials.append(
             blank_trial(
                 f"release {number}", TrialKind.RINGDOWN, dynamic_channels, time,
-                start=3000.0 + 120.0 * number, load_place="end", release=Release(amplitude, 0.02,
-                mode_count=mode_count), held_out=held_out and number == 1,
+                start=3000.0 + 120.0 * number, load_place="end",
+                release=Release(amplitude, 0.02, mode_count=mode_count),
+                held_out=held_out and number == 1,
             )
         )  # fmt: skip
     names = {name for trial in trials for name in trial.channels}
