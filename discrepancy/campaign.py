@@ -106,8 +106,8 @@ class Release:
         Prior relative standard deviation of it [1].
     at_rest : bool
         True: the first sample is at the release, from the static shape under the holding force, and higher
-        modes start as that shape says, within `deviation`; False: the record starts later, and displacement and
-        velocity of each of `mode_count` modes are free.
+        modes start as that shape says, within `deviation`; False: the record starts later, and displacement
+        and velocity of each of `mode_count` modes are free.
     mode_count : int
         Modes whose initial state is free in addition.
     time_zero_deviation : float
@@ -162,8 +162,8 @@ class Trial:
     held_out : bool
         True: not used to find or fit anything, only for proof.
     noise_factor : float
-        Standard deviation of the noise in this trial over that of the channels' noise records, as known from the
-        acquisition (averaging, another range) [1].
+        Standard deviation of the noise in this trial over that of the channels' noise records, as known from
+        the acquisition (averaging, another range) [1].
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""A candidate explanation: no effect, one or several effects at given places, with their shapes fixed or free."""
+"""A candidate explanation: no effect, one or several effects at given places, shapes fixed or free."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -22,8 +22,8 @@ LARGEST_EFFECT = 8.0
 CONVERGED = 1e-2
 """A step that promises less than this [nat] ends a fit."""
 CREEPING, NEAR_END = 0.2, 30.0
-"""Derivatives are renewed where a step promises less than `NEAR_END` [nat], but more than this share of what the
-one before it promised: close to the end, promises should fall fast."""
+"""Derivatives are renewed where a step promises less than `NEAR_END` [nat], but more than this share of what
+the one before it promised: close to the end, promises should fall fast."""
 
 
 @dataclass(frozen=True)
@@ -298,7 +298,7 @@ def _step(
     for block, (inner, inner_gradient) in zip(blocks, eliminated, strict=True):
         local_step = inner_gradient - inner @ step[block.index]
         promised += 0.5 * float(block.local_gradient @ inner_gradient)
-        local_steps.append(local_step)
+        local_steps.append(np.asarray(local_step, dtype=np.float64))
     return Point(step[:shared_size], tuple(local_steps), step[shared_size:]), promised
 
 

@@ -1,4 +1,4 @@
-"""The two gates that a name must pass: absolute fit against the noise record, and shape against its family."""
+"""The two gates that a name must pass: absolute fit against the noise record, shape against its family."""
 
 from math import isinf
 
@@ -17,15 +17,15 @@ SHAPE_GAIN = 2.0
 LAGS, LEAST_RECORD = 20, 100
 """Largest number of autocorrelations, and the shortest record whose whiteness is judged."""
 SAMPLES_PER_LAG = 25
-"""With more lags the far tail of the Ljung-Box statistic is heavier than its limit says: at 100 samples and 20
-lags p < 1e-4 comes 20 times too often, at 4 lags twice."""
+"""With more lags the far tail of the Ljung-Box statistic is heavier than its limit says: at 100 samples and
+20 lags p < 1e-4 comes 20 times too often, at 4 lags twice."""
 
 
 def absolute_gate(problem: Problem, fit: Fit) -> Gate:
     """Judge whether what is left is what the noise records say, and white.
 
-    Tests, by Holm together at `ABSOLUTE_LEVEL`: the sum over all channels, F of each channel against its record,
-    Ljung-Box of each channel over its dynamic records.
+    Tests, by Holm together at `ABSOLUTE_LEVEL`: the sum over all channels, F of each channel against its
+    record, Ljung-Box of each channel over its dynamic records.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def absolute_tests(problem: Problem, fit: Fit) -> list[tuple[str, float]]:
         )
     if len(scores) > 1:
         weights, values = np.array(scores).T
-        # Stouffer's weighted sum of normal scores: exact, while the sum of squares has a heavy tail at small n0
+        # Stouffer's sum of normal scores: exact, while the sum of squares has a heavy tail at small n0
         together = float(weights @ norm.isf(values) / np.sqrt(weights @ weights))
         tests.append(("variance of all channels", float(norm.sf(together))))
     return [*tests, *whiteness_tests(problem, fit)]

@@ -1,6 +1,6 @@
 """From fitted candidates to a verdict: named, a family, a group, unexplained, or nothing missing."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -90,7 +90,10 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         if gate.passed is not False and shape.passed:
             named = named_effects(problem, best)
             return (
-                verdict(VerdictKind.NAMED, _named_sentence(named, p_top), p_top, effects=named, gates=(gate, shape)),
+                verdict(
+                    VerdictKind.NAMED, _named_sentence(named, p_top), p_top,
+                    effects=named, gates=(gate, shape),
+                ),
                 found, best,
             )  # fmt: skip
         if family is not None and not shape.passed:
@@ -120,7 +123,13 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
     return (*_open(problem, found, probabilities, verdict, gate), best)
 
 
-def _open(problem, found, probabilities, verdict, gate):  # type: ignore[no-untyped-def]
+def _open(
+    problem: Problem,
+    found: Search,
+    probabilities: Mapping[tuple[str, ...], float],
+    verdict: Callable[..., Verdict],
+    gate: Gate,
+) -> tuple[Verdict, Search]:
     """Return the verdict where no set reaches the probability that a name needs, and the search."""
     members: list[tuple[str, ...]] = []
     total = 0.0
@@ -197,8 +206,7 @@ def _shape(found: Search, best: Fit) -> tuple[Gate, Fit | None]:
         parts[index] = np.concatenate((parts[index], shape))
         start = Point(best.point.shared, best.point.local, np.concatenate(parts))
         freed = Candidate(tuple(terms))
-        rough = fit(found.problem, freed, start, base=best.base, evidence=False)
-        family = fit(found.problem, freed, rough.point)
+        family = fit(found.problem, freed, start)
         gate = shape_gate(best, family)
         if kept is None or gate.statistic > outcome.statistic:
             outcome, kept = gate, family

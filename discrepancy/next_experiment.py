@@ -1,11 +1,11 @@
 """The next experiment: the feasible test that tells most about what is still open, for its cost.
 
-Each open hypothesis predicts the new trial with the uncertainty of its parameters and of the trial's nuisances; the
-information is the mutual information of hypothesis and data, by simulation with a fixed seed.
+Each open hypothesis predicts the new trial with the uncertainty of its parameters and of the trial's
+nuisances; the information is the mutual information of hypothesis and data, by simulation with a fixed seed.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ class Proposal:
     description: str
     reason: str
     cost: float
-    added: ModelPatch = ModelPatch()
+    added: ModelPatch = field(default_factory=ModelPatch)
 
 
 def next_experiments(
@@ -182,7 +182,7 @@ def _ringdowns(
         return
 
     def at(trial: Trial, factor: float, name: str) -> Trial:
-        assert trial.release is not None  # noqa: S101 - checked above
+        assert trial.release is not None  # checked above
         changed = replace(trial.release, displacement=factor * trial.release.displacement)
         return replace(trial, name=name, release=changed)
 

@@ -1,7 +1,7 @@
 """What the noise record of a channel says: its variance, lines of the mains in it, its correlation in time.
 
-Coloured noise is whitened by an autoregression fitted to the record, so that samples that repeat each other are
-not counted as evidence. Lines of the mains are taken out first: they are an effect, not noise.
+Coloured noise is whitened by an autoregression fitted to the record, so that samples that repeat each other
+are not counted as evidence. Lines of the mains are taken out first: they are an effect, not noise.
 """
 
 from dataclasses import dataclass

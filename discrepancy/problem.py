@@ -1,7 +1,7 @@
 """Campaign and model brought together: standardised residuals of every trial and their derivatives.
 
-A residual is (measured - (1 + gain) model - zero) / s0, whitened in time where the noise record is coloured. The
-variance of each channel's noise is marginalised under the inverse gamma distribution that its noise record
+A residual is (measured - (1 + gain) model - zero) / s0, whitened in time where the noise record is coloured.
+The variance of each channel's noise is marginalised under the inverse gamma distribution that its record
 leaves: -ln L = sum over channels of (n0 + n) / 2 ln(1 + RSS / n0) + constant, RSS in units of s0^2.
 """
 
@@ -30,6 +30,8 @@ IntArray = NDArray[np.int64]
 
 PARAMETER_STEP = 1e-2
 """Step of the forward differences in scaled variables."""
+SHARED_STEP = 1e-3
+"""The same for calibrated parameters: what effects share with the stiffness must cancel to a thousandth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +163,8 @@ class Problem:
                 f"The campaign {campaign.name!r} has no trial to fit: all are held out; mark fewer."
             )
         self.channel_names = tuple(campaign.channels)
-        self.noise = like.noise if like is not None else _noise(campaign, chosen)
+        self.refinement: int = 1 if like is None else like.refinement
+        self.noise: dict[str, NoiseModel] = like.noise if like is not None else _noise(campaign, chosen)
         self.trials = tuple(self._trial_data(trial) for trial in chosen)
         counts = np.zeros(len(self.channel_names))
         for data in self.trials:
@@ -170,6 +173,7 @@ class Problem:
         self.freedom = np.array([self.noise[name].degrees_of_freedom for name in self.channel_names])
         self._responses: dict[object, tuple[FloatArray, FloatArray | None]] = {}
         self._gains: dict[tuple[str, ...], tuple[IntArray, IntArray]] = {}
+        self.shared: GlobalUnknowns
         if like is not None:
             self.shared = like.shared
         else:
@@ -233,14 +237,18 @@ class Problem:
         )
 
     def response(
-        self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch, refinement: int = 1
+        self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch, finer: int = 1
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Return the response (N, C) of a trial without gain and zero, and its rates; kept while it is used."""
+        """Return the response (N, C) of a trial without gain and zero, and its rates; kept while it is used.
+
+        Time steps are `refinement` times `finer` smaller than the model's own.
+        """
         data = self.trials[number]
+        refinement = self.refinement * finer
         conditions = data.unknowns.conditions(data.trial, self.shared.parameters(shared), local)
         key = (
-            number, refinement, patch.primitives, conditions.parameters.tobytes(), conditions.initial.tobytes(),
-            conditions.clock, conditions.health.tobytes(),
+            number, refinement, patch.primitives, conditions.parameters.tobytes(),
+            conditions.initial.tobytes(), conditions.clock, conditions.health.tobytes(),
         )  # fmt: skip
         kept = self._responses.get(key)
         if kept is None:
@@ -288,8 +296,8 @@ class Problem:
         candidate : Candidate
             Effects that act.
         base : Base, optional
-            With it, only the effect is evaluated, at the base's shared and local unknowns; their own steps are
-            added to first order (chord).
+            With it, only the effect is evaluated, at the base's shared and local unknowns; their own steps
+            are added to first order (chord).
         derivatives : bool
             False: the response only.
         known : Linearisation, optional
@@ -329,7 +337,7 @@ class Problem:
         self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch, response: FloatArray
     ) -> FloatArray:
         columns = [
-            (self.response(number, _moved(shared, k), local, patch)[0] - response) / PARAMETER_STEP
+            (self.response(number, _moved(shared, k, SHARED_STEP), local, patch)[0] - response) / SHARED_STEP
             for k in range(len(self.shared.parameter_mean))
         ]
         return np.stack(columns) if columns else np.zeros((0, *response.shape))
@@ -461,9 +469,9 @@ class Problem:
         return Problem(self.campaign, self.model, self.setting, trials, like=self)
 
 
-def _moved(values: FloatArray, index: int) -> FloatArray:
+def _moved(values: FloatArray, index: int, step: float = PARAMETER_STEP) -> FloatArray:
     moved = values.copy()
-    moved[index] += PARAMETER_STEP
+    moved[index] += step
     return moved
 
 

@@ -1,12 +1,12 @@
 """Screening: what an effect could explain, before any fit, to first order in the nuisances.
 
-With d the standardised change that an effect makes to the prediction at the fitted nuisances, J their derivatives
-and H the Hessian of the fit, the misfit after the nuisances have adapted is
+With d the standardised change that an effect makes to the prediction at the fitted nuisances, J their
+derivatives and H the Hessian of the fit, the misfit after the nuisances have adapted is
 
     F(d) = F(0) - b(d) + G(d, d) / 2,   G(c, d) = c.d - (J c)' H^-1 (J d),   b(d) = r.d - g' H^-1 (J d).
 
-Changes of several effects add, so pairs and scales cost inner products only. G is also what separates two effects
-before data are looked at.
+Changes of several effects add, so pairs and scales cost inner products only. G is also what separates two
+effects before data are looked at.
 """
 
 from collections.abc import Iterator
@@ -36,8 +36,8 @@ LEVELS = {1: (-1.5, -0.5, 0.5, 1.5), 2: (-1.3, 0.0, 1.3), 3: (-1.2, 0.0, 1.2)}
 LARGEST_START = 2.5
 """Fits do not begin at larger magnitudes than this many prior deviations: far off, scales mean little."""
 LINEAR = 0.05
-"""Signed magnitudes are tried at one prior deviation and at this share of it: what moves phases (clock, drift)
-leaves the range of first order before its shared part is taken up by the nuisances."""
+"""Signed magnitudes are tried at one prior deviation and at this share of it: what moves phases (clock,
+drift) leaves the range of first order before its shared part is taken up by the nuisances."""
 
 PADDED, PEAKS = 4, 3
 """Zero padding of spectra, and peaks that are tried."""
@@ -83,7 +83,7 @@ class _Piece(NamedTuple):
 
     local: FloatArray  # (L, N C)
     shared: FloatArray  # (K, N C)
-    index: NDArray[np.int64]  # (K,)
+    rows: NDArray[np.int64]  # (K,)
     root: FloatArray  # (N C,)
     residual: FloatArray  # (N C,)
     gradient: FloatArray  # (L,)
@@ -164,7 +164,7 @@ class Screen:
             moved = gains * (response - fit.responses[number])
             d = data.standardised(moved).ravel() * piece.root
             z = piece.local @ d
-            total[piece.index] += piece.shared @ d
+            total[piece.rows] += piece.shared @ d
             fits += float(piece.residual @ d) - float(piece.gradient @ z)
             square += float(d @ d) - float(z @ z)
             parts.append(d)
@@ -250,7 +250,7 @@ def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Ite
         elif isinstance(item, EffectParameter) and item.levels:
             axes.append(tuple(float(ndtri((k + 0.5) / item.levels)) for k in range(item.levels)))
         elif item in term.effect.shape:
-            axes.append((item.prior.normal(item.canonical),))  # type: ignore[union-attr]
+            axes.append((item.prior.normal(item.canonical),))
         else:
             axes.append(levels)
     for values in product(*axes):

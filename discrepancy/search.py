@@ -1,4 +1,4 @@
-"""The search for the set of effects that explains a campaign: screen, fit, add one, take one away, try pairs."""
+"""The search for the set of effects that explains a campaign: screen, fit, add, take away, try pairs."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -7,6 +7,8 @@ from math import ceil, comb, exp, inf, log
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
+
+from fe.patch import ModelPatch
 
 from .candidate import Candidate, Term
 from .catalogue.entry import Effect
@@ -37,8 +39,13 @@ PROMISING, LEAST_PROMISING = 0.3, 5
 least so many; the others too if none of these fits."""
 PAIRS_FITTED = 8
 RIDGES, RIDGE_STEPS, RIDGE_ITERATIONS, RIDGE_GAIN = 2, (-0.8, -0.3, 0.3, 0.8), 8, 1.0
-"""Candidates whose ridges are followed while they do not fit, steps along one in prior deviations, steps of each
-fit, and the gain [nat] that counts."""
+"""Candidates whose ridges are followed while they do not fit, steps along one in prior deviations, steps of
+each fit, and the gain [nat] that counts."""
+SOLVER_SHARE, FINEST = 0.1, 8
+"""Largest share of the noise that the time steps may cost (rms over a channel of a trial), and how much
+smaller than the model's own they may become for it."""
+REFITTED = 3
+"""Candidates that are fitted again with smaller steps."""
 FEW_PLACES = 3
 """Effects with more places than this are those of single channels, which are linear in their size."""
 DELIVERED = 0.7
@@ -157,8 +164,8 @@ class Search:
     def scan(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
         """Fit every effect roughly in addition to those of `base`; return the best of each, best first.
 
-        Close to the truth one linearisation serves all (chord steps). Far from it phases slip over a long record,
-        so that the beginnings of the records are fitted first, and the whole ones from there.
+        Close to the truth one linearisation serves all (chord steps). Far from it phases slip over a long
+        record, so that the beginnings of the records are fitted first, and the whole ones from there.
         """
         found = self._scan_far(base, tuple(effects)) if self._far(base) else self._scan_near(base, effects)
         for item in found:
@@ -308,6 +315,7 @@ class Search:
         for item in ranked[:RIDGES]:
             if not absolute_gate(self.problem, item).passed:
                 self._along_ridge(item)
+        self._settle_steps()
         current = self.best()
         while current.candidate.terms and len(current.candidate.terms) < LARGEST_SET:
             if len(current.candidate.terms) > 1 and self._far(current):
@@ -319,6 +327,18 @@ class Search:
         if not absolute_gate(self.problem, self.best()).passed and len(self.effects) > 1:
             self.fit_pairs()
         self._deletions()
+        self._settle_steps()
+
+    def _settle_steps(self) -> None:
+        """Halve the time steps while they cost the best candidate too much, and fit the best ones again."""
+        while self.problem.refinement < FINEST and solver_share(self.problem, self.best()) > SOLVER_SHARE:
+            self.problem.refinement *= 2
+            if self.beginnings is not None:
+                self.beginnings.refinement = self.problem.refinement
+            ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))[:REFITTED]
+            for item in ranked:
+                if item.candidate.terms:
+                    self.exact[key_of(item.candidate)] = fit(self.problem, item.candidate, item.point)
 
     def _along_ridge(self, found: Fit) -> Fit:
         """Look for a better fit of the same candidate along the direction that its data tell least of.
@@ -453,3 +473,17 @@ def search(problem: Problem, effects: Sequence[Effect]) -> Search:
     found = Search(problem, usable, none)
     found.run()
     return found
+
+
+def solver_share(problem: Problem, fit: Fit) -> float:
+    """Return the largest rms change of a channel when the time steps are halved, over its noise."""
+    largest = 0.0
+    for number, data in enumerate(problem.trials):
+        if not data.trial.is_dynamic:
+            continue
+        candidate = fit.candidate if data.trial.kind in fit.candidate.acts_on else Candidate()
+        patch = candidate.patch(problem.setting, fit.point.effect) if candidate.terms else ModelPatch()
+        finer, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch, finer=2)
+        change = (finer - fit.responses[number]) / data.deviation
+        largest = max(largest, float(np.sqrt((change**2).mean(axis=0)).max()))
+    return largest

@@ -1,7 +1,7 @@
 """What a campaign can decide, before its data are looked at: detectable sizes and confusion groups.
 
-Every effect is put on the model at its prior median; the change it makes, with all nuisances projected out, is
-compared with the noise (can it be seen?) and with what every other effect can do (can it be told apart?).
+Every effect is put on the model at its prior median; the change it makes, with all nuisances projected out,
+is compared with the noise (can it be seen?) and with what every other effect can do (can it be told apart?).
 """
 
 from collections.abc import Sequence
@@ -25,8 +25,11 @@ FloatArray = NDArray[np.float64]
 CONFUSED = 9.0
 """Squared distance [sigma^2] below which two effects form a confusion group."""
 DETECTED = 25.0
-"""Squared distance from the model [sigma^2] at which an effect is found: 3 nats of Bayes factor, the cost of its
-parameters and of its place in the catalogue."""
+"""Squared distance from the model [sigma^2] at which an effect is found: 3 nats of Bayes factor, the cost of
+its parameters and of its place in the catalogue."""
+
+FIRST_ORDER = 25.0
+"""Squared distance from the model [sigma^2] to which effects are shrunk to compare their directions."""
 
 
 @dataclass(frozen=True)
@@ -143,14 +146,22 @@ def separability(
         if not central:
             rows.append(Detectability(effect, "The structure cannot carry it at any size that was tried."))
             continue
-        best = max(central, key=lambda change: change.size)
-        rows.append(_detectability(effect, best))
+        best = max(central, key=_size)
+        if best.size < DETECTED:  # its median place may be where nothing is measured
+            best = max([best, *(change for change in options if _at_reference(change))], key=_size)
+        little, factor = _shrunk(screen, best)
+        rows.append(_detectability(effect, best, min(best.size, little.size / factor**2)))
         if best.size > 1e-6:
             changes[effect.identifier] = [best, *options]
     names = tuple(changes)
-    distance = np.array(
-        [[_distance(screen, changes[i][0], changes[j]) if i != j else 0.0 for j in names] for i in names]
-    )
+    small = {name: [_shrunk(screen, change) for change in changes[name]] for name in names}
+    distance = np.zeros((len(names), len(names)))
+    for i, one in enumerate(names):
+        target, (little, factor) = changes[one][0], small[one][0]
+        for j, other in enumerate(names):
+            if i != j:
+                first_order = _distance(screen, little, [change for change, _ in small[other]]) / factor**2
+                distance[i, j] = min(_distance(screen, target, changes[other]), first_order)
     return Separability(tuple(rows), names, distance, _groups(names, distance))
 
 
@@ -175,19 +186,49 @@ def _reference(screen: Screen, effect: Effect, place: str) -> Change:
     return screen.change(term, start)
 
 
-def _detectability(effect: Effect, change: Change) -> Detectability:
+def _size(change: Change) -> float:
+    return change.size
+
+
+def _at_reference(change: Change) -> bool:
+    """Whether the magnitude is that of `_reference`."""
+    return all(
+        abs(u) in (0.0, 1.0)
+        for item, u in zip(change.term.parameters, change.start, strict=True)
+        if isinstance(item, EffectParameter) and item.magnitude
+    )
+
+
+def _shrunk(screen: Screen, change: Change) -> tuple[Change, float]:
+    """Return a change made so small that it is of first order, and by which factor.
+
+    Effects that move a frequency alike are far apart at their medians, since phases slip by different angles,
+    but each can take the other's frequency.
+    """
+    whole = float((change.vector[screen.sign > 0.0] ** 2).sum())  # before the nuisances take their share
+    factor = sqrt(FIRST_ORDER / whole) if whole > 0.0 else 1.0
+    if factor >= 1.0:
+        return change, 1.0
+    start = change.start.copy()
+    for number, item in enumerate(change.term.parameters):
+        if isinstance(item, EffectParameter) and item.magnitude:
+            start[number] = item.prior.normal(factor * item.prior.value(float(start[number])))
+    return screen.change(change.term, start), factor
+
+
+def _detectability(effect: Effect, change: Change, distance: float) -> Detectability:
     for number, item in enumerate(change.term.parameters):
         if isinstance(item, EffectParameter) and item.magnitude:
             typical = abs(item.prior.value(float(change.start[number])))
-            detectable = typical * sqrt(DETECTED / change.size) if change.size > 0.0 else inf
+            detectable = typical * sqrt(DETECTED / distance) if distance > 0.0 else inf
             return Detectability(
-                effect, "", change.term.place, change.size, item.name, detectable, item.unit, typical
+                effect, "", change.term.place, distance, item.name, detectable, item.unit, typical
             )
-    return Detectability(effect, "", change.term.place, change.size)
+    return Detectability(effect, "", change.term.place, distance)
 
 
 def _distance(screen: Screen, target: Change, options: list[Change]) -> float:
-    """Return d^2 of a change from what an effect can do: its nearest grid point, moved along its parameters."""
+    """Return d^2 of a change from what an effect can do: its nearest grid point, moved by its parameters."""
     sign = screen.sign
     if target.size <= 0.0:
         return 0.0
@@ -239,7 +280,7 @@ def usable(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
     found = tuple(effect for effect in effects if effect.unavailable(setting) is None)
     if not found:
         raise DiscrepancyError(
-            "No effect of the catalogue can be tested with this campaign and model: the campaign needs static, "
-            "ring-down, forced or flight trials whose channels are outputs of the model."
+            "No effect of the catalogue can be tested with this campaign and model: the campaign needs "
+            "static, ring-down, forced or flight trials whose channels are outputs of the model."
         )
     return found

@@ -168,7 +168,8 @@ def global_unknowns(
     """
     prior = [campaign.parameters.get(item.name, (item.mean, item.deviation)) for item in model.parameters]
     used = {name for trial in trials for name in trial.channels}
-    names, centre, scale, precision, fixed = [], [], [], [], {}
+    names, centre, scale, precision = [], [], [], []
+    fixed: dict[str, float] = {}
     for name, channel in campaign.channels.items():
         if name not in used:
             continue
@@ -200,7 +201,7 @@ def global_unknowns(
 
 
 def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray) -> LocalUnknowns:
-    """Return the layout of the unknowns of one trial; `deviation` (C,) scales zeros of which nothing is known."""
+    """Return the layout of the unknowns of one trial; `deviation` (C,) scales zeros nothing is known of."""
     zero_scale = np.array([campaign.channels[name].offset_deviation for name in trial.channels])
     columns = np.flatnonzero(zero_scale > 0.0)
     free = np.isinf(zero_scale[columns])

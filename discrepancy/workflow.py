@@ -26,11 +26,9 @@ from .predictive import residual_set
 from .problem import Problem
 from .proof import prove
 from .residuals import ResidualSet
-from .search import Search
-from .verdict import Proof, Verdict, VerdictKind
+from .search import SOLVER_SHARE, Search, solver_share
+from .verdict import Experiment, Proof, Verdict, VerdictKind
 
-SOLVER_SHARE = 0.1
-"""Largest share of the noise that the time steps may cost (rms over a channel of a trial)."""
 DRAWS = 400
 OPEN_KINDS = (VerdictKind.GROUP, VerdictKind.UNEXPLAINED, VerdictKind.FAMILY, VerdictKind.BELOW_LIMIT)
 
@@ -146,8 +144,8 @@ def investigate(
         share = solver_share(problem, fit)
         if share > SOLVER_SHARE:
             remarks.append(
-                f"The time steps cost up to {share:.2g} of the noise (rms), more than the {SOLVER_SHARE:g} that is "
-                "wanted: probabilities may be too sharp."
+                f"The time steps cost up to {share:.2g} of the noise (rms), more than the {SOLVER_SHARE:g} "
+                "that is wanted: probabilities may be too sharp."
             )
     with stage("Residuals", "residuals"):
         before = residual_set(problem, search.none, sensitivities=thorough)
@@ -161,7 +159,7 @@ def investigate(
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
             proof = prove(before, after, seed=seed)
-    experiments: tuple = ()
+    experiments: tuple[Experiment, ...] = ()
     if thorough and verdict.kind in OPEN_KINDS:
         with stage("Looking for the next experiment", "next"):
             experiments = next_experiments(problem, open_hypotheses(search))
@@ -177,20 +175,6 @@ def checked(campaign: Campaign, model: Model) -> tuple[Campaign, tuple[DataFault
     campaign = mark_outliers(campaign)
     faults = (*faults, *check_against_model(campaign, model))
     return choose_held_out(campaign), faults
-
-
-def solver_share(problem: Problem, fit: Fit) -> float:
-    """Return the largest rms change of a channel when the time steps are halved, over its noise."""
-    largest = 0.0
-    for number, data in enumerate(problem.trials):
-        if not data.trial.is_dynamic:
-            continue
-        candidate = fit.candidate if data.trial.kind in fit.candidate.acts_on else Candidate()
-        patch = candidate.patch(problem.setting, fit.point.effect) if candidate.terms else ModelPatch()
-        finer, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch, refinement=2)
-        change = (finer - fit.responses[number]) / data.deviation
-        largest = max(largest, float(np.sqrt((change**2).mean(axis=0)).max()))
-    return largest
 
 
 def open_hypotheses(search: Search, count: int = 5) -> list[tuple[Fit, float]]:

@@ -74,7 +74,7 @@ def remaining_skin(boxes: list[LocalStiffnessLoss], lines: FloatArray) -> Remain
         raise InvalidPatchError(
             f"A local stiffness loss must leave some stiffness, but leaves {exact.min():g} of it."
         )
-    strip = np.searchsorted(lines, middles) - 1
+    strip = np.maximum(np.searchsorted(lines, middles) - 1, 0)  # one may begin next to nothing above zero
     weights = -np.diff((TIP_OFFSET * lines[-1] - breaks) ** 3)
     count = len(lines) - 1
     of_strips = np.bincount(strip, weights, count) / np.bincount(strip, weights / exact, count)

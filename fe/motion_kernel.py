@@ -7,10 +7,11 @@ Damping kicks have a closed form. Where friction turns over inside a step, the i
 are corrected for the moment of the turn; where it holds, the port is held in place by the impulses that this
 needs, as long as friction can give them.
 
-A port may lie on flexibility R that the modes leave out: x = p . q - R D + e, where D is the force of the laws
-there after a lag, beta D' + D = F (the lag of damping in proportion to the stiffness; backward Euler), and e
-what loads add. The force of a law on such a port is that at the step's end, where it obeys the law at its own
-position: a monotone equation in one unknown. Dry friction is then an elasto-plastic element of stiffness 1/R.
+A port may lie on flexibility R that the modes leave out: x = p . q - R D + e, where D is the force of the
+laws there after a lag, beta D' + D = F (the lag of damping in proportion to the stiffness; backward Euler),
+and e what loads add. The force of a law on such a port is that at the step's end, where it obeys the law at
+its own position: a monotone equation in one unknown. Dry friction is then an elasto-plastic element of
+stiffness 1/R.
 
 Written in the subset of Python that numba compiles too. NumPy only: this file is copied into the FMU. Other
 code may take this file's functions by the names in `COMPILED`, in their order, and compile them.
@@ -32,9 +33,9 @@ displacement; power stiffness: coefficient, exponent, side, reference displaceme
 half width; micro-slip: stiffness, element count; Bouc-Wen: stiffness, yield displacement, order.
 """
 HEAD = 5
-"""Columns of a memory before its hysteretic elements: 1 if friction holds the port; its last position; D; what
-loads that are gone still add to the position, which fades with beta; the last force of damping on a flexible
-port."""
+"""Columns of a memory before its hysteretic elements: 1 if friction holds the port; its last position; D;
+what loads that are gone still add to the position, which fades with beta; the last force of damping on a
+flexible port."""
 
 FIRST_PARTS = 400
 """Parts in which the way from a law's last position to the first one of a motion is followed."""
@@ -103,7 +104,7 @@ def displacement_slope(code: int, law: FloatArray, slip: FloatArray, memory: Flo
 
 
 def bouc_wen_path(law: FloatArray, begin: float, change: float, least: int) -> float:
-    """Return the variable of Bouc and Wen after a way, from its value at the begin, in `least` parts or more."""
+    """Return the variable of Bouc and Wen after a way from its value at the begin, `least` parts or more."""
     width, order = law[1], law[2]
     z, rest = begin / width, change / width
     if z * rest < 0.0:  # unloading: dz = dx until z is zero
@@ -256,7 +257,7 @@ def damped_position(law: FloatArray, last: float, y: float, r: float, h: float) 
         if way <= level:
             return last  # it sticks
         if a == 0.0:
-            return y - sign * level
+            return float(y - sign * level)
     # how far it moves, u; for 0 < p < 1 by w = u^p, in which the force has a slope everywhere
     root = p if 0.0 < p < 1.0 else 1.0
     low, high = 0.0, power(way, root)
@@ -351,7 +352,7 @@ def yielded_position(
     for turn in range(24):
         z = bouc_wen_path(law, memory[HEAD], x - last, least)
         rest = x + share * (z - x) - y
-        if abs(rest) <= 1e-12 * (abs(x) + law[1]):
+        if abs(rest) <= 1e-11 * (abs(x) + law[1]):
             break
         slope = 1.0
         if z * (x - last) > 0.0:
@@ -397,7 +398,7 @@ def law_position(
     if code == FREE_PLAY:
         within = 1.0 - r * law[0]
         if abs(y) < within * law[1]:
-            return y / within
+            return float(y / within)
         return float(y + r * law[0] * (law[1] if y > 0.0 else -law[1]))
     if code == MICRO_SLIP:
         return slipped_position(law, slip, memory, y, r, force)
@@ -478,7 +479,7 @@ def settle(
             if leader[j] == port and codes[j] == POWER_DAMPING and laws[j, 1] == 0.0:
                 own, _ = law_pull(codes[j], laws[j], slips[j], memory[j], last, h, least)
                 current[j] = push / r * own / level
-        return last
+        return float(last)
     sign = 1.0 if push > 0.0 else -1.0
     # the root lies that way from the last position, if the structure is stable
     low, high = last, last + sign * 1e300
@@ -508,7 +509,7 @@ def settle(
             x = 0.5 * (low + high)
         else:
             x += sign * abs(rest)
-    return x
+    return float(x)
 
 
 def integrate(
@@ -619,9 +620,7 @@ def integrate(
                     same = same and ports[j, m] == ports[k, m]
                 if same:
                     leader[j] = k
-    soft = np.flatnonzero(leader == np.arange(laws_count))  # one law for each flexible port
-    soft_count = len(soft)
-    lone = laws_count == 1 and soft_count == 1
+    lone = laws_count == 1 and flexible[0] == 1
     keep = relaxation / (relaxation + h)
     ease = 1.0 - keep
     at_once = 1.0 if relaxation == 0.0 or not known else 0.0
@@ -657,26 +656,28 @@ def integrate(
             if codes[j] == MICRO_SLIP or codes[j] == BOUC_WEN:
                 advance_memory(codes[j], laws[j], slips[j], memory[j], x, FIRST_PARTS)
             current[j] = displacement_force(codes[j], laws[j], memory[j], x)
-    for i in soft:
-        y = feed[0, i] * force[0] + feed[1, i] + memory[i, 3]
+    for port in range(laws_count):
+        if leader[port] != port:  # one law for each flexible port
+            continue
+        y = feed[0, port] * force[0] + feed[1, port] + memory[port, 3]
         for m in range(modes):
-            y += ports[i, m] * q[m]
+            y += ports[port, m] * q[m]
         springs = -1
         springy = np.full(laws_count, -1)
         for j in range(laws_count):
-            if leader[j] != i:
+            if leader[j] != port:
                 continue
             damped = codes[j] == POWER_DAMPING
-            y -= flexibility[i] * memory[j, 2] * (1.0 if damped else 1.0 - at_once)
+            y -= flexibility[port] * memory[j, 2] * (1.0 if damped else 1.0 - at_once)
             if not damped:
                 springs = j if springs < 0 else springs
                 springy[j] = springs
         x = y
         if springs >= 0:
-            r = at_once * flexibility[i]
+            r = at_once * flexibility[port]
             x = settle(springs, springy, codes, laws, slips, memory, y, r, h, FIRST_PARTS, current)
         for j in range(laws_count):
-            if leader[j] != i:
+            if leader[j] != port:
                 continue
             if codes[j] != POWER_DAMPING:
                 advance_memory(codes[j], laws[j], slips[j], memory[j], x, FIRST_PARTS)
@@ -790,26 +791,35 @@ def integrate(
                         current[0] = (y - x) / r
                     lone_memory[1] = x
                     lone_memory[4] = current[0]
+                elif code == BOUC_WEN and r * lone_law[0] > 0.01:  # the solution holds force and memory
+                    current[0] = (y - x) / r
+                    lone_memory[HEAD] = x + current[0] / lone_law[0]
+                    lone_memory[1] = x
                 else:
-                    if code == MICRO_SLIP or code == BOUC_WEN:
+                    if code in (MICRO_SLIP, BOUC_WEN):
                         advance_memory(code, lone_law, lone_slip, lone_memory, x, 1)
-                    current[0] = displacement_force(code, lone_law, lone_memory, x)
+                    if code == MICRO_SLIP and r * lone_law[0] > 0.01:
+                        current[0] = (y - x) / r
+                    else:
+                        current[0] = displacement_force(code, lone_law, lone_memory, x)
                     lone_memory[1] = x
                 lone_memory[2] = keep * lone_memory[2] + ease * current[0]
                 for m in range(modes):
                     v[m] -= ports[0, m] * current[0] * half
             else:
-                for i in soft:
-                    y = feed[0, i] * force_end + feed[1, i] + keep * memory[i, 3]
+                for port in range(laws_count):
+                    if leader[port] != port:
+                        continue
+                    y = feed[0, port] * force_end + feed[1, port] + keep * memory[port, 3]
                     for m in range(modes):
-                        y += ports[i, m] * q[m]
+                        y += ports[port, m] * q[m]
                     for j in range(laws_count):
-                        if leader[j] == i:
-                            y -= flexibility[i] * keep * memory[j, 2]
-                    r = ease * flexibility[i]
-                    x = settle(i, leader, codes, laws, slips, memory, y, r, h, 1, current)
+                        if leader[j] == port:
+                            y -= flexibility[port] * keep * memory[j, 2]
+                    r = ease * flexibility[port]
+                    x = settle(port, leader, codes, laws, slips, memory, y, r, h, 1, current)
                     for j in range(laws_count):
-                        if leader[j] != i:
+                        if leader[j] != port:
                             continue
                         if codes[j] == POWER_DAMPING:
                             memory[j, 1] = x

@@ -42,7 +42,7 @@ class Primitive:
 
 @dataclass(frozen=True, slots=True)
 class PointMass(Primitive):
-    """A mass [kg] on the wing's elastic line at `station` [m] from the root (lumped model: at a named place)."""
+    """A mass [kg] on the elastic line at `station` [m] from the root (lumped model: at a named place)."""
 
     kind: ClassVar[str] = "point_mass"
     mass: float
@@ -140,7 +140,7 @@ class FreePlay(Primitive):
 
 @dataclass(frozen=True, slots=True)
 class MicroSlip(Primitive):
-    """Iwan's joint: `element_count` Jenkins elements in parallel, together `stiffness`, in place of that spring.
+    """Iwan's joint: `element_count` Jenkins elements in parallel in place of a spring of `stiffness`.
 
     At rest the elements carry their share of the stiffness that the linear model already has, so F is the
     hysteretic force less `stiffness` x: what slip takes away. The slip forces of the elements are those of a
@@ -159,7 +159,9 @@ class MicroSlip(Primitive):
 
 @dataclass(frozen=True, slots=True)
 class BoucWen(Primitive):
-    """Bouc-Wen hysteresis: F = stiffness (z - x), z' = v (1 - (0.5 + 0.5 sgn(v z)) |z / yield_displacement|^order).
+    """Bouc-Wen hysteresis: F = stiffness (z - x), z' = v (1 - (1 + sgn(v z)) / 2 |z / z_y|^order).
+
+    z_y is `yield_displacement` [m or rad].
 
     `stiffness` is the part of the port's stiffness that is hysteretic ((1 - alpha) k); below yield F is zero.
     """
@@ -176,7 +178,7 @@ class BoucWen(Primitive):
 
 @dataclass(frozen=True, slots=True)
 class LoadPlace(Primitive):
-    """Applied forces act `along_span` [m] further outboard and `along_chord` [m] further aft than recorded."""
+    """Applied forces act `along_span` [m] further outboard, `along_chord` [m] further aft than recorded."""
 
     kind: ClassVar[str] = "load_place"
     along_span: float
@@ -185,7 +187,7 @@ class LoadPlace(Primitive):
 
 @dataclass(frozen=True, slots=True)
 class LoadGain(Primitive):
-    """The force that acts is (1 + `gain`) times the recorded one plus `tare` [N] (while a force is applied)."""
+    """The force that acts is (1 + `gain`) times the recorded one plus `tare` [N], while one is applied."""
 
     kind: ClassVar[str] = "load_gain"
     gain: float
@@ -226,7 +228,7 @@ class SensorGain(Primitive):
 
 @dataclass(frozen=True, slots=True)
 class SensorDrift(Primitive):
-    """A channel's zero moves: `amplitude` (t / `time`)^`exponent` is added, t since the campaign's start [s]."""
+    """A channel's zero moves by `amplitude` (t / `time`)^`exponent`, t since the campaign's start [s]."""
 
     kind: ClassVar[str] = "sensor_drift"
     channel: str
@@ -238,7 +240,7 @@ class SensorDrift(Primitive):
 
 @dataclass(frozen=True, slots=True)
 class SensorRotation(Primitive):
-    """A strain gauge is turned by `angle` [rad] in the skin from the spanwise direction towards the tip's rear."""
+    """A strain gauge is turned by `angle` [rad] in the skin, from spanwise towards the tip's rear."""
 
     kind: ClassVar[str] = "sensor_rotation"
     channel: str
@@ -310,7 +312,7 @@ class DecayingLine(Primitive):
 
 @dataclass(frozen=True, slots=True)
 class RunOffset(Primitive):
-    """Static readings of the trials labelled `run` have this `offset` (channel's unit): seating, zero of a run."""
+    """Static readings of the trials labelled `run` have this `offset` (channel's unit): seating of a run."""
 
     kind: ClassVar[str] = "run_offset"
     run: str
@@ -325,7 +327,8 @@ PRIMITIVES: dict[str, type[Primitive]] = {
         PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature, StiffnessDrift,
         PowerDamping, PowerStiffness, FreePlay, MicroSlip, BoucWen,
         LoadPlace, LoadGain, Washout, InertiaRelief,
-        SensorGain, SensorDrift, SensorRotation, ThermalStrain, HighPass, Clock, Line, DecayingLine, RunOffset,
+        SensorGain, SensorDrift, SensorRotation, ThermalStrain, HighPass, Clock, Line, DecayingLine,
+        RunOffset,
     )
 }  # fmt: skip
 """Every primitive by its kind."""

@@ -123,12 +123,14 @@ def section_lines(design: WingDesign) -> tuple[float, float]:
 
 def strip_edges(lines: FloatArray, count: int) -> FloatArray:
     """Return at most `count` + 1 of the mesh lines, ends included, that part the span most evenly."""
+    if count >= len(lines) - 1:
+        return np.array(lines)
     wanted = np.linspace(lines[0], lines[-1], count + 1)
     nearest = np.abs(lines[:, np.newaxis] - wanted).argmin(axis=0)
     return np.asarray(lines[np.unique(nearest)])
 
 
-def assemble_patch_operators(operators: AffineOperators, strip_count: int = 24) -> PatchOperators:
+def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) -> PatchOperators:
     """Assemble the operators of the primitives for a wing.
 
     Parameters

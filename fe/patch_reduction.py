@@ -42,7 +42,7 @@ class PatchSettings:
     ranges : ReductionSettings
         Ranges of e, z1, z2 and the masses, those of the reduced model.
     strip_count : int
-        Largest number of strips of the skin.
+        Largest number of strips of the skin; by default each row of cells along the span is one.
     vectors : int
         Size n of the basis.
     states : int
@@ -58,7 +58,7 @@ class PatchSettings:
     """
 
     ranges: ReductionSettings = field(default_factory=ReductionSettings)
-    strip_count: int = 24
+    strip_count: int = 64
     vectors: int = 240
     states: int = 160
     largest_loss: float = 0.7

@@ -28,8 +28,10 @@ _LOADS = 2  # load factor and tip force, as they are recorded
 
 
 class _Moving(NamedTuple):
-    """State of a motion: modes, forces of the laws as omitted modes follow them, loads, what omitted modes still
-    feel of a force that held the wing (1,), memory of the laws."""
+    """State of a motion: modes, forces of the laws as omitted modes follow them, loads, memory of the laws.
+
+    `holding` (1,) is what omitted modes still feel of a force that held the wing.
+    """
 
     q: FloatArray
     v: FloatArray
@@ -95,12 +97,16 @@ class PatchedSteps:
         self._patched = wing.structure(*self._state, patch, temperature)
         arrays = wing.arrays
         factors = wing.strain_factors(patch)
-        self._strain_rows = arrays.strain_rows if factors is None else factors[:, np.newaxis] * arrays.strain_rows
+        self._strain_rows = (
+            arrays.strain_rows if factors is None else factors[:, np.newaxis] * arrays.strain_rows
+        )
         self._plain_rows = np.vstack((arrays.strain_rows[0], arrays.tip_row, arrays.load_tip))
         self._rows = self._plain_rows
         if factors is not None:
             self._rows = np.vstack((self._strain_rows[0], arrays.tip_row, arrays.load_tip))
-        self._units = np.vstack((wing.load_parts(patch.of(*LOADS, PointMass)), wing.force_row(LOAD_PLACE, self._loads)))
+        self._units = np.vstack(
+            (wing.load_parts(patch.of(*LOADS, PointMass)), wing.force_row(LOAD_PLACE, self._loads))
+        )
         ports = {name: wing.port_row(name) for name in PORTS}
         self._port_rows = self._laws.rows(ports, wing.size)
 
@@ -222,7 +228,7 @@ class PatchedSteps:
         return np.asarray(self._patched.static(holding) - shape)
 
     def _feed(self, constant: FloatArray) -> FloatArray:
-        """Return what the modes leave out of the positions (2, J) of the laws' ports under acting loads (3,)."""
+        """Return what the modes leave out of the positions (2, J) of the laws' ports under loads (3,)."""
         fed = self._port_rows @ (self._left_out[:, :3] @ constant)
         return np.stack((np.zeros(len(self._laws)), fed))
 
@@ -341,8 +347,8 @@ class PatchedSteps:
         loads = np.array((load_factor, tip_force))
         _, beta = self._rayleigh
         holding = before.holding * (np.exp(-duration / beta) if beta > 0.0 else 0.0)
-        state = _Moving(moved.q[-1], moved.v[-1], moved.lagged[-1], loads, holding, moved.memory)
-        return self._packed(state)
+        after = _Moving(moved.q[-1], moved.v[-1], moved.lagged[-1], loads, holding, moved.memory)
+        return self._packed(after)
 
     # ------------------------------------------------------------ what is seen
 

@@ -182,10 +182,9 @@ def _show(found: Investigation, tried: SelfCalibration | None, report: Path, con
     console.print(f"Verdict: {verdict.kind.value}", style="bold")
     console.print(headline(verdict), soft_wrap=True)
     if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
-        console.print(
-            f"Probability {probability_text(verdict.probability)}, ln Bayes factor against nothing missing "
-            f"{verdict.log_bayes_factor:.1f}."
-        )
+        against = f", ln Bayes factor against nothing missing {verdict.log_bayes_factor:.1f}"
+        none = verdict.kind is VerdictKind.NOTHING_MISSING
+        console.print(f"Probability {probability_text(verdict.probability)}{'' if none else against}.")
     if verdict.effects:
         table = Table(box=box.SIMPLE_HEAD)
         for heading in ("effect", "place", "parameter", "value", "90 % interval", "unit"):

@@ -169,7 +169,8 @@ def _bases(
     bending = shapes[:, list(order)]
     # What the modes become when e or a mass changes a little.
     images = np.hstack([skin @ bending, *(term @ bending for term in operators.mass_terms[1:])])
-    # A change of a mode solves (K - w^2 M) x = image: two terms of K^-1 (1 + w^2 M K^-1 + ...), whose ratio is
+    # A change of a mode solves (K - w^2 M) x = image: two terms of K^-1 (1 + w^2 M K^-1 + ...), whose ratio
+    # is
     # small because the lowest modes themselves are in the basis. Derivatives of slopes need the second one.
     changed = healthy.raw_solve(images)
     inertial = healthy.raw_solve(mass @ changed)

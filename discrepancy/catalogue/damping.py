@@ -8,8 +8,8 @@ losses give the equivalent viscous ratio zeta_eq = F_0 B / (pi k A):
 - structural, p = 0, a = 1, B = 1: zeta_eq = g / pi with F = g k |x| sgn v;
 - quadratic, p = 2, a = 0, B = 4/3: zeta_eq = 4 F_0 / (3 pi k A) = 4 c A w^2 / (3 pi k) with F = c |v| v.
 
-At a stiff port k is far above the stiffness at rest k_0, and a force of k_0 A holds it still: no more than 0.9 of
-it is built.
+At a stiff port k is far above the stiffness at rest k_0, and a force of k_0 A holds it still: no more than
+0.9 of it is built.
 
 Where the exponents are free, the loss at the amplitude A is kept, so that they change the shape alone.
 """

@@ -79,7 +79,9 @@ class FmuModel:
         self._ports = tuple(port.name for port in description.port)
         self._forces = {place: self.runs.variable(name) for place, name in description.inputs.forces.items()}
         self._check_settings()
-        self.motion = FmuMotion(description, self.runs)
+        means = Conditions(np.array([item.mean for item in self._parameters]))
+        nominal = self._state(_any_trial(TrialKind.RINGDOWN, 1.0), means, (), 0)
+        self.motion = FmuMotion(description, self.runs, nominal)
 
     @classmethod
     def load(cls, path: Path | str) -> "FmuModel":
@@ -171,11 +173,11 @@ class FmuModel:
         if dynamic:
             trial = dynamic[0]
             state = self._state(trial, Conditions(values), (), 0)
-            step = self.motion.step(trial, state, 1)
+            step = self.motion.step(trial, 1)
             seen = {
                 port: self.motion.stiffness(number, state, step) for number, port in enumerate(self._ports)
             }
-            frequency = frequency or self.motion.angular_frequency(trial, state)
+            frequency = frequency or self.motion.measured_frequency(trial, state)
         else:
             some = still[0] if still else _any_trial(TrialKind.STATIC, 1.0)
             state = self._state(some, Conditions(values, health=some.health), (), 0)
@@ -275,7 +277,7 @@ class FmuModel:
         self, trial: Trial, conditions: Conditions, state: State, patch: _Patch, refinement: int
     ) -> tuple[float, int, list[tuple[Excitation, float]]]:
         """Return step, number of steps, and what excites the FMU, each with its factor."""
-        step = self.motion.step(trial, state, refinement)
+        step = self.motion.step(trial, refinement)
         rate, zero = conditions.clock
         end = max((1.0 + rate) * float(trial.time[-1]) + zero, float(trial.time[-1]))
         # a little longer, so that a clock that is being fitted does not ask for another run
@@ -304,7 +306,7 @@ class FmuModel:
                 f"follow only if [release] names parameters of displacement and velocity."
             )
         unit = release.displacement
-        speed = self.motion.rate_unit()
+        speed = self.motion.angular_frequency(trial)
         return [
             (Excitation("displacement"), unit * float(first[0])),
             (Excitation("velocity"), unit * speed * float(first[1])),

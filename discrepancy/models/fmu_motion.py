@@ -88,9 +88,12 @@ class FmuMotion:
         The model's file.
     runs : FmuRuns
         Its FMU.
+    nominal : State
+        Of motions, at the means of the parameters.
     """
 
-    def __init__(self, description: FmuModelDescription, runs: FmuRuns) -> None:
+    def __init__(self, description: FmuModelDescription, runs: FmuRuns, nominal: State) -> None:
+        self.nominal = nominal
         self._description, self._runs = description, runs
         self._ports = description.port
         self._forces = [runs.variable(port.force) for port in self._ports]
@@ -101,7 +104,7 @@ class FmuMotion:
         self._units: dict[Hashable, float] = {}
         self._systems: OrderedDict[Hashable, PortSystem | None] = OrderedDict()
         self._refinements: dict[Hashable, tuple[int, float]] = {}
-        self._frequency: float | None = None
+        self._frequencies: dict[Hashable, float] = {}
         self._port_linear: bool | None = None
         self._refinable: bool | None = None
         self._silent: dict[Hashable, bool] = {}
@@ -139,27 +142,27 @@ class FmuMotion:
 
     # ------------------------------------------------------------ free motion
 
-    def step(self, trial: Trial, state: State, refinement: int) -> float:
+    def step(self, trial: Trial, refinement: int) -> float:
         """Return the communication step [s] of a dynamic trial: a whole part of its sampling interval."""
         if self._description.motion.step is not None:
             return self._description.motion.step
-        frequency = self.angular_frequency(trial, state)
+        frequency = self.angular_frequency(trial)
         return trial.interval / (ceil(frequency * trial.interval / PHASE[trial.kind]) * refinement)
 
-    def angular_frequency(self, trial: Trial, state: State) -> float:
-        """Return that of the mode that is most flexible at the first port [rad/s]; without port, the loudest."""
+    def angular_frequency(self, trial: Trial) -> float:
+        """Return that of the mode that is most flexible at the first port [rad/s]; without port, the loudest.
+
+        That of the nominal state, so that steps do not change while parameters are fitted.
+        """
         if self._description.scales.angular_frequency is not None:
             return self._description.scales.angular_frequency
-        if self._frequency is None:
-            self._frequency = self.measured_frequency(trial, state)
-        return self._frequency
-
-    def rate_unit(self) -> float:
-        """Return the angular frequency [rad/s] by which initial velocities are measured."""
-        return self._description.scales.angular_frequency or self._frequency or 1.0
+        key = (trial.interval, len(trial.time))
+        if key not in self._frequencies:
+            self._frequencies[key] = self.measured_frequency(trial, self.nominal)
+        return self._frequencies[key]
 
     def measured_frequency(self, trial: Trial, state: State) -> float:
-        """Return what `angular_frequency` returns, measured at the sampling interval of a trial."""
+        """Return an angular frequency as `angular_frequency` does, measured in a state at a trial's interval."""
         step = self._description.motion.step or trial.interval
         system = self.system(state, step, len(trial.time)) if self._ports else None
         if system is not None:
@@ -483,17 +486,35 @@ class FmuMotion:
         self, state: State, step: float, steps: int, loads: Loads, refinement: int
     ) -> FloatArray:
         """Return the free motion with small steps; of a release by the ports' system, where it shows it all."""
+        loads = [(part, value) for part, value in loads if value != 0.0]
         kind = tuple(part.kind for part, _ in loads)
+        kind_names = tuple((part.kind, part.name) for part, _ in loads)
         released = all(name in ("displacement", "velocity", "hold") for name in kind)
-        if refinement > 1 and released and self._quiet and self._free_linear.get(kind, True):
-            base = self.system(state, step * refinement, ceil(steps / refinement))
-            fine = self.system(state, step, steps, refinement)
-            if base is not None and fine is not None and self._refinable:
-                coarse = self.free(state, step * refinement, ceil(steps / refinement), loads)
+        possible = (
+            refinement > 1 and released and self._quiet and self._linear.get(("free", kind_names)) is True
+        )
+        if not possible or not self._free_linear.get(kind, True):
+            return self.free(state, step, steps, loads)
+        result = np.zeros(0)
+        for part, value in loads:
+            size = self._units[part.kind, part.name]
+
+            def moved(part: Excitation = part, size: float = size) -> FloatArray:
+                base = self.system(state, step * refinement, ceil(steps / refinement))
+                fine = self.system(state, step, steps, refinement)
+                if base is None or fine is None or not self._refinable:
+                    return np.zeros(0)
+                coarse = self.free(state, step * refinement, ceil(steps / refinement), [(part, size)])
                 start = base.start_of(coarse, LINEAR)
-                if start is not None:
-                    return fine.free(start, steps)
+                return np.zeros(0) if start is None else fine.free(start, steps)
+
+            unit = self._runs.remembered(("refined", state, step, steps, refinement, part.key, size), moved)
+            if not len(unit):
                 self._free_linear[kind] = False
+                return self.free(state, step, steps, loads)
+            result = value / size * unit if not len(result) else result + value / size * unit
+        if len(result):
+            return result
         return self.free(state, step, steps, loads)
 
     def _stepped(

@@ -39,7 +39,7 @@ class ModelParameter:
 
 @dataclass(frozen=True)
 class PortScale:
-    """Natural scales of a port for the campaign at hand, by which effects without dimension are made physical.
+    """Natural scales of a port for the campaign at hand: they make dimensionless effects physical.
 
     Attributes
     ----------
@@ -109,8 +109,8 @@ class Conditions:
         Values of `Model.parameters`, in order.
     initial : (R, 2) ndarray
         Ring-downs. At rest: column 0 holds deviations from the static release shape, in units of the release
-        displacement, by mode, row 0 that of the whole shape (so the motion starts at (1 + initial[0, 0]) times
-        the static shape plus initial[r, 0] of mode r); column 1 is zero. Not at rest: displacement and
+        displacement, by mode, row 0 that of the whole shape (so the motion starts at (1 + initial[0, 0])
+        times the static shape plus initial[r, 0] of mode r); column 1 is zero. Not at rest: displacement and
         velocity / w_r of mode r, in units of the release displacement, at the release point.
     clock : tuple of float
         (rate, zero): a sample stamped t shows the motion at (1 + rate) t + zero [1], [s].
@@ -160,13 +160,13 @@ class Model(Protocol):
         """Return what an output is, or None if the model has no such output."""
 
     def supports(self, primitive: type[Primitive]) -> bool:
-        """Whether the model can carry a primitive (sensor primitives are not asked for: they need no model)."""
+        """Whether the model can carry a primitive; sensors are not asked for: they need no model."""
 
     def ports(self) -> tuple[str, ...]:
         """Names of the ports where internal forces can act."""
 
     def stations(self) -> tuple[float, float] | None:
-        """Return the least and largest station [m] for places along the structure, None if it has no length."""
+        """Return the least and largest station [m] along the structure, None if it has no length."""
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign."""

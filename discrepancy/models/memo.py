@@ -67,7 +67,8 @@ class MemoModel:
         """Return the response of a trial, kept or computed; as `Model.respond`."""
         key = (
             id(trial), outputs, patch.primitives, conditions.parameters.tobytes(),
-            conditions.initial.tobytes(), conditions.clock, conditions.health.tobytes(), components, refinement,
+            conditions.initial.tobytes(), conditions.clock, conditions.health.tobytes(), components,
+            refinement,
         )  # fmt: skip
         kept = self._kept.get(key)
         if kept is not None:

@@ -24,7 +24,7 @@ FloatArray = NDArray[np.float64]
 
 MOST_STATES = 40
 """Largest order of a linear system that is made from records."""
-HANKEL_ROWS = 240
+HANKEL_ROWS = 160
 FIT = 1e-7
 """Largest error of a linear system against the record that it is made of, as a share of the record."""
 
@@ -155,8 +155,10 @@ def port_system(records: FloatArray, ports: list[int], step: float) -> PortSyste
     width = min(HANKEL_ROWS, (count - 2) // 2)
     if width < 4:
         return None
-    blocks = [np.concatenate([seen[1 + i + j] for j in range(width)], axis=1) for i in range(width + 1)]
-    hankel, shifted = np.concatenate(blocks[:-1]), np.concatenate(blocks[1:])
+    row = np.arange(width)
+    both = seen[1 + np.arange(width + 1)[:, None] + row].transpose(0, 2, 1, 3)
+    both = both.reshape((width + 1) * len(ports), width * inputs)
+    hankel, shifted = both[: -len(ports)], both[len(ports) :]
     left, values, right = np.linalg.svd(hankel, full_matrices=False)
     if values[0] == 0.0:
         return None

@@ -39,13 +39,13 @@ from discrepancy.residual_file import read_residuals
 from discrepancy.residuals import ResidualSet
 from discrepancy.self_calibration import (
     NOTHING,
-    Simulator,
     outcome_of,
     self_calibrate,
     wilson,
     write_self_calibration,
 )
 from discrepancy.separability import CONFUSED, Separability, separability
+from discrepancy.simulated_campaigns import Simulator
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.verdict_file import read_verdict
 from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder

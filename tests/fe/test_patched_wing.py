@@ -390,7 +390,14 @@ def test_outputs_by_name(coarse_patched_wing: PatchedWing) -> None:
     across = wing.output_row("strain[24]", 1)
     assert across is not None
     assert np.array_equal(across, wing.arrays.strain_rows[1, 23])
-    for name in ("strain[0]", "strain[25]", "strain[-1]", "displacement[1.9, 0.3]", "displacement[a, b]", "velocity"):
+    for name in (
+        "strain[0]",
+        "strain[25]",
+        "strain[-1]",
+        "displacement[1.9, 0.3]",
+        "displacement[a, b]",
+        "velocity",
+    ):
         assert wing.output_row(name) is None
 
 

@@ -34,8 +34,9 @@ FREQUENCIES, DECAYS = np.array([3.0, 11.0]), np.array([0.25, 0.6])
 class ClosedForm:
     """Responses that are linear in everything a hypothesis can move, or bent where `bent` says so.
 
-    Static: y_c = sum_p theta_p F^(p+1) S_pc, times 1 + z . H_c if `bent`. Ring-down: two decaying modes of unit
-    release, deviations of the initial state by mode; `bent` scales their frequencies with the root of theta_0.
+    Static: y_c = sum_p theta_p F^(p+1) S_pc, times 1 + z . H_c if `bent`. Ring-down: two decaying modes of
+    unit release, deviations of the initial state by mode; `bent` scales their frequencies
+    with the root of theta_0.
     """
 
     bent: bool = False
@@ -356,8 +357,8 @@ class Bench:
     ) -> Campaign:
         """Return the campaign with readings: nuisances and calibrated parameters drawn from their priors.
 
-        Simulated at half the time steps. `noise` draws standard noise; `noise_scale` is the true deviation over
-        the one that the channels' records say.
+        Simulated at half the time steps. `noise` draws standard noise; `noise_scale` is the true deviation
+        over the one that the channels' records say.
         """
         generator = np.random.default_rng(np.random.SeedSequence(seed))
         theta = np.array([p.mean + p.deviation * generator.standard_normal() for p in self.model.parameters])
@@ -424,8 +425,9 @@ def chain_bench(
     for number, amplitude in enumerate(amplitudes):
         trials.append(
             blank_trial(
-                f"release {number}", TrialKind.RINGDOWN, dynamic_channels, time, start=3000.0 + 120.0 * number,
-                load_place="end", release=Release(amplitude, 0.02, mode_count=mode_count),
+                f"release {number}", TrialKind.RINGDOWN, dynamic_channels, time,
+                start=3000.0 + 120.0 * number, load_place="end",
+                release=Release(amplitude, 0.02, mode_count=mode_count),
                 held_out=held_out and number == 1,
             )
         )  # fmt: skip

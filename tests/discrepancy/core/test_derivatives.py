@@ -9,9 +9,10 @@ import pytest
 
 from discrepancy.campaign import NoiseRecord
 from discrepancy.candidate import Candidate, Term
-from discrepancy.catalogue.library import effect_by_identifier
-from discrepancy.problem import Problem
 from discrepancy.catalogue.entry import Setting
+from discrepancy.catalogue.library import effect_by_identifier
+from discrepancy.fitting import fit
+from discrepancy.problem import Problem
 
 STEP = 1e-4
 TOLERANCE = 0.03  # of the column's norm: the code's one-sided step is 1e-2 of a prior deviation
@@ -111,14 +112,15 @@ def test_free_shape_has_its_own_columns(kit, bench, catalogue) -> None:  # type:
 
 def test_chord_steps_are_exact_at_the_base_and_second_order_away(kit, bench, catalogue) -> None:  # type: ignore[no-untyped-def]
     """A chord response differs from the true one by the square of the distance from the base."""
-    from discrepancy.fitting import fit  # noqa: PLC0415
-
     problem = bench.problem(bench.measured(1))
     candidate = Candidate((Term(effect_by_identifier("gauge_gain", catalogue), "g1"),))
     none = fit(problem, Candidate(), problem.start(Candidate()))
     number = len(problem.trials) - 1
     generator = np.random.default_rng(0)
-    away = generator.standard_normal(problem.shared.size), generator.standard_normal(none.point.local[number].size)
+    away = (
+        generator.standard_normal(problem.shared.size),
+        generator.standard_normal(none.point.local[number].size),
+    )
     errors = []
     for size in (0.0, 0.02, 0.04):
         point = replace(

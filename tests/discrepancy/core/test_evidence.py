@@ -157,5 +157,7 @@ def test_without_a_noise_record_the_scale_does_not_matter(kit) -> None:  # type:
     problem = kit.closed_problem(seed=6, effect=0.1, known_noise=False)
     assert np.all(problem.freedom == 0.0)
     sums = np.array([30.0, 40.0, 50.0])
-    assert problem.misfit(4.0 * sums) - problem.misfit(sums) == pytest.approx(0.5 * problem.counts.sum() * log(4.0))
+    assert problem.misfit(4.0 * sums) - problem.misfit(sums) == pytest.approx(
+        0.5 * problem.counts.sum() * log(4.0)
+    )
     np.testing.assert_allclose(problem.precisions(sums), problem.counts / sums)

@@ -45,7 +45,7 @@ def null_gates(kit, freedom, kinds, samples, draws=DRAWS, gap=0.0):  # type: ign
     ],
 )
 def test_absolute_gate_has_its_level(kit, freedom: float, kinds: tuple[str, ...], samples: int) -> None:  # type: ignore[no-untyped-def]
-    """Rejected at most 1e-3 of the time where nothing is missing; at 3000 draws 10 are too many (p < 1e-3)."""
+    """Rejected at most 1e-3 of the time where nothing is missing; of 3000 draws more than 10 are too many."""
     _, _, passed = null_gates(kit, freedom, kinds, samples)
     assert passed.count(False) <= binom.isf(1e-3, DRAWS, ABSOLUTE_LEVEL)
 

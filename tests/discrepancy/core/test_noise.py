@@ -52,7 +52,9 @@ def test_model_of_a_coloured_record() -> None:
 
 def test_white_records_stay_white() -> None:
     generator = np.random.default_rng(3)
-    orders = [len(noise_model(channel(generator.standard_normal(400)), 1.0).autoregression) for _ in range(300)]
+    orders = [
+        len(noise_model(channel(generator.standard_normal(400)), 1.0).autoregression) for _ in range(300)
+    ]
     # the Ljung-Box test of the record has level 1e-3
     assert np.count_nonzero(orders) <= binom.isf(1e-4, 300, 1e-3)
 
@@ -65,7 +67,7 @@ def test_ljung_box_has_its_level() -> None:
 
 
 def test_whitened_noise_is_white() -> None:
-    """A new record of the same process, whitened by the autoregression of the first, is white at its level."""
+    """A new record of the process, whitened by the autoregression of the first, is white."""
     generator = np.random.default_rng(5)
     values = []
     for _ in range(300):
@@ -132,7 +134,9 @@ def test_the_first_whitened_samples_weigh_what_they_are_worth(kit, coefficient: 
     data = problem.trials[0]
     first = []
     for _ in range(400):
-        noise = np.stack([0.02 * np.sqrt(1.0 - coefficient**2) * coloured(generator, (coefficient,), 8, 500)] * 3, 1)
+        noise = np.stack(
+            [0.02 * np.sqrt(1.0 - coefficient**2) * coloured(generator, (coefficient,), 8, 500)] * 3, 1
+        )
         padded = np.zeros(data.weight.shape)
         padded[:8] = noise
         first.append(data.standardised(padded)[0, 0])

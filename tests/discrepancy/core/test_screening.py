@@ -23,7 +23,7 @@ def screened(kit):  # type: ignore[no-untyped-def]
 
 
 def dense_projection(kit, problem, none, term, start):  # type: ignore[no-untyped-def]
-    """Return change d, nuisances' derivatives A and their Hessian, densely, residual and gradient at the fit."""
+    """Return, densely, change d, nuisances' derivatives A, Hessian, residual and gradient at the fit."""
     linear = kit.Linear(problem, Candidate((term,)))
     q = problem.shared.size
     zero = np.concatenate((none.point.shared, np.zeros(1), *none.point.local))
@@ -82,7 +82,7 @@ def test_pairs_are_fitted_together(kit, screened) -> None:  # type: ignore[no-un
 
 
 def test_two_changes_that_are_one_are_no_pair(kit, screened) -> None:  # type: ignore[no-untyped-def]
-    _, _, screen, terms, changes = screened
+    _, _, screen, _, changes = screened
     twin = {"one": [changes[0]], "other": [changes[0]]}
     assert not list(_pairs(twin, screen.sign))
     assert separation(changes[0], changes[0], screen.sign) == pytest.approx(0.0, abs=1e-6 * changes[0].size)

@@ -1,0 +1,182 @@
+"""Names on simulated campaigns of the chain: half the time steps, nuisances and parameters drawn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from discrepancy.naming import name
+from discrepancy.search import key_of
+from discrepancy.verdict import VerdictKind
+
+NO_NAME = (
+    VerdictKind.NOTHING_MISSING,
+    VerdictKind.BELOW_LIMIT,
+    VerdictKind.UNEXPLAINED,
+    VerdictKind.GROUP,
+    VerdictKind.FAMILY,
+)
+CHOSEN = (
+    "point_mass", "root_compliance", "coulomb_friction", "quadratic_damping", "cubic_stiffness",
+    "stiffness_drift", "seating_offset", "gauge_gain", "load_place", "load_cell", "clock_error",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def small(kit):  # type: ignore[no-untyped-def]
+    """A short test: three static trials, two releases of small amplitude."""
+    return kit.chain_bench(amplitudes=(0.004, 0.002), samples=150)
+
+
+@pytest.fixture(scope="module")
+def effects(catalogue):  # type: ignore[no-untyped-def]
+    return tuple(effect for effect in catalogue if effect.identifier in CHOSEN)
+
+
+TRUTHS = {
+    "gauge_gain": ({"gain_error": 0.08}, "g1"),
+    "load_cell": ({"gain_error": 0.05, "tare_ratio": 0.02}, ""),
+    "point_mass": ({"mass_ratio": 0.06, "station_ratio": 0.7}, ""),
+    "coulomb_friction": ({"friction_ratio": 0.02}, "joint"),
+    "quadratic_damping": ({"equivalent_damping_ratio": 0.01}, "end"),
+    "seating_offset": ({"offset_ratio": 0.05}, None),
+}
+
+
+@pytest.mark.parametrize("identifier", TRUTHS)
+def test_an_effect_is_named_with_intervals_that_hold_it(small, effects, catalogue, identifier: str) -> None:  # type: ignore[no-untyped-def]
+    values, place = TRUTHS[identifier]
+    if place is None:
+        effect = next(item for item in catalogue if item.identifier == identifier)
+        place = effect.places(small.setting)[0]
+    problem = small.problem(small.measured(11, small.patch(identifier, values, place)))
+    verdict, found, fit = name(problem, effects)
+    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
+    assert [effect.identifier for effect in verdict.effects] == [identifier]
+    assert verdict.probability >= 0.95
+    assert all(gate.passed is not False for gate in verdict.gates)
+    (effect,) = verdict.effects
+    assert effect.place == place
+    for estimate in effect.parameters:
+        truth = values[estimate.name]
+        # 90 % intervals, widened to 99.9 %: twice as wide
+        middle, half = 0.5 * (estimate.low + estimate.high), 0.5 * (estimate.high - estimate.low)
+        assert abs(truth - middle) <= 2.0 * half + 0.005 * abs(truth), estimate
+    assert fit.candidate.identifiers == (identifier,)
+    assert sum(found.set_probabilities().values()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_nothing_is_missing_where_nothing_is(small, catalogue, seed: int) -> None:  # type: ignore[no-untyped-def]
+    """With the whole catalogue."""
+    verdict, _, _ = name(small.problem(small.measured(seed)), catalogue)
+    assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
+    assert verdict.log_bayes_factor < 3.0
+    assert verdict.effects == ()
+
+
+def test_two_effects_are_found_together(small, effects) -> None:  # type: ignore[no-untyped-def]
+    patch = small.patch("gauge_gain", {"gain_error": 0.10}, "g1")
+    patch = patch + small.patch("quadratic_damping", {"equivalent_damping_ratio": 0.01}, "end")
+    verdict, found, _ = name(small.problem(small.measured(5, patch)), effects)
+    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
+    assert sorted(item.identifier for item in verdict.effects) == ["gauge_gain", "quadratic_damping"]
+    # both were tried alone as well: deletion has its comparison
+    tried = {item.candidate.identifiers for item in found.all().values()}
+    assert {("gauge_gain",), ("quadratic_damping",)} <= tried
+
+
+def test_clock_and_load_cell_are_a_group(bench, effects) -> None:  # type: ignore[no-untyped-def]
+    """All frequencies up by 0.5 %: the clock, or a stiffness 1 % up with a load cell that reads 1 % wrong."""
+    patch = bench.patch("clock_error", {"rate_error": 0.005, "phase_zero": 0.0})
+    verdict, _, _ = name(bench.problem(bench.measured(1, patch)), effects)
+    assert verdict.kind is VerdictKind.GROUP, verdict.sentence
+    assert set(verdict.group) == {"clock_error", "load_cell"}
+
+
+def test_static_displacement_gives_a_group(kit, effects) -> None:  # type: ignore[no-untyped-def]
+    test = kit.chain_bench(amplitudes=(), static_channels=("x3",), gain_deviation=0.0)
+    known = {"stiffness_factor": (1.0, 1e-3), "joint_factor": (1.0, 1e-3), "damping_factor": (1.0, 0.1)}
+    test = replace(test, campaign=replace(test.campaign, parameters=known))
+    patch = test.patch("root_compliance", {"compliance_share": 0.05})
+    campaign = test.measured(2, patch)
+    verdict, _, _ = name(test.problem(campaign), effects)
+    assert verdict.kind is VerdictKind.GROUP, verdict.sentence
+    # the load cell is in reach too (test_separability), but pays for a tare that nothing asks for
+    assert {"root_compliance", "load_place"} <= set(verdict.group)
+
+
+@pytest.mark.parametrize("left_out", ["coulomb_friction", "quadratic_damping"])
+def test_what_the_catalogue_lacks_gets_no_wrong_name(small, effects, left_out: str) -> None:  # type: ignore[no-untyped-def]
+    values, place = TRUTHS[left_out]
+    rest = tuple(effect for effect in effects if effect.identifier != left_out)
+    campaign = small.measured(7, small.patch(left_out, values, place))
+    verdict, _, _ = name(small.problem(campaign), rest)
+    assert verdict.kind in (VerdictKind.UNEXPLAINED, VerdictKind.FAMILY), verdict.sentence
+
+
+def test_the_same_campaign_gives_the_same_verdict(small, effects) -> None:  # type: ignore[no-untyped-def]
+    """To the last bit, from readings to probabilities."""
+    patch = small.patch("gauge_gain", {"gain_error": 0.08}, "g1")
+    runs = []
+    for _ in range(2):
+        verdict, found, fit = name(small.problem(small.measured(11, patch)), effects)
+        runs.append((verdict.probability, verdict.log_bayes_factor, verdict.sentence,
+                     fit.point.effect.tobytes(),
+                     [(key_of(f.candidate), f.log_evidence) for f in found.all().values()]))  # fmt: skip
+    assert runs[0] == runs[1]
+
+
+# ---------------------------------------------------------------- traps
+
+
+def coloured(generator, shape):  # type: ignore[no-untyped-def]
+    white = generator.standard_normal((shape[0] + 200, *shape[1:]))
+    return np.sqrt(1.0 - 0.49) * lfilter([1.0], [1.0, -0.7], white, axis=0)[200:]
+
+
+def outliers(generator, shape):  # type: ignore[no-untyped-def]
+    noise = generator.standard_normal(shape)
+    return np.where(generator.random(shape) < 0.01, 15.0 * noise, noise)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{"noise_scale": 3.0}, {"noise_scale": 0.4}, {"noise": coloured}, {"noise": outliers}],
+    ids=["understated", "overstated", "correlated", "outliers"],
+)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_wrong_noise_makes_no_name(small, effects, how, seed: int) -> None:  # type: ignore[no-untyped-def]
+    """Records that say a third of the noise, or too much, or white where it is not: nothing is named."""
+    verdict, _, _ = name(small.problem(small.measured(seed, **how)), effects)
+    assert verdict.kind in NO_NAME, verdict.sentence
+
+
+@pytest.mark.parametrize(
+    "how", [{"noise_scale": 2.0}, {"noise": coloured}], ids=["understated", "correlated"]
+)
+def test_wrong_noise_makes_no_wrong_name(small, effects, how) -> None:  # type: ignore[no-untyped-def]
+    patch = small.patch("gauge_gain", {"gain_error": 0.10}, "g1")
+    verdict, _, _ = name(small.problem(small.measured(3, patch, **how)), effects)
+    if verdict.kind is VerdictKind.NAMED:
+        assert [item.identifier for item in verdict.effects] == ["gauge_gain"]
+
+
+def test_an_effect_below_detectability_is_not_named(small, effects) -> None:  # type: ignore[no-untyped-def]
+    patch = small.patch("gauge_gain", {"gain_error": 0.004}, "g1")  # within the gauge's own gain error
+    for seed in (1, 2):
+        verdict, _, _ = name(small.problem(small.measured(seed, patch)), effects)
+        assert verdict.kind in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT), verdict.sentence
+
+
+def test_without_an_effect_in_reach_the_gap_stays_unexplained(small, effects) -> None:  # type: ignore[no-untyped-def]
+    """Effects that cannot touch ring-downs do not explain friction."""
+    static = tuple(effect for effect in effects if effect.identifier in ("load_cell", "seating_offset"))
+    values, place = TRUTHS["coulomb_friction"]
+    campaign = small.measured(7, small.patch("coulomb_friction", values, place))
+    verdict, _, _ = name(small.problem(campaign), static)
+    assert verdict.kind is VerdictKind.UNEXPLAINED
+    assert verdict.effects == ()

@@ -1,0 +1,179 @@
+"""What campaigns cannot decide, before any data: the known confusion groups."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from math import inf
+
+import numpy as np
+import pytest
+
+from benchmarks.cantilever import Cantilever, campaign
+from discrepancy.campaign import Campaign, Channel, NoiseRecord, Quantity, Release, TrialKind
+from discrepancy.catalogue.entry import Setting
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.separability import CONFUSED, Separability, _groups, separability
+
+ONE_MODE = """
+format = 1
+name = "One mass on a beam"
+mass = [2.0]
+stiffness = [1974.0]
+characteristic_length = 0.4
+[damping]
+ratios = [0.01]
+[root]
+lever = [0.4]
+[[input]]
+name = "mass"
+vector = [1.0]
+[[output]]
+name = "displacement"
+vector = [1.0]
+[[place]]
+name = "mass"
+vector = [1.0]
+station = 0.4
+[[parameter]]
+name = "stiffness_factor"
+terms = "stiffness"
+deviation = 0.02
+low = 0.7
+high = 1.3
+"""
+
+
+def chosen(catalogue, identifiers: Iterable[str]):  # type: ignore[no-untyped-def]
+    return [effect for effect in catalogue if effect.identifier in set(identifiers)]
+
+
+def decided(model, given: Campaign, effects) -> Separability:  # type: ignore[no-untyped-def]
+    return separability(given, model, Setting(given, model, model.scales(given)), effects)
+
+
+def test_ringdown_of_one_mode_cannot_tell_mass_root_and_clock(kit, catalogue, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    """And none of them from the stiffness, where that is not known from calibration."""
+    path = tmp_path / "one.toml"
+    path.write_text(ONE_MODE, encoding="utf-8")
+    model = LumpedModel.load(path)
+    channel = Channel("x", Quantity.DISPLACEMENT, "displacement", NoiseRecord(2e-5, inf))
+    trial = kit.blank_trial(
+        "release", TrialKind.RINGDOWN, ("x",), 0.02 * np.arange(200), load_place="mass",
+        release=Release(0.01, 0.02, mode_count=1),
+    )  # fmt: skip
+    effects = chosen(catalogue, ("point_mass", "root_compliance", "clock_error", "quadratic_damping"))
+    exact = Campaign("", {"x": channel}, (trial,), None, {"stiffness_factor": (1.0, 1e-4)}, "")
+    found = decided(model, exact, [e for e in effects if e.identifier != "quadratic_damping"])
+    assert set(found.group_of("point_mass")) == {"point_mass", "root_compliance", "clock_error"}
+    assert all(item.distance > 100.0 for item in found.detectability)  # seen they are
+    loose = replace(exact, parameters={"stiffness_factor": (1.0, 0.1)})
+    hidden = decided(model, loose, [e for e in effects if e.identifier != "quadratic_damping"])
+    for seen, item in zip(found.detectability, hidden.detectability, strict=True):
+        if item.effect.identifier != "clock_error":  # its time zero shows
+            assert item.distance < 1e-3 * seen.distance
+
+
+def test_static_displacement_cannot_tell_root_load_place_and_load_cell(kit, bench, catalogue) -> None:  # type: ignore[no-untyped-def]
+    """Static strain takes the root out of that group: it turns without straining."""
+    parameters = {"stiffness_factor": (1.0, 1e-4), "joint_factor": (1.0, 1e-4), "damping_factor": (1.0, 0.1)}
+    effects = chosen(catalogue, ("root_compliance", "load_place", "load_cell"))
+    groups = []
+    for channels in (("x3",), ("x3", "g1", "g2")):
+        test = kit.chain_bench(amplitudes=(), static_channels=channels, gain_deviation=0.0)
+        found = decided(test.model, replace(test.campaign, parameters=parameters), effects)
+        assert all(item.distance > 100.0 for item in found.detectability)
+        groups.append(found)
+    assert set(groups[0].group_of("root_compliance")) == {"root_compliance", "load_place", "load_cell"}
+    assert groups[1].group_of("root_compliance") == ("root_compliance",)
+    loose = {**parameters, "stiffness_factor": (1.0, 5.0)}
+    test = kit.chain_bench(amplitudes=(), static_channels=("x3",), gain_deviation=0.0)
+    hidden = decided(test.model, replace(test.campaign, parameters=loose), effects[:2])
+    assert all(item.distance < CONFUSED for item in hidden.detectability)
+
+
+def static_gauges(names: tuple[str, ...]) -> Campaign:
+    """Static trials of the cantilever with some gauges, the modulus known."""
+    given = campaign()
+    trials = []
+    for trial in given.trials:
+        if trial.kind is TrialKind.STATIC:
+            columns = [trial.channels.index(name) for name in names]
+            trials.append(
+                replace(trial, channels=names, values=trial.values[:, columns], used=trial.used[:, columns])
+            )
+    channels = {name: replace(given.channels[name], gain_deviation=0.0) for name in names}
+    model = Cantilever()
+    known = {item.name: (item.mean, 1e-4 * item.mean) for item in model.parameters}
+    return replace(given, channels=channels, trials=tuple(trials), parameters=known)
+
+
+def test_one_gauge_cannot_tell_gain_misalignment_and_local_damage(catalogue) -> None:  # type: ignore[no-untyped-def]
+    effects = chosen(catalogue, ("gauge_gain", "gauge_misalignment", "local_stiffness_loss"))
+    gauges = [name for name, item in campaign().channels.items() if item.quantity is Quantity.STRAIN]
+    found = decided(Cantilever(), static_gauges((gauges[0],)), effects)
+    assert set(found.group_of("gauge_gain")) == {item.identifier for item in effects}
+
+
+def test_flight_at_one_load_factor_cannot_tell_relief_and_lift(catalogue) -> None:  # type: ignore[no-untyped-def]
+    given = campaign()
+    flight = next(trial for trial in given.trials if trial.kind is TrialKind.FLIGHT)
+    strain = next(
+        n for n, name in enumerate(flight.channels) if given.channels[name].quantity is Quantity.STRAIN
+    )
+    name = flight.channels[strain]
+    one = replace(
+        flight, channels=(name,), values=flight.values[:, [strain]], used=flight.used[:, [strain]],
+        load_factor=np.full_like(flight.load_factor, 2.0),
+    )  # fmt: skip
+    channels = {name: replace(given.channels[name], gain_deviation=0.0)}
+    model = Cantilever()
+    known = {item.name: (item.mean, 1e-4 * item.mean) for item in model.parameters}
+    found = decided(
+        model, replace(given, channels=channels, trials=(one,), parameters=known),
+        chosen(catalogue, ("washout", "inertia_relief")),
+    )  # fmt: skip
+    assert set(found.group_of("washout")) == {"washout", "inertia_relief"}
+
+
+def test_a_whole_laboratory_test_separates(bench, catalogue) -> None:  # type: ignore[no-untyped-def]
+    identifiers = ("point_mass", "root_compliance", "quadratic_damping", "coulomb_friction", "load_cell")
+    effects = chosen(catalogue, identifiers)
+    found = decided(bench.model, bench.campaign, effects)
+    assert found.groups == ()
+    assert set(found.identifiers) == set(identifiers)
+    np.testing.assert_array_equal(np.diag(found.distance), 0.0)
+    for item in found.detectability:
+        assert item.detectable < item.typical
+
+
+def test_measured_values_do_not_count(bench, catalogue) -> None:  # type: ignore[no-untyped-def]
+    effects = chosen(catalogue, ("gauge_gain", "load_cell", "root_compliance"))
+    first = decided(bench.model, bench.measured(1), effects)
+    second = decided(bench.model, bench.measured(2), effects)
+    np.testing.assert_allclose(first.distance, second.distance, rtol=1e-6)
+
+
+def test_what_cannot_be_tested_says_why(bench, catalogue) -> None:  # type: ignore[no-untyped-def]
+    found = decided(bench.model, bench.campaign, chosen(catalogue, ("washout", "gauge_gain")))
+    reasons = {item.effect.identifier: item.reason for item in found.detectability}
+    assert reasons["washout"]
+    assert reasons["gauge_gain"] == ""
+    assert found.identifiers == ("gauge_gain",)
+    assert found.group_of("gauge_gain") == ("gauge_gain",)
+
+
+@pytest.mark.parametrize(
+    ("near", "groups"),
+    [
+        ((), ()),
+        (((0, 1),), (("a", "b"),)),
+        (((0, 1), (1, 3)), (("a", "b", "d"),)),
+        (((0, 2), (1, 3)), (("a", "c"), ("b", "d"))),
+    ],
+)
+def test_groups_are_connected_sets(near, groups) -> None:  # type: ignore[no-untyped-def]
+    distance = np.full((4, 4), 100.0)
+    for i, j in near:
+        distance[i, j] = CONFUSED - 1.0  # one direction suffices
+    assert _groups(("a", "b", "c", "d"), distance) == groups

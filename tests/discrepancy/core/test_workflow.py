@@ -1,0 +1,104 @@
+"""The whole way on simulated campaigns of the chain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from discrepancy.candidate import Candidate
+from discrepancy.verdict import VerdictKind
+from discrepancy.workflow import investigate, open_hypotheses, patch_draws, solver_share
+
+
+@pytest.fixture(scope="module")
+def laboratory(kit):  # type: ignore[no-untyped-def]
+    """Static trials and releases; one of each held out."""
+    return kit.chain_bench(amplitudes=(0.004, 0.003, 0.002), samples=200, held_out=True)
+
+
+@pytest.fixture(scope="module")
+def effects(catalogue):  # type: ignore[no-untyped-def]
+    chosen = ("quadratic_damping", "gauge_gain", "load_cell", "stiffness_drift", "coulomb_friction")
+    return tuple(effect for effect in catalogue if effect.identifier in chosen)
+
+
+@pytest.fixture(scope="module")
+def damped(laboratory):  # type: ignore[no-untyped-def]
+    patch = laboratory.patch("quadratic_damping", {"equivalent_damping_ratio": 0.01}, "end")
+    return laboratory.measured(21, patch)
+
+
+@pytest.fixture(scope="module")
+def found(laboratory, damped, effects):  # type: ignore[no-untyped-def]
+    return investigate(damped, laboratory.model, effects, seed=3)
+
+
+def test_an_effect_is_named_and_proved_on_trials_not_used(found) -> None:  # type: ignore[no-untyped-def]
+    assert found.verdict.kind is VerdictKind.NAMED, found.verdict.sentence
+    assert found.proof is not None
+    assert found.proof.gap_closed >= 0.9
+    assert 0.8 <= found.proof.held_out_after.chi_square_per_dof <= 1.2
+    assert found.proof.log_score_gain > 0.0
+    assert found.location is not None
+    assert not any("time steps cost" in remark for remark in found.verdict.remarks)
+    assert solver_share(found.problem, found.fit) < 0.1
+
+
+def test_draws_of_the_patch_have_the_posteriors_spread(found) -> None:  # type: ignore[no-untyped-def]
+    (draws,) = patch_draws(found.problem, found.fit, seed=1, count=300)
+    term = found.fit.candidate.terms[0]
+    values = np.array([draw.primitives[0].coefficient for draw in draws])
+    spread = float(np.sqrt(found.fit.effect_covariance[0, 0]))
+    ends = [
+        Candidate((term,)).patch(found.problem.setting, found.fit.point.effect + side * spread).primitives[0]
+        for side in (-1.0, 1.0)
+    ]
+    assert values.std() == pytest.approx(0.5 * (ends[1].coefficient - ends[0].coefficient), rel=0.2)
+    again = patch_draws(found.problem, found.fit, seed=1, count=300)[0]
+    assert again == draws
+
+
+def test_open_hypotheses_are_different_sets(found) -> None:  # type: ignore[no-untyped-def]
+    items = open_hypotheses(found.search, count=4)
+    sets = [fit.candidate.identifiers for fit, _ in items]
+    assert len(set(sets)) == len(sets)
+    assert [p for _, p in items] == sorted((p for _, p in items), reverse=True)
+
+
+def test_the_same_seed_gives_the_same_verdict(laboratory, damped, effects, found) -> None:  # type: ignore[no-untyped-def]
+    again = investigate(damped, laboratory.model, effects, seed=3)
+    assert again.verdict.sentence == found.verdict.sentence
+    assert again.verdict.probability == found.verdict.probability
+    assert again.proof.gap_closed == found.proof.gap_closed
+    assert again.fit.point.effect.tobytes() == found.fit.point.effect.tobytes()
+
+
+def test_nothing_missing_ends_without_proof_or_experiment(laboratory, effects) -> None:  # type: ignore[no-untyped-def]
+    result = investigate(laboratory.measured(22), laboratory.model, effects)
+    assert result.verdict.kind is VerdictKind.NOTHING_MISSING, result.verdict.sentence
+    assert result.proof is None
+    assert result.verdict.next_experiments == ()
+
+
+def test_microstrain_for_strain_is_an_error_of_the_data(laboratory, effects) -> None:  # type: ignore[no-untyped-def]
+    """Not an effect."""
+    campaign = laboratory.measured(23)
+    trials = []
+    for trial in campaign.trials:
+        values = trial.values.copy()
+        values[:, trial.channels.index("g1")] *= 1e6
+        trials.append(replace(trial, values=values))
+    result = investigate(replace(campaign, trials=tuple(trials)), laboratory.model, effects)
+    assert result.verdict.kind is VerdictKind.DATA_ERROR, result.verdict.sentence
+    assert result.search is None
+
+
+def test_an_open_verdict_comes_with_experiments(bench, catalogue) -> None:  # type: ignore[no-untyped-def]
+    chosen = tuple(effect for effect in catalogue if effect.identifier in ("clock_error", "load_cell"))
+    patch = bench.patch("clock_error", {"rate_error": 0.005, "phase_zero": 0.0})
+    result = investigate(bench.measured(1, patch), bench.model, chosen)
+    assert result.verdict.kind is VerdictKind.GROUP, result.verdict.sentence
+    for item in result.verdict.next_experiments:
+        assert 0.0 < item.information <= np.log(3.0) + 1e-9

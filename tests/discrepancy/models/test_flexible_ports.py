@@ -1,0 +1,368 @@
+"""Laws at a joint whose flexibility the modes leave out, against a general integrator of all of it."""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from discrepancy.campaign import Quantity, Release
+from discrepancy.compiled_motion import compiled_kernel
+from discrepancy.models.second_order import Motion, SecondOrderSystem
+from fe.motion import ModalMotion, ModalSystem, laws_of, simulate, slip_displacements
+from fe.patch import (
+    BoucWen,
+    FreePlay,
+    MicroSlip,
+    ModelPatch,
+    PowerDamping,
+    PowerStiffness,
+    Primitive,
+)
+
+FloatArray = NDArray[np.float64]
+
+LIGHT = 1e-9
+"""Mass of the joint's own node [kg], as good as none: the mode that it makes is left out."""
+BETA = 1e-3
+ROOT = 6000.0
+"""Spring of the joint [N/m]: a seventh of the compliance of the tip."""
+TIP = np.array([0.0, 0.0, 0.0, 1.0])
+RELEASE = Release(displacement=0.02, deviation=0.0, at_rest=True, mode_count=1, time_zero_deviation=0.0)
+TIME = np.linspace(0.0, 2.796, 700)
+A = 0.02 * 0.135
+"""About the motion of the joint [m]."""
+
+
+def chain(modes: int, beta: float) -> SecondOrderSystem:
+    """Three masses of 1 kg in a row on a joint whose node weighs next to nothing."""
+    springs = np.array([ROOT, 2000.0, 4000.0, 5000.0])
+    stretch = np.eye(4) - np.eye(4, k=-1)
+    stiffness = stretch.T @ np.diag(springs) @ stretch
+    mass = np.diag([LIGHT, 1.0, 1.0, 1.0])
+    ports = {"joint": np.array([1.0, 0.0, 0.0, 0.0]), "tip": TIP}
+    return SecondOrderSystem(mass, 0.3 * mass + beta * stiffness, stiffness, ports, modes, beta)
+
+
+def ringdown(beta: float, *items: Primitive, refinement: int = 1) -> Motion:
+    system = chain(3, beta)
+    laws = laws_of(ModelPatch(items), list(system.ports))
+    return system.ringdown(TIP, RELEASE, np.zeros((0, 2)), TIME, laws, refinement=refinement)
+
+
+LAWS = {
+    "coulomb": (PowerDamping("joint", 0.2 * ROOT * A, 0.0, 0.0, 1.0, 1.0),),
+    "strong coulomb": (PowerDamping("joint", 0.8 * ROOT * A, 0.0, 0.0, 1.0, 1.0),),
+    "structural": (PowerDamping("joint", 0.3 * ROOT * A, 0.0, 1.0, 1.0, A),),
+    "slow damping": (PowerDamping("joint", 0.3 * ROOT * A, 0.4, 0.3, 15.0 * A, A),),
+    "viscous": (PowerDamping("joint", 0.3 * ROOT * A, 1.0, 0.0, 15.0 * A, A),),
+    "quadratic": (PowerDamping("joint", 0.3 * ROOT * A, 2.0, 0.0, 15.0 * A, A),),
+    "crack": (PowerStiffness("joint", -0.5 * ROOT * A, 1.0, 1, A),),
+    "cubic": (PowerStiffness("joint", 0.5 * ROOT * A, 3.0, 0, A),),
+    "softening": (PowerStiffness("joint", -0.2 * ROOT * A, 2.0, 0, A),),
+    "steep": (PowerStiffness("joint", 0.3 * ROOT * A, 0.6, -1, A),),
+    "play": (FreePlay("joint", 0.7 * ROOT, 0.2 * A),),
+    "micro-slip": (MicroSlip("joint", 0.3 * ROOT * A, 0.7 * ROOT, -0.5),),
+    "bouc-wen": (BoucWen("joint", 0.7 * ROOT, 0.5 * A, 1.0),),
+    "sharp bouc-wen": (BoucWen("joint", 0.7 * ROOT, 0.5 * A, 4.0),),
+    "two": (
+        PowerDamping("joint", 0.15 * ROOT * A, 0.0, 0.0, 1.0, 1.0),
+        MicroSlip("joint", 0.3 * ROOT * A, 0.7 * ROOT, -0.5),
+    ),
+    "three": (
+        PowerDamping("joint", 0.2 * ROOT * A, 0.5, 0.0, 15.0 * A, A),
+        FreePlay("joint", 0.4 * ROOT, 0.2 * A),
+        PowerStiffness("joint", 0.3 * ROOT * A, 3.0, 0, A),
+    ),
+    "elsewhere": (
+        PowerDamping("joint", 0.2 * ROOT * A, 0.0, 0.0, 1.0, 1.0),
+        PowerStiffness("tip", 2.0, 3.0, 0, 0.02),
+    ),
+}
+
+
+def test_the_modes_leave_out_nearly_all_of_the_joint() -> None:
+    system = chain(3, 0.0)
+    row = system.ports["joint"]
+    assert float(row @ system.residual(row)) > 0.7 * float(row @ system.flexibility(row))
+
+
+Law = Callable[..., Any]
+"""Force at a position x and the states of elements, or the rates of elements."""
+
+
+def sprung(items: tuple[Primitive, ...]) -> tuple[Law, Law, int]:
+    """Return the force of the laws without damping, the rates of their elements at a speed, and how many."""
+    forces: list[Any] = []
+    rates: list[Any] = []
+    for item in items:
+        begin = sum(1 if isinstance(i, BoucWen) else i.element_count for i in items[: items.index(item)]
+                    if isinstance(i, BoucWen | MicroSlip))  # fmt: skip
+        if isinstance(item, PowerStiffness) and item.port == "joint":
+            forces.append(
+                lambda x, z, i=item: i.coefficient * abs(x / i.reference_displacement) ** i.exponent
+                * np.sign(x) * (i.side * x >= 0.0)
+            )  # fmt: skip
+        elif isinstance(item, FreePlay):
+            forces.append(lambda x, z, i=item: -i.stiffness * np.clip(x, -i.half_width, i.half_width))
+        elif isinstance(item, BoucWen):
+            forces.append(lambda x, z, i=item, k=begin: i.stiffness * (z[k] - x))
+            rates.append(
+                lambda z, v, i=item, k=begin: np.array(
+                    [v * (1.0 - (abs(z[k] / i.yield_displacement) ** i.order if z[k] * v > 0.0 else 0.0))]
+                )
+            )
+        elif isinstance(item, MicroSlip):
+            slips, part = slip_displacements(item), slice(begin, begin + item.element_count)
+            forces.append(lambda x, z, i=item, c=part: i.stiffness * (z[c].mean() - x))
+            rates.append(
+                lambda z, v, c=part, s=slips: np.where((np.abs(z[c]) >= s) & (z[c] * v > 0.0), 0.0, v)
+            )
+    count = sum(
+        i.element_count if isinstance(i, MicroSlip) else 1
+        for i in items
+        if isinstance(i, BoucWen | MicroSlip)
+    )
+    return (
+        lambda x, z: sum(force(x, z) for force in forces),
+        lambda z, v: np.concatenate([rate(z, v) for rate in rates]) if rates else np.zeros(0),
+        count,
+    )
+
+
+def joint_speed(push: float, damper: float, x: float, items: tuple[Primitive, ...]) -> float:
+    """Speed v of a joint without mass: damper v + sum F(x, v) = push."""
+    dampings = [item for item in items if isinstance(item, PowerDamping)]
+    level = sum(d.coefficient * abs(x / d.reference_displacement) ** d.displacement_exponent
+                for d in dampings if d.velocity_exponent == 0.0)  # fmt: skip
+    rest = max(abs(push) - level, 0.0)
+    drags = [d for d in dampings if d.velocity_exponent > 0.0]
+
+    def left(v: float) -> float:
+        total = damper * v - rest
+        for d in drags:
+            total += (d.coefficient * abs(x / d.reference_displacement) ** d.displacement_exponent
+                      * (v / d.reference_velocity) ** d.velocity_exponent)  # fmt: skip
+        return float(total)
+
+    size = brentq(left, 0.0, rest / damper, xtol=1e-15) if drags and rest > 0.0 else rest / damper
+    return float(np.sign(push) * size)
+
+
+def integrated(items: tuple[Primitive, ...], time: FloatArray) -> FloatArray:
+    """Displacements (N, 2) of tip and joint after the release, by a general integrator; no mass there."""
+    system = chain(3, BETA)
+    stiffness, damping = system.stiffness, BETA * system.stiffness + 0.3 * system.mass
+    inverse = np.linalg.inv(stiffness)
+    force, rates, count = sprung(items)
+    at_tip = next((item for item in items if getattr(item, "port", "") == "tip"), None)
+
+    def cubic(u: float) -> float:
+        if at_tip is None:
+            return 0.0
+        assert isinstance(at_tip, PowerStiffness)
+        return at_tip.coefficient * (u / at_tip.reference_displacement) ** 3
+
+    # static: the joint at x, its elements led there in one go
+    def elements(x: float) -> FloatArray:
+        if count == 0 or x == 0.0:
+            return np.zeros(count)
+        way = solve_ivp(
+            lambda s, z: rates(z, x), (0.0, 1.0), np.zeros(count), rtol=1e-9, atol=1e-14, max_step=0.01
+        )
+        return np.asarray(way.y[:, -1])
+
+    def held(x: float) -> float:
+        inner = force(x, elements(x))
+        pull = (0.02 + inverse[3, 0] * inner) / inverse[3, 3]
+        return float(inverse[0, 3] * pull - inverse[0, 0] * inner - x)
+
+    x = brentq(held, 0.0, 3.0 * A, xtol=1e-14)
+    z = elements(x)
+    inner = force(x, z)
+    pull = (0.02 + inverse[3, 0] * inner) / inverse[3, 3]
+    u = inverse[:, 3] * pull - inverse[:, 0] * inner
+
+    def derivative(t: float, y: FloatArray) -> FloatArray:
+        u, v, x, z = y[:3], y[3:6], y[6], y[7:]
+        place = np.concatenate(([x], u))
+        push = -stiffness[0] @ place - damping[0, 1:] @ v - force(x, z)
+        speed = joint_speed(push, damping[0, 0] - 0.3 * LIGHT, x, items)
+        a = -(stiffness @ place)[1:] - damping[1:] @ np.concatenate(([speed], v))
+        a[2] -= cubic(u[2])
+        return np.concatenate((v, a, [speed], rates(z, speed)))
+
+    begin = np.concatenate((u[1:], np.zeros(3), [x], z))
+    found = solve_ivp(derivative, (0.0, time[-1]), begin, t_eval=time, rtol=1e-6, atol=1e-9, max_step=2e-3)
+    return np.asarray(found.y[[2, 6]].T)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_ring_down_is_that_of_the_whole_structure(name: str) -> None:
+    rows = np.vstack((TIP, np.array([1.0, 0.0, 0.0, 0.0])))
+    count = 250
+    true = integrated(LAWS[name], TIME[:count])
+    effect, usual, fine = (
+        np.abs(motion.values(rows)[:count] - true).max(axis=0)
+        for motion in (ringdown(BETA), ringdown(BETA, *LAWS[name]), ringdown(BETA, *LAWS[name], refinement=8))
+    )
+    assert np.all(fine < 0.01 * effect + 1e-3 * np.array([0.02, A]))
+    assert fine[0] < 1e-3 * 0.02
+    assert np.all(usual < np.array([0.03, 0.08]) * effect + 1e-3 * np.array([0.02, A]))
+
+
+@pytest.mark.parametrize("name", ["coulomb", "structural", "crack", "play", "micro-slip", "bouc-wen", "two"])
+def test_steps_half_as_long_change_little_and_ever_less(name: str) -> None:
+    coarse, middle, fine = (
+        ringdown(5e-4, *LAWS[name], refinement=number).values(TIP[None]) for number in (1, 2, 8)
+    )
+    assert np.abs(coarse - fine).max() < 1e-3 * 0.02
+    assert np.abs(middle - fine).max() < 0.75 * np.abs(coarse - fine).max() + 1e-9
+
+
+@pytest.mark.parametrize("name", ["play", "micro-slip", "bouc-wen", "cubic"])
+def test_without_lag_the_order_is_two(name: str) -> None:
+    smooth = {"play": LAWS["crack"]}.get(name, LAWS[name])
+    errors = []
+    fine = ringdown(0.0, *smooth, refinement=16).values(TIP[None])
+    for refinement in (1, 2):
+        errors.append(
+            np.sqrt(np.mean((ringdown(0.0, *smooth, refinement=refinement).values(TIP[None]) - fine) ** 2))
+        )
+    assert errors[0] / errors[1] > 3.0
+
+
+def joint(stiffness: float, flexibility: float, beta: float = 0.0) -> ModalSystem:
+    """One mass of 1 kg on a spring; its port has a flexibility behind it."""
+    w = np.array([np.sqrt(stiffness)])
+    return ModalSystem(w, np.zeros((1, 1)), {"mass": np.ones(1)}, np.array([flexibility]), beta)
+
+
+def move(
+    system: ModalSystem, *items: Primitive, q: float = 1.0, v: float = 0.0, **options: object
+) -> ModalMotion:
+    laws = laws_of(ModelPatch(items), ["mass"])
+    return simulate(
+        system, laws, q=np.array([q]), v=np.array([v]), force=np.zeros(801), interval=0.005,
+        kernel=compiled_kernel(), **options,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def test_friction_that_holds_is_a_spring_of_the_flexibility() -> None:
+    # it sticks at the release, where the spring 1/R is without force: about that place, k + 1/R
+    k, r = 40.0, 1.0 / 60.0
+    moved = move(joint(k, r), PowerDamping("mass", 1e4, 0.0, 0.0, 1.0, 1.0), substeps=20)
+    time = 0.005 * np.arange(801)
+    rest = 60.0 / 100.0
+    assert moved.q[:, 0] == pytest.approx(rest + (1.0 - rest) * np.cos(10.0 * time), abs=2e-4)
+    assert moved.port_forces[:, 0] == pytest.approx((moved.q[:, 0] - 1.0) / r, abs=1e-9)
+
+
+def test_friction_that_slips_loses_the_area_of_its_loop() -> None:
+    # Jenkins: in a cycle from -X to X the loop takes 4 F (X - R F); the mass loses that energy
+    k, r, level = 40.0, 1.0 / 60.0, 1.5
+    moved = move(joint(k, r), PowerDamping("mass", level, 0.0, 0.0, 1.0, 1.0), substeps=20)
+    x, energy = moved.q[:, 0], 0.5 * (k * moved.q[:, 0] ** 2 + moved.v[:, 0] ** 2)
+    energy = energy + 0.5 * r * moved.port_forces[:, 0] ** 2
+    turns = np.flatnonzero(np.diff(np.sign(moved.v[1:, 0]))) + 1
+    for begin, end in itertools.pairwise(turns):
+        loss = level * (abs(x[begin] - x[end]) - 2.0 * r * level)
+        assert energy[begin] - energy[end] == pytest.approx(loss, rel=0.02)
+    assert np.abs(moved.port_forces).max() <= level * (1.0 + 1e-12)
+
+
+def test_the_shape_family_is_continuous_at_dry_friction() -> None:
+    system = joint(40.0, 1.0 / 60.0, 1e-3)
+    dry, nearly = (
+        move(system, PowerDamping("mass", 1.5, p, a, 6.0, 1.0)) for p, a in ((0.0, 0.0), (1e-5, 1e-5))
+    )
+    assert np.abs(dry.q - nearly.q).max() < 1e-3
+    sides = [move(system, PowerDamping("mass", 1.5, p, 0.0, 6.0, 1.0)).q for p in (0.49, 0.5, 0.51)]
+    assert np.abs(sides[2] - 2.0 * sides[1] + sides[0]).max() < 1e-3
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 2.0])
+def test_less_and_less_flexibility_tends_to_none(exponent: float) -> None:
+    item = PowerDamping("mass", 1.5, exponent, 0.0, 6.0, 1.0)
+    # with large steps a port with little flexibility is one without (`port_flexibility`)
+    rigid = move(joint(40.0, 0.0), item, substeps=40).q
+    errors = [np.abs(move(joint(40.0, r), item, substeps=40).q - rigid).max() for r in (1.2e-2, 6e-3, 3e-3)]
+    assert errors[2] < 0.6 * errors[0]
+    assert np.array_equal(move(joint(40.0, 2e-3), item, substeps=40).q, rigid)
+
+
+@pytest.mark.parametrize(
+    "name", ["coulomb", "structural", "quadratic", "cubic", "play", "micro-slip", "bouc-wen"]
+)
+def test_no_flexibility_changes_no_bit(name: str) -> None:
+    modal = chain(3, 0.0).modal
+    laws = laws_of(ModelPatch(LAWS[name]), list(modal.ports))
+    given: dict[str, Any] = {
+        "q": np.array([0.02, 0.001, 0.0]),
+        "v": np.zeros(3),
+        "force": np.zeros(300),
+        "interval": 0.004,
+    }
+    none, zero = (
+        simulate(replace(modal, flexibility=f, relaxation=b), laws, kernel=compiled_kernel(), **given)
+        for f, b in ((None, 0.0), (np.zeros(2), 1e-3))
+    )
+    assert np.array_equal(none.q, zero.q)
+    assert np.array_equal(none.port_forces, zero.port_forces)
+    assert np.array_equal(none.lagged, none.port_forces)
+
+
+@pytest.mark.parametrize("name", ["cubic", "crack", "play", "micro-slip", "bouc-wen"])
+def test_a_slow_force_leads_through_the_static_states(name: str) -> None:
+    system = chain(3, 1e-3)
+    system = replace(system, damping=system.damping + 4.0 * system.mass)
+    laws = laws_of(ModelPatch(LAWS[name]), list(system.ports))
+    time = np.linspace(0.0, 90.0, 3001)
+    force = np.asarray(15.0 * np.sin(2.0 * np.pi * time / 90.0))
+    rows = np.vstack((TIP, [1.0, 0.0, 0.0, 0.0]))
+    moved = system.forced(TIP, force, time, laws).values(rows)
+    still = system.static(np.outer(force, TIP), laws) @ rows.T
+    assert np.abs(moved - still).max(axis=0) == pytest.approx(np.zeros(2), abs=7e-3 * np.abs(still).max())
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_release_goes_on_from_its_static_state(name: str) -> None:
+    motion = ringdown(1e-3, *LAWS[name])
+    rows = np.vstack((TIP, [1.0, 0.0, 0.0, 0.0]))
+    first = motion.response(rows, (Quantity.DISPLACEMENT,) * 2).values[0]
+    assert first[0] == pytest.approx(0.02, rel=1e-9)
+    system = motion.system
+    at_rest = system.static(np.outer([0.0, motion.holding], TIP), motion.laws)[-1]
+    assert first[1] == pytest.approx(at_rest[0], rel=1e-4)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_plain_python_gives_the_same(name: str) -> None:
+    modal = chain(3, 1e-3).modal
+    laws = laws_of(ModelPatch(LAWS[name]), list(modal.ports))
+    given: dict[str, Any] = {
+        "q": np.array([0.02, 0.001, 0.0]),
+        "v": np.array([0.1, 0.0, 0.2]),
+        "force": np.zeros(30),
+        "interval": 0.004,
+    }
+    plain, compiled = (simulate(modal, laws, kernel=kernel, **given) for kernel in (None, compiled_kernel()))
+    assert plain.q == pytest.approx(compiled.q, abs=1e-12)
+    assert plain.memory == pytest.approx(compiled.memory, abs=1e-9)
+    # and a motion goes on from its memory
+    one = simulate(modal, laws, kernel=compiled_kernel(), **{**given, "force": np.zeros(16)})
+    rest = simulate(
+        modal, laws, kernel=compiled_kernel(),
+        **{**given, "force": np.zeros(15), "q": one.q[-1], "v": one.v[-1], "memory": one.memory},
+    )  # fmt: skip
+    assert rest.q[-1] == pytest.approx(compiled.q[-1], abs=1e-10)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_no_law_adds_energy(name: str) -> None:
+    assert np.abs(ringdown(BETA, *LAWS[name]).values(TIP[None])).max() <= 0.02 * 1.001
