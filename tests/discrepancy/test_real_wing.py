@@ -69,16 +69,10 @@ def test_the_scatter_between_trials_is_the_noise(tmp_path: Path) -> None:
     time = 0.03 * np.arange(400)
     # a motion of no law that a model could have, the same in all trials but for size, delay and zero
     motion = np.sin(30.0 * np.sqrt(1.0 + time)) / (1.0 + time)
-    windows: list[tuple[FloatArray, FloatArray]] = [
-        (
-            time,
-            (1.0 + 0.02 * k) * motion
-            + 1e-3 * k * np.gradient(motion)
-            + 0.1 * k
-            + 1e-2 * generator.normal(size=400),
-        )
-        for k in range(5)
-    ]
+    windows: list[tuple[FloatArray, FloatArray]] = []
+    for k in range(5):
+        shown = (1.0 + 0.02 * k) * motion + 1e-3 * k * np.gradient(motion) + 0.1 * k
+        windows.append((time, np.asarray(shown + 1e-2 * generator.normal(size=400))))
     noise = trial_scatter(windows)
     assert noise.shape == (1600,)
     assert np.std(noise) == pytest.approx(1e-2, rel=0.06)
