@@ -66,7 +66,7 @@ def test_a_sample_is_the_mean_of_four_columns_without_the_shared_zero(tmp_path: 
 
 def test_the_scatter_between_trials_is_the_noise(tmp_path: Path) -> None:
     generator = np.random.default_rng(5)
-    time = 0.03 * np.arange(400)
+    time: FloatArray = 0.03 * np.arange(400, dtype=np.float64)
     # a motion of no law that a model could have, the same in all trials but for size, delay and zero
     motion = np.sin(30.0 * np.sqrt(1.0 + time)) / (1.0 + time)
     windows: list[tuple[FloatArray, FloatArray]] = []
