@@ -219,7 +219,7 @@ def _ringdowns(
         longer,
         f"Record the same release three times as long ({3 * count * largest.interval:.3g} s).",
         "What decays with the motion and what goes on with time part company.",
-        0.7,
+        1.2,
     )
     if problem.model.supports(PointMass):
         stations = problem.model.stations()
