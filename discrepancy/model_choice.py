@@ -1,7 +1,7 @@
 """Which model a campaign is compared with: a wing (shipped, calibrated, designed), a lumped model, an FMU."""
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ from typing import Any
 from calibration.errors import CalibrationError
 from calibration.result import CalibrationResult
 from discrepancy.errors import ModelError
+from discrepancy.from_run import CALIBRATION_FILE, DESIGN_FILE, run_model
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
@@ -105,6 +106,20 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
     shipped = not path.suffix and not path.exists()
     file = SHIPPED_MODELS / f"{path}.toml" if shipped else path
     return ModelChoice(model, ModelKind.LUMPED, path.name, hash_file(file), path=None if shipped else path)
+
+
+def choice_of_run(folder: Path) -> ModelChoice:
+    """Return the model that the twin of a run folder believed, with its patch if it had one.
+
+    Raises
+    ------
+    CampaignFileError, ModelError
+        As `run_model`.
+    """
+    model = run_model(folder)
+    calibration = folder / CALIBRATION_FILE
+    choice = _calibrated(calibration, None) if calibration.is_file() else _wing(folder / DESIGN_FILE, None)
+    return replace(choice, model=model)
 
 
 def shipped_lumped_models() -> tuple[str, ...]:

@@ -82,6 +82,21 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
             found, found.none,
         )  # fmt: skip
 
+    if found.family is not None and bayes >= BAYES_FACTOR:
+        named = named_effects(problem, found.family)
+        text = ", ".join(sorted({effect.family for effect in named}))
+        return (
+            verdict(
+                VerdictKind.FAMILY,
+                f"An effect of the family {text} is missing, with a shape of its own.",
+                p_top,
+                effects=named,
+                family=text,
+                gates=(absolute_gate(problem, found.family), shape_gate(best, found.family)),
+            ),
+            found,
+            found.family,
+        )
     gate = absolute_gate(problem, best)
     # sets that hold the best one and more agree with it; they only leave a further effect open
     p_top = sum(p for names, p in probabilities.items() if set(top) <= set(names))

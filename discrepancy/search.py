@@ -14,7 +14,7 @@ from .candidate import Candidate, Term
 from .catalogue.entry import Effect
 from .errors import ModelError
 from .fitting import Fit, fit
-from .gates import absolute_gate
+from .gates import SHAPE_GAIN, absolute_gate
 from .problem import Point, Problem, shortened
 from .screening import Change, Screen, rescaled
 
@@ -85,6 +85,8 @@ class Search:
         Fitted by few steps only; their evidence is approximate.
     beginnings : Problem or None
         The problem with the beginnings of its records, once it was needed.
+    family : Fit or None
+        The family of the most probable effect with a free shape, where it alone explains the data.
     """
 
     problem: Problem
@@ -93,6 +95,7 @@ class Search:
     exact: dict[Key, Fit] = field(default_factory=dict)
     rough: dict[Key, Fit] = field(default_factory=dict)
     beginnings: Problem | None = None
+    family: Fit | None = None
 
     def __post_init__(self) -> None:
         self.exact[()] = self.none
@@ -317,6 +320,10 @@ class Search:
                 self._along_ridge(item)
         self._settle_steps()
         current = self.best()
+        if current.candidate.terms and absolute_gate(self.problem, current).passed is False:
+            self.family = self._family(current)
+            if self.family is not None:
+                return
         while current.candidate.terms and len(current.candidate.terms) < LARGEST_SET:
             if len(current.candidate.terms) > 1 and self._far(current):
                 break  # a third effect is looked for only where two nearly do
@@ -328,6 +335,29 @@ class Search:
             self.fit_pairs()
         self._deletions()
         self._settle_steps()
+
+    def _family(self, named: Fit) -> Fit | None:
+        """Return the free-shape family of an effect where it explains the data and the effect itself does not.
+
+        A law with a shape of its own is a simpler cause than two laws, so it is tried before pairs are.
+        """
+        freed = named.candidate.freed()
+        if freed.size == named.candidate.size:
+            return None
+        effect = np.concatenate(
+            [
+                np.concatenate((part, [item.prior.normal(item.canonical) for item in term.effect.shape]))
+                for term, part in zip(
+                    named.candidate.terms, named.candidate.parts(named.point.effect), strict=True
+                )
+            ]
+        )
+        try:
+            found = fit(self.problem, freed, Point(named.point.shared, named.point.local, effect))
+        except ModelError:
+            return None
+        gained = found.log_evidence - named.log_evidence > SHAPE_GAIN
+        return found if gained and absolute_gate(self.problem, found).passed is not False else None
 
     def _settle_steps(self) -> None:
         """Halve the time steps while they cost the best candidate too much, and fit the best ones again."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from uav_twin.discrepancy_catalogue import effects, example
+from uav_twin.discrepancy_catalogue import convert, effects, example
 from uav_twin.discrepancy_check import check
 from uav_twin.discrepancy_run import run
 
@@ -15,3 +15,4 @@ discrepancy_app.command("run")(run)
 discrepancy_app.command("check")(check)
 discrepancy_app.command("effects")(effects)
 discrepancy_app.command("example")(example)
+discrepancy_app.command("convert")(convert)

@@ -198,3 +198,16 @@ def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> d
                 f"{text!r} must end with numbers, such as {identifier}:{names[0]}=0.1."
             ) from None
     return values
+
+
+def convert(
+    out: Annotated[Path, typer.Argument(help="Folder to write the campaign to.", show_default=False)],
+    data: Annotated[
+        Path, typer.Option(help="The authors' calibration folder, as published.", show_default=False)
+    ],
+) -> None:
+    """Write the real wing's published ring-downs and load test as a campaign."""
+    from discrepancy.real_wing import write_wing_campaign
+
+    campaign = write_wing_campaign(data, out)
+    typer.echo(f"{campaign.name}: {len(campaign.trials)} trials in {out}")

@@ -22,7 +22,15 @@ SHOWN_EXPERIMENTS = 3
 
 
 def run(
-    campaign: Annotated[Path, typer.Argument(help="Folder with campaign.toml.", show_default=False)],
+    campaign: Annotated[
+        Path | None, typer.Argument(help="Folder with campaign.toml.", show_default=False)
+    ] = None,
+    from_run: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of a mission (uav-twin run): its flight and its twin's model are compared."
+        ),
+    ] = None,
     model: Annotated[
         str | None,
         typer.Option(
@@ -57,7 +65,9 @@ def run(
     from discrepancy.campaign_file import read_campaign
     from discrepancy.catalogue.library import load_catalogue
     from discrepancy.document_file import Origin
-    from discrepancy.model_choice import choose_model
+    from discrepancy.errors import CampaignFileError
+    from discrepancy.from_run import run_campaign
+    from discrepancy.model_choice import choice_of_run, choose_model
     from discrepancy.separability import separability
     from discrepancy.verdict import VerdictKind
     from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
@@ -65,12 +75,18 @@ def run(
     from reporting.progress import RichProgress
     from reporting.provenance import collect_provenance
 
-    folder = out if out is not None else Path("verdicts") / campaign.resolve().name
+    if (campaign is None) == (from_run is None):
+        raise CampaignFileError("Give either the folder of a campaign or --from-run with that of a mission.")
+    if from_run is not None and model is not None:
+        raise CampaignFileError("--from-run takes the model that the twin believed; leave --model out.")
+    source = campaign if from_run is None else from_run
+    assert source is not None
+    folder = out if out is not None else Path("verdicts") / source.resolve().name
     check_folder(folder, replace_it=replace)
-    data = read_campaign(campaign)
+    data = read_campaign(source) if from_run is None else run_campaign(source)
     catalogue = load_catalogue(effects or ())
     progress = RichProgress()
-    choice = choose_model(model, progress)
+    choice = choose_model(model, progress) if from_run is None else choice_of_run(from_run)
     found = investigate(data, choice.model, catalogue, seed=seed, progress=progress)
     able, tried = None, None
     if found.problem is not None:
@@ -83,7 +99,7 @@ def run(
         choice.model.name,
         data.data_hash,
         choice.source_hash,
-        _command(campaign, model, seed, effects or [], calibrate),
+        _command(source, model, seed, effects or [], calibrate, from_run=from_run is not None),
         collect_provenance(seed, input_hashes=_inputs(data.data_hash, choice, effects or [])),
     )
     pack = None if choice.design is None else _packing(choice, progress)
@@ -117,9 +133,11 @@ def _calibrated(
         )  # fmt: skip
 
 
-def _command(campaign: Path, model: str | None, seed: int, effects: list[Path], calibrate: int | None) -> str:
+def _command(
+    source: Path, model: str | None, seed: int, effects: list[Path], calibrate: int | None, *, from_run: bool
+) -> str:
     """Return the command without the folders of this machine."""
-    words = ["uav-twin", "discrepancy", "run", campaign.resolve().name]
+    words = ["uav-twin", "discrepancy", "run", *(["--from-run"] if from_run else []), source.resolve().name]
     if model is not None:
         words += ["--model", Path(model).name]
     words += ["--seed", str(seed)]
