@@ -1,6 +1,6 @@
 """Any FMU with a binding as a model: its inputs loaded, its outputs read, internal forces at its ports."""
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, inf
 from pathlib import Path
@@ -77,9 +77,7 @@ class FmuModel:
         )
         self._keys = [self.runs.parameter(item.variable or item.name) for item in description.parameter]
         self._ports = tuple(port.name for port in description.port)
-        self._forces = {
-            place: self.runs.variable(name) for place, name in description.inputs.forces.items()
-        }
+        self._forces = {place: self.runs.variable(name) for place, name in description.inputs.forces.items()}
         self._check_settings()
         means = Conditions(np.array([item.mean for item in self._parameters]))
         nominal = self._state(_any_trial(TrialKind.RINGDOWN, 1.0), means, (), 0)
@@ -314,9 +312,7 @@ class FmuModel:
             (Excitation("velocity"), unit * speed * float(first[1])),
         ]
 
-    def _forced(
-        self, trial: Trial, patch: _Patch, step: float, steps: int
-    ) -> list[tuple[Excitation, float]]:
+    def _forced(self, trial: Trial, patch: _Patch, step: float, steps: int) -> list[tuple[Excitation, float]]:
         at_ends = np.interp(step * np.arange(steps + 1), trial.time, trial.force)
         held = 0.5 * (at_ends[1:] + at_ends[:-1])
         on = (at_ends[1:] != 0.0) | (at_ends[:-1] != 0.0)
@@ -527,8 +523,8 @@ class FmuModel:
                 identifier = effects[item.kind]
                 if f"effect.{identifier}.active" in settings:
                     raise ModelError(
-                        f"The patch has two primitives {item.kind!r}, but the FMU model {self.name!r} carries "
-                        f"one (effect.{identifier})."
+                        f"The patch has two primitives {item.kind!r}, but the FMU model {self.name!r} "
+                        f"carries one (effect.{identifier})."
                     )
                 settings[f"effect.{identifier}.active"] = 1.0
                 for key, value in item.to_mapping().items():
@@ -561,8 +557,9 @@ def _any_trial(kind: TrialKind, interval: float) -> Trial:
     """Return a trial that asks for nothing, for scales without a campaign."""
     count = 1 if kind is TrialKind.STATIC else 400
     zeros, empty = np.zeros(count), np.zeros((count, 0))
+    time = np.asarray(interval * np.arange(count), dtype=np.float64)
     return Trial(
-        "", kind, (), empty, empty.astype(bool), interval * np.arange(count), zeros, zeros, DEFAULT_PLACE, zeros,
+        "", kind, (), empty, empty.astype(bool), time, zeros, zeros, DEFAULT_PLACE, zeros,
         0.0, "", np.zeros((1, 2)), np.zeros((1, 2)),
     )  # fmt: skip
 
@@ -571,5 +568,3 @@ _NOTHING = _Patch(NO_LAWS, (), 0.0, 0.0, 0.0, 0.0)
 _ORDER: Mapping[Quantity, int] = {
     Quantity.DISPLACEMENT: 0, Quantity.VELOCITY: 1, Quantity.ACCELERATION: 2,
 }  # fmt: skip
-Evaluate = Callable[[FloatArray], FloatArray]
-Key = Hashable
