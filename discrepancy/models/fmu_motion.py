@@ -453,7 +453,8 @@ class FmuMotion:
         raise ModelError(
             f"The internal force at {', '.join(dict.fromkeys(laws.ports))} does not converge in the "
             f"co-simulation with the FMU model {self._description.name!r}: halving steps of "
-            f"{2.0 * step:.2g} s still changes the motion by {change:.1g} of its size; the force is too stiff for the port."
+            f"{2.0 * step:.2g} s still changes the motion by {change:.1g} of its size; the force is too "
+            f"stiff for the port."
         )
 
     def _coupled(
