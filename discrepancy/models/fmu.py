@@ -1,6 +1,6 @@
 """Any FMU with a binding as a model: its inputs loaded, its outputs read, internal forces at its ports."""
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, inf
 from pathlib import Path
@@ -523,8 +523,8 @@ class FmuModel:
                 identifier = effects[item.kind]
                 if f"effect.{identifier}.active" in settings:
                     raise ModelError(
-                        f"The patch has two primitives {item.kind!r}, but the FMU model {self.name!r} carries "
-                        f"one (effect.{identifier})."
+                        f"The patch has two primitives {item.kind!r}, but the FMU model {self.name!r} "
+                        f"carries one (effect.{identifier})."
                     )
                 settings[f"effect.{identifier}.active"] = 1.0
                 for key, value in item.to_mapping().items():
@@ -557,8 +557,9 @@ def _any_trial(kind: TrialKind, interval: float) -> Trial:
     """Return a trial that asks for nothing, for scales without a campaign."""
     count = 1 if kind is TrialKind.STATIC else 400
     zeros, empty = np.zeros(count), np.zeros((count, 0))
+    time = np.asarray(interval * np.arange(count), dtype=np.float64)
     return Trial(
-        "", kind, (), empty, empty.astype(bool), interval * np.arange(count), zeros, zeros, DEFAULT_PLACE, zeros,
+        "", kind, (), empty, empty.astype(bool), time, zeros, zeros, DEFAULT_PLACE, zeros,
         0.0, "", np.zeros((1, 2)), np.zeros((1, 2)),
     )  # fmt: skip
 
@@ -567,5 +568,3 @@ _NOTHING = _Patch(NO_LAWS, (), 0.0, 0.0, 0.0, 0.0)
 _ORDER: Mapping[Quantity, int] = {
     Quantity.DISPLACEMENT: 0, Quantity.VELOCITY: 1, Quantity.ACCELERATION: 2,
 }  # fmt: skip
-Evaluate = Callable[[FloatArray], FloatArray]
-Key = Hashable

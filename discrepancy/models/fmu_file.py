@@ -84,7 +84,7 @@ class Rest(Section):
 
 
 class Moving(Section):
-    """`[motion]`: ring-downs and forced trials; `step` [s] only if the FMU has one step size, `parameters` too."""
+    """`[motion]`: ring-downs and forced trials; `step` [s] only if the FMU has one step size."""
 
     step: Positive | None = None
     parameters: dict[Name, Number] = Field(default_factory=dict)
@@ -121,7 +121,7 @@ class ReleaseOf(Section):
 
 
 class Output(Section):
-    """`[[output]]`: what a channel's `output` names; `{a..b}` in both names stands for all numbers from a to b."""
+    """`[[output]]`: what a channel's `output` names; `{a..b}` stands for all numbers from a to b."""
 
     name: Name
     variable: Name | None = None
@@ -157,7 +157,7 @@ class ParameterOf(Section):
 
 
 class ScalesOf(Section):
-    """`[scales]`: natural scales that the FMU cannot say, see `discrepancy.models.interface.Scales`; all SI."""
+    """`[scales]`: natural scales that the FMU cannot say, as in `Scales`; all SI."""
 
     length: Positive | None = None
     tip_stiffness: Positive | None = None
@@ -209,7 +209,7 @@ class FmuModelDescription(Section):
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         for kind, items in (("port", self.port), ("parameter", self.parameter), ("output", self.output)):
-            names = [item.name for item in items]  # type: ignore[attr-defined]
+            names = [item.name for item in items]
             for name in names:
                 if names.count(name) > 1:
                     raise ValueError(f"there are two of {kind} {name!r}")

@@ -31,7 +31,7 @@ PHASE = {TrialKind.RINGDOWN: 0.1, TrialKind.FORCED: 0.05}
 LINEAR = 1e-6
 """Largest deviation from superposition, as a share of the motion, of an FMU that is taken as linear."""
 CONVERGED = 1e-4
-"""Largest rms change of a motion with laws when steps are halved, as a share of the output's largest motion."""
+"""Largest rms change of a motion with laws when steps are halved, as a share of the largest motion."""
 MOST_REFINEMENT = 64
 """Steps that do not converge at this refinement are given up."""
 RECORD = 600
@@ -162,7 +162,7 @@ class FmuMotion:
         return self._frequencies[key]
 
     def measured_frequency(self, trial: Trial, state: State) -> float:
-        """Return an angular frequency as `angular_frequency` does, measured in a state at a trial's interval."""
+        """Return what `angular_frequency` does, measured in a state at a trial's interval."""
         step = self._description.motion.step or trial.interval
         system = self.system(state, step, len(trial.time)) if self._ports else None
         if system is not None:
@@ -182,7 +182,8 @@ class FmuMotion:
         spectrum = np.abs(np.fft.rfft(moving * np.hanning(len(moving))[:, None], 4 * len(moving), axis=0))
         if not np.any(spectrum):
             raise ModelError(
-                f"The FMU model {self._description.name!r} does not move; state angular_frequency in [scales]."
+                f"The FMU model {self._description.name!r} does not move; state angular_frequency in "
+                "[scales]."
             )
         best = int(np.argmax(spectrum[:, np.argmax(spectrum.max(axis=0))]))
         return 2.0 * np.pi * max(best, 1) / (4 * len(moving) * step)
@@ -273,8 +274,8 @@ class FmuMotion:
         if abs(reached - displacement) <= 1e-6 * abs(displacement):
             return amount
         raise ModelError(
-            f"Nothing that [release] names puts {way.output!r} of the FMU model {self._description.name!r} at "
-            f"{displacement:g} m; correct displacement, hold or output there."
+            f"Nothing that [release] names puts {way.output!r} of the FMU model "
+            f"{self._description.name!r} at {displacement:g} m; correct displacement, hold or output there."
         )
 
     def _superposed(
@@ -410,8 +411,8 @@ class FmuMotion:
     ) -> tuple[FloatArray, float]:
         """Return the outputs (K, C) of a dynamic trial with laws at ports, and the step [s].
 
-        Steps are halved until that changes no output by more than `CONVERGED` of its largest motion (rms); what was
-        enough is kept for laws of this kind up to twice as strong.
+        Steps are halved until that changes no output by more than `CONVERGED` of its largest motion (rms);
+        what was enough is kept for laws of this kind up to twice as strong.
 
         Raises
         ------
@@ -440,9 +441,10 @@ class FmuMotion:
             step, steps, loads = excite(2 * refinement)
             fine = self._coupled(laws, state, step, steps, loads, 2 * refinement)
             shared = fine[::2][: len(coarse)]
-            size = np.max(np.abs(shared - shared.mean(axis=0)), axis=0)
-            difference = np.sqrt(np.mean((coarse[: len(shared)] - shared) ** 2, axis=0))
-            change = float(np.max(difference / np.where(size > 0.0, size, np.inf)))
+            with np.errstate(all="ignore"):  # an unstable coupling grows beyond all numbers
+                size = np.max(np.abs(shared - shared.mean(axis=0)), axis=0)
+                difference = np.sqrt(np.mean((coarse[: len(shared)] - shared) ** 2, axis=0))
+                change = float(np.max(difference / np.where(size > 0.0, size, np.inf)))
             if not np.isfinite(difference).all():
                 change = np.inf
             if change <= CONVERGED:
@@ -450,8 +452,9 @@ class FmuMotion:
             refinement, coarse = 2 * refinement, fine
         raise ModelError(
             f"The internal force at {', '.join(dict.fromkeys(laws.ports))} does not converge in the "
-            f"co-simulation with the FMU model {self._description.name!r}: halving steps of {2.0 * step:.2g} s "
-            f"still changes the motion by {change:.1g} of its size; the force is too stiff for the port."
+            f"co-simulation with the FMU model {self._description.name!r}: halving steps of "
+            f"{2.0 * step:.2g} s still changes the motion by {change:.1g} of its size; the force is too "
+            f"stiff for the port."
         )
 
     def _coupled(
@@ -485,7 +488,7 @@ class FmuMotion:
     def _refined_free(
         self, state: State, step: float, steps: int, loads: Loads, refinement: int
     ) -> FloatArray:
-        """Return the free motion with small steps; of a release by the ports' system, where it shows it all."""
+        """Return the free motion with small steps; of a release by the ports' system if that has it all."""
         loads = [(part, value) for part, value in loads if value != 0.0]
         kind = tuple(part.kind for part, _ in loads)
         kind_names = tuple((part.kind, part.name) for part, _ in loads)

@@ -1,4 +1,4 @@
-"""Runs of an FMU for a model: one instance for each step size, kept and reset; what was asked once is remembered."""
+"""Runs of an FMU for a model: an instance for each step size, kept and reset; results are remembered."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -94,7 +94,7 @@ class FmuRuns:
         given, base = self._description, self._base
         wanted = given.inputs
         inputs: dict[str, Input] = {}
-        units = {
+        units: dict[str | None, str] = {
             **dict.fromkeys(wanted.forces.values(), "N"),
             wanted.load_factor: "1", wanted.z1: "1", wanted.z2: "1",
             wanted.temperature: "K" if wanted.temperature_reference is None else "degC",
@@ -262,7 +262,7 @@ class FmuRuns:
     def advanced(
         self, asset: FmiAsset, histories: Mapping[str, FloatArray | float], steps: int
     ) -> FloatArray:
-        """Return the outputs (steps, C) at the ends of steps under inputs that are held in each; `ModelError`."""
+        """Return the outputs (steps, C) at the ends of steps, inputs held in each; raises `ModelError`."""
         self.step_count += steps
         try:
             return asset.simulate(load=histories, steps=steps).values

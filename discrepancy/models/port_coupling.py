@@ -198,8 +198,8 @@ def _held_damping(
 ) -> float:
     """Return the force that damping gives when it is held over a step.
 
-    `speed` of the port at the begin, its acceleration `push` without this force, `gain` of its speed by a unit
-    of force over the step, and `strength` |s|^`exponent` the deceleration by the law.
+    `speed` of the port at the begin, its acceleration `push` without this force, `gain` of its speed by a
+    unit of force over the step, and `strength` |s|^`exponent` the deceleration by the law.
     """
     if strength == 0.0 or gain <= 0.0:
         return 0.0
@@ -381,8 +381,8 @@ def coupled_motion(
     )  # fmt: skip
     functions["coupled"](
         *(np.ascontiguousarray(item, dtype=np.float64) for item in arrays), system.step,
-        np.ascontiguousarray(free.gain[np.ix_(index, index)]), index, laws.codes, laws.values, laws.slips, memory,
-        states, applied, functions["held_forces"], *(functions[name] for name in _SHARED),
+        np.ascontiguousarray(free.gain[np.ix_(index, index)]), index, laws.codes, laws.values, laws.slips,
+        memory, states, applied, functions["held_forces"], *(functions[name] for name in _SHARED),
     )  # fmt: skip
     return states, applied
 
