@@ -337,7 +337,7 @@ class Search:
         self._settle_steps()
 
     def _family(self, named: Fit) -> Fit | None:
-        """Return the free-shape family of an effect where it explains the data and the effect itself does not.
+        """Return the free-shape family of an effect where it explains the data and the effect does not.
 
         A law with a shape of its own is a simpler cause than two laws, so it is tried before pairs are.
         """
