@@ -42,8 +42,8 @@ class Value:
         """Return the natural logarithm; raises `IdentificationError` where a value is not positive."""
         if not np.all(self.value > 0.0):
             raise IdentificationError(
-                "A strain of the local model is not positive, so far is it from the design it was made at; take "
-                "a smaller step."
+                "A strain of the local model is not positive, so far is it from the design it was made at; "
+                "take a smaller step."
             )
         return Value(np.log(self.value), self.gradient / self.value[..., None])
 
