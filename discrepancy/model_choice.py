@@ -81,7 +81,7 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
         raise ModelError(
             f"{path} is an FMU: give a TOML file that says which of its variables are load, outputs and "
             "ports "
-            '(kind = "fmu", docs/foreign_fmus.md), or for the wing its calibration.nc or design.'
+            '(kind = "fmu", docs/fmu_models.md), or for the wing its calibration.nc or design.'
         )
     if path.suffix and not path.is_file():
         raise ModelError(f"There is no model file {path}; give a calibration (.nc) or a model (.toml).")
