@@ -39,7 +39,12 @@ class Value:
         self.gradient = gradient
 
     def log(self) -> Value:
-        """Return the natural logarithm."""
+        """Return the natural logarithm; raises `IdentificationError` where a value is not positive."""
+        if not np.all(self.value > 0.0):
+            raise IdentificationError(
+                "A strain of the local model is not positive, so far is it from the design it was made at; "
+                "take a smaller step."
+            )
         return Value(np.log(self.value), self.gradient / self.value[..., None])
 
     def over(self, other: Value) -> Value:

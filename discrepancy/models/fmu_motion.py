@@ -14,13 +14,8 @@ from discrepancy.campaign import Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_runs import FmuRuns, is_affine
-from discrepancy.models.port_coupling import (
-    LawStepper,
-    PortMotion,
-    PortSystem,
-    coupled_motion,
-    port_system,
-)
+from discrepancy.models.port_coupling import LawStepper, PortMotion, coupled_motion
+from discrepancy.models.port_system import PortSystem, port_system
 from fe.motion import Laws
 from fmu_asset.session import FmiAsset
 

@@ -307,7 +307,7 @@ WRONG_TOML = [
     ("load_place = [1.0, 0.35]", "load_place = [1.0]", r"must be a name or \[y, x\]"),
     ("release = {", "releases = {", r"unknown key `trial\[2\].releases`"),
     ('release = { displacement = 50, unit = "mm" }', "", "the ring-down 'release' needs `release`"),
-    ("displacement = 50", "displacement = -50", "should be greater than 0, and -50 came"),
+    ("displacement = 50", "displacement = 0", "must not be zero: its sign is the side"),
     ("reference_temperature = 20.0", "", "the campaign has no `reference_temperature`"),
     ("standard_deviation = 0.05", "standard_deviation = 0", "should be greater than 0"),
     ("z1 = 0.2", "z1 = 20", "less than or equal to 1, and 20 came"),

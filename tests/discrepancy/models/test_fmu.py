@@ -1,5 +1,6 @@
 """FMUs as models against the lumped model of the same rig, and our wing FMU against the wing model."""
 
+import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from discrepancy.catalogue.library import load_catalogue
 from discrepancy.errors import ModelError
 from discrepancy.examples import example_campaign, plan_for
 from discrepancy.models.fmu import FmuModel
+from discrepancy.models.fmu_file import parse_fmu_model
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.verdict import VerdictKind
@@ -364,6 +366,14 @@ def test_a_wrong_file_is_refused_in_one_sentence(
         FmuModel.load(write(tmp_path, foreign_fmu("rig2"), (old, new)))
     assert sentence in str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+def test_the_documented_file_is_one() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "fmu_models.md").read_text(encoding="utf-8")
+    example = page.split("```toml\n")[1].split("```")[0]
+    described = parse_fmu_model(tomllib.loads(example))
+    assert described.effects == {"point_mass": "unmodelled_point_mass"}
+    assert described.scales.length == 0.4
 
 
 def test_missing_files_are_refused(tmp_path: Path) -> None:

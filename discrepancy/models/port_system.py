@@ -1,0 +1,177 @@
+"""The ports of a linear FMU as a linear system, made from its answers to single forces."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm, logm
+
+FloatArray = NDArray[np.float64]
+
+MOST_STATES = 40
+"""Largest order of a linear system that is made from records."""
+HANKEL_ROWS = 160
+FIT = 1e-7
+"""Largest error of a linear system against the record that it is made of, as a share of the record."""
+
+
+@dataclass(frozen=True, eq=False)
+class PortSystem:
+    """What forces at P ports do to C outputs of a linear FMU, step by step, beside its free motion.
+
+    s(k+1) = A s(k) + B f(k), y(k+1) = C s(k+1) + D f(k), f held over the step.
+
+    Attributes
+    ----------
+    transition, drive, outputs, direct : ndarray
+        A (n, n), B (n, P), C (C, n), D (C, P).
+    step : float
+        [s].
+    """
+
+    transition: FloatArray
+    drive: FloatArray
+    outputs: FloatArray
+    direct: FloatArray
+    step: float
+
+    @cached_property
+    def generator(self) -> FloatArray:
+        """Matrix (n, n) of the motion in time, s' = G s without forces [1/s]."""
+        return np.asarray(np.real(logm(self.transition)) / self.step)
+
+    def refined(self, parts: int) -> "PortSystem":
+        """Return the same system with steps that are so many times smaller."""
+        order = len(self.transition)
+        block = np.zeros((2 * order, 2 * order))
+        block[:order, :order], block[:order, order:] = self.generator, np.eye(order)
+        whole, part = expm(block * self.step), expm(block * self.step / parts)
+        start = np.linalg.solve(whole[:order, order:], self.drive)
+        return PortSystem(
+            part[:order, :order], part[:order, order:] @ start, self.outputs, self.direct, self.step / parts
+        )
+
+    def motion(self, forces: FloatArray) -> FloatArray:
+        """Return the outputs (N + 1, C) under forces (N, P), from rest."""
+        states = np.zeros((len(forces) + 1, len(self.transition)))
+        for k, force in enumerate(forces):
+            states[k + 1] = self.transition @ states[k] + self.drive @ force
+        return self.seen(states, forces)
+
+    def seen(self, states: FloatArray, forces: FloatArray) -> FloatArray:
+        """Return the outputs (N + 1, C) of states (N + 1, n) and forces (N, P)."""
+        values = states @ self.outputs.T
+        values[1:] += forces @ self.direct.T
+        return np.asarray(values)
+
+    def start_of(self, free: FloatArray, tolerance: float) -> FloatArray | None:
+        """Return the state (n,) from which the system moves as `free` (K, C), None if it does not."""
+        rows = np.empty((*free.shape, len(self.transition)))
+        rows[0] = self.outputs
+        for k in range(1, len(free)):
+            rows[k] = rows[k - 1] @ self.transition
+        size = np.max(np.abs(free), axis=0)
+        weight = 1.0 / np.where(size > 0.0, size, 1.0)
+        flat = (rows * weight[:, None]).reshape(-1, len(self.transition))
+        unit = np.max(np.abs(flat), axis=0)
+        unit[unit == 0.0] = 1.0
+        goal = (free * weight).ravel()
+        start = np.linalg.lstsq(flat / unit, goal, rcond=1e-14)[0]
+        if np.max(np.abs(flat / unit @ start - goal)) > tolerance:
+            return None
+        return np.asarray(start / unit)
+
+    def free(self, start: FloatArray, steps: int) -> FloatArray:
+        """Return the free motion (steps + 1, C) from a state (n,)."""
+        states = np.empty((steps + 1, len(start)))
+        states[0] = start
+        block = [np.eye(len(start))]
+        for _ in range(min(64, steps + 1)):
+            block.append(self.transition @ block[-1])
+        jump, powers = block.pop(), np.stack(block)
+        now = start
+        for k in range(0, steps + 1, len(powers)):
+            part = powers @ now
+            states[k : k + len(powers)] = part[: steps + 1 - k]
+            now = jump @ now
+        return np.asarray(states @ self.outputs.T)
+
+    def gain(self) -> FloatArray:
+        """Return the outputs (C, P) at rest under constant unit forces."""
+        still = np.linalg.solve(np.eye(len(self.transition)) - self.transition, self.drive)
+        return np.asarray(self.outputs @ still + self.direct)
+
+    def modes(self, row: FloatArray, port: int) -> tuple[FloatArray, FloatArray]:
+        """Return the modes that a port sees: angular frequencies [rad/s] and squared shapes at it [1/kg].
+
+        `row` (n,) is that of the port's displacement.
+        """
+        values, shapes = np.linalg.eig(self.transition)
+        into = np.linalg.solve(shapes, self.drive[:, port].astype(complex))
+        keep = (values.imag > 1e-12) & (np.abs(values) > 0.0)
+        values, into, out = values[keep], into[keep], (row @ shapes)[keep]
+        rate = np.log(values) / self.step
+        # over a step the force adds (e^(rate h) - 1) / rate of what it gives at once
+        residue = out * into * rate / (values - 1.0)
+        return np.abs(rate), np.abs(2.0 * rate.imag * residue)
+
+
+def port_system(records: FloatArray, ports: list[int], step: float) -> PortSystem | None:
+    """Return the linear system of answers to unit forces that are held over the first step only.
+
+    The realisation of Ho and Kalman (1966) as by Juang and Pappa (1985), from the displacements of the ports.
+
+    Parameters
+    ----------
+    records : (K, C, P) ndarray
+        Outputs at the ends of the steps for a force at each port.
+    ports : list of int
+        Columns of the ports' displacements.
+    step : float
+        [s].
+
+    Returns
+    -------
+    PortSystem or None
+        None if no system of at most `MOST_STATES` states shows the records within `FIT`.
+    """
+    count, columns, inputs = records.shape
+    size = np.max(np.abs(records), axis=(0, 2))
+    seen = records[:, ports, :] / np.where(size[ports] > 0.0, size[ports], 1.0)[None, :, None]
+    width = min(HANKEL_ROWS, (count - 2) // 2)
+    if width < 4:
+        return None
+    row = np.arange(width)
+    both = seen[1 + np.arange(width + 1)[:, None] + row].transpose(0, 2, 1, 3)
+    both = both.reshape((width + 1) * len(ports), width * inputs)
+    hankel, shifted = both[: -len(ports)], both[len(ports) :]
+    left, values, right = np.linalg.svd(hankel, full_matrices=False)
+    if values[0] == 0.0:
+        return None
+    tried = 0
+    for threshold in (1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7):
+        order = int(np.sum(values > threshold * values[0]))
+        if order == tried or order > MOST_STATES:
+            continue
+        tried = order
+        root = np.sqrt(values[:order])
+        transition = (left[:, :order] / root).T @ shifted @ (right[:order].T / root)
+        if np.max(np.abs(np.linalg.eigvals(transition))) > 1.0 + 1e-9:
+            continue
+        try:
+            drive = np.linalg.solve(transition, (root[:, None] * right[:order])[:, :inputs])
+        except np.linalg.LinAlgError:
+            continue
+        states = np.empty((count, order, inputs))
+        states[0] = drive
+        for k in range(1, count):
+            states[k] = transition @ states[k - 1]
+        flat = states[1:].transpose(0, 2, 1).reshape(-1, order)
+        goal = records[1:].transpose(0, 2, 1).reshape(-1, columns)
+        unit = np.max(np.abs(flat), axis=0)
+        rows = np.linalg.lstsq(flat / unit, goal, rcond=1e-14)[0].T / unit
+        error = np.max(np.abs(goal - flat @ rows.T), axis=0)
+        if np.all(error <= FIT * np.max(np.abs(goal), axis=0) + 1e-300):
+            return PortSystem(transition, drive, rows, records[0] - rows @ drive, step)
+    return None
