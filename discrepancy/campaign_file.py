@@ -267,6 +267,12 @@ def _health(section: TrialSection, table: Table, user: str) -> tuple[FloatArray,
             health[:, index] = stated
         if f"{name}_deviation" in table.columns:
             deviation[:, index] = table.numbers(f"{name}_deviation", user)
+            negative = np.flatnonzero(deviation[:, index] < 0.0)
+            if negative.size:
+                raise CampaignFileError(
+                    f"{table.name}, line {table.lines[int(negative[0])]}: {name}_deviation is a standard "
+                    f"deviation, and {deviation[negative[0], index]:g} came."
+                )
         elif section.health is not None:
             deviation[:, index] = section.health.deviation
     return health, deviation

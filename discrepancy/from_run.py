@@ -85,8 +85,8 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
     -------
     Campaign
         Strain channels g1, g2, ...; flight trials whose rows are turns, some of them held out. The time of a
-        turn is that at its end, as the FMU has it. Health is uncertain in every turn. The truth of the run is
-        not read.
+        turn is that at its end, as the FMU has it. Health is uncertain in every turn. Of the
+        truth, only a temperature that the asset monitors and the scenario's noise of the gauges are read.
 
     Raises
     ------

@@ -290,9 +290,9 @@ def _signs(campaign: Campaign, scales: dict[tuple[str, str], float]) -> Iterator
     for name in reversed_channels:
         yield DataFault(
             FaultKind.SIGN,
-            f"The channel {name!r} moves against the model in every trial: reverse its sign (strain is "
-            "positive in "
-            "tension, displacement upwards), or correct its `output`.",
+            f"The channel {name!r} moves against the model in every trial: reverse its sign (as the "
+            "model has it: displacement upwards, the wing's strain positive where upward load compresses the "
+            "upper skin), or correct its `output`.",
             name,
         )
 

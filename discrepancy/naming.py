@@ -37,11 +37,14 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         All candidates.
     Fit
         The one that stands for the verdict: of the named set, of the family, of the most probable member of a
-        group, or the one without effect.
+        group, of the nearest set where nothing reaches the probability of a name, or the one without effect.
     """
     found = search(problem, effects)
     probabilities = found.set_probabilities()
+    top, p_top = next(iter(probabilities.items()))
     best = found.best()
+    if top and best.candidate.identifiers != top:  # a set that is probable by its many places together
+        best = _best_of(found, top)
     bayes = _single_evidence(found, best) - found.none.log_evidence
     hypotheses = _hypotheses(problem, found, probabilities)
     inclusion = {
@@ -62,7 +65,6 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
 
     none_gate = absolute_gate(problem, found.none)
     p_none = probabilities.get((), 0.0)
-    top, p_top = next(iter(probabilities.items()))
     if not top or (bayes < BAYES_FACTOR and none_gate.passed is not False):
         if none_gate.passed is False:
             return (
@@ -76,7 +78,10 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         return (
             verdict(
                 VerdictKind.NOTHING_MISSING,
-                "The model explains the data within their noise.",
+                "The model explains the data within their noise."
+                if none_gate.passed
+                else "No effect of the catalogue explains the data better than the model does; whether that "
+                "is within their noise is not known, for there is no noise record.",
                 p_none, gates=(none_gate,),
             ),
             found, found.none,
@@ -84,11 +89,11 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
 
     if found.family is not None and bayes >= BAYES_FACTOR:
         named = named_effects(problem, found.family)
-        text = ", ".join(sorted({effect.family for effect in named}))
+        text, sentence = _family(named)
         return (
             verdict(
                 VerdictKind.FAMILY,
-                f"An effect of the family {text} is missing, with a shape of its own.",
+                sentence,
                 p_top,
                 effects=named,
                 family=text,
@@ -106,7 +111,7 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
             named = named_effects(problem, best)
             return (
                 verdict(
-                    VerdictKind.NAMED, _named_sentence(named, p_top), p_top,
+                    VerdictKind.NAMED, _named_sentence(named, p_top, gate), p_top,
                     effects=named, gates=(gate, shape),
                 ),
                 found, best,
@@ -115,11 +120,10 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
             family_gate = absolute_gate(problem, family)
             if family_gate.passed is not False:
                 named = named_effects(problem, family)
-                text = ", ".join(sorted({effect.family for effect in named}))
+                text, sentence = _family(named)
                 return (
                     verdict(
-                        VerdictKind.FAMILY,
-                        f"An effect of the family {text} is missing, with a shape of its own.",
+                        VerdictKind.FAMILY, sentence,
                         p_top, effects=named, family=text, gates=(family_gate, shape),
                     ),
                     found, family,
@@ -135,7 +139,7 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
             found, found.none,
         )  # fmt: skip
 
-    return (*_open(problem, found, probabilities, verdict, gate), best)
+    return _open(problem, found, probabilities, verdict, best)
 
 
 def _open(
@@ -143,9 +147,9 @@ def _open(
     found: Search,
     probabilities: Mapping[tuple[str, ...], float],
     verdict: Callable[..., Verdict],
-    gate: Gate,
-) -> tuple[Verdict, Search]:
-    """Return the verdict where no set reaches the probability that a name needs, and the search."""
+    best: Fit,
+) -> tuple[Verdict, Search, Fit]:
+    """Return the verdict where no set reaches the probability that a name needs, as `name` does."""
     members: list[tuple[str, ...]] = []
     total = 0.0
     for names, p in probabilities.items():
@@ -161,13 +165,13 @@ def _open(
                 VerdictKind.BELOW_LIMIT,
                 "Something may be missing, but too small for these data to tell from noise"
                 + (f"; the nearest are {', '.join(hints[:4])}." if hints else "."),
-                total, group=tuple(hints), gates=(gate,),
+                total, group=tuple(hints), gates=(absolute_gate(problem, best),),
             ),
-            found,
+            found, best,
         )  # fmt: skip
     gates = [absolute_gate(problem, item) for item in fits]
     fitting = [
-        (names, item)
+        (names, item, each)
         for names, item, each in zip(members, fits, gates, strict=True)
         if each.passed is not False
     ]
@@ -180,17 +184,21 @@ def _open(
                 else f"There is a gap, and {len(fitting)} explanations fit it alike.",
                 total, gates=(gates[0],), resembles=members[0],
             ),
-            found,
+            found, best,
         )  # fmt: skip
-    group = tuple(dict.fromkeys(" + ".join(names) for names, _ in fitting))
-    effects = tuple(effect for _, item in fitting for effect in named_effects(problem, item))
+    # those that do not fit take their probability with them
+    together = sum(probabilities[names] for names, _, _ in fitting)
+    group = tuple(dict.fromkeys(" + ".join(names) for names, _, _ in fitting))
+    effects = tuple(effect for _, item, _ in fitting for effect in named_effects(problem, item))
+    _, nearest, gate = fitting[0]
+    sentence = (
+        f"One of {', '.join(group)} is missing; these data cannot tell which."
+        if len(group) > 1
+        else f"There is a gap that {group[0]} fits, but not with the probability that a name needs."
+    )
     return (
-        verdict(
-            VerdictKind.GROUP,
-            f"One of {', '.join(group)} is missing; these data cannot tell which.",
-            total, effects=effects, group=group, gates=(gates[0],),
-        ),
-        found,
+        verdict(VerdictKind.GROUP, sentence, together, effects=effects, group=group, gates=(gate,)),
+        found, nearest,
     )  # fmt: skip
 
 
@@ -282,6 +290,18 @@ def _hypotheses(
     return tuple(rows)
 
 
-def _named_sentence(named: tuple[NamedEffect, ...], probability: float) -> str:
+def _family(named: tuple[NamedEffect, ...]) -> tuple[str, str]:
+    """Return the families whose shape is free, and the sentence of the verdict."""
+    text = ", ".join(sorted({effect.family for effect in named if effect.shape}))
+    beside = ", ".join(effect.name for effect in named if not effect.shape)
+    return text, (
+        f"An effect of the family {text} is missing, with a shape of its own"
+        f"{f', beside {beside}' if beside else ''}."
+    )
+
+
+def _named_sentence(named: tuple[NamedEffect, ...], probability: float, gate: Gate) -> str:
     what = " and ".join(f"{effect.name}{f' at {effect.place}' if effect.place else ''}" for effect in named)
-    return f"The model lacks {what} (probability {probability:.3f})."
+    certain = "> 0.999" if probability > 0.9995 else f"{probability:.3f}"  # never one
+    limit = "" if gate.passed else " Whether that is all is not known: there is no noise record."
+    return f"The model lacks {what} (probability {certain}).{limit}"

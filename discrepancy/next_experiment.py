@@ -104,12 +104,17 @@ def mutual_information(
     model = PatchedModel(problem.model, proposal.added) if len(proposal.added) else problem.model
     there = Problem(problem.campaign, model, problem.setting, (proposal.trial,), like=problem)
     data = there.trials[0]
+    # without a record, what the most probable hypothesis left stands for the noise
+    rest = np.sqrt(problem.precisions(fits[0].sums))
+    unit = np.where(problem.freedom > 0.0, 1.0, rest)[data.groups]
+    noise_units = np.broadcast_to(unit, data.weight.shape).ravel()
     means, spreads = [], []
     for item in fits:
         point = Point(item.point.shared, (np.zeros(data.unknowns.size),), item.point.effect)
         parts = there.linearise(0, point, item.candidate)
         local, shared, index = there.jacobian(0, point, parts, item.candidate)
-        means.append(data.standardised(there.prediction(0, point, parts.response)).ravel())
+        local, shared = local * noise_units, shared * noise_units
+        means.append(data.standardised(there.prediction(0, point, parts.response)).ravel() * noise_units)
         root = np.linalg.cholesky(item.covariance[np.ix_(index, index)] + 1e-12 * np.eye(len(index)))
         precision = np.maximum(data.unknowns.precision, 1e-4)  # a free zero is known to a hundred s0
         spreads.append(np.concatenate((local / np.sqrt(precision)[:, np.newaxis], root.T @ shared)))

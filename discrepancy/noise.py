@@ -19,7 +19,7 @@ from .campaign import Channel
 FloatArray = NDArray[np.float64]
 
 MAINS = (50.0, 60.0, 400.0)
-"""Frequencies at which mains lines are looked for [Hz]."""
+"""Mains frequencies [Hz], of land and aircraft: an effect, and looked for in noise records."""
 LARGEST_ORDER = 12
 WHITE_LEVEL = 1e-6
 """Noise is taken as white unless the Ljung-Box test of the record rejects it at this level.
@@ -54,11 +54,6 @@ class NoiseModel:
     autoregression: FloatArray
     interval: float | None
     lines: tuple[float, ...]
-
-    @property
-    def is_known(self) -> bool:
-        """Whether an absolute statement about the fit is possible."""
-        return self.degrees_of_freedom > 0.0
 
     def whiten(self, columns: FloatArray, interval: float) -> FloatArray:
         """Return the columns (..., N) of a dynamic record filtered so that this noise becomes white.
@@ -105,7 +100,7 @@ class NoiseModel:
 
 
 def aliased(frequency: float, interval: float) -> float:
-    """Return the frequency [Hz] at which a line shows when sampled at `interval` [s]."""
+    """Return where a line shows [Hz] when sampled at `interval` [s]: 50 Hz shows at 10 Hz with 1/60 s."""
     rate = 1.0 / interval
     return abs(frequency - rate * round(frequency / rate))
 

@@ -164,7 +164,7 @@ class Problem:
             )
         self.channel_names = tuple(campaign.channels)
         self.refinement: int = 1 if like is None else like.refinement
-        self.noise: dict[str, NoiseModel] = like.noise if like is not None else _noise(campaign, chosen)
+        self.noise: dict[str, NoiseModel] = like.noise if like is not None else _noise(campaign)
         self.trials = tuple(self._trial_data(trial) for trial in chosen)
         counts = np.zeros(len(self.channel_names))
         for data in self.trials:
@@ -462,7 +462,7 @@ class Problem:
         n0, n = self.freedom, self.counts
         with np.errstate(divide="ignore", invalid="ignore"):
             weights = np.where(np.isinf(n0), 1.0, (n0 + n) / (n0 + sums))
-        return np.where(n > 0, weights, 1.0)
+        return np.where((n > 0) & (n0 + sums > 0.0), weights, 1.0)
 
     def with_trials(self, trials: tuple[Trial, ...]) -> "Problem":
         """Return the same problem on other trials, with the same noise and global unknowns."""
@@ -475,17 +475,20 @@ def _moved(values: FloatArray, index: int, step: float = PARAMETER_STEP) -> Floa
     return moved
 
 
-def _noise(campaign: Campaign, trials: tuple[Trial, ...]) -> dict[str, NoiseModel]:
-    """Noise models of all channels; where nothing is known, a thousandth of the channel's range stands in."""
-    found = {}
-    for name, channel in campaign.channels.items():
-        spans = [
-            float(np.ptp(trial.values[:, trial.channels.index(name)]))
-            for trial in campaign.trials
-            if name in trial.channels
-        ]
-        found[name] = noise_model(channel, 1e-3 * max([*spans, 1e-12]))
-    return found
+def _noise(campaign: Campaign) -> dict[str, NoiseModel]:
+    return {
+        name: noise_model(channel, stand_in(campaign, name)) for name, channel in campaign.channels.items()
+    }
+
+
+def stand_in(campaign: Campaign, name: str) -> float:
+    """Return what stands in for a noise deviation of which nothing is known: a thousandth of the range."""
+    spans = [
+        float(np.ptp(trial.values[:, trial.channels.index(name)]))
+        for trial in campaign.trials
+        if name in trial.channels
+    ]
+    return 1e-3 * max([*spans, 1e-12])
 
 
 def shortened(trial: Trial, count: int) -> Trial:

@@ -11,13 +11,13 @@ from math import inf, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from .campaign import Campaign, Trial
+from .campaign import Campaign, NoiseRecord, Trial
 from .candidate import Candidate, Term
 from .catalogue.entry import Effect, EffectParameter, Setting
 from .errors import DiscrepancyError, ModelError
 from .fitting import fit
 from .models.interface import Model
-from .problem import PARAMETER_STEP, Problem
+from .problem import PARAMETER_STEP, Problem, stand_in
 from .screening import Change, Screen
 
 FloatArray = NDArray[np.float64]
@@ -96,7 +96,11 @@ class Separability:
 
 
 def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
-    """Return the campaign with what the model predicts in the place of the data."""
+    """Return the campaign with what the model predicts in the place of the data.
+
+    Such data leave no rest from which an unknown noise could be told: channels without a noise record get one
+    of a thousandth of their range.
+    """
     problem = Problem(campaign, model, setting)
     point = problem.start(Candidate())
     trials: list[Trial] = []
@@ -109,7 +113,14 @@ def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign
     for trial in campaign.trials:
         values = predicted.get(trial.name)
         trials.append(trial if values is None else replace(trial, values=values))
-    return replace(campaign, trials=tuple(trials))
+    ideal = replace(campaign, trials=tuple(trials))
+    channels = {
+        name: channel
+        if channel.noise is not None
+        else replace(channel, noise=NoiseRecord(stand_in(ideal, name), inf))
+        for name, channel in campaign.channels.items()
+    }
+    return replace(ideal, channels=channels)
 
 
 def separability(
@@ -120,7 +131,7 @@ def separability(
     Parameters
     ----------
     campaign : Campaign
-        Inputs, channels and noise count; the measured values do not.
+        Inputs, channels and noise count; the measured values do not. See `as_predicted` for unknown noise.
     model : Model
         The model as it is.
     setting : Setting

@@ -176,7 +176,9 @@ class Verdict:
     sentence : str
         It in one sentence.
     probability : float
-        Of the named set, family or group.
+        Among the hypotheses compared: of the named set with all that hold it, of the group together, of
+        'none' (nothing missing), of the candidates with 'none' (below detectability). Of a family: that of
+        its member in the catalogue, since families are not compared. Of an unexplained gap it says nothing.
     log_bayes_factor : float
         ln of evidence of the best hypothesis over that of 'none'.
     effects : tuple of NamedEffect

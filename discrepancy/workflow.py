@@ -16,6 +16,7 @@ from .catalogue.entry import Effect, Setting
 from .catalogue.library import load_catalogue
 from .data_fault import DataFault
 from .data_quality import check_against_model, check_data, mark_outliers
+from .errors import CampaignDataError
 from .fitting import Fit
 from .held_out import choose_held_out
 from .locate import Location, locate
@@ -30,6 +31,8 @@ from .search import SOLVER_SHARE, Search, solver_share
 from .verdict import Experiment, Proof, Verdict, VerdictKind
 
 DRAWS = 400
+IMPLAUSIBLE = 4.0
+"""Prior deviations from which on a parameter or a gain is remarked on."""
 OPEN_KINDS = (VerdictKind.GROUP, VerdictKind.UNEXPLAINED, VerdictKind.FAMILY, VerdictKind.BELOW_LIMIT)
 
 
@@ -140,6 +143,7 @@ def investigate(
         problem = Problem(campaign, model, setting)
         verdict, search, fit = name(problem, load_catalogue() if effects is None else effects)
     remarks = [fault.sentence for fault in faults] + list(campaign.remarks)
+    remarks += strained(problem, fit)
     with stage("Checking the time steps", "steps"):
         share = solver_share(problem, fit)
         if share > SOLVER_SHARE:
@@ -170,11 +174,40 @@ def investigate(
 
 
 def checked(campaign: Campaign, model: Model) -> tuple[Campaign, tuple[DataFault, ...]]:
-    """Return the campaign with outliers marked and trials held out, and what is wrong with it."""
+    """Return the campaign with outliers marked and trials held out, and what is wrong with it.
+
+    Raises
+    ------
+    CampaignDataError
+        If the campaign states a calibrated parameter that the model does not have.
+    """
+    known = [item.name for item in model.parameters]
+    for parameter in campaign.parameters:
+        if parameter not in known:
+            raise CampaignDataError(
+                f"The campaign states the parameter {parameter!r}, which {model.name} does not have; it has "
+                f"{', '.join(known) or 'none'}: correct the name, or leave [parameters.{parameter}] out."
+            )
     faults = check_data(campaign)
     campaign = mark_outliers(campaign)
     faults = (*faults, *check_against_model(campaign, model))
     return choose_held_out(campaign), faults
+
+
+def strained(problem: Problem, fit: Fit) -> list[str]:
+    """Return a sentence for each calibrated parameter and gain that a fit takes far from its prior.
+
+    The gates judge residuals alone: what an implausible nuisance has taken up leaves none.
+    """
+    names = [f"The parameter {item.name!r}" for item in problem.model.parameters]
+    names += [f"The gain of the channel {name!r}" for name in problem.shared.gain_channels]
+    rows = zip(names, fit.point.shared, problem.shared.precision, strict=True)
+    return [
+        f"{name} lies {abs(u):.1f} of its stated deviations off in the hypothesis of the verdict, which "
+        "rests on that deviation; the gates do not judge it. Check it."
+        for name, u, precision in rows
+        if precision > 0.0 and abs(u) > IMPLAUSIBLE
+    ]
 
 
 def open_hypotheses(search: Search, count: int = 5) -> list[tuple[Fit, float]]:

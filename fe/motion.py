@@ -62,7 +62,7 @@ class Laws:
         return np.array([ports[name] for name in self.ports], dtype=np.float64).reshape(len(self), width)
 
     def memory(self) -> FloatArray:
-        """Return the memory (J, 2 + E) of laws that have never been loaded."""
+        """Return the memory (J, 5 + E) of laws that have never been loaded."""
         return np.zeros((len(self), HEAD + self.slips.shape[1]))
 
 
@@ -379,7 +379,7 @@ def simulate(
         Between samples [s].
     shape, constant : (M,) ndarray, optional
         Modal shape of the force, and a constant modal force; zero if left out.
-    memory : (J, 2 + E) ndarray, optional
+    memory : (J, 5 + E) ndarray, optional
         Of the laws, as `static_solution` or an earlier call returned it. Left out: each law has been loaded
         from zero to its first position without turning back.
     feed : (2, J) ndarray, optional

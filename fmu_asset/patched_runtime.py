@@ -38,7 +38,6 @@ STRUCTURE_FILES = (
     "motion_kernel.py",
     "local_loss.py",
     "patch_arrays.py",
-    "local_loss.py",
     "patched_wing.py",
     "patched_steps.py",
 )

@@ -193,7 +193,7 @@ def _show(found: Investigation, tried: SelfCalibration | None, report: Path, con
     from rich import box
     from rich.table import Table
 
-    from discrepancy.report.text import estimate_text, headline, probability_text, unit_text
+    from discrepancy.report.text import estimate_text, headline, percent, probability_text, unit_text
     from discrepancy.verdict import VerdictKind
 
     verdict, proof = found.verdict, found.proof
@@ -223,13 +223,13 @@ def _show(found: Investigation, tried: SelfCalibration | None, report: Path, con
         first, second, where = proof.fitted_before, proof.fitted_after, "fitted trials (none is held out)"
         if proof.held_out_before is not None and proof.held_out_after is not None:
             first, second, where = proof.held_out_before, proof.held_out_after, "held-out trials"
-        closed = f", {100.0 * proof.gap_closed:.1f} % of the gap closed" if isfinite(proof.gap_closed) else ""
-        console.print(
-            f"χ²/dof on {where}: {first.chi_square_per_dof:.3g} before, {second.chi_square_per_dof:.3g} "
-            "with the "
-            f"effect{closed}.",
-            soft_wrap=True,
+        closed = f", {percent(proof.gap_closed)} % of the gap closed" if isfinite(proof.gap_closed) else ""
+        why = f" {proof.gap_reason}" if proof.held_out_before is not None and proof.gap_reason else ""
+        scores = (
+            f"χ²/dof on {where}: {first.chi_square_per_dof:.3g} before, {second.chi_square_per_dof:.3g} with "
+            f"the effect{closed}.{why}"
         )
+        console.print(scores if isfinite(first.chi_square_per_dof) else proof.remaining, soft_wrap=True)
     for experiment in verdict.next_experiments[:SHOWN_EXPERIMENTS]:
         console.print(f"Next: {experiment.description} ({experiment.information:.2f} nat)", soft_wrap=True)
     for fault in found.faults:

@@ -14,10 +14,9 @@ from discrepancy.catalogue.building import (
     trials,
 )
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting
+from discrepancy.noise import MAINS, aliased
 from fe.patch import EVERY_CHANNEL, Clock, DecayingLine, Line, ModelPatch
 
-MAINS = (50.0, 60.0, 400.0)
-"""Mains frequencies [Hz]: land and aircraft."""
 RINGDOWN = frozenset({TrialKind.RINGDOWN})
 ALL = "all "
 """Begins the place that stands for all channels of a quantity."""
@@ -34,12 +33,6 @@ def _clock(setting: Setting, values: Mapping[str, float], place: str) -> ModelPa
 # ---------------------------------------------------------------- mains hum
 
 
-def alias(frequency: float, interval: float) -> float:
-    """Return where a line shows in a spectrum: 50 Hz at 60 samples a second shows at 10 Hz."""
-    rate = 1.0 / interval
-    return abs(frequency - rate * round(frequency / rate))
-
-
 def mains_lines(setting: Setting) -> tuple[str, ...]:
     """Return the mains lines that can be seen, such as "50 Hz" or "50 or 400 Hz".
 
@@ -49,11 +42,11 @@ def mains_lines(setting: Setting) -> tuple[str, ...]:
     sampled = [(trial.interval, float(trial.time[-1] - trial.time[0])) for trial in trials(setting, *DYNAMIC)]
     groups: list[list[float]] = []
     for frequency in MAINS:
-        if all(alias(frequency, interval) * length < 1.0 for interval, length in sampled):
+        if all(aliased(frequency, interval) * length < 1.0 for interval, length in sampled):
             continue
         for group in groups:
             if all(
-                abs(alias(frequency, interval) - alias(group[0], interval)) * length < 0.5
+                abs(aliased(frequency, interval) - aliased(group[0], interval)) * length < 0.5
                 for interval, length in sampled
             ):
                 group.append(frequency)

@@ -133,8 +133,8 @@ def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) ->
     if unknown:
         lines.append(
             f"Give a noise record for {', '.join(unknown)} (samples at rest, or a standard deviation with "
-            "its degrees "
-            "of freedom): without it the absolute gate cannot be applied."
+            "its degrees of freedom): without it the absolute gate cannot be applied, and the sizes above "
+            "take a thousandth of the range for its noise."
         )
     if not campaign.held_out:
         lines.append(

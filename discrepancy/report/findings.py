@@ -5,13 +5,13 @@ from math import isfinite, isnan
 
 from discrepancy.report.content import ReportInput
 from discrepancy.report.text import (
-    MEANING,
     added_label,
     catalogue_of,
     estimate_text,
     formula,
     headline,
     listing,
+    meaning,
     number,
     p_value_text,
     percent,
@@ -33,7 +33,7 @@ def add_verdict(page: Page, content: ReportInput) -> None:
     investigation = content.investigation
     verdict = investigation.verdict
     page.add_notice(headline(verdict))
-    page.add_paragraph(MEANING[verdict.kind])
+    page.add_paragraph(meaning(verdict))
     _add_highlights(page, investigation)
     catalogue = catalogue_of(investigation)
     if verdict.kind is VerdictKind.UNEXPLAINED and verdict.resembles:

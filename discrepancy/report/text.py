@@ -21,7 +21,15 @@ MEANING = {
     "fit the model.",
     VerdictKind.BELOW_LIMIT: "The data do not decide between noise and a small effect.",
 }
-"""What each kind of verdict means, in a sentence."""
+"""What each kind of verdict means, in a sentence, where the channels have noise records."""
+
+UNJUDGED = {
+    VerdictKind.NOTHING_MISSING: "No effect of the catalogue is needed. Without a noise record it is not "
+    "known whether what the model leaves is noise.",
+    VerdictKind.NAMED: "The name has the probability and the evidence that a name needs. Without a noise "
+    "record the gate of absolute fit could not be applied: it is not known whether that is all.",
+}
+"""The same, where no channel has a noise record."""
 
 SHORT_UNITS = {"1": "", "m/s2": "m/s²"}
 
@@ -106,6 +114,12 @@ def headline(verdict: Verdict) -> str:
     if about is None:
         return text + "."
     return f"{text} ({about} {probability_text(verdict.probability)})."
+
+
+def meaning(verdict: Verdict) -> str:
+    """Return what the verdict means, in a sentence."""
+    judged = all(gate.passed is not None for gate in verdict.gates)
+    return MEANING[verdict.kind] if judged else UNJUDGED.get(verdict.kind, MEANING[verdict.kind])
 
 
 def hypothesis_name(hypothesis: Hypothesis) -> str:

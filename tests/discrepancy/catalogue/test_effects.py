@@ -14,12 +14,13 @@ from hypothesis import strategies as st
 
 from benchmarks.cantilever import LENGTH, TIP, Cantilever, campaign
 from discrepancy.campaign import Campaign, Channel, Quantity, Release, Trial, TrialKind
-from discrepancy.catalogue.clock_and_lines import alias, mains_lines
+from discrepancy.catalogue.clock_and_lines import mains_lines
 from discrepancy.catalogue.damping import loss_integral
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import library
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import Conditions
+from discrepancy.noise import aliased
 from discrepancy.sensing import observe
 from fe.patch import (
     EVERY_CHANNEL,
@@ -319,7 +320,7 @@ def test_lines_that_a_sampling_rate_can_show(setting: Setting, rate: float, line
 @given(st.floats(1.0, 500.0), st.floats(5.0, 2000.0))
 def test_an_alias_has_the_same_samples(frequency: float, rate: float) -> None:
     time = np.arange(20) / rate
-    seen = alias(frequency, 1.0 / rate)
+    seen = aliased(frequency, 1.0 / rate)
     assert 0.0 <= seen <= 0.5 * rate * (1.0 + 1e-12)
     np.testing.assert_allclose(
         np.cos(2.0 * pi * seen * time),

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from discrepancy.naming import name
+from discrepancy.candidate import Candidate, Term
+from discrepancy.fitting import fit
+from discrepancy.naming import _open, name
 from discrepancy.search import key_of
-from discrepancy.verdict import VerdictKind
+from discrepancy.verdict import Verdict, VerdictKind
 
 NO_NAME = (
     VerdictKind.NOTHING_MISSING,
@@ -180,3 +183,36 @@ def test_without_an_effect_in_reach_the_gap_stays_unexplained(small, effects) ->
     verdict, _, _ = name(small.problem(campaign), static)
     assert verdict.kind is VerdictKind.UNEXPLAINED
     assert verdict.effects == ()
+
+
+def test_without_a_noise_record_the_sentence_says_so(kit) -> None:  # type: ignore[no-untyped-def]
+    """Neither that nothing is missing nor that the name is all can be said of an absolute fit."""
+    effects = (kit.offset_effect(),)
+    verdict, _, _ = name(kit.closed_problem(seed=3, known_noise=False), effects)
+    assert verdict.kind is VerdictKind.NOTHING_MISSING
+    assert "there is no noise record" in verdict.sentence
+    verdict, _, _ = name(kit.closed_problem(seed=3, effect=0.4, known_noise=False), effects)
+    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
+    assert "there is no noise record" in verdict.sentence
+    verdict, _, _ = name(kit.closed_problem(seed=3, effect=0.4), effects)
+    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
+    assert "record" not in verdict.sentence
+
+
+def test_members_that_do_not_fit_are_no_part_of_a_group(small, effects) -> None:  # type: ignore[no-untyped-def]
+    """Patch and proof are those of a member; the probability is that of the members together."""
+    values, place = TRUTHS["coulomb_friction"]
+    problem = small.problem(small.measured(11, small.patch("coulomb_friction", values, place)))
+    _, found, _ = name(problem, effects)
+    candidate = Candidate((Term(next(item for item in effects if item.identifier == "load_cell")),))
+    wrong = fit(problem, candidate, problem.start(candidate))
+    found.keep(wrong, exact=True)
+    right = ("coulomb_friction",)
+    shares = {wrong.candidate.identifiers: 0.6, right: 0.38, (): 0.02}
+    verdict, _, nearest = _open(problem, found, shares, partial(Verdict, log_bayes_factor=0.0), wrong)
+    assert verdict.kind is VerdictKind.GROUP
+    assert verdict.group == right
+    assert "cannot tell which" not in verdict.sentence
+    assert verdict.probability == pytest.approx(0.38)
+    assert nearest.candidate.identifiers == right
+    assert verdict.gates[0].passed

@@ -124,3 +124,17 @@ def test_proposals_are_trials_of_the_kinds_that_were_done(bench) -> None:  # typ
     before = max((t for t in problem.campaign.trials if t.release), key=lambda t: t.release.displacement)
     assert longer.interval == pytest.approx(before.interval)
     assert len(longer.time) == 3 * len(before.time)
+
+
+def test_without_a_record_the_rest_stands_for_the_noise(kit) -> None:  # type: ignore[no-untyped-def]
+    """The information does not depend on the scale that stands in for an unknown noise."""
+    found = []
+    for known in (True, False):
+        problem = kit.closed_problem(seed=13, effect=0.05, known_noise=known)
+        none = fit(problem, Candidate(), problem.start(Candidate()), iterations=40)
+        candidate = Candidate((Term(kit.offset_effect(), "y1"),))
+        other = fit(problem, candidate, problem.start(candidate), iterations=40)
+        proposal = Proposal(problem.campaign.trials[0], "", "", 1.0)
+        found.append(mutual_information(problem, proposal, [other, none], np.array([0.5, 0.5])))
+    assert 0.0 < found[0] < log(2.0)
+    assert found[1] == pytest.approx(found[0], abs=0.1)

@@ -44,7 +44,7 @@ def test_model_of_a_coloured_record() -> None:
     noise = noise_model(channel(samples), 1.0)
     assert noise.standard_deviation == pytest.approx(3.0, rel=0.05)  # of the innovation
     assert noise.static_deviation == pytest.approx(3.0 / 0.6, rel=0.1)  # sigma / sqrt(1 - a^2)
-    assert noise.is_known
+    assert noise.degrees_of_freedom > 0.0
     assert noise.applies(INTERVAL)
     assert not noise.applies(2.0 * INTERVAL)
     np.testing.assert_array_equal(noise.whiten(samples, 2.0 * INTERVAL), samples)
@@ -115,7 +115,7 @@ def test_aliases_agree_at_the_samples(frequency: float, interval: float) -> None
 def test_records_that_say_little() -> None:
     """No record, a stated deviation, and a record too short for a spectrum."""
     none = noise_model(Channel("g", Quantity.STRAIN, "g", None), 0.7)
-    assert not none.is_known
+    assert none.degrees_of_freedom == 0.0
     assert none.standard_deviation == none.static_deviation == 0.7
     stated = noise_model(Channel("g", Quantity.STRAIN, "g", NoiseRecord(2.0, inf)), 0.7)
     assert (stated.standard_deviation, stated.degrees_of_freedom) == (2.0, inf)

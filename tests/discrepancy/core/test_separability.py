@@ -13,7 +13,7 @@ from benchmarks.cantilever import Cantilever, campaign
 from discrepancy.campaign import Campaign, Channel, NoiseRecord, Quantity, Release, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.separability import CONFUSED, Separability, _groups, separability
+from discrepancy.separability import CONFUSED, Separability, _groups, as_predicted, separability
 
 ONE_MODE = """
 format = 1
@@ -177,3 +177,23 @@ def test_groups_are_connected_sets(near, groups) -> None:  # type: ignore[no-unt
     for i, j in near:
         distance[i, j] = CONFUSED - 1.0  # one direction suffices
     assert _groups(("a", "b", "c", "d"), distance) == groups
+
+
+def test_an_unknown_noise_is_taken_as_a_thousandth_of_the_range(bench, effects_of_gauges) -> None:  # type: ignore[no-untyped-def]
+    """Detectable sizes are finite, and those of a stated deviation of that size."""
+    given = bench.measured(1)
+    blank = replace(
+        given, channels={name: replace(item, noise=None) for name, item in given.channels.items()}
+    )
+    found = decided(bench.model, blank, effects_of_gauges)
+    assert all(0.0 < item.detectable < inf for item in found.detectability)
+    ideal = as_predicted(blank, bench.model, Setting(blank, bench.model, bench.model.scales(blank)))
+    stated = replace(blank, channels=ideal.channels)
+    again = decided(bench.model, stated, effects_of_gauges)
+    for one, other in zip(found.detectability, again.detectability, strict=True):
+        assert one.detectable == pytest.approx(other.detectable, rel=0.05)
+
+
+@pytest.fixture
+def effects_of_gauges(catalogue):  # type: ignore[no-untyped-def]
+    return chosen(catalogue, ("gauge_gain", "quadratic_damping"))

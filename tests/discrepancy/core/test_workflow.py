@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from discrepancy.candidate import Candidate
+from discrepancy.errors import CampaignDataError
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate, open_hypotheses, patch_draws, solver_share
 
@@ -102,3 +103,25 @@ def test_an_open_verdict_comes_with_experiments(bench, catalogue) -> None:  # ty
     assert result.verdict.kind is VerdictKind.GROUP, result.verdict.sentence
     for item in result.verdict.next_experiments:
         assert 0.0 < item.information <= np.log(3.0) + 1e-9
+
+
+def test_a_parameter_that_the_model_lacks_is_refused(laboratory, effects) -> None:  # type: ignore[no-untyped-def]
+    misspelt = replace(laboratory.measured(1), parameters={"stifness_factor": (1.0, 0.01)})
+    with pytest.raises(CampaignDataError, match=r"'stifness_factor'.*stiffness_factor"):
+        investigate(misspelt, laboratory.model, effects)
+
+
+def test_a_gain_far_from_its_prior_is_remarked_on(laboratory, effects) -> None:  # type: ignore[no-untyped-def]
+    """A displacement sensor with a wrong gain beside gauges has no entry: the nuisance takes it, far out."""
+    campaign = laboratory.measured(1)
+    trials = []
+    for trial in campaign.trials:
+        values = trial.values.copy()
+        if "x2" in trial.channels:
+            values[:, trial.channels.index("x2")] *= 1.05
+        trials.append(replace(trial, values=values))
+    wrong = replace(campaign, trials=tuple(trials))
+    found = investigate(wrong, laboratory.model, effects[:1], thorough=False)
+    assert any("The gain of the channel 'x2'" in remark for remark in found.verdict.remarks)
+    plain = investigate(campaign, laboratory.model, effects[:1], thorough=False)
+    assert not any("of its stated deviations" in remark for remark in plain.verdict.remarks)

@@ -329,6 +329,7 @@ WRONG_TABLES = [
     ("tip_up", "force,g17\n1,\n", CampaignDataError, "no reading in the column 'g17'"),
     ("tip_up", "time,force,g17\n2,1,1\n1,1,1\n", CampaignDataError, "times of .* run backwards"),
     ("turn", "load_factor,g17,z1\n1,2,7\n", CampaignFileError, "z1 is a fraction from 0 to 1, and 7 came"),
+    ("turn", "load_factor,g17,z2_deviation\n1,2,-1\n", CampaignFileError, "z2_deviation is a"),
     ("release", "time,w [mm]\n0,1\n1,1\n", CampaignDataError, "holds 2 samples .* at least 8"),
     ("release", RELEASE.replace("0.020,", "0.018,"), CampaignDataError, "does not increase after sample 10"),
     ("release", RELEASE.replace("0.020,", "0.0195,"), CampaignDataError, "25.00% of an interval off an even"),
