@@ -42,7 +42,7 @@ def choose_held_out(campaign: Campaign) -> Campaign:
     split: dict[str, tuple[Trial, Trial]] = {}
     for kind in TrialKind:
         trials = [trial for trial in campaign.trials if trial.kind is kind]
-        spared = _spared(trials, campaign)
+        spared = _spared(trials, campaign, chosen)
         chosen |= spared
         if not spared and kind in (TrialKind.STATIC, TrialKind.FLIGHT):
             for trial in trials:
@@ -69,12 +69,12 @@ def choose_held_out(campaign: Campaign) -> Campaign:
 def level(trial: Trial) -> float:
     """Return the level of a trial: release displacement, or the largest force or load factor."""
     if trial.release is not None:
-        return trial.release.displacement
+        return abs(trial.release.displacement)
     inputs = trial.load_factor if trial.kind is TrialKind.FLIGHT else trial.force
     return float(np.max(np.abs(inputs)))
 
 
-def _spared(trials: list[Trial], campaign: Campaign) -> set[str]:
+def _spared(trials: list[Trial], campaign: Campaign, taken: set[str]) -> set[str]:
     if len(trials) < LEAST_TRIALS:
         return set()
     wanted = max(1, round(SHARE * len(trials)))
@@ -88,7 +88,11 @@ def _spared(trials: list[Trial], campaign: Campaign) -> set[str]:
         if len(spared) == wanted:
             break
         left = [trial for trial in trials if trial.name not in spared | {trials[index].name}]
-        others = [trial for trial in campaign.trials if trial.kind is not trials[index].kind]
+        others = [
+            trial
+            for trial in campaign.trials
+            if trial.kind is not trials[index].kind and trial.name not in taken
+        ]
         if _stays_covered(trials[index], left, others):
             spared.add(trials[index].name)
     return spared
