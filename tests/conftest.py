@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 if TYPE_CHECKING:
     from calibration.result import CalibrationResult
     from fe.patch_arrays import PatchArrays
 
 LEVELS = (0, 20, 40, 60, 80)
+
+# The same examples in every run of continuous integration; new ones at each run of a developer.
+settings.register_profile("ci", derandomize=True)
+if os.environ.get("CI"):
+    settings.load_profile("ci")
 
 
 def synthetic_library() -> dict[str, object]:
