@@ -41,7 +41,7 @@ def absolute_gate(problem: Problem, fit: Fit) -> Gate:
         judged all the same and can fail.
     """
     tests = absolute_tests(problem, fit)
-    known = any(not name.startswith("whiteness") for name, _ in tests)
+    known = any(name.startswith("variance") for name, _ in tests)
     if not tests:
         recorded = bool(np.any(problem.freedom[problem.counts > 0.0] > 0.0))
         why = "Too few readings for the unknowns" if recorded else "No noise record"
@@ -49,13 +49,12 @@ def absolute_gate(problem: Problem, fit: Fit) -> Gate:
     name, least = min(tests, key=lambda test: test[1])
     statistic = min(1.0, least * len(tests))
     if statistic < ABSOLUTE_LEVEL:
-        return Gate(
-            "absolute fit", False, statistic, ABSOLUTE_LEVEL, f"What is left is more than noise: {name}."
-        )
+        reason = f"More is left than noise and priors allow: {name}."
+        return Gate("absolute fit", False, statistic, ABSOLUTE_LEVEL, reason)
     if not known:
         return Gate(
             "absolute fit", None, statistic, ABSOLUTE_LEVEL,
-            "No noise record: only the whiteness of what is left could be judged, and it is white.",
+            "No noise record: only priors and the whiteness of what is left could be judged, and they agree.",
         )  # fmt: skip
     return Gate(
         "absolute fit", True, statistic, ABSOLUTE_LEVEL, "What is left agrees with the noise records."
@@ -83,7 +82,21 @@ def absolute_tests(problem: Problem, fit: Fit) -> list[tuple[str, float]]:
         # Stouffer's sum of normal scores: exact, while the sum of squares has a heavy tail at small n0
         together = float(weights @ norm.isf(values) / np.sqrt(weights @ weights))
         tests.append(("variance of all channels", float(norm.sf(together))))
-    return [*tests, *whiteness_tests(problem, fit)]
+    return [*tests, *prior_tests(problem, fit), *whiteness_tests(problem, fit)]
+
+
+def prior_tests(problem: Problem, fit: Fit) -> list[tuple[str, float]]:
+    """Return name and p-value of the tests that shared unknowns stayed within their priors.
+
+    A wrong model can fit by leaving what was calibrated. Conservative: estimates scatter less than the prior.
+    """
+    count = len(problem.shared.parameter_mean)
+    proper = problem.shared.gain_precision > 0.0
+    groups = {
+        "calibrated parameters beside their priors": fit.point.shared[:count],
+        "gains beside their priors": fit.point.shared[count:][proper],
+    }
+    return [(name, float(chi2.sf(u @ u, u.size))) for name, u in groups.items() if u.size]
 
 
 def whiteness_tests(problem: Problem, fit: Fit) -> list[tuple[str, float]]:

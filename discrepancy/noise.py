@@ -21,8 +21,10 @@ FloatArray = NDArray[np.float64]
 MAINS = (50.0, 60.0, 400.0)
 """Mains frequencies [Hz], of land and aircraft: an effect, and looked for in noise records."""
 LARGEST_ORDER = 12
-WHITE_LEVEL = 1e-3
-"""Noise is taken as white unless the Ljung-Box test of the record rejects it at this level."""
+WHITE_LEVEL = 1e-6
+"""Noise is taken as white unless the Ljung-Box test of the record rejects it at this level.
+
+Whitening by a chance correlation would colour white data."""
 LINE_LEVEL = 1e-4
 
 

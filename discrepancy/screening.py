@@ -74,8 +74,15 @@ class Change:
 
     @property
     def gain(self) -> float:
-        """Decrease of the misfit at the best scale [nat]."""
+        """Decrease of the misfit at the best scale [nat]; none where a positive size would turn negative."""
+        if self.fits < 0.0 and not self._may_turn:
+            return 0.0
         return 0.5 * self.fits * self.scale
+
+    @property
+    def _may_turn(self) -> bool:
+        sizes = [item.prior.shape for item in self.term.parameters if _is_magnitude(item)]
+        return not sizes or any(shape != "log_normal" for shape in sizes)
 
 
 class _Piece(NamedTuple):

@@ -52,6 +52,8 @@ DELIVERED = 0.7
 """Share of the screened gain that chord steps must reach."""
 FAR = 1.5
 """Chi-square per sample above which a fit is far from the truth."""
+STRAINED = 4.0
+"""Prior deviations beyond which a shared unknown says the same."""
 BEGINNING, LEAST_SAMPLES = 4.0, 60
 """The beginning of a record: this many periods of the first mode, at least that many samples."""
 SHORT_STEPS, FAR_STEPS = 12, 6
@@ -176,7 +178,11 @@ class Search:
         return sorted(found, key=lambda item: -self.score(item))
 
     def _far(self, base: Fit) -> bool:
-        return base.chi_square > FAR * float(self.problem.counts.sum())
+        """Whether a fit is far from the truth: much is left, or what is shared had to leave its prior."""
+        strain = np.abs(base.point.shared[self.problem.shared.precision > 0.0])
+        return bool(
+            base.chi_square > FAR * float(self.problem.counts.sum()) or strain.max(initial=0.0) > STRAINED
+        )
 
     def _scan_near(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
         found = []
