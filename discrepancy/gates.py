@@ -37,14 +37,15 @@ def absolute_gate(problem: Problem, fit: Fit) -> Gate:
     Returns
     -------
     Gate
-        `passed` is None where no channel has a noise record; whiteness is judged all the same and can fail.
+        `passed` is None where no channel has a noise record and more readings than unknowns; whiteness is
+        judged all the same and can fail.
     """
     tests = absolute_tests(problem, fit)
     known = any(name.startswith("variance") for name, _ in tests)
     if not tests:
-        return Gate(
-            "absolute fit", None, np.nan, ABSOLUTE_LEVEL, "No noise record: the fit cannot be judged."
-        )
+        recorded = bool(np.any(problem.freedom[problem.counts > 0.0] > 0.0))
+        why = "Too few readings for the unknowns" if recorded else "No noise record"
+        return Gate("absolute fit", None, np.nan, ABSOLUTE_LEVEL, f"{why}: the fit cannot be judged.")
     name, least = min(tests, key=lambda test: test[1])
     statistic = min(1.0, least * len(tests))
     if statistic < ABSOLUTE_LEVEL:

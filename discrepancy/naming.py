@@ -80,8 +80,8 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
                 VerdictKind.NOTHING_MISSING,
                 "The model explains the data within their noise."
                 if none_gate.passed
-                else "No effect of the catalogue explains the data better than the model does; whether that "
-                "is within their noise is not known, for there is no noise record.",
+                else "No effect of the catalogue explains the data better than the model does. "
+                f"{none_gate.reason}",
                 p_none, gates=(none_gate,),
             ),
             found, found.none,
@@ -303,5 +303,5 @@ def _family(named: tuple[NamedEffect, ...]) -> tuple[str, str]:
 def _named_sentence(named: tuple[NamedEffect, ...], probability: float, gate: Gate) -> str:
     what = " and ".join(f"{effect.name}{f' at {effect.place}' if effect.place else ''}" for effect in named)
     certain = "> 0.999" if probability > 0.9995 else f"{probability:.3f}"  # never one
-    limit = "" if gate.passed else " Whether that is all is not known: there is no noise record."
+    limit = "" if gate.passed else f" {gate.reason}"
     return f"The model lacks {what} (probability {certain}).{limit}"

@@ -33,6 +33,9 @@ PARAMETER_STEP = 1e-2
 SHARED_STEP = 1e-3
 """The same for calibrated parameters: what effects share with the stiffness must cancel to a thousandth."""
 
+QUIETEST = 1e-12
+"""Least variance of an unknown noise over its stand-in: a billionth of the range, from rounding."""
+
 
 @dataclass(frozen=True, eq=False)
 class TrialData:
@@ -453,7 +456,7 @@ class Problem:
             terms = np.where(
                 np.isinf(n0),
                 0.5 * sums,
-                np.where(n0 > 0.0, known, 0.5 * n * np.log(np.maximum(sums, 1e-300))),
+                np.where(n0 > 0.0, known, 0.5 * n * np.log(np.maximum(sums, QUIETEST * n))),
             )
         return float(terms[n > 0].sum())
 
@@ -461,8 +464,9 @@ class Problem:
         """Return the expected precision of each channel's noise over 1 / s0^2, given the residuals."""
         n0, n = self.freedom, self.counts
         with np.errstate(divide="ignore", invalid="ignore"):
-            weights = np.where(np.isinf(n0), 1.0, (n0 + n) / (n0 + sums))
-        return np.where((n > 0) & (n0 + sums > 0.0), weights, 1.0)
+            left = np.where(n0 > 0.0, sums, np.maximum(sums, QUIETEST * n))
+            weights = np.where(np.isinf(n0), 1.0, (n0 + n) / (n0 + left))
+        return np.where(n > 0, weights, 1.0)
 
     def with_trials(self, trials: tuple[Trial, ...]) -> "Problem":
         """Return the same problem on other trials, with the same noise and global unknowns."""

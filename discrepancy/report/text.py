@@ -24,12 +24,12 @@ MEANING = {
 """What each kind of verdict means, in a sentence, where the channels have noise records."""
 
 UNJUDGED = {
-    VerdictKind.NOTHING_MISSING: "No effect of the catalogue is needed. Without a noise record it is not "
-    "known whether what the model leaves is noise.",
-    VerdictKind.NAMED: "The name has the probability and the evidence that a name needs. Without a noise "
-    "record the gate of absolute fit could not be applied: it is not known whether that is all.",
+    VerdictKind.NOTHING_MISSING: "No effect of the catalogue is needed. Whether what the model leaves is "
+    "noise could not be judged.",
+    VerdictKind.NAMED: "The name has the probability and the evidence that a name needs. The gate of "
+    "absolute fit could not be applied: it is not known whether that is all.",
 }
-"""The same, where no channel has a noise record."""
+"""The same, where the absolute fit could not be judged: no noise record, or too few readings."""
 
 SHORT_UNITS = {"1": "", "m/s2": "m/s²"}
 

@@ -190,10 +190,10 @@ def test_without_a_noise_record_the_sentence_says_so(kit) -> None:  # type: igno
     effects = (kit.offset_effect(),)
     verdict, _, _ = name(kit.closed_problem(seed=3, known_noise=False), effects)
     assert verdict.kind is VerdictKind.NOTHING_MISSING
-    assert "there is no noise record" in verdict.sentence
+    assert "No noise record" in verdict.sentence
     verdict, _, _ = name(kit.closed_problem(seed=3, effect=0.4, known_noise=False), effects)
     assert verdict.kind is VerdictKind.NAMED, verdict.sentence
-    assert "there is no noise record" in verdict.sentence
+    assert "No noise record" in verdict.sentence
     verdict, _, _ = name(kit.closed_problem(seed=3, effect=0.4), effects)
     assert verdict.kind is VerdictKind.NAMED, verdict.sentence
     assert "record" not in verdict.sentence

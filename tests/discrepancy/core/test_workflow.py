@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from discrepancy.candidate import Candidate
+from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError
+from discrepancy.separability import as_predicted
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate, open_hypotheses, patch_draws, solver_share
 
@@ -125,3 +127,14 @@ def test_a_gain_far_from_its_prior_is_remarked_on(laboratory, effects) -> None: 
     assert any("The gain of the channel 'x2'" in remark for remark in found.verdict.remarks)
     plain = investigate(campaign, laboratory.model, effects[:1], thorough=False)
     assert not any("of its stated deviations" in remark for remark in plain.verdict.remarks)
+
+
+def test_data_without_any_noise_end_with_a_verdict(laboratory, effects) -> None:  # type: ignore[no-untyped-def]
+    """What the model says, to the last bit, and no noise record: nothing to weigh the rest by."""
+    setting = Setting(laboratory.campaign, laboratory.model, laboratory.model.scales(laboratory.campaign))
+    exact = as_predicted(laboratory.campaign, laboratory.model, setting)
+    trials = tuple(trial for trial in exact.trials if not trial.held_out)
+    channels = {name: replace(item, noise=None) for name, item in exact.channels.items()}
+    found = investigate(replace(exact, trials=trials, channels=channels), laboratory.model, effects)
+    assert found.verdict.kind is VerdictKind.NOTHING_MISSING
+    assert "No noise record" in found.verdict.sentence
