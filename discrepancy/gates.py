@@ -42,9 +42,9 @@ def absolute_gate(problem: Problem, fit: Fit) -> Gate:
     """
     tests = absolute_tests(problem, fit)
     known = any(name.startswith("variance") for name, _ in tests)
+    recorded = bool(np.any(problem.freedom[problem.counts > 0.0] > 0.0))
+    why = "Too few readings for the unknowns" if recorded else "No noise record"
     if not tests:
-        recorded = bool(np.any(problem.freedom[problem.counts > 0.0] > 0.0))
-        why = "Too few readings for the unknowns" if recorded else "No noise record"
         return Gate("absolute fit", None, np.nan, ABSOLUTE_LEVEL, f"{why}: the fit cannot be judged.")
     name, least = min(tests, key=lambda test: test[1])
     statistic = min(1.0, least * len(tests))
@@ -54,7 +54,7 @@ def absolute_gate(problem: Problem, fit: Fit) -> Gate:
     if not known:
         return Gate(
             "absolute fit", None, statistic, ABSOLUTE_LEVEL,
-            "No noise record: only priors and the whiteness of what is left could be judged, and they agree.",
+            f"{why}: only priors and the whiteness of what is left could be judged, and they agree.",
         )  # fmt: skip
     return Gate(
         "absolute fit", True, statistic, ABSOLUTE_LEVEL, "What is left agrees with the noise records."

@@ -16,6 +16,8 @@ SURE = 0.95
 """Probability that a name needs."""
 BAYES_FACTOR = 3.0
 """ln Bayes factor against 'none' that a name needs [nat]."""
+UNSURE = 0.5
+"""Probability of 'none' below which the data leave open whether something is missing."""
 LARGEST_GROUP = 6
 
 
@@ -75,6 +77,8 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
                 ),
                 found, found.none,
             )  # fmt: skip
+        if top and p_none < UNSURE:
+            return _open(problem, found, probabilities, verdict, best)
         return (
             verdict(
                 VerdictKind.NOTHING_MISSING,

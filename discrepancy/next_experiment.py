@@ -270,9 +270,10 @@ def _statics(statics: list[Trial], problem: Problem) -> Iterator[Proposal]:
                 "The root turns with the moment, the load cell with the force, the wing with both.",
                 1.0,
             )
-    yield Proposal(
-        replace(largest, name="warmer", temperature=largest.temperature + 15.0),
-        "Repeat the static loading 15 K warmer.",
-        "Only effects of temperature follow it.",
-        3.0,
-    )
+    if problem.model.supports(ModulusTemperature) and problem.campaign.reference_temperature is not None:
+        yield Proposal(
+            replace(largest, name="warmer", temperature=largest.temperature + 15.0),
+            "Repeat the static loading 15 K warmer.",
+            "Only effects of temperature follow it.",
+            3.0,
+        )

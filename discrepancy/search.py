@@ -12,7 +12,7 @@ from fe.patch import ModelPatch
 
 from .candidate import Candidate, Term
 from .catalogue.entry import Effect
-from .errors import ModelError
+from .errors import FitError, ModelError
 from .fitting import Fit, fit
 from .gates import SHAPE_GAIN, absolute_gate
 from .problem import Point, Problem, shortened
@@ -198,7 +198,7 @@ class Search:
                     continue
                 try:
                     fits.append(self.roughly(base, base.candidate.plus(change.term), rescaled(change)))
-                except ModelError:  # the best scale is more than the structure can carry
+                except (FitError, ModelError):  # the best scale is more than the structure can carry
                     continue
             if fits:
                 best = max(fits, key=self.score)
@@ -214,7 +214,7 @@ class Search:
             return max(
                 rough, fit(self.problem, rough.candidate, rough.point, iterations=SHORT_STEPS), key=self.score
             )
-        except ModelError:
+        except (FitError, ModelError):
             return rough
 
     def _scan_far(self, base: Fit, effects: tuple[Effect, ...]) -> list[Fit]:
@@ -258,7 +258,7 @@ class Search:
         start = Point(near.point.shared, near.point.local, np.concatenate((near.point.effect, added)))
         try:
             return fit(self._short(), candidate, start, iterations=SHORT_STEPS, evidence=False)
-        except ModelError:
+        except (FitError, ModelError):
             return None
 
     def _whole(self, starts: list[Fit], least: float) -> list[Fit]:
@@ -268,7 +268,7 @@ class Search:
         for item in sorted(starts, key=lambda start: start.objective)[:count]:
             try:
                 whole = fit(self.problem, item.candidate, item.point, iterations=FAR_STEPS, give_up=least)
-            except ModelError:
+            except (FitError, ModelError):
                 continue
             least = min(least, whole.objective + CLOSE)
             found.append(whole)
@@ -300,7 +300,7 @@ class Search:
         if found is None or found.log_evidence < rough.log_evidence - 5.0:
             try:
                 found = fit(self.problem, rough.candidate, rough.point)
-            except ModelError:  # chord steps led to where the structure cannot follow
+            except (FitError, ModelError):  # chord steps led to where the structure cannot follow
                 found = rough
             self.keep(found, exact=True)
         return self.exact[key]
@@ -360,7 +360,7 @@ class Search:
         )
         try:
             found = fit(self.problem, freed, Point(named.point.shared, named.point.local, effect))
-        except ModelError:
+        except (FitError, ModelError):
             return None
         gained = found.log_evidence - named.log_evidence > SHAPE_GAIN
         return found if gained and absolute_gate(self.problem, found).passed is not False else None
@@ -374,7 +374,11 @@ class Search:
             ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))[:REFITTED]
             for item in ranked:
                 if item.candidate.terms:
-                    self.exact[key_of(item.candidate)] = fit(self.problem, item.candidate, item.point)
+                    try:
+                        again = fit(self.problem, item.candidate, item.point)
+                    except (FitError, ModelError):  # the rough one stands
+                        continue
+                    self.exact[key_of(item.candidate)] = again
 
     def _along_ridge(self, found: Fit) -> Fit:
         """Look for a better fit of the same candidate along the direction that its data tell least of.
@@ -393,7 +397,7 @@ class Search:
                         self.problem, found.candidate, start,
                         iterations=RIDGE_ITERATIONS, give_up=better.objective,
                     )  # fmt: skip
-                except ModelError:
+                except (FitError, ModelError):
                     continue
                 if item.objective < better.objective - RIDGE_GAIN:
                     better = item
@@ -431,7 +435,7 @@ class Search:
             else:
                 try:
                     found = self.roughly(self.none, candidate, start)
-                except ModelError:
+                except (FitError, ModelError):
                     found = None
             if found is not None:
                 rough.append(found)
@@ -452,9 +456,11 @@ class Search:
             if key_of(less) not in self.exact:
                 parts = best.candidate.parts(best.point.effect)
                 effect = np.concatenate(parts[:index] + parts[index + 1 :])
-                self.keep(
-                    fit(self.problem, less, Point(best.point.shared, best.point.local, effect)), exact=True
-                )
+                start = Point(best.point.shared, best.point.local, effect)
+                try:
+                    self.keep(fit(self.problem, less, start), exact=True)
+                except (FitError, ModelError):
+                    continue
 
 
 def _worth(change: Change) -> float:

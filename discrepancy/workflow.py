@@ -197,14 +197,15 @@ def checked(campaign: Campaign, model: Model) -> tuple[Campaign, tuple[DataFault
 def strained(problem: Problem, fit: Fit) -> list[str]:
     """Return a sentence for each calibrated parameter and gain that a fit takes far from its prior.
 
-    The gates judge residuals alone: what an implausible nuisance has taken up leaves none.
+    What an implausible nuisance has taken up leaves no residual; the absolute gate judges all gains together,
+    and all parameters.
     """
     names = [f"The parameter {item.name!r}" for item in problem.model.parameters]
     names += [f"The gain of the channel {name!r}" for name in problem.shared.gain_channels]
     rows = zip(names, fit.point.shared, problem.shared.precision, strict=True)
     return [
         f"{name} lies {abs(u):.1f} of its stated deviations off in the hypothesis of the verdict, which "
-        "rests on that deviation; the gates do not judge it. Check it."
+        "rests on that deviation: check it."
         for name, u, precision in rows
         if precision > 0.0 and abs(u) > IMPLAUSIBLE
     ]
