@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from discrepancy.campaign_schema import (
+    INPUT_COLUMNS,
     CampaignSection,
     ChannelSection,
     ReleaseSection,
@@ -147,6 +148,13 @@ def _trial(
     zeros = np.zeros(count)
     forced = section.kind in (TrialKind.STATIC, TrialKind.FORCED)
     chosen = _measured(section, table, campaign)
+    known = {*INPUT_COLUMNS, *(channel.table_column for channel in campaign.channel)}
+    unknown = [name for name in table.columns if name not in known]
+    if unknown:
+        remarks.append(
+            f"{table.name}: no channel has the column {', '.join(map(repr, unknown))}, which is left out; "
+            "if that is not meant, check its spelling."
+        )
     columns, used = zip(*(_readings(channel, section, table, remarks) for channel in chosen), strict=True)
     health, health_deviation = _health(section, table, user)
     return Trial(

@@ -234,6 +234,10 @@ def _show(found: Investigation, tried: SelfCalibration | None, report: Path, con
         console.print(f"Next: {experiment.description} ({experiment.information:.2f} nat)", soft_wrap=True)
     for fault in found.faults:
         console.print(f"Data: {fault.sentence}", soft_wrap=True)
+    said = {fault.sentence for fault in found.faults}
+    for remark in verdict.remarks:
+        if remark not in said:
+            console.print(f"Note: {remark}", soft_wrap=True)
     if tried is not None:
         right, wrong = tried.share("right"), tried.share("wrong")
         false = tried.share("wrong", null=True)

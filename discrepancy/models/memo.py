@@ -2,16 +2,17 @@
 
 from collections import OrderedDict
 
-from discrepancy.campaign import Campaign, Quantity, Trial
-from fe.patch import ModelPatch, Primitive
+from discrepancy.campaign import Quantity, Trial
+from fe.patch import ModelPatch
 
-from .interface import Conditions, Model, ModelParameter, Response, Scales
+from .interface import Conditions, Model, Response
+from .wrapped import WrappedModel
 
 KEPT = 400
 """Responses kept; the oldest goes first."""
 
 
-class MemoModel:
+class MemoModel(WrappedModel):
     """A `Model` around another one that keeps responses to the same question.
 
     Parameters
@@ -21,38 +22,8 @@ class MemoModel:
     """
 
     def __init__(self, model: Model) -> None:
-        self.inner = model
+        super().__init__(model)
         self._kept: OrderedDict[object, tuple[Trial, Response]] = OrderedDict()
-
-    @property
-    def name(self) -> str:
-        """Name for people."""
-        return self.inner.name
-
-    @property
-    def parameters(self) -> tuple[ModelParameter, ...]:
-        """Calibrated parameters."""
-        return self.inner.parameters
-
-    def output_quantity(self, output: str) -> Quantity | None:
-        """Return what an output is, or None if the model has no such output."""
-        return self.inner.output_quantity(output)
-
-    def supports(self, primitive: type[Primitive]) -> bool:
-        """Whether the model can carry a primitive."""
-        return self.inner.supports(primitive)
-
-    def ports(self) -> tuple[str, ...]:
-        """Names of the ports where internal forces can act."""
-        return self.inner.ports()
-
-    def stations(self) -> tuple[float, float] | None:
-        """Return the least and largest station [m], None if the model has no length."""
-        return self.inner.stations()
-
-    def scales(self, campaign: Campaign) -> Scales:
-        """Return the natural scales under a campaign."""
-        return self.inner.scales(campaign)
 
     def respond(
         self,

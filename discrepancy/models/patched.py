@@ -1,12 +1,13 @@
 """A model with a patch built in: a known addition, or an effect that was found."""
 
-from discrepancy.campaign import Campaign, Quantity, Trial
-from fe.patch import ModelPatch, Primitive
+from discrepancy.campaign import Quantity, Trial
+from fe.patch import ModelPatch
 
-from .interface import Conditions, Model, ModelParameter, Response, Scales
+from .interface import Conditions, Model, Response
+from .wrapped import WrappedModel
 
 
-class PatchedModel:
+class PatchedModel(WrappedModel):
     """A `Model` that adds a patch to every question; sensors in it are not its business.
 
     Parameters
@@ -18,37 +19,8 @@ class PatchedModel:
     """
 
     def __init__(self, model: Model, patch: ModelPatch) -> None:
-        self.inner, self.patch = model, patch
-
-    @property
-    def name(self) -> str:
-        """Name for people."""
-        return self.inner.name
-
-    @property
-    def parameters(self) -> tuple[ModelParameter, ...]:
-        """Calibrated parameters."""
-        return self.inner.parameters
-
-    def output_quantity(self, output: str) -> Quantity | None:
-        """Return what an output is, or None if the model has no such output."""
-        return self.inner.output_quantity(output)
-
-    def supports(self, primitive: type[Primitive]) -> bool:
-        """Whether the model can carry a primitive."""
-        return self.inner.supports(primitive)
-
-    def ports(self) -> tuple[str, ...]:
-        """Names of the ports where internal forces can act."""
-        return self.inner.ports()
-
-    def stations(self) -> tuple[float, float] | None:
-        """Return the least and largest station [m], None if the model has no length."""
-        return self.inner.stations()
-
-    def scales(self, campaign: Campaign) -> Scales:
-        """Return the natural scales under a campaign, without the patch."""
-        return self.inner.scales(campaign)
+        super().__init__(model)
+        self.patch = patch
 
     def respond(
         self,

@@ -117,6 +117,12 @@ def test_everything_comes_out_in_si(tmp_path: Path) -> None:
     assert [trial.name for trial in campaign.fitted] == ["tip load up", "release"]
 
 
+def test_a_column_of_no_channel_is_remarked(tmp_path: Path) -> None:
+    campaign = read_campaign(folder_of(tmp_path, tip_up="force,g71,w [mm]\n0,0.5,0.1\n5,120.25,7.3\n"))
+    assert campaign.trials[0].channels == ("tip",)
+    assert any("'g71'" in remark and "tip_up.csv" in remark for remark in campaign.remarks)
+
+
 def test_hash_follows_every_file(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     before = read_campaign(folder).data_hash
