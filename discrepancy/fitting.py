@@ -21,6 +21,8 @@ LARGEST_EFFECT = 8.0
 """Effect parameters stay within this many prior deviations of their median."""
 CONVERGED = 1e-2
 """A step that promises less than this [nat] ends a fit."""
+STEP_SHARES = (1.0, 0.3)
+"""Shares of a step that are tried before the damping grows."""
 CREEPING, NEAR_END = 0.2, 30.0
 """Derivatives are renewed where a step promises less than `NEAR_END` [nat], but more than this share of what
 the one before it promised: close to the end, promises should fall fast."""
@@ -66,6 +68,9 @@ class Fit:
         At the point (or older, after chord steps).
     converged : bool
         Whether the last step was short enough.
+    draws : (N, E) ndarray or None
+        From the posterior of the scaled effect parameters, where it is wider than their covariance (see
+        `posterior`).
     """
 
     candidate: Candidate
@@ -79,6 +84,7 @@ class Fit:
     spent: FloatArray
     linearisations: tuple[Linearisation, ...] = field(repr=False)
     converged: bool = True
+    draws: FloatArray | None = field(default=None, repr=False)
 
     @property
     def effect_covariance(self) -> FloatArray:
@@ -163,9 +169,9 @@ def fit(
     FitError
         If the model gives numbers that are not finite at the start.
     """
-    point = _bounded(start)
+    descent = _Descent(problem, candidate, base, local_only)
     damping = 1e-3
-    state = _evaluate(problem, candidate, point, base)
+    state = descent.state(_bounded(start))
     if not np.isfinite(state.objective):
         raise FitError(
             f"The model gives values that are not finite for {candidate.identifiers or ('no effect',)}; "
@@ -173,45 +179,38 @@ def fit(
         )
     converged, fresh, before = False, True, np.inf
     for _ in range(iterations):
-        step, promised = _step(problem, candidate, state, damping, local_only=local_only)
+        step, promised = descent.step(state, damping)
         if not fresh and CREEPING * before < promised < NEAR_END:
             # old derivatives turn a long valley into a row of short steps, each of which keeps its promise
-            state, fresh = _evaluate(problem, candidate, state.point, base), True
-            step, promised = _step(problem, candidate, state, damping, local_only=local_only)
+            state, fresh = descent.state(state.point), True
+            step, promised = descent.step(state, damping)
         before = promised
         if promised < CONVERGED and fresh:
             converged = True
             break
         if promised < CONVERGED:
-            state, fresh = _evaluate(problem, candidate, state.point, base), True
+            state, fresh = descent.state(state.point), True
             continue
-        following = None
-        trial_point = _bounded(_plus(state.point, step))
-        try:
-            proposal = _evaluate(problem, candidate, trial_point, base, derivatives=False)
-            if proposal.objective < state.objective:
-                following = _evaluate(problem, candidate, trial_point, base, known=state.parts)
-        except ModelError:  # outside what the structure can carry: a shorter step
-            following = None
+        following = descent.following(state, step, damping)
         if following is not None:
             gain = state.objective - following.objective
             damping = max(damping * (0.1 if gain > 0.5 * promised else 0.5), 1e-9)
             state, fresh = following, base is not None
             if gain < 0.7 * promised and base is None:  # derivatives have grown old
-                state, fresh = _evaluate(problem, candidate, state.point, base), True
+                state, fresh = descent.state(state.point), True
             if give_up is not None and state.objective - 2.0 * promised > give_up:
                 break
             if gain < CONVERGED and damping < 1e-2 and fresh:
                 converged = True
                 break
         elif not fresh:
-            state, fresh = _evaluate(problem, candidate, state.point, base), True
+            state, fresh = descent.state(state.point), True
         else:
             damping = max(10.0 * damping, 1e-4)
             if damping > 1e6:
                 break
     if not fresh and evidence:
-        state = _evaluate(problem, candidate, state.point, base)
+        state = descent.state(state.point)
     return _finished(problem, candidate, state, converged, evidence)
 
 
@@ -225,37 +224,73 @@ class _State:
     parts: tuple[Linearisation, ...]
 
 
-def _evaluate(
-    problem: Problem,
-    candidate: Candidate,
-    point: Point,
-    base: Base | None,
-    derivatives: bool = True,
-    known: tuple[Linearisation, ...] | None = None,
-) -> _State:
-    parts: list[Linearisation] = []
-    residuals, responses = [], []
-    for number in range(len(problem.trials)):
-        part = problem.linearise(
-            number, point, candidate, base,
-            derivatives=derivatives, known=None if known is None else known[number],
-        )  # fmt: skip
-        parts.append(part)
-        responses.append(part.response)
-        residuals.append(problem.residual(number, point, part.response))
-    sums = problem.group_sums(residuals)
-    prior = 0.5 * float(problem.shared.precision @ point.shared**2) + 0.5 * float(point.effect @ point.effect)
-    for data, u in zip(problem.trials, point.local, strict=True):
-        prior += 0.5 * float(data.unknowns.precision @ u**2)
-    objective = problem.misfit(sums) + prior
-    return _State(
-        point,
-        objective if np.isfinite(objective) else np.inf,
-        tuple(residuals),
-        tuple(responses),
-        sums,
-        tuple(parts),
-    )
+@dataclass
+class _Descent:
+    """What a descent needs at every point: problem, candidate, and the steps of its derivatives."""
+
+    problem: Problem
+    candidate: Candidate
+    base: Base | None
+    local_only: bool
+    deviation: FloatArray | None = None  # (E,) of the effect parameters, once known
+
+    def state(
+        self, point: Point, *, derivatives: bool = True, known: tuple[Linearisation, ...] | None = None
+    ) -> _State:
+        """Return objective and derivatives at a point; `known` are derivatives by nuisances, near enough."""
+        problem = self.problem
+        parts: list[Linearisation] = []
+        residuals, responses = [], []
+        for number in range(len(problem.trials)):
+            part = problem.linearise(
+                number, point, self.candidate, self.base, derivatives=derivatives,
+                known=None if known is None else known[number], effect_steps=self.deviation,
+            )  # fmt: skip
+            parts.append(part)
+            responses.append(part.response)
+            residuals.append(problem.residual(number, point, part.response))
+        sums = problem.group_sums(residuals)
+        prior = 0.5 * float(problem.shared.precision @ point.shared**2)
+        prior += 0.5 * float(point.effect @ point.effect)
+        for data, u in zip(problem.trials, point.local, strict=True):
+            prior += 0.5 * float(data.unknowns.precision @ u**2)
+        objective = problem.misfit(sums) + prior
+        return _State(
+            point,
+            objective if np.isfinite(objective) else np.inf,
+            tuple(residuals),
+            tuple(responses),
+            sums,
+            tuple(parts),
+        )
+
+    def step(self, state: _State, damping: float) -> tuple[Point, float]:
+        """Return the step and the decrease it promises [nat]."""
+        step, promised, self.deviation = _step(
+            self.problem, self.candidate, state, damping, local_only=self.local_only
+        )
+        return step, promised
+
+    def following(self, state: _State, step: Point, damping: float) -> _State | None:
+        """Return the state after a step, or None if none better was found.
+
+        Where the phases of a record bend the valley that the step follows, its end lies on the slope; a
+        second step with the same derivatives leads back to the bottom (the second-order correction of
+        Transtrum and Sethna 2012, arXiv:1201.5885, with the whole step as difference).
+        """
+        for share in STEP_SHARES:
+            try:
+                ahead = _ahead(self.candidate, state.point, step, share)
+                proposal = self.state(ahead, derivatives=False)
+                if not proposal.objective < state.objective and np.isfinite(proposal.objective):
+                    correction, _ = self.step(self.state(ahead, known=state.parts), damping)
+                    ahead = _ahead(self.candidate, ahead, correction)
+                    proposal = self.state(ahead, derivatives=False)
+                if proposal.objective < state.objective:
+                    return self.state(ahead, known=state.parts)
+            except ModelError:  # outside what the structure can carry: a shorter step
+                continue
+        return None
 
 
 def _blocks(problem: Problem, candidate: Candidate, state: _State) -> list[TrialBlock]:
@@ -268,8 +303,8 @@ def _blocks(problem: Problem, candidate: Candidate, state: _State) -> list[Trial
 
 def _step(
     problem: Problem, candidate: Candidate, state: _State, damping: float, *, local_only: bool = False
-) -> tuple[Point, float]:
-    """Return the step and the decrease it promises [nat]."""
+) -> tuple[Point, float, FloatArray]:
+    """Return the step, the decrease it promises [nat], and the deviations (E,) of the effect parameters."""
     shared_size = problem.shared.size
     size = shared_size + candidate.size
     prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
@@ -290,7 +325,9 @@ def _step(
         eliminated.append((inner, inner_gradient))
     matrix += damping * np.diag(damped_diagonal + prior)
     try:
-        step = np.zeros(size) if local_only else cho_solve(cho_factor(matrix), gradient)
+        factor = cho_factor(matrix)
+        step = np.zeros(size) if local_only else cho_solve(factor, gradient)
+        variance = np.diag(cho_solve(factor, np.eye(size)[:, shared_size:])[shared_size:])
     except LinAlgError as cause:
         raise FitError("The normal equations of a fit are singular; a parameter has no influence.") from cause
     promised = 0.5 * float(gradient @ step)
@@ -299,7 +336,7 @@ def _step(
         local_step = inner_gradient - inner @ step[block.index]
         promised += 0.5 * float(block.local_gradient @ inner_gradient)
         local_steps.append(np.asarray(local_step, dtype=np.float64))
-    return Point(step[:shared_size], tuple(local_steps), step[shared_size:]), promised
+    return Point(step[:shared_size], tuple(local_steps), step[shared_size:]), promised, np.sqrt(variance)
 
 
 def _finished(problem: Problem, candidate: Candidate, state: _State, converged: bool, evidence: bool) -> Fit:
@@ -349,11 +386,19 @@ def _finished(problem: Problem, candidate: Candidate, state: _State, converged: 
     )
 
 
-def _plus(point: Point, step: Point) -> Point:
-    return Point(
-        point.shared + step.shared,
-        tuple(u + du for u, du in zip(point.local, step.local, strict=True)),
-        point.effect + step.effect,
+def _ahead(candidate: Candidate, point: Point, step: Point, share: float = 1.0) -> Point:
+    """Return the point a share of a step ahead."""
+    parameters = [item for term in candidate.terms for item in term.parameters]
+    effect = [
+        item.prior.stepped(u, du) if getattr(item, "magnitude", False) else u + du
+        for item, u, du in zip(parameters, point.effect.tolist(), (share * step.effect).tolist(), strict=True)
+    ]
+    return _bounded(
+        Point(
+            point.shared + share * step.shared,
+            tuple(u + share * du for u, du in zip(point.local, step.local, strict=True)),
+            np.array(effect, dtype=np.float64),
+        )
     )
 
 

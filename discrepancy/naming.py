@@ -8,6 +8,7 @@ from .candidate import Candidate, Term
 from .catalogue.entry import NINETY, Effect
 from .fitting import Fit, fit
 from .gates import SHAPE_GAIN, absolute_gate, shape_gate
+from .posterior import with_draws
 from .problem import Point, Problem
 from .search import Search, search
 from .verdict import Estimate, Gate, Hypothesis, NamedEffect, Verdict, VerdictKind
@@ -92,7 +93,8 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         )  # fmt: skip
 
     if found.family is not None and bayes >= BAYES_FACTOR:
-        named = named_effects(problem, found.family)
+        drawn = with_draws(problem, found.family)
+        named = named_effects(problem, drawn)
         text, sentence = _family(named)
         return (
             verdict(
@@ -101,10 +103,10 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
                 p_top,
                 effects=named,
                 family=text,
-                gates=(absolute_gate(problem, found.family), shape_gate(best, found.family)),
+                gates=(absolute_gate(problem, drawn), shape_gate(best, drawn)),
             ),
             found,
-            found.family,
+            drawn,
         )
     gate = absolute_gate(problem, best)
     # sets that hold the best one and more agree with it; they only leave a further effect open
@@ -112,6 +114,7 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
     if p_top >= SURE and bayes >= BAYES_FACTOR:
         shape, family = _shape(found, best)
         if gate.passed is not False and shape.passed:
+            best = with_draws(problem, best)
             named = named_effects(problem, best)
             return (
                 verdict(
@@ -123,6 +126,7 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         if family is not None and not shape.passed:
             family_gate = absolute_gate(problem, family)
             if family_gate.passed is not False:
+                family = with_draws(problem, family)
                 named = named_effects(problem, family)
                 text, sentence = _family(named)
                 return (
@@ -241,14 +245,23 @@ def _shape(found: Search, best: Fit) -> tuple[Gate, Fit | None]:
 
 
 def named_effects(problem: Problem, found: Fit) -> tuple[NamedEffect, ...]:
-    """Return the effects of a fit with medians and 90 % intervals of their parameters (Laplace)."""
+    """Return the effects of a fit with values and 90 % intervals of their parameters.
+
+    Intervals are those of the fit's draws, else of its covariance.
+    """
     named = []
     deviation = np.sqrt(np.diag(found.effect_covariance))
+    low, high = found.point.effect - NINETY * deviation, found.point.effect + NINETY * deviation
+    if found.draws is not None:
+        low, high = np.quantile(found.draws, (0.05, 0.95), axis=0)
+        # the most probable value may be one of many optima along a ridge
+        low, high = np.minimum(low, found.point.effect), np.maximum(high, found.point.effect)
     at = 0
     for term, part in zip(found.candidate.terms, found.candidate.parts(found.point.effect), strict=True):
         estimates = []
-        for item, u, spread in zip(term.parameters, part, deviation[at : at + len(part)], strict=True):
-            ends = [item.prior.value(float(u + side * NINETY * spread)) for side in (-1.0, 1.0)]
+        rows = slice(at, at + len(part))
+        for item, u, *interval in zip(term.parameters, part, low[rows], high[rows], strict=True):
+            ends = [item.prior.value(float(end)) for end in interval]
             estimates.append(
                 Estimate(
                     item.name,

@@ -30,6 +30,8 @@ IntArray = NDArray[np.int64]
 
 PARAMETER_STEP = 1e-2
 """Step of the forward differences in scaled variables."""
+LEAST_STEP = 1e-4
+"""Least step by effect parameters, above the rounding of the integration."""
 SHARED_STEP = 1e-3
 """The same for calibrated parameters: what effects share with the stiffness must cancel to a thousandth."""
 
@@ -287,6 +289,7 @@ class Problem:
         *,
         derivatives: bool = True,
         known: Linearisation | None = None,
+        effect_steps: FloatArray | None = None,
     ) -> Linearisation:
         """Return response and derivatives of a trial.
 
@@ -305,6 +308,9 @@ class Problem:
             False: the response only.
         known : Linearisation, optional
             Derivatives by shared and local unknowns that are near enough.
+        effect_steps : (E,) ndarray, optional
+            Deviations of the effect parameters. Differences over about one deviation average over the kinks
+            of friction and hysteresis, and do not reach beyond where the parameters may lie.
         """
         data = self.trials[number]
         kind = data.trial.kind
@@ -330,10 +336,13 @@ class Problem:
         if not derivatives:
             return Linearisation(response, _NOTHING, _NOTHING, _NOTHING)
         effect = np.zeros((candidate.size, *response.shape))
+        steps = np.full(candidate.size, PARAMETER_STEP)
+        if effect_steps is not None:
+            steps = np.clip(effect_steps, LEAST_STEP, PARAMETER_STEP)
         for k in range(candidate.size):
             if kind in candidate.acting(k):
-                moved = candidate.patch(self.setting, _moved(point.effect, k))
-                effect[k] = (self.response(number, shared, local, moved)[0] - at_base) / PARAMETER_STEP
+                moved = candidate.patch(self.setting, _moved(point.effect, k, steps[k]))
+                effect[k] = (self.response(number, shared, local, moved)[0] - at_base) / steps[k]
         return Linearisation(response, parameters, by_local, effect)
 
     def _by_parameters(

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from math import sqrt
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,9 @@ from scipy.special import ndtri
 
 from fe.patch import EVERY_CHANNEL, SENSORS, ModelPatch
 
+from .campaign import TrialKind
 from .candidate import Candidate, Term
-from .catalogue.entry import EffectParameter
+from .catalogue.entry import EffectParameter, ShapeParameter
 from .errors import ModelError
 from .fitting import LARGEST_EFFECT, Fit, trial_block
 from .problem import Problem
@@ -81,7 +82,7 @@ class Change:
 
     @property
     def _may_turn(self) -> bool:
-        sizes = [item.prior.shape for item in self.term.parameters if _is_magnitude(item)]
+        sizes = [item.prior.shape for item in self.term.parameters if is_magnitude(item)]
         return not sizes or any(shape != "log_normal" for shape in sizes)
 
 
@@ -150,13 +151,28 @@ class Screen:
 
     def change(self, term: Term, start: FloatArray) -> Change:
         """Return what a term does at scaled parameters, besides the effects of the fit."""
-        problem, fit = self.problem, self.fit
-        candidate = fit.candidate.plus(term)
-        acting = term.effect.acts_on
-        effect = np.concatenate((fit.point.effect, start))
-        channels = _channels_of(
-            candidate.terms[-1].effect.patch(problem.setting, term.values(start), term.place)
+        candidate = self.fit.candidate.plus(term)
+        channels = _channels_of(term.effect.patch(self.problem.setting, term.values(start), term.place))
+        vector, fits, size = self._moved(
+            candidate, np.concatenate((self.fit.point.effect, start)), term.effect.acts_on, channels
         )
+        return Change(term, start, vector, fits, max(size, 0.0))
+
+    def rise(self, effect: FloatArray) -> float:
+        """Return by how much the misfit rises [nat] when the fit's own effect parameters (E,) are these."""
+        candidate = self.fit.candidate
+        _, fits, size = self._moved(candidate, effect, candidate.acts_on, frozenset())
+        return 0.5 * size - fits
+
+    def _moved(
+        self,
+        candidate: Candidate,
+        effect: FloatArray,
+        acting: frozenset[TrialKind],
+        channels: frozenset[str],
+    ) -> tuple[FloatArray, float, float]:
+        """Return vector, b and G of the change to a candidate, in trials and channels that it touches."""
+        problem, fit = self.problem, self.fit
         total = np.zeros(self._size)
         parts, fits, square = [], 0.0, 0.0
         tail = []
@@ -179,8 +195,7 @@ class Screen:
         y = self._inverse @ total
         fits -= float(self._gradient @ y)
         square -= float(y @ y)
-        vector = np.concatenate((*parts, *tail, y))
-        return Change(term, start, vector, fits, max(square, 0.0))
+        return np.concatenate((*parts, *tail, y)), fits, square
 
     def _peaks(self, term: Term) -> tuple[float, ...]:
         """Return peaks of the residuals' mean spectrum at a term's channel, over the first frequency."""
@@ -242,12 +257,15 @@ def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Ite
     """
     axes: list[tuple[float, ...]] = []
     scaled = False
-    count = sum(1 for item in term.parameters if not _is_magnitude(item))
+    count = sum(1 for item in term.parameters if not is_magnitude(item))
     levels = LEVELS.get(count, (-1.0, 1.0))
     for item in term.parameters:
-        if _is_magnitude(item):
+        if is_magnitude(item):
             signed = item.prior.value(0.0) == 0.0
-            if scaled:
+            if item.levels and not scaled:
+                axes.append(_spread_levels(item))
+                scaled = True
+            elif scaled:
                 axes.append((-1.0, 0.0, 1.0) if signed else (0.0,))
             else:
                 axes.append((1.0, *((LINEAR,) if fine else ())) if signed else (0.0,))
@@ -255,7 +273,7 @@ def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Ite
         elif item.name == term.effect.spectral and peaks:
             axes.append(tuple(float(np.clip(item.prior.normal(peak), -3.0, 3.0)) for peak in peaks))
         elif isinstance(item, EffectParameter) and item.levels:
-            axes.append(tuple(float(ndtri((k + 0.5) / item.levels)) for k in range(item.levels)))
+            axes.append(_spread_levels(item))
         elif item in term.effect.shape:
             axes.append((item.prior.normal(item.canonical),))
         else:
@@ -264,7 +282,13 @@ def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Ite
         yield np.array(values)
 
 
-def _is_magnitude(item: object) -> bool:
+def _spread_levels(item: EffectParameter) -> tuple[float, ...]:
+    """Return the scaled values of a parameter that asks for so many, evenly over its prior."""
+    return tuple(float(ndtri((k + 0.5) / item.levels)) for k in range(item.levels))
+
+
+def is_magnitude(item: EffectParameter | ShapeParameter) -> TypeGuard[EffectParameter]:
+    """Whether an effect vanishes with a parameter."""
     return isinstance(item, EffectParameter) and item.magnitude
 
 
@@ -273,7 +297,7 @@ def rescaled(change: Change) -> FloatArray:
     start = change.start.copy()
     factor = change.scale
     for number, item in enumerate(change.term.parameters):
-        if not _is_magnitude(item):
+        if not is_magnitude(item):
             continue
         prior = item.prior
         value = prior.value(float(start[number])) * factor

@@ -11,12 +11,12 @@ from scipy.special import logsumexp
 from fe.patch import ModelPatch
 
 from .candidate import Candidate, Term
-from .catalogue.entry import Effect
+from .catalogue.entry import Effect, EffectParameter, ShapeParameter
 from .errors import FitError, ModelError
 from .fitting import Fit, fit
 from .gates import SHAPE_GAIN, absolute_gate
 from .problem import Point, Problem, shortened
-from .screening import Change, Screen, rescaled
+from .screening import Change, Screen, is_magnitude, rescaled
 
 FloatArray = NDArray[np.float64]
 
@@ -38,9 +38,11 @@ PROMISING, LEAST_PROMISING = 0.3, 5
 """Far from the truth, effects are fitted whose screened gain is at least this share of the best one's, and at
 least so many; the others too if none of these fits."""
 PAIRS_FITTED = 8
-RIDGES, RIDGE_STEPS, RIDGE_ITERATIONS, RIDGE_GAIN = 2, (-0.8, -0.3, 0.3, 0.8), 8, 1.0
-"""Candidates whose ridges are followed while they do not fit, steps along one in prior deviations, steps of
-each fit, and the gain [nat] that counts."""
+RIDGES, RIDGE_STEPS, PLACE_STEPS = 2, (-0.8, -0.3, 0.3, 0.8), (-0.15, -0.05, 0.05, 0.15)
+"""Candidates that do not fit whose neighbourhood is searched; steps along the ridge of the least-known
+direction, and of parameters that are not mere sizes, in prior deviations."""
+NEIGHBOUR_ITERATIONS, NEIGHBOUR_GAIN = 8, 1.0
+"""Steps of each of these fits, and the gain [nat] that counts."""
 SOLVER_SHARE, FINEST = 0.1, 8
 """Largest share of the noise that the time steps may cost (rms over a channel of a trial), and how much
 smaller than the model's own they may become for it."""
@@ -172,17 +174,24 @@ class Search:
         Close to the truth one linearisation serves all (chord steps). Far from it phases slip over a long
         record, so that the beginnings of the records are fitted first, and the whole ones from there.
         """
-        found = self._scan_far(base, tuple(effects)) if self._far(base) else self._scan_near(base, effects)
-        for item in found:
+        effects = tuple(effects)
+        found = [] if self._misfits(base) else self._scan_near(base, effects)
+        if self._far(base):
+            found += self._scan_far(base, effects)
+        best: dict[tuple[str, ...], Fit] = {}
+        for item in sorted(found, key=self.score):
             self.keep(item, exact=False)
-        return sorted(found, key=lambda item: -self.score(item))
+            best[item.candidate.identifiers] = item
+        return sorted(best.values(), key=lambda item: -self.score(item))
 
     def _far(self, base: Fit) -> bool:
         """Whether a fit is far from the truth: much is left, or what is shared had to leave its prior."""
         strain = np.abs(base.point.shared[self.problem.shared.precision > 0.0])
-        return bool(
-            base.chi_square > FAR * float(self.problem.counts.sum()) or strain.max(initial=0.0) > STRAINED
-        )
+        return self._misfits(base) or bool(strain.max(initial=0.0) > STRAINED)
+
+    def _misfits(self, base: Fit) -> bool:
+        """Whether much is left by a fit."""
+        return base.chi_square > FAR * float(self.problem.counts.sum())
 
     def _scan_near(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
         found = []
@@ -323,7 +332,7 @@ class Search:
         ranked = self.refine(self.scan(self.none, self.effects), floor)
         for item in ranked[:RIDGES]:
             if not absolute_gate(self.problem, item).passed:
-                self._along_ridge(item)
+                self._around(item)
         self._settle_steps()
         current = self.best()
         if current.candidate.terms and absolute_gate(self.problem, current).passed is False:
@@ -380,32 +389,34 @@ class Search:
                         continue
                     self.exact[key_of(item.candidate)] = again
 
-    def _along_ridge(self, found: Fit) -> Fit:
-        """Look for a better fit of the same candidate along the direction that its data tell least of.
+    def _around(self, found: Fit) -> Fit:
+        """Look for a better fit of the same candidate beside its optimum, and keep it.
 
-        Hysteresis of several elements has many local optima along such a ridge.
+        Hysteresis of several elements has many local optima along the direction that the data tell least of,
+        and a place has them at each sensor that it passes.
         """
-        size = found.candidate.size
-        while size > 1:
-            _, directions = np.linalg.eigh(found.effect_covariance)
-            ridge = directions[:, -1]
+        free = [number for number, item in enumerate(_parameters(found.candidate)) if not is_magnitude(item)]
+        while True:
+            moves = [step * axis for axis in np.eye(found.candidate.size)[free] for step in PLACE_STEPS]
+            if found.candidate.size > 1:
+                _, directions = np.linalg.eigh(found.effect_covariance)
+                moves += [step * directions[:, -1] for step in RIDGE_STEPS]
             better = found
-            for step in RIDGE_STEPS:
-                start = Point(found.point.shared, found.point.local, found.point.effect + step * ridge)
+            for move in moves:
+                start = Point(found.point.shared, found.point.local, found.point.effect + move)
                 try:
                     item = fit(
                         self.problem, found.candidate, start,
-                        iterations=RIDGE_ITERATIONS, give_up=better.objective,
+                        iterations=NEIGHBOUR_ITERATIONS, give_up=better.objective,
                     )  # fmt: skip
                 except (FitError, ModelError):
                     continue
-                if item.objective < better.objective - RIDGE_GAIN:
+                if item.objective < better.objective - NEIGHBOUR_GAIN:
                     better = item
             if better is found:
-                break
+                return found
             found = better
             self.keep(found, exact=True)
-        return found
 
     def _extended(self, current: Fit) -> Fit | None:
         """Return a better set with one more effect, or None."""
@@ -461,6 +472,10 @@ class Search:
                     self.keep(fit(self.problem, less, start), exact=True)
                 except (FitError, ModelError):
                     continue
+
+
+def _parameters(candidate: Candidate) -> list[EffectParameter | ShapeParameter]:
+    return [item for term in candidate.terms for item in term.parameters]
 
 
 def _worth(change: Change) -> float:

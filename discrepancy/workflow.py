@@ -221,11 +221,14 @@ def open_hypotheses(search: Search, count: int = 5) -> list[tuple[Fit, float]]:
 
 
 def patch_draws(problem: Problem, fit: Fit, seed: int, count: int = DRAWS) -> list[list[ModelPatch]]:
-    """Return for each effect of a fit its patch at draws of the posterior (Laplace)."""
+    """Return for each effect of a fit its patch at draws of the posterior: of the fit, else Gaussian."""
     generator = np.random.default_rng(seed)
-    size = fit.candidate.size
-    root = np.linalg.cholesky(fit.effect_covariance + 1e-15 * np.eye(size))
-    draws = fit.point.effect + generator.standard_normal((count, size)) @ root.T
+    if fit.draws is not None:
+        draws = generator.choice(fit.draws, count)
+    else:
+        size = fit.candidate.size
+        root = np.linalg.cholesky(fit.effect_covariance + 1e-15 * np.eye(size))
+        draws = fit.point.effect + generator.standard_normal((count, size)) @ root.T
     patches: list[list[ModelPatch]] = []
     at = 0
     for term in fit.candidate.terms:

@@ -15,6 +15,10 @@ NINETY = 1.6448536269514722
 """Standard normal quantile of 0.95."""
 
 
+LEAST_SHRINKAGE = 0.3
+"""A step takes no positive value below this share of itself."""
+
+
 @dataclass(frozen=True)
 class Prior:
     """Prior of one number, as a map of a standard normal variable u.
@@ -49,6 +53,16 @@ class Prior:
             return (value - 0.5 * (self.low + self.high)) / (0.5 * (self.high - self.low) / NINETY)
         middle, half = 0.5 * (log(self.low) + log(self.high)), 0.5 * (log(self.high) - log(self.low))
         return (log(value) - middle) / (half / NINETY)
+
+    def stepped(self, u: float, step: float) -> float:
+        """Return the standard normal variable after a step, taken along the value's tangent.
+
+        What follows a value in proportion is far from following its logarithm.
+        """
+        if self.shape != "log_normal":
+            return u + step
+        slope = 0.5 * (log(self.high) - log(self.low)) / NINETY
+        return u + log(max(1.0 + slope * step, LEAST_SHRINKAGE)) / slope
 
 
 @dataclass(frozen=True)

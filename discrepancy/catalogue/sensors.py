@@ -189,6 +189,7 @@ GAUGE_MISALIGNMENT = Effect(
             "angle from the spanwise direction, in the skin",
             Prior("normal", -15.0 * pi / 180.0, 15.0 * pi / 180.0),
             magnitude=True,
+            levels=2,  # shear makes the two senses differ
         ),
     ),
     build=_misalignment,
