@@ -13,6 +13,9 @@ from .catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
 
 FloatArray = NDArray[np.float64]
 
+FREE_SHAPE = " (free shape)"
+"""What marks the identifier of an effect whose shape is free: its family."""
+
 
 @dataclass(frozen=True)
 class Term:
@@ -31,6 +34,11 @@ class Term:
     effect: Effect
     place: str = ""
     free_shape: bool = False
+
+    @property
+    def label(self) -> str:
+        """The effect's identifier, marked where its shape is free."""
+        return self.effect.identifier + (FREE_SHAPE if self.free_shape else "")
 
     @property
     def parameters(self) -> tuple[EffectParameter | ShapeParameter, ...]:
@@ -61,8 +69,13 @@ class Candidate:
 
     @property
     def identifiers(self) -> tuple[str, ...]:
-        """Identifiers of the effects, sorted."""
-        return tuple(sorted(term.effect.identifier for term in self.terms))
+        """Identifiers of the effects, sorted; those of free shape are marked by `FREE_SHAPE`."""
+        return tuple(sorted(term.label for term in self.terms))
+
+    @property
+    def is_family(self) -> bool:
+        """Whether a shape is free."""
+        return any(term.free_shape for term in self.terms)
 
     @property
     def size(self) -> int:
@@ -108,7 +121,3 @@ class Candidate:
     def without(self, index: int) -> "Candidate":
         """Return this set less one effect."""
         return Candidate(self.terms[:index] + self.terms[index + 1 :])
-
-    def freed(self) -> "Candidate":
-        """Return the families of these effects: all shapes free."""
-        return Candidate(tuple(Term(term.effect, term.place, True) for term in self.terms))

@@ -4,13 +4,13 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from .candidate import Candidate, Term
+from .candidate import FREE_SHAPE, Candidate
 from .catalogue.entry import NINETY, Effect
-from .fitting import Fit, fit
+from .fitting import Fit
 from .gates import SHAPE_GAIN, absolute_gate, shape_gate
 from .posterior import with_draws
-from .problem import Point, Problem
-from .search import Search, search
+from .problem import Problem
+from .search import Search, free_shape, search
 from .verdict import Estimate, Gate, Hypothesis, NamedEffect, Verdict, VerdictKind
 
 SURE = 0.95
@@ -40,18 +40,16 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         All candidates.
     Fit
         The one that stands for the verdict: of the named set, of the family, of the most probable member of a
-        group, of the nearest set where nothing reaches the probability of a name, or the one without effect.
+        group or of what is too small to tell; else the one without effect.
     """
     found = search(problem, effects)
-    probabilities = found.set_probabilities()
+    probabilities = _settled_probabilities(found)
     top, p_top = next(iter(probabilities.items()))
-    best = found.best()
-    if top and best.candidate.identifiers != top:  # a set that is probable by its many places together
-        best = _best_of(found, top)
+    best = _best_of(found, top) if top else found.best()
     bayes = _single_evidence(found, best) - found.none.log_evidence
     hypotheses = _hypotheses(problem, found, probabilities)
     inclusion = {
-        effect.identifier: sum(p for names, p in probabilities.items() if effect.identifier in names)
+        effect.identifier: sum(p for names, p in probabilities.items() if effect.identifier in _plain(names))
         for effect in found.effects
     }
 
@@ -66,18 +64,24 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
             **more,  # type: ignore[arg-type]
         )
 
+    def family_of(fit: Fit, gates: tuple[Gate, ...]) -> tuple[Verdict, Search, Fit]:
+        drawn = with_draws(problem, fit)
+        named = named_effects(problem, drawn)
+        text, sentence = _family(named)
+        more = {"effects": named, "family": text, "gates": gates}
+        return verdict(VerdictKind.FAMILY, sentence, p_top, **more), found, drawn
+
+    def unexplained(sentence: str, gates: tuple[Gate, ...]) -> tuple[Verdict, Search, Fit]:
+        more = {"gates": gates, "resembles": top}
+        return verdict(VerdictKind.UNEXPLAINED, sentence, p_top, **more), found, found.none
+
     none_gate = absolute_gate(problem, found.none)
     p_none = probabilities.get((), 0.0)
     if not top or (bayes < BAYES_FACTOR and none_gate.passed is not False):
         if none_gate.passed is False:
-            return (
-                verdict(
-                    VerdictKind.UNEXPLAINED,
-                    f"There is a gap ({none_gate.reason}) that no effect of the catalogue explains.",
-                    p_none, gates=(none_gate,),
-                ),
-                found, found.none,
-            )  # fmt: skip
+            return unexplained(
+                f"There is a gap that no effect of the catalogue explains. {none_gate.reason}", (none_gate,)
+            )
         if top and p_none < UNSURE:
             return _open(problem, found, probabilities, verdict, best)
         return (
@@ -92,62 +96,58 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
             found, found.none,
         )  # fmt: skip
 
-    if found.family is not None and bayes >= BAYES_FACTOR:
-        drawn = with_draws(problem, found.family)
-        named = named_effects(problem, drawn)
-        text, sentence = _family(named)
-        return (
-            verdict(
-                VerdictKind.FAMILY,
-                sentence,
-                p_top,
-                effects=named,
-                family=text,
-                gates=(absolute_gate(problem, drawn), shape_gate(best, drawn)),
-            ),
-            found,
-            drawn,
-        )
-    gate = absolute_gate(problem, best)
     # sets that hold the best one and more agree with it; they only leave a further effect open
-    p_top = sum(p for names, p in probabilities.items() if set(top) <= set(names))
-    if p_top >= SURE and bayes >= BAYES_FACTOR:
-        shape, family = _shape(found, best)
-        if gate.passed is not False and shape.passed:
-            best = with_draws(problem, best)
-            named = named_effects(problem, best)
-            return (
-                verdict(
-                    VerdictKind.NAMED, _named_sentence(named, p_top, gate), p_top,
-                    effects=named, gates=(gate, shape),
-                ),
-                found, best,
-            )  # fmt: skip
-        if family is not None and not shape.passed:
-            family_gate = absolute_gate(problem, family)
-            if family_gate.passed is not False:
-                family = with_draws(problem, family)
-                named = named_effects(problem, family)
-                text, sentence = _family(named)
-                return (
-                    verdict(
-                        VerdictKind.FAMILY, sentence,
-                        p_top, effects=named, family=text, gates=(family_gate, shape),
-                    ),
-                    found, family,
-                )  # fmt: skip
-            gate = family_gate
-        return (
-            verdict(
-                VerdictKind.UNEXPLAINED,
-                f"There is a gap that no effect of the catalogue fits; the nearest is "
-                f"{' with '.join(top)}, but {gate.reason[0].lower()}{gate.reason[1:]}",
-                p_top, gates=(gate, shape), resembles=top,
-            ),
-            found, found.none,
-        )  # fmt: skip
+    p_top = sum(p for names, p in probabilities.items() if set(_plain(top)) <= set(_plain(names)))
+    if p_top < SURE or bayes < BAYES_FACTOR:
+        return _open(problem, found, probabilities, verdict, best)
+    gate = absolute_gate(problem, best)
+    if best.candidate.is_family:
+        return family_of(best, (gate,))
+    shape, family = _shape(found, best)
+    if gate.passed is not False and shape.passed:
+        best = with_draws(problem, best)
+        named = named_effects(problem, best)
+        more = {"effects": named, "gates": (gate, shape)}
+        return verdict(VerdictKind.NAMED, _named_sentence(named, p_top, gate), p_top, **more), found, best
+    if family is not None and not shape.passed:
+        gate = absolute_gate(problem, family)
+        if gate.passed is not False:
+            return family_of(family, (gate, shape))
+    return unexplained(
+        f"There is a gap that no effect of the catalogue fits; the nearest is {' with '.join(top)}, but "
+        f"{gate.reason[0].lower()}{gate.reason[1:]}",
+        (gate, shape),
+    )
 
-    return _open(problem, found, probabilities, verdict, best)
+
+def _settled_probabilities(found: Search) -> dict[tuple[str, ...], float]:
+    """Return the probabilities of sets, those that matter fitted exactly: few steps give rough evidence."""
+    probabilities = found.set_probabilities()
+    for _ in range(LARGEST_GROUP):
+        exact = {item.candidate.identifiers for item in found.exact.values()}
+        rough = [names for names in _members(probabilities) if names not in exact]
+        if not rough:
+            break
+        _best_of(found, rough[0])
+        probabilities = found.set_probabilities()
+    return probabilities
+
+
+def _members(probabilities: Mapping[tuple[str, ...], float]) -> list[tuple[str, ...]]:
+    """Return the most probable sets that together reach the probability of a name."""
+    members: list[tuple[str, ...]] = []
+    total = 0.0
+    for names, p in probabilities.items():
+        members.append(names)
+        total += p
+        if total >= SURE:
+            break
+    return members
+
+
+def _plain(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return identifiers without the mark of a free shape."""
+    return tuple(name.removesuffix(FREE_SHAPE) for name in names)
 
 
 def _open(
@@ -158,13 +158,8 @@ def _open(
     best: Fit,
 ) -> tuple[Verdict, Search, Fit]:
     """Return the verdict where no set reaches the probability that a name needs, as `name` does."""
-    members: list[tuple[str, ...]] = []
-    total = 0.0
-    for names, p in probabilities.items():
-        members.append(names)
-        total += p
-        if total >= SURE:
-            break
+    members = _members(probabilities)
+    total = sum(probabilities[names] for names in members)
     fits = [_best_of(found, names) for names in members]
     if () in members:
         hints = sorted({name for names in members for name in names})
@@ -187,12 +182,12 @@ def _open(
         return (
             verdict(
                 VerdictKind.UNEXPLAINED,
-                "There is a gap that no effect of the catalogue fits."
+                f"There is a gap that no effect of the catalogue fits. {gates[0].reason}"
                 if not fitting
                 else f"There is a gap, and {len(fitting)} explanations fit it alike.",
                 total, gates=(gates[0],), resembles=members[0],
             ),
-            found, best,
+            found, found.none,
         )  # fmt: skip
     # those that do not fit take their probability with them
     together = sum(probabilities[names] for names, _, _ in fitting)
@@ -200,7 +195,7 @@ def _open(
     effects = tuple(effect for _, item, _ in fitting for effect in named_effects(problem, item))
     _, nearest, gate = fitting[0]
     sentence = (
-        f"One of {', '.join(group)} is missing; these data cannot tell which."
+        f"Either {', '.join(group[:-1])} or {group[-1]} is missing; these data cannot tell which."
         if len(group) > 1
         else f"There is a gap that {group[0]} fits, but not with the probability that a name needs."
     )
@@ -227,17 +222,10 @@ def _single_evidence(found: Search, best: Fit) -> float:
 def _shape(found: Search, best: Fit) -> tuple[Gate, Fit | None]:
     """Free the shape of each effect of the best set in turn; return the outcome that matters most."""
     outcome, kept = shape_gate(best, None), None
-    for index, term in enumerate(best.candidate.terms):
-        if not term.effect.shape:
+    for number in range(len(best.candidate.terms)):
+        family = free_shape(found.problem, best, number)
+        if family is None:
             continue
-        terms = list(best.candidate.terms)
-        terms[index] = Term(term.effect, term.place, free_shape=True)
-        parts = list(best.candidate.parts(best.point.effect))
-        shape = [item.prior.normal(item.canonical) for item in term.effect.shape]
-        parts[index] = np.concatenate((parts[index], shape))
-        start = Point(best.point.shared, best.point.local, np.concatenate(parts))
-        freed = Candidate(tuple(terms))
-        family = fit(found.problem, freed, start)
         gate = shape_gate(best, family)
         if kept is None or gate.statistic > outcome.statistic:
             outcome, kept = gate, family

@@ -2,9 +2,9 @@
 
 Hysteresis far below its slip force shows one combination of its parameters only: the posterior is a long,
 bent ridge with many small optima on it, and the curvature at one of them says nothing of its length. The
-nuisances adapt to first order at every draw (`Screen.rise`), so that a draw costs one evaluation of the model;
-where a record's phases bend the valley, the misfit rises faster than it would if they adapted fully, so that
-only posteriors that are wider than Gaussian are drawn from.
+nuisances adapt to first order at every draw (`Screen.rise`), so that a draw costs one evaluation of the
+model; where a record's phases bend the valley, the misfit rises faster than it would if they adapted fully,
+so that only posteriors that are wider than Gaussian are drawn from.
 """
 
 from collections.abc import Callable

@@ -68,7 +68,7 @@ Key = tuple[tuple[str, str], ...]
 
 def key_of(candidate: Candidate) -> Key:
     """Return what tells candidates apart: sorted (identifier, place)."""
-    return tuple(sorted((term.effect.identifier, term.place) for term in candidate.terms))
+    return tuple(sorted((term.label, term.place) for term in candidate.terms))
 
 
 @dataclass
@@ -89,8 +89,6 @@ class Search:
         Fitted by few steps only; their evidence is approximate.
     beginnings : Problem or None
         The problem with the beginnings of its records, once it was needed.
-    family : Fit or None
-        The family of the most probable effect with a free shape, where it alone explains the data.
     """
 
     problem: Problem
@@ -99,7 +97,6 @@ class Search:
     exact: dict[Key, Fit] = field(default_factory=dict)
     rough: dict[Key, Fit] = field(default_factory=dict)
     beginnings: Problem | None = None
-    family: Fit | None = None
 
     def __post_init__(self) -> None:
         self.exact[()] = self.none
@@ -107,13 +104,17 @@ class Search:
     # ---------------------------------------------------------------- probabilities
 
     def log_prior(self, candidate: Candidate) -> float:
-        """Return ln of the prior probability of a candidate at its places."""
+        """Return ln of the prior probability of a candidate at its places.
+
+        A free shape has to gain what the shape gate asks for.
+        """
         count = len(candidate.terms)
         if count == 0:
             return log(PRIOR_NONE)
         sets = comb(len(self.effects), count)
         places = sum(log(self._places(term.effect)) for term in candidate.terms)
-        return log((1.0 - PRIOR_NONE) * SET_SHARES[count - 1] / sets) - places
+        free = sum(SHAPE_GAIN for term in candidate.terms if term.free_shape)
+        return log((1.0 - PRIOR_NONE) * SET_SHARES[count - 1] / sets) - places - free
 
     def _places(self, effect: Effect) -> int:
         return len(effect.places(self.problem.setting))
@@ -336,8 +337,8 @@ class Search:
         self._settle_steps()
         current = self.best()
         if current.candidate.terms and absolute_gate(self.problem, current).passed is False:
-            self.family = self._family(current)
-            if self.family is not None:
+            self._families()
+            if self.best().candidate.is_family:
                 return
         while current.candidate.terms and len(current.candidate.terms) < LARGEST_SET:
             if len(current.candidate.terms) > 1 and self._far(current):
@@ -351,28 +352,24 @@ class Search:
         self._deletions()
         self._settle_steps()
 
-    def _family(self, named: Fit) -> Fit | None:
-        """Return the free-shape family of an effect where it explains the data and the effect does not.
+    def _families(self) -> None:
+        """Fit the free-shape families of the single effects that come closest, and keep those that fit.
 
         A law with a shape of its own is a simpler cause than two laws, so it is tried before pairs are.
         """
-        freed = named.candidate.freed()
-        if freed.size == named.candidate.size:
-            return None
-        effect = np.concatenate(
-            [
-                np.concatenate((part, [item.prior.normal(item.canonical) for item in term.effect.shape]))
-                for term, part in zip(
-                    named.candidate.terms, named.candidate.parts(named.point.effect), strict=True
-                )
-            ]
-        )
-        try:
-            found = fit(self.problem, freed, Point(named.point.shared, named.point.local, effect))
-        except (FitError, ModelError):
-            return None
-        gained = found.log_evidence - named.log_evidence > SHAPE_GAIN
-        return found if gained and absolute_gate(self.problem, found).passed is not False else None
+        singles = [item for item in self.exact.values() if len(item.candidate.terms) == 1]
+        kept: dict[tuple[str, str], Fit] = {}
+        for named in sorted(singles, key=self.score, reverse=True)[:EXACT_FITS]:
+            family = free_shape(self.problem, named, 0)
+            if family is None or family.log_evidence - named.log_evidence <= SHAPE_GAIN:
+                continue
+            (term,) = family.candidate.terms
+            key = (term.effect.family, term.place)  # members of a family are the same law once it is free
+            better = key not in kept or self.score(kept[key]) < self.score(family)
+            if better and absolute_gate(self.problem, family).passed is not False:
+                kept[key] = family
+        for family in kept.values():
+            self.keep(family, exact=True)
 
     def _settle_steps(self) -> None:
         """Halve the time steps while they cost the best candidate too much, and fit the best ones again."""
@@ -472,6 +469,36 @@ class Search:
                     self.keep(fit(self.problem, less, start), exact=True)
                 except (FitError, ModelError):
                     continue
+
+
+def free_shape(problem: Problem, named: Fit, number: int) -> Fit | None:
+    """Fit the family of one effect of a fit: its shape free, from the canonical one.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the fit.
+    named : Fit
+        With canonical shapes.
+    number : int
+        Of the effect among its terms.
+
+    Returns
+    -------
+    Fit or None
+        None where no shape is to free, or the structure cannot follow.
+    """
+    terms, parts = list(named.candidate.terms), list(named.candidate.parts(named.point.effect))
+    effect = terms[number].effect
+    if not effect.shape:
+        return None
+    terms[number] = Term(effect, terms[number].place, free_shape=True)
+    parts[number] = np.append(parts[number], [item.prior.normal(item.canonical) for item in effect.shape])
+    start = Point(named.point.shared, named.point.local, np.concatenate(parts))
+    try:
+        return fit(problem, Candidate(tuple(terms)), start)
+    except (FitError, ModelError):
+        return None
 
 
 def _parameters(candidate: Candidate) -> list[EffectParameter | ShapeParameter]:

@@ -144,6 +144,10 @@ def investigate(
         verdict, search, fit = name(problem, load_catalogue() if effects is None else effects)
     remarks = [fault.sentence for fault in faults] + list(campaign.remarks)
     remarks += strained(problem, fit)
+    if fit.candidate.terms and not fit.converged:
+        remarks.append(
+            "The fit of the verdict had not settled when it ended: its intervals may be too narrow."
+        )
     with stage("Checking the time steps", "steps"):
         share = solver_share(problem, fit)
         if share > SOLVER_SHARE:

@@ -13,7 +13,6 @@ from discrepancy.catalogue.building import (
     at_strain_channels,
     campaign_times,
     channels,
-    gauges,
     largest_reading,
     needs,
     somewhere,
@@ -54,8 +53,8 @@ def _zero_drift(setting: Setting, values: Mapping[str, float], place: str) -> Mo
 
 
 def _calibrated(setting: Setting) -> tuple[str, ...]:
-    """Return the gauges whose gain is known at all: a free gain absorbs an error of it."""
-    return tuple(channel.name for channel in gauges(setting) if not isinf(channel.gain_deviation))
+    """Return the channels whose gain is known at all: a free gain absorbs an error of it."""
+    return tuple(channel.name for channel in channels(setting) if not isinf(channel.gain_deviation))
 
 
 def _gauge_gain(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
@@ -149,9 +148,9 @@ GAUGE_ZERO_DRIFT = Effect(
 
 GAUGE_GAIN = Effect(
     identifier="gauge_gain",
-    name="gain error of a gauge",
+    name="gain error of a sensor",
     family="sensor gain",
-    equation="eps -> (1 + g) eps",
+    equation="y -> (1 + g) y",
     signature="One channel is off by the same share in every trial.",
     reference="Hoffmann 1989, An Introduction to Measurements using Strain Gages",
     acts_on=EVERY_TRIAL,
@@ -160,7 +159,7 @@ GAUGE_GAIN = Effect(
             "gain_error",
             "g",
             "1",
-            "relative error of the gauge factor and amplifier",
+            "relative error of the gauge factor or sensitivity, and amplifier",
             Prior("normal", -0.15, 0.15),
             magnitude=True,
         ),

@@ -332,7 +332,7 @@ def test_hidden_gain_is_named_and_nothing_where_nothing_is(rig: FmuModel, lumped
         campaign(rig, lumped, SensorGain("leaf_strain", 0.08)), rig, some_effects(), thorough=False
     )
     assert found.verdict.kind is VerdictKind.NAMED
-    assert "gain error of a gauge at leaf_strain" in found.verdict.sentence
+    assert "gain error of a sensor at leaf_strain" in found.verdict.sentence
     clean = investigate(campaign(rig, lumped, None), rig, some_effects(), thorough=False)
     assert clean.verdict.kind is VerdictKind.NOTHING_MISSING
 
