@@ -22,7 +22,7 @@ LARGEST_EFFECT = 8.0
 CONVERGED = 1e-2
 """A step that promises less than this [nat] ends a fit."""
 STEP_SHARES = (1.0, 0.3)
-"""Shares of a step that are tried before the damping grows."""
+"""Shares of a step that are tried before the damping grows; chord steps are rough and try the first only."""
 CREEPING, NEAR_END = 0.2, 30.0
 """Derivatives are renewed where a step promises less than `NEAR_END` [nat], but more than this share of what
 the one before it promised: close to the end, promises should fall fast."""
@@ -278,7 +278,7 @@ class _Descent:
         second step with the same derivatives leads back to the bottom (the second-order correction of
         Transtrum and Sethna 2012, arXiv:1201.5885, with the whole step as difference).
         """
-        for share in STEP_SHARES:
+        for share in STEP_SHARES if self.base is None else STEP_SHARES[:1]:
             try:
                 ahead = _ahead(self.candidate, state.point, step, share)
                 proposal = self.state(ahead, derivatives=False)

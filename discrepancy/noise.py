@@ -6,7 +6,7 @@ are not counted as evidence. Lines of the mains are taken out first: they are an
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import inf
+from math import ceil, inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,10 @@ FloatArray = NDArray[np.float64]
 
 MAINS = (50.0, 60.0, 400.0)
 """Mains frequencies [Hz], of land and aircraft: an effect, and looked for in noise records."""
+MAINS_DEVIATION = 1e-3
+"""Share of its frequency by which the mains may be off."""
+LINE_STEPS = 4
+"""Frequencies that are tried within the resolution of a record."""
 LARGEST_ORDER = 12
 WHITE_LEVEL = 1e-6
 """Noise is taken as white unless the Ljung-Box test of the record rejects it at this level.
@@ -135,28 +139,45 @@ def noise_model(channel: Channel, fallback: float) -> NoiseModel:
 
 
 def without_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tuple[float, ...]]:
-    """Return the record without the mains lines that stand out of it, and their frequencies [Hz]."""
+    """Return the record without the mains lines that stand out of it, and their nominal frequencies [Hz].
+
+    The mains wander by `MAINS_DEVIATION` of their frequency, which a long record resolves.
+    """
     found: list[float] = []
     rest = samples
-    time = interval * np.arange(len(samples))
+    resolution = 1.0 / (len(samples) * interval)
     for frequency in MAINS:
         shown = aliased(frequency, interval)
-        resolution = 1.0 / (len(samples) * interval)
         if shown < 2.0 * resolution or shown > 0.5 / interval - 2.0 * resolution:
             continue
-        waves = np.stack((np.cos(2.0 * np.pi * shown * time), np.sin(2.0 * np.pi * shown * time)), axis=1)
-        amplitude, *_ = np.linalg.lstsq(waves, rest, rcond=None)
-        line = waves @ amplitude
+        reach = MAINS_DEVIATION * frequency
+        tried = shown + np.linspace(-reach, reach, 2 * ceil(LINE_STEPS * reach / resolution) + 1)
+        tried = tried[(tried > resolution) & (tried < 0.5 / interval - resolution)]
+        lines = [_line(rest, interval, float(candidate)) for candidate in tried]
+        line = max(lines, key=lambda item: float(item @ item))
         left = rest - line
         # against the neighbourhood of the line, so that coloured noise is not taken for one
         spectrum = np.abs(np.fft.rfft(left)) ** 2
         index = round(shown / resolution)
-        near = np.r_[spectrum[max(1, index - 12) : max(1, index - 2)], spectrum[index + 3 : index + 13]]
+        wide = 3 + ceil(reach / resolution)
+        near = np.r_[
+            spectrum[max(1, index - wide - 9) : max(1, index - wide + 1)],
+            spectrum[index + wide : index + wide + 10],
+        ]
         level = near.mean() * 2.0 / len(samples)  # mean power that a line of noise alone takes from the sum
-        if level > 0.0 and line @ line > 0.5 * chi2.isf(LINE_LEVEL, 2) * level:
+        independent = 1.0 + 2.0 * reach / resolution
+        if level > 0.0 and line @ line > 0.5 * chi2.isf(LINE_LEVEL / independent, 2) * level:
             found.append(frequency)
             rest = left
     return rest, tuple(found)
+
+
+def _line(samples: FloatArray, interval: float, frequency: float) -> FloatArray:
+    """Return the line of a frequency in a record, by least squares."""
+    phase = 2.0 * np.pi * frequency * interval * np.arange(len(samples))
+    waves = np.stack((np.cos(phase), np.sin(phase)), axis=1)
+    amplitude, *_ = np.linalg.lstsq(waves, samples, rcond=None)
+    return np.asarray(waves @ amplitude)
 
 
 def ljung_box(series: FloatArray, lags: int, fitted: int = 0) -> float:

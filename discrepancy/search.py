@@ -34,6 +34,8 @@ WORTH_FITTING = 2.0
 """Screened gain below which an effect is not fitted at all: it could not win a name [nat]."""
 WORTH_ADDING = 4.0
 """The same for one more effect, whose prior is smaller."""
+OUT_OF_REACH = 3.0 * CLOSE
+"""Chord steps end where they have no prospect to come within this of the best [nat]."""
 PROMISING, LEAST_PROMISING = 0.3, 5
 """Far from the truth, effects are fitted whose screened gain is at least this share of the best one's, and at
 least so many; the others too if none of these fits."""
@@ -177,7 +179,7 @@ class Search:
         """
         effects = tuple(effects)
         found = [] if self._misfits(base) else self._scan_near(base, effects)
-        if self._far(base):
+        if self._far(base) and not any(absolute_gate(self.problem, item).passed for item in found):
             found += self._scan_far(base, effects)
         best: dict[tuple[str, ...], Fit] = {}
         for item in sorted(found, key=self.score):
@@ -197,19 +199,21 @@ class Search:
     def _scan_near(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
         found = []
         least = WORTH_ADDING if base.candidate.terms else WORTH_FITTING
-        screened = self.screened(base, effects)
-        enough = PROMISING * max(
-            (change.gain for changes in screened.values() for change in changes), default=0.0
-        )
-        for changes in screened.values():
+        ranked = [changes for changes in self.screened(base, effects).values() if changes]
+        ranked.sort(key=lambda changes: -max(change.gain for change in changes))
+        enough = PROMISING * max((change.gain for change in ranked[0]), default=0.0) if ranked else 0.0
+        prospect = base.objective - (least if base.candidate.terms else 0.0)
+        for changes in ranked:
             fits = []
             for change in changes:
                 if change.gain < least:
                     continue
+                candidate = base.candidate.plus(change.term)
                 try:
-                    fits.append(self.roughly(base, base.candidate.plus(change.term), rescaled(change)))
+                    fits.append(self.roughly(base, candidate, rescaled(change), give_up=prospect))
                 except (FitError, ModelError):  # the best scale is more than the structure can carry
                     continue
+                prospect = min(prospect, fits[-1].objective + OUT_OF_REACH)
             if fits:
                 best = max(fits, key=self.score)
                 gain = max(change.gain for change in changes)
@@ -243,12 +247,16 @@ class Search:
         """Fit effects to the beginnings of the records, the best of them to whole records."""
         starts = []
         for changes in ranked:
-            fits = [
-                self._shortly(near, base.candidate.plus(change.term), rescaled(change)) for change in changes
-            ]
-            found = [item for item in fits if item is not None]
-            if found:
-                starts.append(min(found, key=lambda item: item.objective))
+            best = None
+            for change in changes:
+                candidate = base.candidate.plus(change.term)
+                item = self._shortly(
+                    near, candidate, rescaled(change), None if best is None else best.objective
+                )
+                if item is not None and (best is None or item.objective < best.objective):
+                    best = item
+            if best is not None:
+                starts.append(best)
         return self._whole(starts, base.objective)
 
     def _near(self, base: Fit) -> Fit:
@@ -263,11 +271,15 @@ class Search:
         )
         return fit(self._short(), base.candidate, expected, local_only=True, evidence=False)
 
-    def _shortly(self, near: Fit, candidate: Candidate, added: FloatArray) -> Fit | None:
+    def _shortly(
+        self, near: Fit, candidate: Candidate, added: FloatArray, give_up: float | None = None
+    ) -> Fit | None:
         """Fit a candidate to the beginnings, or return None where the structure cannot follow."""
         start = Point(near.point.shared, near.point.local, np.concatenate((near.point.effect, added)))
         try:
-            return fit(self._short(), candidate, start, iterations=SHORT_STEPS, evidence=False)
+            return fit(
+                self._short(), candidate, start, iterations=SHORT_STEPS, evidence=False, give_up=give_up
+            )
         except (FitError, ModelError):
             return None
 
@@ -298,10 +310,12 @@ class Search:
             self.beginnings = self.problem.with_trials(tuple(trials))
         return self.beginnings
 
-    def roughly(self, base: Fit, candidate: Candidate, added: FloatArray) -> Fit:
-        """Fit a candidate by chord steps from a base."""
+    def roughly(
+        self, base: Fit, candidate: Candidate, added: FloatArray, *, give_up: float | None = None
+    ) -> Fit:
+        """Fit a candidate by chord steps from a base; see `fit` for `give_up`."""
         start = Point(base.point.shared, base.point.local, np.concatenate((base.point.effect, added)))
-        return fit(self.problem, candidate, start, base=base.base, iterations=CHORD_STEPS)
+        return fit(self.problem, candidate, start, base=base.base, iterations=CHORD_STEPS, give_up=give_up)
 
     def exactly(self, rough: Fit) -> Fit:
         """Fit a candidate to convergence from a rough fit, and keep it."""

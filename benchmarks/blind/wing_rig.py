@@ -114,8 +114,22 @@ class WingRig:
     def _ports(self, basis: WingBasis) -> dict[str, FloatArray]:
         ports = {"root": basis.root, "tip": basis.displacement[LOAD_POINT]}
         ports |= {f"line{k}": row for k, row in enumerate(basis.line[2])}
-        ports["span"] = self.area_shares() @ basis.line[2][list(self.strips)]
+        ports["span"] = self.mean_weights() @ basis.line[2]
         return ports
+
+    def mean_weights(self) -> FloatArray:
+        """Weights (K,) of the displacements of the stations whose sum is the mean over the planform.
+
+        Inboard of the first station, where the root bends too, it grows as the distance to the power 3/2.
+        """
+        stations, plan = self.store.basis().stations, self.design.planform
+        taper = (plan.tip_chord - plan.root_chord) / plan.semi_span
+        width = np.zeros(len(stations))
+        width[:-1] += 0.5 * np.diff(stations)
+        width[1:] += 0.5 * np.diff(stations)
+        weights = width * (plan.root_chord + taper * stations)
+        weights[0] += stations[0] * (plan.root_chord / 2.5 + taper * stations[0] / 3.5)
+        return np.asarray(weights / (0.5 * (plan.root_chord + plan.tip_chord) * plan.semi_span))
 
     def _at(self, basis: WingBasis, station: float) -> FloatArray:
         """Displacement (3, r) of the straight chord line at a station, straight between mesh lines."""
