@@ -115,7 +115,8 @@ def test_grids_hold_one_scale_and_every_level(catalogue) -> None:  # type: ignor
             first = effect.parameters[magnitudes[0]]
             found = {float(point[magnitudes[0]]) for point in points}
             if first.levels:
-                assert len(found) == first.levels and min(found) == pytest.approx(-max(found))
+                assert len(found) == first.levels
+                assert min(found) == pytest.approx(-max(found))
             else:
                 assert found == ({1.0, LINEAR} if signed else {0.0})
         # none of them is the model as it was
