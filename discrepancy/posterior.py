@@ -79,7 +79,12 @@ def _reached(energy: Callable[[FloatArray], float], centre: FloatArray, axis: Fl
 
 
 def ensemble(
-    energy: Callable[[FloatArray], float], centre: FloatArray, axes: FloatArray, seed: int = SEED
+    energy: Callable[[FloatArray], float],
+    centre: FloatArray,
+    axes: FloatArray,
+    *,
+    sweeps: int = SWEEPS,
+    seed: int = SEED,
 ) -> FloatArray:
     """Return draws by stretch moves of an ensemble (Goodman and Weare 2010, CAMCoS 5 (1), 65-80).
 
@@ -91,6 +96,8 @@ def ensemble(
         Where the ensemble begins.
     axes : (E, E) ndarray
         Columns along which it is spread at first.
+    sweeps : int
+        Moves of each member; the first `SETTLING` are left out.
     seed : int
         Of the moves.
 
@@ -108,7 +115,7 @@ def ensemble(
     walkers[stranded], values[stranded] = centre, energy(centre)
     kept = []
     half = count // 2
-    for sweep in range(SWEEPS):
+    for sweep in range(sweeps):
         for moving, others in ((slice(0, half), slice(half, count)), (slice(half, count), slice(0, half))):
             for index in range(count)[moving]:
                 other = walkers[generator.integers(*others.indices(count)[:2])]

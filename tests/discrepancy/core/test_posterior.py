@@ -1,0 +1,92 @@
+"""Draws from posteriors: known densities, quadratic misfits, and a ripple that hides how wide one is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import sin
+
+import numpy as np
+import pytest
+
+from discrepancy.candidate import Candidate, Term
+from discrepancy.catalogue.entry import Effect
+from discrepancy.fitting import fit
+from discrepancy.naming import named_effects
+from discrepancy.posterior import ensemble, with_draws
+from discrepancy.screening import Screen
+from discrepancy.workflow import patch_draws
+from fe.patch import ModelPatch, RunOffset
+
+RIPPLES = 600.0
+"""Waves of the ripple in a metre, over 2 pi."""
+
+
+def test_ensembles_have_the_moments_of_a_gaussian() -> None:
+    """Spread a hundredth of what it should be at first."""
+    root = np.array([[1.0, 0.0], [0.9, 0.2]])
+    precision = np.linalg.inv(root @ root.T)
+    draws = ensemble(
+        lambda x: 0.5 * float((x - 1.0) @ precision @ (x - 1.0)), np.ones(2), 0.01 * np.eye(2), seed=4
+    )
+    np.testing.assert_allclose(draws.mean(axis=0), 1.0, atol=0.35)
+    np.testing.assert_allclose(draws.std(axis=0), np.sqrt(np.diag(root @ root.T)), rtol=0.35)
+    again = ensemble(
+        lambda x: 0.5 * float((x - 1.0) @ precision @ (x - 1.0)), np.ones(2), 0.01 * np.eye(2), seed=4
+    )
+    assert draws.tobytes() == again.tobytes()
+
+
+def test_ensembles_follow_a_bent_ridge() -> None:
+    draws = ensemble(
+        lambda x: 0.5 * x[0] ** 2 + 0.5 * ((x[1] - x[0] ** 2) / 0.2) ** 2,
+        np.zeros(2),
+        0.1 * np.eye(2),
+        sweeps=400,
+        seed=2,
+    )
+    assert draws[:, 0].std() == pytest.approx(1.0, rel=0.4)
+    assert np.abs(draws[:, 1] - draws[:, 0] ** 2).mean() < 0.2
+
+
+def test_the_misfit_rises_by_the_covariance_where_all_is_linear(kit) -> None:  # type: ignore[no-untyped-def]
+    problem = kit.closed_problem(seed=3, effect=0.2)
+    candidate = Candidate((Term(kit.offset_effect(), "y1"),))
+    found = fit(problem, candidate, problem.start(candidate), iterations=40)
+    screen = Screen(problem, found, record_noise=False)
+    (centre,), deviation = found.point.effect, float(np.sqrt(found.effect_covariance[0, 0]))
+    for steps in (-2.0, 0.5, 1.0):
+        moved = centre + steps * deviation
+        rise = screen.rise(np.array([moved])) + 0.5 * (moved**2 - centre**2)
+        # a fit ends a little beside its optimum
+        assert rise == pytest.approx(0.5 * steps**2, rel=0.01)
+    assert with_draws(problem, found) is found
+
+
+def rippled(kit) -> Effect:  # type: ignore[no-untyped-def]
+    """An offset with a ripple on it, whose slope at an optimum is up to four times that of its course."""
+    smooth = kit.offset_effect()
+
+    def build(setting, values, place):  # type: ignore[no-untyped-def]
+        size = values["offset"]
+        offset = size + 3.0 / RIPPLES * sin(RIPPLES * size)
+        return ModelPatch((RunOffset("A", offset, channel=place, quantity=""),))
+
+    return replace(smooth, identifier="rippled", build=build)
+
+
+def test_intervals_are_as_wide_as_the_posterior_behind_ripples(kit) -> None:  # type: ignore[no-untyped-def]
+    problem = kit.closed_problem(seed=3, effect=0.2)
+    candidate = Candidate((Term(kit.offset_effect(), "y1"),))
+    smooth = fit(problem, candidate, problem.start(candidate), iterations=40)
+    candidate = Candidate((Term(rippled(kit), "y1"),))
+    found = fit(problem, candidate, smooth.point, iterations=40)
+    drawn = with_draws(problem, found)
+    (narrow,) = named_effects(problem, found)[0].parameters
+    (wide,) = named_effects(problem, drawn)[0].parameters
+    (course,) = named_effects(problem, smooth)[0].parameters
+    assert narrow.high - narrow.low < 0.5 * (course.high - course.low)
+    assert wide.high - wide.low == pytest.approx(course.high - course.low, rel=0.3)
+    assert with_draws(problem, found).draws.tobytes() == drawn.draws.tobytes()
+    (patches,) = patch_draws(problem, drawn, seed=1, count=300)
+    offsets = np.array([item.offset for patch in patches for item in patch])
+    assert np.ptp(np.quantile(offsets, (0.05, 0.95))) == pytest.approx(course.high - course.low, rel=0.3)
