@@ -11,6 +11,7 @@ from math import ceil, inf
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
+from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
@@ -153,8 +154,7 @@ def without_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tup
         reach = MAINS_DEVIATION * frequency
         tried = shown + np.linspace(-reach, reach, 2 * ceil(LINE_STEPS * reach / resolution) + 1)
         tried = tried[(tried > resolution) & (tried < 0.5 / interval - resolution)]
-        lines = [_line(rest, interval, float(candidate)) for candidate in tried]
-        line = max(lines, key=lambda item: float(item @ item))
+        line = _strongest_line(rest, interval, tried)
         left = rest - line
         # against the neighbourhood of the line, so that coloured noise is not taken for one
         spectrum = np.abs(np.fft.rfft(left)) ** 2
@@ -170,6 +170,23 @@ def without_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tup
             found.append(frequency)
             rest = left
     return rest, tuple(found)
+
+
+def _strongest_line(samples: FloatArray, interval: float, tried: FloatArray) -> FloatArray:
+    """Return the line of most power near the frequencies (T,) that are tried."""
+
+    def missed(frequency: float) -> float:
+        line = _line(samples, interval, frequency)
+        return -float(line @ line)
+
+    best = float(min(tried, key=missed))
+    if len(tried) > 1:
+        step = float(tried[1] - tried[0])
+        bounds = (best - step, best + step)
+        best = float(
+            minimize_scalar(missed, bounds=bounds, method="bounded", options={"xatol": 1e-3 * step}).x
+        )
+    return _line(samples, interval, best)
 
 
 def _line(samples: FloatArray, interval: float, frequency: float) -> FloatArray:

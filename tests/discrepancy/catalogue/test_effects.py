@@ -16,7 +16,7 @@ from benchmarks.cantilever import LENGTH, TIP, Cantilever, campaign
 from discrepancy.campaign import Campaign, Channel, Quantity, Release, Trial, TrialKind
 from discrepancy.catalogue.clock_and_lines import mains_lines
 from discrepancy.catalogue.damping import loss_integral
-from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Effect, Prior, Setting
 from discrepancy.catalogue.library import library
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import Conditions
@@ -415,3 +415,14 @@ def test_the_campaign_of_these_tests_has_releases() -> None:
     assert [trial.release for trial in campaign().trials if trial.kind is TrialKind.RINGDOWN] == [
         Release(0.08), Release(0.04),
     ]  # fmt: skip
+
+
+@given(st.floats(-3.0, 3.0), st.floats(-2.0, 2.0))
+def test_steps_of_sizes_are_straight_in_the_value(u: float, step: float) -> None:
+    """What grows with a value is followed exactly; no step passes zero; other priors are straight already."""
+    prior = Prior("log_normal", 0.01, 1.0)
+    slope = (prior.value(u + 1e-6) - prior.value(u - 1e-6)) / 2e-6
+    target = prior.value(u) + slope * step
+    reached = prior.value(prior.stepped(u, step))
+    assert reached == pytest.approx(max(target, LEAST_SHRINKAGE * prior.value(u)), rel=1e-6)
+    assert Prior("normal", -1.0, 1.0).stepped(u, step) == u + step

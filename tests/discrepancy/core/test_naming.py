@@ -11,9 +11,11 @@ from scipy.signal import lfilter
 
 from discrepancy.candidate import Candidate, Term
 from discrepancy.fitting import fit
+from discrepancy.gates import SHAPE_GAIN
 from discrepancy.naming import _open, name
 from discrepancy.search import key_of
 from discrepancy.verdict import Verdict, VerdictKind
+from fe.patch import ModelPatch, PowerDamping
 
 NO_NAME = (
     VerdictKind.NOTHING_MISSING,
@@ -216,3 +218,24 @@ def test_members_that_do_not_fit_are_no_part_of_a_group(small, effects) -> None:
     assert verdict.probability == pytest.approx(0.38)
     assert nearest.candidate.identifiers == right
     assert verdict.gates[0].passed
+
+
+# ---------------------------------------------------------------- families
+
+
+def test_a_law_between_two_named_ones_is_their_family_once(small, effects) -> None:  # type: ignore[no-untyped-def]
+    """|v|^0.5 lies between dry friction and viscous damping: one family, beside those of other laws."""
+    law = PowerDamping("end", 1.0, 0.5, 0.0, 1.0, 1.0)
+    campaign = small.measured(3, ModelPatch((law,)))
+    verdict, found, fit = name(small.problem(campaign), effects)
+    assert verdict.kind is VerdictKind.FAMILY, verdict.sentence
+    families = [item for item in found.exact.values() if item.candidate.is_family]
+    laws = [(term.effect.family, term.place) for item in families for term in item.candidate.terms]
+    assert len(laws) == len(set(laws))
+    shape = {item.name: item for effect in verdict.effects for item in effect.shape}
+    assert shape["velocity_exponent"].low < 0.5 < shape["velocity_exponent"].high
+    # what is free pays for it before the data speak
+    for item in families:
+        named = Candidate(tuple(replace(term, free_shape=False) for term in item.candidate.terms))
+        assert found.log_prior(item.candidate) == pytest.approx(found.log_prior(named) - SHAPE_GAIN)
+    assert fit.candidate.is_family

@@ -13,7 +13,15 @@ from scipy.signal import lfilter
 from scipy.stats import binom, kstest
 
 from discrepancy.campaign import Channel, NoiseRecord, Quantity
-from discrepancy.noise import NoiseModel, aliased, autoregression, ljung_box, noise_model, without_lines
+from discrepancy.noise import (
+    MAINS_DEVIATION,
+    NoiseModel,
+    aliased,
+    autoregression,
+    ljung_box,
+    noise_model,
+    without_lines,
+)
 
 INTERVAL = 0.002
 
@@ -154,3 +162,16 @@ def test_whitening_is_that_of_the_whole_covariance(coefficients: tuple[float, ..
     white = noise.whiten(x, INTERVAL)
     np.testing.assert_allclose(white @ white.T, x @ np.linalg.solve(covariance, x.T), rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(noise.whiten(x[:, :2], INTERVAL), white[:, :2], rtol=1e-12)
+
+
+@pytest.mark.parametrize("share", [-0.8, -0.2, 0.5, 1.0])
+def test_lines_are_found_where_the_mains_are_off(share: float) -> None:
+    """A record of 8 s resolves 0.125 Hz, and 400 Hz may be off by 0.4 Hz."""
+    generator = np.random.default_rng(9)
+    time = 1e-3 * np.arange(8000)
+    frequency = 400.0 * (1.0 + share * MAINS_DEVIATION)
+    samples = generator.standard_normal(8000) + 2.0 * np.cos(2.0 * np.pi * frequency * time + 0.3)
+    rest, lines = without_lines(samples, 1e-3)
+    assert lines == (400.0,)
+    assert rest.std() == pytest.approx(1.0, rel=0.03)
+    assert ljung_box(rest, 20) > 1e-3
