@@ -21,6 +21,8 @@ LARGEST_EFFECT = 8.0
 """Effect parameters stay within this many prior deviations of their median."""
 CONVERGED = 1e-2
 """A step that promises less than this [nat] ends a fit."""
+STALLED = 1
+"""So do more than this many steps in a row that gain less, whatever they promised."""
 STEP_SHARES = (1.0, 0.3)
 """Shares of a step that are tried before the damping grows; chord steps are rough and try the first only."""
 CREEPING, NEAR_END = 0.2, 30.0
@@ -177,7 +179,7 @@ def fit(
             f"The model gives values that are not finite for {candidate.identifiers or ('no effect',)}; "
             "check the ranges of its parameters."
         )
-    converged, fresh, before = False, True, np.inf
+    converged, fresh, before, stalled = False, True, np.inf, 0
     for _ in range(iterations):
         step, promised = descent.step(state, damping)
         if not fresh and CREEPING * before < promised < NEAR_END:
@@ -200,7 +202,8 @@ def fit(
                 state, fresh = descent.state(state.point), True
             if give_up is not None and state.objective - 2.0 * promised > give_up:
                 break
-            if gain < CONVERGED and damping < 1e-2 and fresh:
+            stalled = stalled + 1 if gain < CONVERGED and damping < 1e-2 else 0
+            if stalled > STALLED and fresh:
                 converged = True
                 break
         elif not fresh:
