@@ -19,6 +19,8 @@ LARGEST_SHARE = 0.03
 """Largest share of a record in time that may be left out; above it the record is at fault."""
 SIGNIFICANT = 5.0
 """A sample is an outlier if it is this many robust deviations off what its neighbours say."""
+GLITCH = 7.0
+"""The same beside what a model predicts."""
 SIGNIFICANT_ROW = 8.0
 """The same for a row of a static or flight trial, in deviations of the noise record."""
 _SHAPES = ((3, 5), (4, 5), (6, 5), (9, 5), (13, 5), (18, 5), (6, 9), (9, 9), (9, 13), (13, 13), (18, 13))
@@ -125,6 +127,42 @@ def sample_outliers(values: FloatArray, used: BoolArray | None = None) -> BoolAr
     crowded = np.convolve(found, np.ones(5), mode="same") >= 3
     event = np.convolve(crowded, np.ones(5), mode="same") > 0
     result: BoolArray = found & ~event
+    return result
+
+
+def glitches(residual: FloatArray, used: BoolArray) -> BoolArray:
+    """Return which samples of what a model leaves of an even record are single wrong readings, (N,).
+
+    Judges what `sample_outliers` cannot: the ends of a record, and places where the motion is too fast for
+    neighbours to foretell a sample. A wrong model leaves waves, in which neighbours are alike.
+
+    Parameters
+    ----------
+    residual : (N,) ndarray
+        Measured less predicted.
+    used : (N,) ndarray of bool
+        Samples that count.
+    """
+    rows = np.flatnonzero(used)
+    found = np.zeros(len(residual), dtype=bool)
+    if len(rows) < 4 * _EDGE:
+        return found
+    rest = residual[rows]
+    around = np.stack([_shifted(rest, shift) for shift in (-2, -1, 1, 2)])
+    beside = rest - np.nanmedian(around, axis=0)
+    scale = max(_NORMAL * float(np.median(np.abs(beside))), 1e-300)
+    alone = np.abs(rest) > 2.0 * np.nanmax(np.abs(around), axis=0)
+    found[rows[alone & (np.abs(beside) > GLITCH * scale)]] = True
+    return found
+
+
+def _shifted(values: FloatArray, shift: int) -> FloatArray:
+    """Return each sample's neighbour, NaN beyond the ends."""
+    result = np.full(len(values), np.nan)
+    if shift > 0:
+        result[:-shift] = values[shift:]
+    else:
+        result[-shift:] = values[:shift]
     return result
 
 

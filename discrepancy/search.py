@@ -346,7 +346,7 @@ class Search:
         floor = self.score(self.none) - 6.0
         ranked = self.refine(self.scan(self.none, self.effects), floor)
         for item in ranked[:RIDGES]:
-            if not absolute_gate(self.problem, item).passed:
+            if not self._misfits(item) and not absolute_gate(self.problem, item).passed:
                 self._around(item)
         self._settle_steps()
         current = self.best()
@@ -374,7 +374,8 @@ class Search:
         singles = [item for item in self.exact.values() if len(item.candidate.terms) == 1]
         kept: dict[tuple[str, str], Fit] = {}
         for named in sorted(singles, key=self.score, reverse=True)[:EXACT_FITS]:
-            family = free_shape(self.problem, named, 0)
+            reach = named.objective if not kept else min(item.objective for item in kept.values()) + CLOSE
+            family = free_shape(self.problem, named, 0, give_up=min(reach, self.best().objective))
             if family is None or family.log_evidence - named.log_evidence <= SHAPE_GAIN:
                 continue
             (term,) = family.candidate.terms
@@ -485,7 +486,7 @@ class Search:
                     continue
 
 
-def free_shape(problem: Problem, named: Fit, number: int) -> Fit | None:
+def free_shape(problem: Problem, named: Fit, number: int, *, give_up: float | None = None) -> Fit | None:
     """Fit the family of one effect of a fit: its shape free, from the canonical one.
 
     Parameters
@@ -496,6 +497,8 @@ def free_shape(problem: Problem, named: Fit, number: int) -> Fit | None:
         With canonical shapes.
     number : int
         Of the effect among its terms.
+    give_up : float, optional
+        See `fit`.
 
     Returns
     -------
@@ -510,7 +513,7 @@ def free_shape(problem: Problem, named: Fit, number: int) -> Fit | None:
     parts[number] = np.append(parts[number], [item.prior.normal(item.canonical) for item in effect.shape])
     start = Point(named.point.shared, named.point.local, np.concatenate(parts))
     try:
-        return fit(problem, Candidate(tuple(terms)), start)
+        return fit(problem, Candidate(tuple(terms)), start, give_up=give_up)
     except (FitError, ModelError):
         return None
 

@@ -18,13 +18,15 @@ from .data_fault import DataFault
 from .data_quality import check_against_model, check_data, mark_outliers
 from .errors import CampaignDataError
 from .fitting import Fit
+from .fitting import fit as fit_to
 from .held_out import choose_held_out
 from .locate import Location, locate
 from .models.interface import Model
 from .naming import name
 from .next_experiment import next_experiments
+from .outliers import LARGEST_SHARE, glitches
 from .predictive import residual_set
-from .problem import Problem
+from .problem import Point, Problem
 from .proof import prove
 from .residuals import ResidualSet
 from .search import SOLVER_SHARE, Search, solver_share
@@ -141,6 +143,10 @@ def investigate(
     setting = Setting(campaign, model, model.scales(campaign))
     with stage("Fitting what is known, and searching the catalogue", "name"):
         problem = Problem(campaign, model, setting)
+        cleaned = without_glitches(problem)
+        if cleaned is not campaign:
+            campaign, setting = cleaned, replace(setting, campaign=cleaned)
+            problem = Problem(campaign, model, setting)
         verdict, search, fit = name(problem, load_catalogue() if effects is None else effects)
     remarks = [fault.sentence for fault in faults] + list(campaign.remarks)
     remarks += strained(problem, fit)
@@ -196,6 +202,40 @@ def checked(campaign: Campaign, model: Model) -> tuple[Campaign, tuple[DataFault
     campaign = mark_outliers(campaign)
     faults = (*faults, *check_against_model(campaign, model))
     return choose_held_out(campaign), faults
+
+
+def without_glitches(problem: Problem) -> Campaign:
+    """Return a problem's campaign without single readings that are far off what the model predicts.
+
+    The model as it is need not fit: see `outliers.glitches`.
+    """
+    none = fit_to(problem, Candidate(), problem.start(Candidate()), evidence=False)
+    fits = [(problem, none)]
+    if problem.campaign.held_out:
+        there = problem.with_trials(problem.campaign.held_out)
+        local = tuple(np.zeros(data.unknowns.size) for data in there.trials)
+        start = Point(none.point.shared, local, none.point.effect)
+        fits.append((there, fit_to(there, Candidate(), start, local_only=True, evidence=False)))
+    trials = {trial.name: trial for trial in problem.campaign.trials}
+    remarks = list(problem.campaign.remarks)
+    for part, fitted in fits:
+        for data, residual in zip(part.trials, fitted.residuals, strict=True):
+            trial = trials[data.trial.name]
+            if not trial.is_dynamic:
+                continue
+            used = trial.used.copy()
+            for number, channel in enumerate(trial.channels):
+                found = glitches(residual[:, number], data.weight[:, number] > 0.0)
+                if found.any() and found.sum() <= LARGEST_SHARE * len(found):
+                    used[found, number] = False
+                    remarks.append(
+                        f"{found.sum()} of {len(found)} readings of {channel!r} in the trial {trial.name!r} "
+                        "are far off what the model and their neighbours say, and left out."
+                    )
+            trials[trial.name] = replace(trial, used=used)
+    if len(remarks) == len(problem.campaign.remarks):
+        return problem.campaign
+    return replace(problem.campaign, trials=tuple(trials.values()), remarks=tuple(remarks))
 
 
 def strained(problem: Problem, fit: Fit) -> list[str]:

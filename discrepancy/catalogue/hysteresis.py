@@ -16,7 +16,8 @@ from fe.patch import BoucWen, MicroSlip, ModelPatch
 
 FAMILY = "rate-independent hysteresis"
 ELEMENTS = 24
-"""Jenkins elements of a joint; twice as many change its loss by less than a hundredth where a few slip."""
+"""Jenkins elements of a joint: the loss of a cycle is that of a continuous distribution within 2 % from a
+twentieth of the largest slip displacement on, within 13 % at a hundredth."""
 
 
 def _micro_slip(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
