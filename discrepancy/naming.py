@@ -8,9 +8,10 @@ from .candidate import FREE_SHAPE, Candidate
 from .catalogue.entry import NINETY, Effect
 from .fitting import Fit
 from .gates import SHAPE_GAIN, absolute_gate, shape_gate
+from .neighbourhood import free_shape
 from .posterior import with_draws
 from .problem import Problem
-from .search import Search, free_shape, search
+from .search import Search, search
 from .verdict import Estimate, Gate, Hypothesis, NamedEffect, Verdict, VerdictKind
 
 SURE = 0.95

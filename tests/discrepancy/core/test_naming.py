@@ -12,8 +12,8 @@ from scipy.signal import lfilter
 from discrepancy.candidate import Candidate, Term
 from discrepancy.fitting import fit
 from discrepancy.gates import SHAPE_GAIN
+from discrepancy.hypotheses import key_of
 from discrepancy.naming import _open, name
-from discrepancy.search import key_of
 from discrepancy.verdict import Verdict, VerdictKind
 from fe.patch import ModelPatch, PowerDamping
 

@@ -7,8 +7,8 @@ import pytest
 
 from discrepancy.candidate import Candidate, Term
 from discrepancy.fitting import fit
+from discrepancy.promising import pairs
 from discrepancy.screening import LINEAR, Screen, cosine, grid, rescaled, separation
-from discrepancy.search import _pairs
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def test_gain_is_what_a_fit_achieves(screened) -> None:  # type: ignore[no-untyp
 def test_pairs_are_fitted_together(kit, screened) -> None:  # type: ignore[no-untyped-def]
     problem, none, screen, terms, changes = screened
     options = {change.term.effect.identifier: [change] for change in changes}
-    ((misfit, first, second),) = list(_pairs(options, screen.sign))
+    ((misfit, first, second),) = list(pairs(options, screen.sign))
     candidate = Candidate(terms)
     found = fit(problem, candidate, problem.start(candidate), iterations=40)
     assert none.objective - found.objective == pytest.approx(-misfit, rel=0.02, abs=0.05)
@@ -84,7 +84,7 @@ def test_pairs_are_fitted_together(kit, screened) -> None:  # type: ignore[no-un
 def test_two_changes_that_are_one_are_no_pair(kit, screened) -> None:  # type: ignore[no-untyped-def]
     _, _, screen, _, changes = screened
     twin = {"one": [changes[0]], "other": [changes[0]]}
-    assert not list(_pairs(twin, screen.sign))
+    assert not list(pairs(twin, screen.sign))
     assert separation(changes[0], changes[0], screen.sign) == pytest.approx(0.0, abs=1e-6 * changes[0].size)
     assert cosine(changes[0], changes[0], screen.sign) == pytest.approx(1.0, abs=1e-9)
 

@@ -63,6 +63,27 @@ def test_draws_of_the_patch_have_the_posteriors_spread(found) -> None:  # type: 
     assert again == draws
 
 
+def test_wrong_readings_at_the_ends_of_records_are_left_out(laboratory, effects) -> None:  # type: ignore[no-untyped-def]
+    """A heavily damped line would explain the first one; held-out records are judged as well."""
+    campaign = laboratory.measured(21)
+    trials = []
+    for trial in campaign.trials:
+        values = trial.values.copy()
+        if trial.is_dynamic:
+            row = 0 if trial.held_out else len(values) - 1
+            noise = campaign.channels[trial.channels[0]].noise.standard_deviation
+            values[row, 0] += 30.0 * noise
+        trials.append(replace(trial, values=values))
+    found = investigate(replace(campaign, trials=tuple(trials)), laboratory.model, effects, thorough=False)
+    assert found.verdict.kind is VerdictKind.NOTHING_MISSING, found.verdict.sentence
+    for trial in found.campaign.trials:
+        if trial.is_dynamic:
+            row = 0 if trial.held_out else len(trial.time) - 1
+            assert not trial.used[row, 0]
+            assert trial.used.sum() >= trial.used.size - 2
+            assert any(repr(trial.name) in text and "left out" in text for text in found.campaign.remarks)
+
+
 def test_open_hypotheses_are_different_sets(found) -> None:  # type: ignore[no-untyped-def]
     items = open_hypotheses(found.search, count=4)
     sets = [fit.candidate.identifiers for fit, _ in items]

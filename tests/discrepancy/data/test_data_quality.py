@@ -20,7 +20,7 @@ from discrepancy.data_quality import (
 )
 from discrepancy.errors import CampaignDataError
 from discrepancy.examples import ExamplePlan, example_campaign
-from discrepancy.outliers import sample_outliers
+from discrepancy.outliers import glitches, sample_outliers
 from fe.patch import HighPass, ModelPatch, SensorDrift, SensorGain
 
 PLAN = ExamplePlan(
@@ -377,3 +377,41 @@ def test_rows_of_static_trials(campaign) -> None:
     # A trial that is off in many rows is not a matter of single readings.
     moved = replace(trio[2], values=trio[2].values + 1e-3)
     assert left_out(*trio[:2], moved) == [[], [], []]
+
+
+# ---------------------------------------------------------------- beside what a model predicts
+
+
+@pytest.mark.parametrize("place", [0, 1, 57, 198, 199])
+def test_a_wrong_reading_is_found_at_the_ends_too(place: int) -> None:
+    residual = np.random.default_rng(1).standard_normal(200)
+    residual[place] += 20.0
+    found = glitches(residual, np.ones(200, dtype=bool))
+    np.testing.assert_array_equal(np.flatnonzero(found), [place])
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=60, deadline=None)
+def test_noise_has_no_glitches(seed: int) -> None:
+    """Seven robust deviations of a difference: once in a thousand records of this length at most."""
+    residual = np.random.default_rng(seed).standard_normal(1500)
+    assert not glitches(residual, np.ones(1500, dtype=bool)).any()
+
+
+def test_waves_of_a_wrong_model_and_steps_are_no_glitches() -> None:
+    generator = np.random.default_rng(2)
+    time = np.arange(800) / 100.0
+    wave = 60.0 * np.exp(-0.3 * time) * np.cos(2.0 * np.pi * 5.0 * time) + generator.standard_normal(800)
+    step = np.where(time > 4.0, 40.0, 0.0) + generator.standard_normal(800)
+    used = np.ones(800, dtype=bool)
+    assert not glitches(wave, used).any()
+    assert not glitches(step, used).any()
+    # what is left out already is neither judged nor a neighbour
+    wave[100] = 1e6
+    used[100] = False
+    assert not glitches(wave, used).any()
+
+
+def test_a_record_too_short_to_judge_is_left_alone() -> None:
+    residual = np.array([0.1, -0.2, 30.0, 0.1, 0.0, 0.2, -0.1])
+    assert not glitches(residual, np.ones(7, dtype=bool)).any()

@@ -1,0 +1,126 @@
+"""Fits far from the truth: phases slip over a long record, so that its beginning is fitted first."""
+
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .candidate import Candidate
+from .catalogue.entry import Effect
+from .errors import FitError, ModelError
+from .fitting import Fit, fit
+from .gates import absolute_gate
+from .problem import Point, Problem, shortened
+from .promising import FAR_STARTS, starts
+from .screening import Change, Screen, rescaled
+
+FloatArray = NDArray[np.float64]
+
+CLOSE = 12.0
+"""Candidates within this log evidence of the best are fitted exactly [nat]."""
+PROMISING, LEAST_PROMISING = 0.3, 5
+"""Effects are fitted whose screened gain is at least this share of the best one's, and at least so many; the
+others too if none of these fits."""
+BEGINNING, LEAST_SAMPLES = 4.0, 60
+"""The beginning of a record: this many periods of the first mode, at least that many samples."""
+SHORT_STEPS, FAR_STEPS = 12, 6
+"""Steps on the beginnings, and then on whole records, before candidates are compared."""
+FAR_FITS, FAR_EXTENSIONS = 6, 4
+"""Candidates that go on from the beginnings to whole records: single effects, and longer sets."""
+
+
+class Beginnings:
+    """A problem beside itself with the beginnings of its dynamic records only.
+
+    Parameters
+    ----------
+    problem : Problem
+        With whole records.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+
+    @cached_property
+    def short(self) -> Problem:
+        """The problem with the beginnings of its dynamic records."""
+        period = 2.0 * np.pi / self.problem.setting.scales.angular_frequency
+        trials = []
+        for data in self.problem.trials:
+            trial = data.trial
+            count = len(trial.time)
+            if trial.is_dynamic:
+                count = min(count, max(LEAST_SAMPLES, ceil(BEGINNING * period / trial.interval)))
+            trials.append(shortened(trial, count))
+        return self.problem.with_trials(tuple(trials))
+
+    def refine(self, refinement: int) -> None:
+        """Take time steps so many times smaller than the model's own."""
+        if "short" in self.__dict__:
+            self.short.refinement = refinement
+
+    def scan(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
+        """Fit effects in addition to those of `base`, beginnings first; return the most promising ones."""
+        near = self.near(base)
+        screen = Screen(self.short, near)
+        ranked = [changes for effect in effects if (changes := starts(screen, effect, FAR_STARTS))]
+        ranked.sort(key=lambda changes: -changes[0].gain)
+        enough = PROMISING * ranked[0][0].gain if ranked else 0.0
+        first = max(LEAST_PROMISING, sum(changes[0].gain >= enough for changes in ranked))
+        found = self._from_beginnings(base, near, ranked[:first])
+        if not base.candidate.terms and not any(absolute_gate(self.problem, item).passed for item in found):
+            found += self._from_beginnings(base, near, ranked[first:])
+        return found
+
+    def _from_beginnings(self, base: Fit, near: Fit, ranked: list[list[Change]]) -> list[Fit]:
+        """Fit effects to the beginnings of the records, the best of them to whole records."""
+        begun = []
+        for changes in ranked:
+            best = None
+            for change in changes:
+                candidate = base.candidate.plus(change.term)
+                item = self.shortly(
+                    near, candidate, rescaled(change), None if best is None else best.objective
+                )
+                if item is not None and (best is None or item.objective < best.objective):
+                    best = item
+            if best is not None:
+                begun.append(best)
+        return self.whole(begun, base.objective)
+
+    def near(self, base: Fit) -> Fit:
+        """Fit the beginnings with the effects of a base; shared unknowns as expected before the data.
+
+        The nuisances of a wrong model are far off and make a bad start.
+        """
+        expected = Point(
+            np.zeros_like(base.point.shared),
+            tuple(np.zeros_like(u) for u in base.point.local),
+            base.point.effect,
+        )
+        return fit(self.short, base.candidate, expected, local_only=True, evidence=False)
+
+    def shortly(
+        self, near: Fit, candidate: Candidate, added: FloatArray, give_up: float | None = None
+    ) -> Fit | None:
+        """Fit a candidate to the beginnings, or return None where the structure cannot follow."""
+        start = Point(near.point.shared, near.point.local, np.concatenate((near.point.effect, added)))
+        try:
+            return fit(self.short, candidate, start, iterations=SHORT_STEPS, evidence=False, give_up=give_up)
+        except (FitError, ModelError):
+            return None
+
+    def whole(self, begun: Sequence[Fit], least: float) -> list[Fit]:
+        """Fit the most promising candidates to whole records from where the beginnings led."""
+        found: list[Fit] = []
+        count = FAR_FITS if all(len(item.candidate.terms) == 1 for item in begun) else FAR_EXTENSIONS
+        for item in sorted(begun, key=lambda start: start.objective)[:count]:
+            try:
+                whole = fit(self.problem, item.candidate, item.point, iterations=FAR_STEPS, give_up=least)
+            except (FitError, ModelError):
+                continue
+            least = min(least, whole.objective + CLOSE)
+            found.append(whole)
+        return found
