@@ -31,6 +31,8 @@ WORTH_ADDING = 4.0
 OUT_OF_REACH = 3.0 * CLOSE
 """Chord steps end where they have no prospect to come within this of the best [nat]."""
 PAIRS_FITTED = 8
+RIVALS = 30.0
+"""Effects that fit within this log evidence of the best one have families that may overtake it [nat]."""
 RIDGES = 2
 """Candidates that do not quite fit whose neighbourhood is searched."""
 SOLVER_SHARE, FINEST = 0.1, 8
@@ -166,11 +168,10 @@ class Search(Hypotheses):
             if not self._misfits(item) and not absolute_gate(self.problem, item).passed:
                 self.keep(around(self.problem, item), exact=True)
         self._settle_steps()
+        self._families()
         current = self.best()
-        if current.candidate.terms and absolute_gate(self.problem, current).passed is False:
-            self._families()
-            if self.best().candidate.is_family:
-                return
+        if current.candidate.is_family:
+            return
         while current.candidate.terms and len(current.candidate.terms) < LARGEST_SET:
             if len(current.candidate.terms) > 1 and self._far(current):
                 break  # a third effect is looked for only where two nearly do
@@ -184,13 +185,21 @@ class Search(Hypotheses):
         self._settle_steps()
 
     def _families(self) -> None:
-        """Fit the free-shape families of the single effects that come closest, and keep those that fit.
+        """Fit the free-shape families of single effects that come close, and keep those that fit.
 
-        A law with a shape of its own is a simpler cause than two laws, so it is tried before pairs are.
+        A law with a shape of its own is a simpler cause than two laws, so it is tried before pairs are. Where
+        the best effect fits, families compete only if others fit as well: its own is for the shape gate.
         """
         singles = [item for item in self.exact.values() if len(item.candidate.terms) == 1]
+        singles = sorted(singles, key=self.score, reverse=True)[:EXACT_FITS]
+        fitting = [item for item in singles if absolute_gate(self.problem, item).passed is not False]
+        if fitting and fitting[0] is singles[0]:
+            close = self.score(singles[0]) - RIVALS
+            singles = [item for item in fitting if self.score(item) > close]
+            if len(singles) == 1 or absolute_gate(self.problem, self.none).passed is not False:
+                return
         kept: dict[tuple[str, str], Fit] = {}
-        for named in sorted(singles, key=self.score, reverse=True)[:EXACT_FITS]:
+        for named in singles:
             reach = named.objective if not kept else min(item.objective for item in kept.values()) + CLOSE
             family = free_shape(self.problem, named, 0, give_up=min(reach, self.best().objective))
             if family is None or family.log_evidence - named.log_evidence <= SHAPE_GAIN:
