@@ -8,14 +8,17 @@ calibration folder.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import matplotlib as mpl
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from discrepancy.models.wing import WingModel
+from discrepancy.naming import named_effects
 from discrepancy.problem import Problem
 from discrepancy.real_wing import SIGNAL, RecordPlan, wing_campaign
 from discrepancy.workflow import Investigation, investigate
@@ -29,6 +32,35 @@ def report(found: Investigation, table: Table, label: str) -> None:
     rms = " to ".join(f"{1e3 * score.rms[SIGNAL]:.3f}" for score in scores if SIGNAL in score.rms)
     chi = " to ".join(f"{score.chi_square_per_dof:.2f}" for score in scores)
     table.add_row(label, found.verdict.kind.value, found.verdict.sentence, rms, chi)
+
+
+def alone(runs: Sequence[Investigation]) -> Table:
+    """Return what single effects and their families leave and how probable they make the data, by window."""
+    table = Table("one effect alone", *(f"ln evidence from {begin:g} s" for begin in BEGINS), "left, uV")
+    rows: dict[str, list[str]] = {}
+    left: dict[str, str] = {}
+    for number, found in enumerate(runs):
+        if found.search is None or found.problem is None:
+            continue
+        for item in found.search.all().values():
+            if len(item.candidate.terms) > 1:
+                continue
+            label = " ".join(item.candidate.identifiers) or "none"
+            shape = [u for part in named_effects(found.problem, item) for u in part.shape]
+            label_row = rows.setdefault(label, [""] * len(runs))
+            label_row[number] = f"{item.log_evidence:.1f}" + "".join(
+                f" ({u.name} {u.value:.2f})" for u in shape
+            )
+            if number == 0:
+                rest = [
+                    1e6 * data.deviation[0] * float(np.sqrt((residual[:, 0] ** 2).mean()))
+                    for data, residual in zip(found.problem.trials, item.residuals, strict=True)
+                    if data.trial.is_dynamic
+                ]
+                left[label] = ", ".join(f"{value:.0f}" for value in rest)
+    for label, values in rows.items():
+        table.add_row(label, *values, left.get(label, ""))
+    return table
 
 
 def draw(found: Investigation, folder: Path) -> None:
@@ -65,11 +97,11 @@ def main() -> int:
     given = parser.parse_args()
     model = WingModel.shipped()
     table = Table("records", "verdict", "", "held out: rms, mV", "chi^2 / dof")
-    first: Investigation | None = None
+    runs = []
     for begin in BEGINS:
-        found = investigate(wing_campaign(given.data, RecordPlan(begin=begin)), model)
-        first = first or found
-        report(found, table, f"all, ring-downs from {begin:g} s")
+        runs.append(investigate(wing_campaign(given.data, RecordPlan(begin=begin)), model))
+        report(runs[-1], table, f"all, ring-downs from {begin:g} s")
+    first = runs[0]
     whole = wing_campaign(given.data)
     still = replace(
         whole,
@@ -80,19 +112,20 @@ def main() -> int:
     report(static, table, "loading runs alone")
     console = Console(width=160)
     console.print(table)
+    console.print(alone(runs))
     console.print("Loading runs alone:", static.verdict.probability)
     for row in static.verdict.hypotheses[:6]:
         console.print(
             [effect.identifier for effect in row.effects], f"{row.probability:.3f}", f"{row.chi_square:.1f}"
         )
-    if first is not None:
-        if first.location is not None:
-            for item in first.location.explanations:
-                console.print(item)
-        for experiment in first.verdict.next_experiments:
-            console.print(experiment.description, f"{float(experiment.information):.3f}")
-        if given.pictures is not None:
-            draw(first, given.pictures)
+    if first.location is not None:
+        for item in first.location.explanations:
+            console.print(item)
+    for experiment in first.verdict.next_experiments:
+        console.print(experiment.description, f"{float(experiment.information):.3f}")
+    if given.pictures is not None:
+        given.pictures.mkdir(parents=True, exist_ok=True)
+        draw(first, given.pictures)
     return 0
 
 
