@@ -54,7 +54,7 @@ DESCRIPTION = (
     "under load factor and tip force, with two regions that can lose stiffness."
 )
 
-_OWN_FILES = ("behaviour.py", "slave.py", "variables.py")
+_OWN_FILES = ("base_slave.py", "behaviour.py", "slave.py", "variables.py")
 
 _SCRIPT = '''"""Loaded by the FMI wrapper; everything is in the package beside it."""
 from uav_wing_0_content_0__runtime.entry import Fmi2Slave, WingSlave, keep_alive
@@ -73,12 +73,12 @@ _ENTRY = '''"""Joins the slave, the reduced model and pythonfmu's base class."""
 import ctypes
 import json
 
+from .base_slave import Contents
 from .behaviour import Physics, WingBehaviour
 from .fe.damping import rayleigh_damping_ratio
 from .fe.reduced import ReducedModel
 from .fe.transient import ModalIntegrator, TransientState
 from .pythonfmu.fmi2slave import Fmi2Slave
-from .slave import Contents
 from .slave import WingSlave as _WingSlave
 from .variables import variable_table
 

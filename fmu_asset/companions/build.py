@@ -29,6 +29,7 @@ from ..packing import (
 from ..variables import ENUMERATIONS, FmuVariable, Unit
 from . import damage_growth, strain_gauges
 
+_SHARED_FILES = ("base_slave.py", "variables.py")
 _OWN_FILES = ("slave.py", "table.py")
 _STATUS = tuple(enumeration for enumeration in ENUMERATIONS if enumeration.name == "Status")
 _UNITS = (
@@ -53,9 +54,9 @@ class Companion{tag}(CompanionSlave, Fmi2Slave):
 _ENTRY = '''"""Joins the slave, the behaviour and pythonfmu's base class."""
 import json
 
+from .base_slave import Contents
 from .companions import {name} as companion
 from .companions.slave import CompanionSlave as _CompanionSlave
-from .companions.slave import Contents
 from .pythonfmu.fmi2slave import Fmi2Slave
 
 __all__ = ["CompanionSlave", "Fmi2Slave", "keep_alive"]
@@ -203,7 +204,7 @@ def _members(
         f"resources/{module}.py": _SCRIPT.format(module=module, tag=PLACEHOLDER).encode(),
         f"{runtime}/__init__.py": b'"""An FMU of uav-twin."""\n',
         f"{runtime}/entry.py": _ENTRY.format(name=companion.name).encode(),
-        f"{runtime}/variables.py": (own / "variables.py").read_bytes(),
+        **{f"{runtime}/{name}": (own / name).read_bytes() for name in _SHARED_FILES},
         f"{runtime}/companions/__init__.py": b'"""What the FMU does."""\n',
         f"{runtime}/pythonfmu/__init__.py": b'"""The base class of pythonfmu."""\n',
     }
