@@ -1,10 +1,8 @@
 """Which model a campaign is compared with: a wing (shipped, calibrated, designed), a lumped model, an FMU."""
 
-import tomllib
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 
 from calibration.errors import CalibrationError
 from calibration.result import CalibrationResult
@@ -14,6 +12,7 @@ from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
+from discrepancy.models.model_file import read_toml
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
 from fe.design import SHIPPED_DESIGN, WingDesign, load_design
 from fe.errors import FiniteElementError
@@ -94,7 +93,7 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
             f"shipped lumped model ({', '.join(shipped_lumped_models())}) is expected."
         )
     if path.suffix == ".toml":
-        content = _content(path)
+        content = read_toml(path, "model")
         if content.get("kind") == "fmu":
             described = FmuModel.load(path)
             file = path.parent / described.description.fmu
@@ -125,13 +124,6 @@ def choice_of_run(folder: Path) -> ModelChoice:
 def shipped_lumped_models() -> tuple[str, ...]:
     """Return the names of the lumped models that come with the package."""
     return tuple(sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml")))
-
-
-def _content(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as cause:
-        raise ModelError(f"The model {path} cannot be read: {cause}.") from cause
 
 
 def _wing(path: Path | None, progress: Progress | None) -> ModelChoice:
