@@ -18,6 +18,7 @@ from discrepancy.candidate import Candidate
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.from_run import RunPlan, held_out_turns, run_campaign, run_model
+from discrepancy.model_choice import choice_of_run
 from discrepancy.models.interface import Conditions
 from discrepancy.models.memo import MemoModel
 from discrepancy.problem import Point, Problem
@@ -105,6 +106,9 @@ def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path: Path) 
     plain = model.respond(campaign.trials[0], outputs, ModelPatch(), conditions).values
     np.testing.assert_allclose(again[:, 8], 1.05 * plain[:, 8], rtol=1e-12)
     np.testing.assert_array_equal(np.delete(again, 8, axis=1), np.delete(shown, 8, axis=1))
+    patched = choice_of_run(folder).source_hash
+    (folder / "asset" / "model_patch.json").unlink()
+    assert choice_of_run(folder).source_hash != patched
 
 
 @pytest.mark.xdist_group("wing")
