@@ -162,6 +162,8 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
 def run_model(folder: Path | str) -> Model:
     """Return the model that the twin of a run believed: the wing of its design or calibration, patched.
 
+    The whole patch of the twin's model is in it, sensors too: they act in `discrepancy.sensing.observe`.
+
     Raises
     ------
     CampaignFileError

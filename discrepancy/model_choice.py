@@ -1,19 +1,19 @@
 """Which model a campaign is compared with: a wing (shipped, calibrated, designed), a lumped model, an FMU."""
 
-import tomllib
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 
 from calibration.errors import CalibrationError
 from calibration.result import CalibrationResult
 from discrepancy.errors import ModelError
-from discrepancy.from_run import CALIBRATION_FILE, DESIGN_FILE, run_model
+from discrepancy.from_run import CALIBRATION_FILE, DESIGN_FILE, MODEL_PATCH_FILE, run_model
 from discrepancy.models.fmu import FmuModel
+from discrepancy.models.fmu_runs import binding_file
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
+from discrepancy.models.model_file import read_toml
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
 from fe.design import SHIPPED_DESIGN, WingDesign, load_design
 from fe.errors import FiniteElementError
@@ -43,7 +43,8 @@ class ModelChoice:
     label : str
         What the command line names it by, without its folder; empty for the shipped wing.
     source_hash : str
-        SHA-256 of the file that it was read from (with the prior, for a wing without calibration).
+        SHA-256 of all that it was read from: its file, with the prior for a wing without calibration, with
+        FMU and binding for the description of an FMU, with the patch of a run's twin.
     design : WingDesign or None
         Of a wing.
     path : Path or None
@@ -94,12 +95,9 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
             f"shipped lumped model ({', '.join(shipped_lumped_models())}) is expected."
         )
     if path.suffix == ".toml":
-        content = _content(path)
+        content = read_toml(path, "model")
         if content.get("kind") == "fmu":
-            described = FmuModel.load(path)
-            file = path.parent / described.description.fmu
-            source = hash_record({"description": hash_file(path), "fmu": hash_file(file)})
-            return ModelChoice(described, ModelKind.FMU, path.name, source, path=path)
+            return _fmu(path)
         if "format" not in content:  # a wing design has none
             return _wing(path, progress)
     model = LumpedModel.load(path)
@@ -119,7 +117,11 @@ def choice_of_run(folder: Path) -> ModelChoice:
     model = run_model(folder)
     calibration = folder / CALIBRATION_FILE
     choice = _calibrated(calibration, None) if calibration.is_file() else _wing(folder / DESIGN_FILE, None)
-    return replace(choice, model=model)
+    patch = folder / MODEL_PATCH_FILE
+    if not patch.is_file():
+        return replace(choice, model=model)
+    source = hash_record({"model": choice.source_hash, "patch": hash_file(patch)})
+    return replace(choice, model=model, source_hash=source)
 
 
 def shipped_lumped_models() -> tuple[str, ...]:
@@ -127,11 +129,15 @@ def shipped_lumped_models() -> tuple[str, ...]:
     return tuple(sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml")))
 
 
-def _content(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as cause:
-        raise ModelError(f"The model {path} cannot be read: {cause}.") from cause
+def _fmu(path: Path) -> ModelChoice:
+    model = FmuModel.load(path)
+    files = {
+        "description": path,
+        "fmu": path.parent / model.description.fmu,
+        "binding": binding_file(model.description, path.parent),
+    }
+    source = hash_record({name: hash_file(file) for name, file in files.items() if file is not None})
+    return ModelChoice(model, ModelKind.FMU, path.name, source, path=path)
 
 
 def _wing(path: Path | None, progress: Progress | None) -> ModelChoice:

@@ -151,7 +151,19 @@ def write_patch(
 def fmu_outputs(campaign: Campaign) -> dict[str, str]:
     """Return the outputs of the wing FMU by the names of the channels that measure them.
 
-    Channels that the FMU has no output for (velocities, displacements of other places) are not in it.
+    Gauges count from 1 in campaigns, in patches and in the FMU alike, so that `strain[k]` of a channel is
+    `strain[k]` of the FMU, whatever the channel is called. Channels that the FMU has no output for
+    (velocities, displacements of other places) are not in the table.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Whose channels are asked for.
+
+    Returns
+    -------
+    dict of str to str
+        Output by channel, such as "strain[17]" for "g17".
     """
     outputs = {}
     for name, channel in campaign.channels.items():

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from discrepancy.campaign import Campaign, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
 from discrepancy.models.interface import Conditions, Model
+from discrepancy.models.wrapped import built_in_sensors
 from fe.errors import InvalidPatchError
-from fe.patch import SENSORS, ModelPatch
+from fe.patch import EVERY_CHANNEL, SENSORS, ModelPatch, Primitive
 from fe.sensors import SensorRecord, apply_sensors, check_channels, clock_of, needs_components, uses_sensors
 
 FloatArray = NDArray[np.float64]
@@ -46,7 +47,8 @@ def observe(
     Parameters
     ----------
     model : Model
-        Gives the response under the structure, force and load primitives of the patch.
+        Gives the response under the structure, force and load primitives of the patch. Sensors that it has
+        built in act before those of the patch.
     campaign : Campaign
         Whose channels the trial names.
     trial : Trial
@@ -68,6 +70,7 @@ def observe(
     outputs = tuple(
         (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
     )
+    patch = _by_channels(built_in_sensors(model), campaign) + patch
     if not uses_sensors(patch):
         response = model.respond(trial, outputs, patch, conditions, refinement=refinement)
         return Observed(response.values, response.rates)
@@ -93,6 +96,22 @@ def observe(
         response.transverse,
         response.shear,
     )
+
+
+def _by_channels(sensors: ModelPatch, campaign: Campaign) -> ModelPatch:
+    """Return sensor primitives for the channels that measure the outputs which they name."""
+    found: list[Primitive] = []
+    for item in sensors:
+        output = getattr(item, "channel", EVERY_CHANNEL)
+        if output == EVERY_CHANNEL:
+            found.append(item)
+            continue
+        found += [
+            replace(item, channel=name)  # type: ignore[call-arg]
+            for name, channel in campaign.channels.items()
+            if channel.output == output
+        ]
+    return ModelPatch(tuple(found))
 
 
 def observe_response(

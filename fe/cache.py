@@ -1,18 +1,14 @@
 """Reduced models kept between runs: an unchanged design is built once, a changed one is built anew."""
 
-import fcntl
 import hashlib
-import logging
-import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from .archive import write_bytes_atomically
 from .errors import ReducedModelFileError
 from .fields import FieldBasis, WingFields, field_basis
+from .kept import built_once, cache_folder, kept
 from .reduced import ReducedModel
 
 if TYPE_CHECKING:
@@ -47,16 +43,6 @@ MODELLING_FILES = (
     "turn_load.py",
 )
 """The files that decide what a reduced model holds; a change in any of them makes a new cache entry."""
-
-_logger = logging.getLogger(__name__)
-
-_Kept = TypeVar("_Kept")
-
-
-def cache_folder() -> Path:
-    """Return the folder of the kept models: `$XDG_CACHE_HOME/uav-twin`, or `~/.cache/uav-twin`."""
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(base) if base else Path.home() / ".cache") / "uav-twin"
 
 
 def modelling_hash() -> str:
@@ -114,10 +100,9 @@ def reduced_model(
     FiniteElementError
         If the design cannot be modelled or reduced.
     """
-    design = _shipped(design)
-    entry, wing_design = _entry(design, settings), design
-    kept = _kept(lambda: _checked_model(entry.model, wing_design))
-    return kept or _build(design, progress, settings).model
+    wing = given_or_shipped(design)
+    entry = _entry(wing, settings)
+    return kept(lambda: _checked_model(entry.model, wing)) or _build(wing, progress, settings).model
 
 
 def wing_fields(
@@ -146,28 +131,18 @@ def wing_fields(
     FiniteElementError
         If the design cannot be modelled or reduced.
     """
-    design = _shipped(design)
-    entry, wing_design = _entry(design, settings), design
-    return _kept(lambda: _checked_fields(entry, wing_design)) or _build(design, progress, settings)
+    wing = given_or_shipped(design)
+    entry = _entry(wing, settings)
+    return kept(lambda: _checked_fields(entry, wing)) or _build(wing, progress, settings)
 
 
-def _shipped(design: "WingDesign | None") -> "WingDesign":
+def given_or_shipped(design: "WingDesign | None") -> "WingDesign":
+    """Return a design, the shipped one if none is given."""
     if design is not None:
         return design
     from .design import load_design
 
     return load_design()
-
-
-def _kept(load: Callable[[], _Kept]) -> _Kept | None:
-    """Return what `load` reads, or nothing if it is not there or not usable."""
-    try:
-        return load()
-    except OSError:  # not there, or not readable
-        return None
-    except ReducedModelFileError as error:
-        _logger.warning("A kept model is not usable and is built anew: %s", error)
-        return None
 
 
 def _checked_model(path: Path, design: "WingDesign") -> ReducedModel:
@@ -185,23 +160,19 @@ def _checked_fields(entry: _Entry, design: "WingDesign") -> WingFields:
 def _build(
     design: "WingDesign", progress: "Progress | None", settings: "ReductionSettings | None"
 ) -> WingFields:
-    """Build and keep an entry; of several builders of one entry, one builds and the others wait for it."""
     entry = _entry(design, settings)
-    with locked(entry.model.with_suffix(".lock")):
-        try:
-            return _checked_fields(entry, design)  # another process may have been faster
-        except (OSError, ReducedModelFileError):
-            pass
-        wing = build(design, progress, settings)
-        try:
-            # the model last: where it is, its fields are
-            write_bytes_atomically(entry.fields, wing.basis.to_bytes())
-            write_bytes_atomically(entry.model, wing.model.to_bytes())
-        except OSError as error:
-            _logger.warning(
-                "The model could not be kept in %s and will be built again: %s", cache_folder(), error
-            )
-    return wing
+
+    def keep(wing: WingFields) -> None:
+        # the model last: where it is, its fields are
+        write_bytes_atomically(entry.fields, wing.basis.to_bytes())
+        write_bytes_atomically(entry.model, wing.model.to_bytes())
+
+    return built_once(
+        entry.model,
+        load=lambda: _checked_fields(entry, design),
+        build=lambda: build(design, progress, settings),
+        keep=keep,
+    )
 
 
 def build(
@@ -241,19 +212,3 @@ def build(
             operators = assemble(design)
         reduction = reduce_model(operators, settings, progress)
         return WingFields(reduction.model, field_basis(operators, reduction))
-
-
-@contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Hold a lock file while building; without a writable folder there is nothing to guard."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    except OSError:
-        yield
-        return
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)

@@ -1,12 +1,12 @@
 """Wings for patches kept between runs, beside the reduced models and like them."""
 
 import hashlib
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .cache import cache_folder, locked, modelling_hash
+from .cache import given_or_shipped, modelling_hash
 from .errors import ReducedModelFileError
+from .kept import built_once, cache_folder, kept
 from .patch_arrays import PatchArrays
 
 if TYPE_CHECKING:
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
 PATCH_FILES = ("patch_arrays.py", "patch_operators.py", "patch_reduction.py")
 """The files that decide, besides `fe.cache.MODELLING_FILES`, what a wing for patches holds."""
-
-_logger = logging.getLogger(__name__)
 
 
 def patch_cache_key(design: "WingDesign", settings: "PatchSettings | None" = None) -> str:
@@ -54,39 +52,25 @@ def patch_arrays(
     FiniteElementError
         If the design cannot be modelled or reduced.
     """
-    if design is None:
-        from .design import load_design
+    wing = given_or_shipped(design)
+    path = cache_folder() / f"wing-{patch_cache_key(wing, settings)}-patches.npz"
 
-        design = load_design()
-    path = cache_folder() / f"wing-{patch_cache_key(design, settings)}-patches.npz"
-    kept = _kept(path, design)
-    if kept is not None:
-        return kept
-    with locked(path.with_suffix(".lock")):
-        kept = _kept(path, design)  # another process may have been faster
-        if kept is not None:
-            return kept
-        arrays = build_patch_arrays(design, progress, settings)
-        try:
-            arrays.save(path)
-        except OSError as error:
-            _logger.warning(
-                "The wing for patches could not be kept in %s and will be built again: %s",
-                cache_folder(),
-                error,
-            )
+    def load() -> PatchArrays:
+        return _checked(path, wing)
+
+    return kept(load) or built_once(
+        path,
+        load=load,
+        build=lambda: build_patch_arrays(wing, progress, settings),
+        keep=lambda arrays: arrays.save(path),
+    )
+
+
+def _checked(path: Path, design: "WingDesign") -> PatchArrays:
+    arrays = PatchArrays.load(path)
+    if arrays.design_hash != design.hash:
+        raise ReducedModelFileError(f"{path} holds the wing of another design; delete it.")
     return arrays
-
-
-def _kept(path: Path, design: "WingDesign") -> PatchArrays | None:
-    try:
-        arrays = PatchArrays.load(path)
-    except OSError:  # not there, or not readable
-        return None
-    except ReducedModelFileError as error:
-        _logger.warning("A kept wing for patches is not usable and is built anew: %s", error)
-        return None
-    return arrays if arrays.design_hash == design.hash else None
 
 
 def build_patch_arrays(

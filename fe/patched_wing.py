@@ -17,7 +17,6 @@ from .errors import InvalidPatchError
 from .local_loss import boxes_of, remaining_skin, strain_factors
 from .patch import (
     InertiaRelief,
-    LoadGain,
     LoadPlace,
     ModelPatch,
     ModulusTemperature,
@@ -446,58 +445,3 @@ class PatchedWing:
         arrays = self.arrays
         skin = remaining_skin(boxes, arrays.strip_lines)
         return strain_factors(skin, arrays.gauge_stations, arrays.gauge_length, self._skin_share)
-
-    # ------------------------------------------------------------ for a model that has its own static part
-
-    def static_change(
-        self,
-        young_modulus_factor: float,
-        stiffness_loss: tuple[float, float],
-        load_factor: float,
-        tip_force: float,
-        patch: ModelPatch,
-        temperature_difference: float = 0.0,
-    ) -> tuple[FloatArray, float, float]:
-        """Return what structure and load primitives change of the static response: patched less unpatched.
-
-        Parameters
-        ----------
-        young_modulus_factor, stiffness_loss, load_factor, tip_force
-            As of `ReducedModel.static_response`.
-        patch : ModelPatch
-            Changes; internal forces and sensors are passed over.
-        temperature_difference : float
-            [K].
-
-        Returns
-        -------
-        strain : (G,) ndarray
-            Change of the strains.
-        tip_displacement, load_point_displacement : float
-            Changes [m].
-
-        Raises
-        ------
-        InvalidPatchError
-            If the patch cannot be.
-        """
-        force = tip_force
-        for item in patch:
-            if isinstance(item, LoadGain):
-                force = (1.0 + item.gain) * force + (item.tare if tip_force != 0.0 else 0.0)
-        before = self.structure(young_modulus_factor, stiffness_loss, 0.0, 0.0).static(
-            self.load(load_factor) + tip_force * self.arrays.load_tip
-        )
-        after = self.structure(
-            young_modulus_factor, stiffness_loss, 0.0, 0.0, patch, temperature_difference
-        ).static(self.load(load_factor, patch) + force * self.force_row(LOAD_PLACE, patch))
-        change = after - before
-        strain = self.arrays.strain_rows[0] @ change
-        factors = self.strain_factors(patch)
-        if factors is not None:
-            strain = strain + (factors - 1.0) * (self.arrays.strain_rows[0] @ after)
-        return (
-            np.asarray(strain),
-            float(self.arrays.tip_row @ change),
-            float(self.arrays.load_tip @ change),
-        )

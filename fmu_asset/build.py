@@ -7,15 +7,12 @@ names that two FMUs in one process would share.
 
 from __future__ import annotations
 
-import ast
-import hashlib
-import io
 import json
 import os
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, distribution, version
+from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
@@ -29,15 +26,25 @@ from .compiled.package import DATA_FILE, binary_of, compiled_members
 from .description import documentation_page, model_description
 from .effect_variables import effect_rows, switch_of, units_of
 from .errors import FmuBuildError, PatchFileError
+from .packing import (
+    PLACEHOLDER,
+    archive_bytes,
+    check_start,
+    checked_target,
+    content_hash_of,
+    emptied,
+    filled,
+    guid_of,
+    pythonfmu_members,
+    pythonfmu_version,
+    tag_of,
+)
 from .patch_file import PatchFile
 from .patched_runtime import output_channels, patched_members, plain_effects
 from .variables import UNITS, FmuVariable, variable_table
 
 FmuKind = Literal["python", "compiled", "source"]
 """Run by Python, compiled for this machine, or the sources of the compiled one alone."""
-
-PYTHONFMU_VERSION = "0.7.0"
-"""The only version whose wrapper these FMUs were tried with; its conventions are not a public interface."""
 
 MODE_COUNT = 6
 """Number of modes of which frequency and damping ratio are outputs, if the model has as many."""
@@ -47,13 +54,7 @@ DESCRIPTION = (
     "under load factor and tip force, with two regions that can lose stiffness."
 )
 
-_OWN_FILES = ("behaviour.py", "slave.py", "variables.py")
-_PLACEHOLDER = "0_content_0_"
-_TAG_LENGTH = len(_PLACEHOLDER)
-_DATE = (1980, 1, 1, 0, 0, 0)
-_TEXT_SUFFIXES = (".py", ".xml", ".txt", ".html", ".json", ".c", ".h")
-# Where the GUID itself stands, between these two; elsewhere the placeholder stands for the tag.
-_GUID_PLACES = {"modelDescription.xml": 'guid="{}"', "sources/wing_variables.h": 'WING_GUID "{}"'}
+_OWN_FILES = ("base_slave.py", "behaviour.py", "slave.py", "variables.py")
 
 _SCRIPT = '''"""Loaded by the FMI wrapper; everything is in the package beside it."""
 from uav_wing_0_content_0__runtime.entry import Fmi2Slave, WingSlave, keep_alive
@@ -72,12 +73,12 @@ _ENTRY = '''"""Joins the slave, the reduced model and pythonfmu's base class."""
 import ctypes
 import json
 
+from .base_slave import Contents
 from .behaviour import Physics, WingBehaviour
 from .fe.damping import rayleigh_damping_ratio
 from .fe.reduced import ReducedModel
 from .fe.transient import ModalIntegrator, TransientState
 from .pythonfmu.fmi2slave import Fmi2Slave
-from .slave import Contents
 from .slave import WingSlave as _WingSlave
 from .variables import variable_table
 
@@ -192,11 +193,7 @@ def build_fmu(
     PatchFileError
         If the FMU cannot carry an effect of the patch.
     """
-    target = Path(path)
-    if target.suffix != ".fmu":
-        raise FmuBuildError(f"An FMU must have the suffix .fmu, but {target} was given.")
-    if target.exists() and not replace:
-        raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
+    target = checked_target(path, replace=replace)
     content, content_hash = fmu_bytes(
         model, state, kind, note=note, resources=resources, patch=patch, activate=activate, arrays=arrays
     )
@@ -207,9 +204,9 @@ def build_fmu(
 def _info(model: ReducedModel, path: Path, content: bytes, content_hash: str) -> FmuInfo:
     return FmuInfo(
         path=path,
-        guid=_guid(content_hash),
+        guid=guid_of(content_hash),
         content_hash=content_hash,
-        model_identifier=f"uav_wing_{content_hash[:_TAG_LENGTH]}",
+        model_identifier=f"uav_wing_{tag_of(content_hash)}",
         design_hash=model.design_hash,
         size=len(content),
     )
@@ -232,39 +229,37 @@ def fmu_bytes(
     table = variable_table(
         gauge_count=model.gauge_count, mode_count=mode_count, validity=model.validity, start=start
     )
-    _check_start(table)
+    check_start(table)
     effects = []
     if patch is not None:
         check_kind(kind)
         effects = plain_effects(patch.for_outputs(output_channels(model.gauge_count)))
         start |= {switch_of(effect): float(activate) for effect in effects}
         table += effect_rows(effects, len(table), start)
-        _check_start(table)
+        check_start(table)
     description = f"{DESCRIPTION} {note}".strip()
     if kind == "python":
         template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start}, description)
         if effects:
-            template |= patched_members(f"resources/uav_wing_{_PLACEHOLDER}_runtime", model, effects, arrays)
+            template |= patched_members(f"resources/uav_wing_{PLACEHOLDER}_runtime", model, effects, arrays)
     else:
         template = compiled_members(
             model,
             table,
-            identifier=f"uav_wing_{_PLACEHOLDER}",
-            guid=_PLACEHOLDER,
-            content_tag=_PLACEHOLDER,
+            identifier=f"uav_wing_{PLACEHOLDER}",
+            guid=PLACEHOLDER,
+            content_tag=PLACEHOLDER,
             description=description,
         )
     for name, content in (resources or {}).items():
         if f"resources/{name}" in template or "/" in name or not name:
             raise FmuBuildError(f"A resource of an FMU cannot have the name {name!r}; choose another one.")
         template[f"resources/{name}"] = content
-    content_hash = _hash(template)
-    members = {
-        _named(name, content_hash): _filled(name, data, content_hash) for name, data in template.items()
-    }
+    content_hash = content_hash_of(template)
+    members = filled(template, content_hash)
     if kind == "compiled":
-        members |= binary_of(members, f"uav_wing_{content_hash[:_TAG_LENGTH]}")
-    return _archive(members), content_hash
+        members |= binary_of(members, f"uav_wing_{tag_of(content_hash)}")
+    return archive_bytes(members), content_hash
 
 
 def check_kind(kind: FmuKind) -> None:
@@ -315,67 +310,30 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
     else:
         tag = members["resources/slavemodule.txt"].decode("ascii").strip().removeprefix("uav_wing_")
     declared = root.split('guid="', 1)[1].split('"', 1)[0]
-    template = {
-        name.replace(tag, _PLACEHOLDER): _emptied(name, data, tag, declared) for name, data in members.items()
-    }
-    return declared, _guid(_hash(template))
-
-
-def _check_start(table: Iterable[FmuVariable]) -> None:
-    for row in table:
-        if row.start is None:
-            continue
-        low = -float("inf") if row.minimum is None else row.minimum
-        high = float("inf") if row.maximum is None else row.maximum
-        if not low <= row.start <= high:
-            raise FmuBuildError(
-                f"The start value {row.start:g} of {row.name} lies outside {low:g} to {high:g}, the range of "
-                + (
-                    "that number of an effect; correct the patch."
-                    if row.variability == "tunable"
-                    else "the reduced model; give another state or build a model with a wider range."
-                )
-            )
+    return declared, guid_of(content_hash_of(emptied(members, tag, declared)))
 
 
 def _members(
     model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str, object], description: str
 ) -> dict[str, bytes]:
     """Return the files of the archive, with the placeholder wherever the content hash will stand."""
-    try:
-        installed = version("pythonfmu")
-    except PackageNotFoundError as error:
-        raise FmuBuildError("Building an FMU needs pythonfmu; install the project's requirements.") from error
-    if installed != PYTHONFMU_VERSION:
-        raise FmuBuildError(
-            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed} is installed."
-        )
-    # As installed, not as imported: an FMU in this process may have brought a pythonfmu of its own.
-    wrapper = Path(str(distribution("pythonfmu").locate_file("pythonfmu")))
+    installed = pythonfmu_version()
     own, wing = files("fmu_asset"), files("fe")
-    module = f"uav_wing_{_PLACEHOLDER}"
+    module = f"uav_wing_{PLACEHOLDER}"
     runtime = f"resources/{module}_runtime"
     members = {
         "modelDescription.xml": model_description(
             identifier=module,
-            guid=_PLACEHOLDER,
+            guid=PLACEHOLDER,
             table=table,
             description=description,
             version=version("uav-twin"),
             generation_tool=f"uav-twin with PythonFMU {installed}",
             units=UNITS + units_of(table),
         ),
-        f"binaries/linux64/{module}.so": (
-            wrapper / "resources/binaries/linux64/libpythonfmu-export.so"
-        ).read_bytes(),
-        f"binaries/win64/{module}.dll": (
-            wrapper / "resources/binaries/win64/pythonfmu-export.dll"
-        ).read_bytes(),
         "documentation/index.html": documentation_page(table, description),
-        "documentation/licenses/pythonfmu.txt": _licence("pythonfmu"),
         "resources/reduced_model.npz": model,
         "resources/start.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode(),
-        "resources/slavemodule.txt": module.encode(),
         f"resources/{module}.py": _SCRIPT.encode(),
         f"{runtime}/__init__.py": b'"""The wing FMU."""\n',
         f"{runtime}/entry.py": _ENTRY.encode(),
@@ -384,78 +342,4 @@ def _members(
     }
     members |= {f"{runtime}/{name}": (own / name).read_bytes() for name in _OWN_FILES}
     members |= {f"{runtime}/fe/{name}": (wing / name).read_bytes() for name in RUNTIME_FILES}
-    members |= {
-        f"{runtime}/pythonfmu/{name}": (wrapper / name).read_bytes()
-        for name in relative_imports(wrapper, ["fmi2slave.py"])
-    }
-    return members
-
-
-def relative_imports(folder: Path, names: Iterable[str]) -> list[str]:
-    """Return files of a package together with all files that they import relatively, sorted."""
-    found: set[str] = set()
-    pending = list(names)
-    while pending:
-        name = pending.pop()
-        if name in found:
-            continue
-        found.add(name)
-        for node in ast.walk(ast.parse((folder / name).read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.level == 1 and node.module:
-                pending.append(f"{node.module}.py")
-    return sorted(found)
-
-
-def _licence(package: str) -> bytes:
-    found = [entry for entry in distribution(package).files or () if entry.name == "LICENSE"]
-    if not found:
-        raise FmuBuildError(f"The licence of {package} is missing from its installation; install it again.")
-    return Path(str(found[0].locate())).read_bytes()
-
-
-def _hash(template: Mapping[str, bytes]) -> str:
-    """Return the SHA-256 over names and contents, the placeholder standing for the hash itself."""
-    digest = hashlib.sha256()
-    for name in sorted(template):
-        digest.update(f"{name}\0{len(template[name])}\0".encode())
-        digest.update(template[name])
-    return digest.hexdigest()
-
-
-def _guid(content_hash: str) -> str:
-    h = content_hash
-    return f"{{{h[:8]}-{h[8:12]}-{h[12:16]}-{h[16:20]}-{h[20:32]}}}"
-
-
-def _named(name: str, content_hash: str) -> str:
-    return name.replace(_PLACEHOLDER, content_hash[:_TAG_LENGTH])
-
-
-def _filled(name: str, data: bytes, content_hash: str) -> bytes:
-    if not name.endswith(_TEXT_SUFFIXES):
-        return data
-    place = _GUID_PLACES.get(name)
-    if place is not None:
-        data = data.replace(place.format(_PLACEHOLDER).encode(), place.format(_guid(content_hash)).encode())
-    return data.replace(_PLACEHOLDER.encode(), content_hash[:_TAG_LENGTH].encode())
-
-
-def _emptied(name: str, data: bytes, tag: str, guid: str) -> bytes:
-    if not name.endswith(_TEXT_SUFFIXES):
-        return data
-    place = _GUID_PLACES.get(name)
-    if place is not None:
-        data = data.replace(place.format(guid).encode(), place.format(_PLACEHOLDER).encode())
-    return data.replace(tag.encode(), _PLACEHOLDER.encode())
-
-
-def _archive(members: Mapping[str, bytes]) -> bytes:
-    """Return a zip archive with fixed dates and order; stored, since compression differs between versions."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name in sorted(members, key=lambda name: (name != "modelDescription.xml", name)):
-            entry = zipfile.ZipInfo(name, date_time=_DATE)
-            entry.create_system = 3
-            entry.external_attr = 0o644 << 16
-            archive.writestr(entry, members[name])
-    return buffer.getvalue()
+    return members | pythonfmu_members(module, f"{runtime}/pythonfmu", ["fmi2slave.py"])

@@ -50,6 +50,7 @@ import json
 
 import numpy as np
 
+from .base_slave import Contents
 from .behaviour import Physics
 from .effect_variables import effect_rows
 from .fe.damping import rayleigh_damping_ratio
@@ -60,7 +61,6 @@ from .fe.sensor_stream import Sample, SensorStream, needs_structure
 from .fe.transient import ModalIntegrator, TransientState
 from .patched_behaviour import PatchedBehaviour, PatchedPhysics
 from .pythonfmu.fmi2slave import Fmi2Slave
-from .slave import Contents
 from .slave import WingSlave as _WingSlave
 from .variables import variable_table
 

@@ -17,7 +17,6 @@ import importlib.util
 import os
 import sys
 from collections.abc import Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -25,20 +24,20 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from reporting.files import atomic_write_bytes
 
-from .build import (
-    _PLACEHOLDER,
-    _TAG_LENGTH,
-    PYTHONFMU_VERSION,
-    FmuInfo,
-    _archive,
-    _guid,
-    _hash,
-    _licence,
-    _named,
-    relative_imports,
-)
+from .build import FmuInfo
 from .description import number
 from .errors import FmuBuildError
+from .packing import (
+    PLACEHOLDER,
+    archive_bytes,
+    checked_target,
+    content_hash_of,
+    filled,
+    guid_of,
+    pythonfmu_members,
+    pythonfmu_version,
+    tag_of,
+)
 
 _BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
@@ -87,18 +86,14 @@ def build_script_fmu(
     FmuBuildError
         The file exists, the suffix is wrong, or the script cannot be packed; the sentence says why.
     """
-    target = Path(path)
-    if target.suffix != ".fmu":
-        raise FmuBuildError(f"An FMU must have the suffix .fmu, but {target} was given.")
-    if target.exists() and not replace:
-        raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
+    target = checked_target(path, replace=replace)
     content, content_hash = script_fmu(script)
     atomic_write_bytes(target, content)
     return FmuInfo(
         path=target,
-        guid=_guid(content_hash),
+        guid=guid_of(content_hash),
         content_hash=content_hash,
-        model_identifier=f"{Path(script).stem}_{content_hash[:_TAG_LENGTH]}",
+        model_identifier=f"{Path(script).stem}_{tag_of(content_hash)}",
         design_hash="",
         size=len(content),
     )
@@ -116,51 +111,23 @@ def script_fmu(script: str | os.PathLike[str]) -> tuple[bytes, str]:
         source = file.read_bytes()
     except OSError as error:
         raise FmuBuildError(f"The model script {file} cannot be read ({error.strerror or error}).") from error
-    try:
-        installed = version("pythonfmu")
-    except PackageNotFoundError as error:
-        raise FmuBuildError("Building an FMU needs pythonfmu; install the project's requirements.") from error
-    if installed != PYTHONFMU_VERSION:
-        raise FmuBuildError(
-            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed} is installed."
-        )
+    pythonfmu_version()
     template = _members(file, source)
-    content_hash = _hash(template)
-    tag, guid = content_hash[:_TAG_LENGTH], _guid(content_hash)
-    members = {}
-    for name, data in template.items():
-        if name == "modelDescription.xml":
-            data = data.replace(f'guid="{_PLACEHOLDER}"'.encode(), f'guid="{guid}"'.encode())
-        if name.endswith((".py", ".xml", ".txt")):
-            data = data.replace(_PLACEHOLDER.encode(), tag.encode())
-        members[_named(name, content_hash)] = data
-    return _archive(members), content_hash
+    content_hash = content_hash_of(template)
+    return archive_bytes(filled(template, content_hash)), content_hash
 
 
 def _members(file: Path, source: bytes) -> dict[str, bytes]:
     model = _model_class(file)
-    module, name = f"{file.stem}_{_PLACEHOLDER}", model.__name__
-    wrapper = Path(str(distribution("pythonfmu").locate_file("pythonfmu")))
+    module, name = f"{file.stem}_{PLACEHOLDER}", model.__name__
     runtime = f"resources/{module}_runtime"
     members = {
         "modelDescription.xml": _description(file, model, module),
-        f"binaries/linux64/{module}.so": (
-            wrapper / "resources/binaries/linux64/libpythonfmu-export.so"
-        ).read_bytes(),
-        f"binaries/win64/{module}.dll": (
-            wrapper / "resources/binaries/win64/pythonfmu-export.dll"
-        ).read_bytes(),
-        "documentation/licenses/pythonfmu.txt": _licence("pythonfmu"),
-        "resources/slavemodule.txt": module.encode(),
-        f"resources/{module}.py": _MODULE.format(module=module, name=name, tag=_PLACEHOLDER).encode(),
+        f"resources/{module}.py": _MODULE.format(module=module, name=name, tag=PLACEHOLDER).encode(),
         f"{runtime}/__init__.py": _RUNTIME.encode(),
         f"{runtime}/model.py": source,
     }
-    members |= {
-        f"resources/pythonfmu/{part}": (wrapper / part).read_bytes()
-        for part in relative_imports(wrapper, ["__init__.py"])
-    }
-    return members
+    return members | pythonfmu_members(module, "resources/pythonfmu", ["__init__.py"])
 
 
 def _model_class(file: Path) -> type[Any]:
@@ -201,7 +168,7 @@ def _description(file: Path, model: type[Any], identifier: str) -> bytes:
     except Exception as error:
         raise FmuBuildError(f"{model.__name__} of {file} cannot be instantiated: {error!r}.") from error
     root.set("modelName", file.stem)
-    root.set("guid", _PLACEHOLDER)
+    root.set("guid", PLACEHOLDER)
     root.set("generationTool", f"uav-twin with {root.get('generationTool')}")
     root.attrib.pop("generationDateAndTime", None)
     interface = root.find("CoSimulation")

@@ -1,31 +1,26 @@
 """Any FMU with a binding as a model: its inputs loaded, its outputs read, internal forces at its ports."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from math import ceil, inf
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign import Campaign, Quantity, Trial, TrialKind
 from discrepancy.compiled_motion import compiled_kernel
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
 from discrepancy.models.fmu_motion import Excitation, FmuMotion, State
+from discrepancy.models.fmu_patch import NO_PATCH, SortedPatch, carries, sorted_patch
 from discrepancy.models.fmu_runs import FmuRuns
+from discrepancy.models.fmu_samples import sampled
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
-from fe.errors import InvalidPatchError, SolutionError
-from fe.motion import NO_LAWS, Laws, laws_of, static_solution
+from fe.errors import SolutionError
+from fe.motion import Laws, static_solution
 from fe.patch import (
-    INTERNAL_FORCES,
-    SENSORS,
-    LoadGain,
-    LoadPlace,
     ModelPatch,
     Primitive,
-    StiffnessDrift,
 )
 
 FloatArray = NDArray[np.float64]
@@ -33,18 +28,6 @@ FloatArray = NDArray[np.float64]
 DEFAULT_PLACE = "tip_load"
 STATIC_ITERATIONS = 30
 STATIC_TOLERANCE = 1e-9
-
-
-@dataclass(frozen=True)
-class _Patch:
-    """A patch by what is done with it."""
-
-    laws: Laws
-    settings: tuple[tuple[str, float], ...]
-    gain: float
-    tare: float
-    along_span: float
-    along_chord: float
 
 
 class FmuModel:
@@ -134,14 +117,7 @@ class FmuModel:
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive."""
-        if primitive in SENSORS or primitive.kind in self.description.effects:
-            return True
-        if primitive is LoadGain:
-            return bool(self._forces)
-        if primitive is LoadPlace:
-            inputs = self.description.inputs
-            return bool(self._forces) and inputs.bending_moment is not None
-        return primitive in INTERNAL_FORCES and primitive is not StiffnessDrift and bool(self._ports)
+        return carries(self.description, primitive)
 
     def ports(self) -> tuple[str, ...]:
         """Names of the ports."""
@@ -163,9 +139,9 @@ class FmuModel:
         for trial in campaign.trials:
             state = self._state(trial, Conditions(values), (), 0)
             if trial.is_dynamic:
-                moved = self._free(trial, Conditions(values), state, _NOTHING, 1)[0]
+                moved = self._free(trial, Conditions(values), state, NO_PATCH, 1)[0]
             else:
-                moved = self._at_rest_values(trial, Conditions(values, health=trial.health), _NOTHING)
+                moved = self._at_rest_values(trial, Conditions(values, health=trial.health), NO_PATCH)
             for port, column in zip(self._ports, port_columns, strict=True):
                 largest[port] = max(largest[port], float(np.max(np.abs(moved[:, column]))))
         frequency = given.angular_frequency
@@ -241,20 +217,22 @@ class FmuModel:
                 f"{conditions.parameters.size} came."
             )
         columns = self._columns(outputs)
-        sorted_patch = self._sorted(patch)
+        parts = sorted_patch(patch, self.description)
         if not trial.is_dynamic:
             moving = (Quantity.VELOCITY, Quantity.ACCELERATION)
             if any(quantity in moving for _, quantity in outputs):
                 raise ModelError(
                     f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
                 )
-            return Response(self._at_rest_values(trial, conditions, sorted_patch)[:, columns])
-        state = self._state(trial, conditions, sorted_patch.settings, 0)
-        values, step = self._moving(trial, conditions, state, sorted_patch, refinement)
-        return self._sampled(trial, conditions, values[:, columns], step, outputs)
+            return Response(self._at_rest_values(trial, conditions, parts)[:, columns])
+        state = self._state(trial, conditions, parts.settings, 0)
+        values, step = self._moving(trial, conditions, state, parts, refinement)
+        rate, zero = conditions.clock
+        derivatives = [self._derivatives(output, quantity) for output, quantity in outputs]
+        return sampled(values[:, columns], step, (1.0 + rate) * trial.time + zero, derivatives)
 
     def _moving(
-        self, trial: Trial, conditions: Conditions, state: State, patch: _Patch, refinement: int
+        self, trial: Trial, conditions: Conditions, state: State, patch: SortedPatch, refinement: int
     ) -> tuple[FloatArray, float]:
         """Return all outputs (K, C) on the grid of the communication step [s], and the step."""
         if not len(patch.laws):
@@ -268,13 +246,13 @@ class FmuModel:
         )
 
     def _free(
-        self, trial: Trial, conditions: Conditions, state: State, patch: _Patch, refinement: int
+        self, trial: Trial, conditions: Conditions, state: State, patch: SortedPatch, refinement: int
     ) -> tuple[FloatArray, float]:
         step, steps, loads = self._excitations(trial, conditions, state, patch, refinement)
         return self.motion.free(state, step, steps, loads), step
 
     def _excitations(
-        self, trial: Trial, conditions: Conditions, state: State, patch: _Patch, refinement: int
+        self, trial: Trial, conditions: Conditions, state: State, patch: SortedPatch, refinement: int
     ) -> tuple[float, int, list[tuple[Excitation, float]]]:
         """Return step, number of steps, and what excites the FMU, each with its factor."""
         step = self.motion.step(trial, refinement)
@@ -312,7 +290,9 @@ class FmuModel:
             (Excitation("velocity"), unit * speed * float(first[1])),
         ]
 
-    def _forced(self, trial: Trial, patch: _Patch, step: float, steps: int) -> list[tuple[Excitation, float]]:
+    def _forced(
+        self, trial: Trial, patch: SortedPatch, step: float, steps: int
+    ) -> list[tuple[Excitation, float]]:
         at_ends = np.interp(step * np.arange(steps + 1), trial.time, trial.force)
         held = 0.5 * (at_ends[1:] + at_ends[:-1])
         on = (at_ends[1:] != 0.0) | (at_ends[:-1] != 0.0)
@@ -339,41 +319,9 @@ class FmuModel:
                     )
         return loads
 
-    def _sampled(
-        self,
-        trial: Trial,
-        conditions: Conditions,
-        values: FloatArray,
-        step: float,
-        outputs: Sequence[tuple[str, Quantity]],
-    ) -> Response:
-        """Return values and rates at the samples, with derivatives where a channel wants them."""
-        rate, zero = conditions.clock
-        times = (1.0 + rate) * trial.time + zero
-        before = times < 0.0
-        grid = step * np.arange(len(values))
-        curve = CubicSpline(grid, values)
-        at = np.clip(times, 0.0, grid[-1])
-        shown, rates = curve(at), curve(at, 1)
-        index = times / step
-        if np.all(np.abs(index - np.round(index)) < 1e-6):
-            shown = values[np.clip(np.round(index).astype(int), 0, len(values) - 1)]
-        rates[before] = 0.0
-        for column, (output, quantity) in enumerate(outputs):
-            order = _ORDER.get(quantity, 0) - _ORDER.get(Quantity(self.runs.quantities[output]), 0)
-            if order > 0 and quantity is not Quantity.SIGNAL:
-                shown = shown.copy() if order and not shown.flags.owndata else shown
-                # derivatives of the derivative's own spline keep the order of the first one
-                slope = curve.derivative()(grid)[:, column]
-                own = CubicSpline(grid, slope)
-                shown[:, column] = own(at, order - 1)
-                rates[:, column] = own(at, order)
-                shown[before, column] = 0.0
-        return Response(np.ascontiguousarray(shown), np.ascontiguousarray(rates))
-
     # ------------------------------------------------------------ rest
 
-    def _at_rest_values(self, trial: Trial, conditions: Conditions, patch: _Patch) -> FloatArray:
+    def _at_rest_values(self, trial: Trial, conditions: Conditions, patch: SortedPatch) -> FloatArray:
         """Return all outputs (N, C) of a static trial or a flight."""
         inputs = self.description.inputs
         flight = trial.kind is TrialKind.FLIGHT
@@ -483,6 +431,12 @@ class FmuModel:
         parameters |= dict(settings)
         return State(tuple(sorted(parameters.items())), tuple(sorted(inputs.items())))
 
+    def _derivatives(self, output: str, quantity: Quantity) -> int:
+        """Return how often an output is derived for a channel of a quantity."""
+        if quantity is Quantity.SIGNAL:
+            return 0
+        return max(_ORDER.get(quantity, 0) - _ORDER.get(Quantity(self.runs.quantities[output]), 0), 0)
+
     def _columns(self, outputs: Sequence[tuple[str, Quantity]]) -> list[int]:
         columns = []
         for output, quantity in outputs:
@@ -511,47 +465,6 @@ class FmuModel:
             )
         return self._forces[place]
 
-    def _sorted(self, patch: ModelPatch) -> _Patch:
-        forces: list[Primitive] = []
-        settings: dict[str, float] = {}
-        gain, tare, along_span, along_chord = 0.0, 0.0, 0.0, 0.0
-        effects = self.description.effects
-        for item in patch:
-            if isinstance(item, SENSORS):
-                continue
-            if item.kind in effects:
-                identifier = effects[item.kind]
-                if f"effect.{identifier}.active" in settings:
-                    raise ModelError(
-                        f"The patch has two primitives {item.kind!r}, but the FMU model {self.name!r} "
-                        f"carries one (effect.{identifier})."
-                    )
-                settings[f"effect.{identifier}.active"] = 1.0
-                for key, value in item.to_mapping().items():
-                    if key != "kind":
-                        settings[f"effect.{identifier}.{key}"] = float(value)
-            elif not self.supports(type(item)):
-                port = " (it has no port)" if isinstance(item, INTERNAL_FORCES) and not self._ports else ""
-                raise ModelError(
-                    f"The FMU model {self.name!r} cannot carry the primitive {item.kind!r}{port}."
-                )
-            elif isinstance(item, LoadGain):
-                gain, tare = (1.0 + gain) * (1.0 + item.gain) - 1.0, tare * (1.0 + item.gain) + item.tare
-            elif isinstance(item, LoadPlace):
-                along_span, along_chord = along_span + item.along_span, along_chord + item.along_chord
-            else:
-                forces.append(item)
-        if along_chord and self.description.inputs.torque is None:
-            raise ModelError(
-                f"The FMU model {self.name!r} names no torque in [inputs], so a load cannot move along the "
-                f"chord."
-            )
-        try:
-            laws = laws_of(ModelPatch(tuple(forces)), self._ports) if forces else NO_LAWS
-        except InvalidPatchError as cause:
-            raise ModelError(str(cause)) from cause
-        return _Patch(laws, tuple(sorted(settings.items())), gain, tare, along_span, along_chord)
-
 
 def _any_trial(kind: TrialKind, interval: float) -> Trial:
     """Return a trial that asks for nothing, for scales without a campaign."""
@@ -564,7 +477,6 @@ def _any_trial(kind: TrialKind, interval: float) -> Trial:
     )  # fmt: skip
 
 
-_NOTHING = _Patch(NO_LAWS, (), 0.0, 0.0, 0.0, 0.0)
 _ORDER: Mapping[Quantity, int] = {
     Quantity.DISPLACEMENT: 0, Quantity.VELOCITY: 1, Quantity.ACCELERATION: 2,
 }  # fmt: skip

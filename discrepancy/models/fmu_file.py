@@ -1,27 +1,25 @@
 """An FMU as a model, described by a TOML file: which variables are parameters, inputs, outputs and ports."""
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from discrepancy.errors import ModelError
+from discrepancy.models.model_file import (
+    NotNegative,
+    Number,
+    Positive,
+    Section,
+    check_unique,
+    checked,
+    read_toml,
+)
 from fe.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0)]
-Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0)]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 CARRIED = tuple(item.kind for item in (*STRUCTURE, *LOADS, StiffnessDrift))
 """Kinds of primitives that an FMU can carry as its own parameters."""
-
-
-class Section(BaseModel):
-    """A table of the file; unknown keys are refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Inputs(Section):
@@ -209,10 +207,7 @@ class FmuModelDescription(Section):
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         for kind, items in (("port", self.port), ("parameter", self.parameter), ("output", self.output)):
-            names = [item.name for item in items]
-            for name in names:
-                if names.count(name) > 1:
-                    raise ValueError(f"there are two of {kind} {name!r}")
+            check_unique(kind, [item.name for item in items])
         for kind in self.effects:
             if kind not in CARRIED:
                 raise ValueError(
@@ -233,19 +228,7 @@ def parse_fmu_model(content: dict[str, Any], source: str = "the FMU model") -> F
     ModelError
         One sentence that names `source`, the place, what came and what was expected.
     """
-    try:
-        return FmuModelDescription.model_validate(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "extra_forbidden":
-            sentence = f"{source}: {place!r} is not a key of an FMU model; remove it or correct its spelling"
-        elif first["type"] == "missing":
-            sentence = f"{source}: {place!r} is missing"
-        else:
-            message = first["msg"].removeprefix("Value error, ")
-            sentence = f"{source}: {place + ': ' if place else ''}{message[0].lower() + message[1:]}"
-        raise ModelError(f"{sentence}.") from None
+    return checked(FmuModelDescription, content, source, "an FMU model")
 
 
 def load_fmu_model(path: Path | str) -> FmuModelDescription:
@@ -256,11 +239,4 @@ def load_fmu_model(path: Path | str) -> FmuModelDescription:
     ModelError
         If there is no such file, it is not TOML, or its content is no FMU model.
     """
-    file = Path(path)
-    try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ModelError(f"The FMU model {file} cannot be read: {error.strerror}.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ModelError(f"The FMU model {file} is not valid TOML: {error}.") from None
-    return parse_fmu_model(content, str(file))
+    return parse_fmu_model(read_toml(Path(path), "FMU model"), str(path))

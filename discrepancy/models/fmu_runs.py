@@ -67,11 +67,8 @@ class FmuRuns:
     # ------------------------------------------------------------ names
 
     def _base_binding(self, folder: Path) -> Binding | None:
-        given = self._description.binding
-        if given is None:
-            return None
-        shipped = binding_files()
-        return load_binding(shipped[given] if given in shipped else folder / given)
+        file = binding_file(self._description, folder)
+        return None if file is None else load_binding(file)
 
     def variable(self, name: str) -> str:
         """Return the FMU's name of an input or output that the description names."""
@@ -281,6 +278,12 @@ class FmuRuns:
         """Return the largest size that an input may have, both signs."""
         low, high = self._first.input_range("load", self.variable(name))
         return min(abs(low), abs(high))
+
+
+def binding_file(description: FmuModelDescription, folder: Path) -> Path | None:
+    """Return the binding file that a description names, a shipped one or one seen from its folder."""
+    given = description.binding
+    return None if given is None else binding_files().get(given, folder / given)
 
 
 def is_affine(zero: FloatArray, parts: Sequence[FloatArray], half: FloatArray, tolerance: float) -> bool:

@@ -1,32 +1,31 @@
 """A lumped model as a TOML file: matrices, named vectors and calibrated parameters, checked strictly."""
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from discrepancy.errors import ModelError
+from discrepancy.models.model_file import (
+    NotNegative,
+    Number,
+    Positive,
+    Section,
+    check_unique,
+    checked,
+    read_toml,
+)
 
 FloatArray = NDArray[np.float64]
 
 SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"
 """Models that come with the package, by file name without the ending."""
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0)]
-Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0)]
 Name = Annotated[str, Field(min_length=1, max_length=100)]
 Vector = tuple[Number, ...]
 Matrix = tuple[Vector, ...]
-
-
-class Section(BaseModel):
-    """A table of the file; unknown keys are refused, and numbers and words are not turned into each other."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Damping(Section):
@@ -188,15 +187,15 @@ class LumpedDescription(Section):
                         )
                 if not any(item.vector):
                     raise ValueError(f"vector of {kind} {item.name!r} is zero")
-            _unique(kind, [item.name for item in items])
+            check_unique(kind, [item.name for item in items])
         if self.root is not None and (len(self.root.lever) != n or not any(self.root.lever)):
             raise ValueError(f"lever of root must have {n} entries that are not all zero")
         if self.damping.ratios is not None and len(self.damping.ratios) != n:
             raise ValueError(f"damping.ratios needs one value for each of the {n} modes")
-        _unique("place station", [f"{place.station:g}" for place in self.place])
+        check_unique("place station", [f"{place.station:g}" for place in self.place])
         parts = [part.name for part in (*self.mass_part, *self.stiffness_part)]
-        _unique("part", [*parts, "mass", "stiffness", "damping"])
-        _unique("parameter", [item.name for item in self.parameter])
+        check_unique("part", [*parts, "mass", "stiffness", "damping"])
+        check_unique("parameter", [item.name for item in self.parameter])
         for parameter in self.parameter:
             for term in parameter.scaled:
                 if term not in ("mass", "stiffness", "damping", *parts):
@@ -226,12 +225,6 @@ def matrix_of(content: Matrix | Vector) -> FloatArray:
     return np.diag(array) if array.ndim == 1 else array
 
 
-def _unique(kind: str, names: list[str]) -> None:
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"there are two of {kind} {name!r}")
-
-
 def parse_lumped(content: dict[str, Any], source: str = "the lumped model") -> LumpedDescription:
     """Check the content of a lumped model's file.
 
@@ -240,23 +233,7 @@ def parse_lumped(content: dict[str, Any], source: str = "the lumped model") -> L
     ModelError
         One sentence that names `source`, the place, what came and what was expected.
     """
-    try:
-        return LumpedDescription.model_validate(content)
-    except ValidationError as error:
-        details = error.errors()
-        # Of a matrix that may also be a diagonal both readings are reported; the other one says too little.
-        first = next((detail for detail in details if detail["type"] != "tuple_type"), details[0])
-        place = ".".join(str(part) for part in first["loc"] if "tuple[" not in str(part))
-        if first["type"] == "extra_forbidden":
-            sentence = (
-                f"{source}: {place!r} is not a key of a lumped model; remove it or correct its spelling"
-            )
-        elif first["type"] == "missing":
-            sentence = f"{source}: {place!r} is missing"
-        else:
-            message = first["msg"].removeprefix("Value error, ")
-            sentence = f"{source}: {place + ': ' if place else ''}{message[0].lower() + message[1:]}"
-        raise ModelError(f"{sentence}.") from None
+    return checked(LumpedDescription, content, source, "a lumped model")
 
 
 def load_lumped(path: Path | str) -> LumpedDescription:
@@ -273,10 +250,4 @@ def load_lumped(path: Path | str) -> LumpedDescription:
         if not file.exists():
             known = ", ".join(sorted(item.stem for item in SHIPPED_MODELS.glob("*.toml")))
             raise ModelError(f"There is no lumped model {str(path)!r}; shipped are {known}, or give a file.")
-    try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ModelError(f"The lumped model {file} cannot be read: {error.strerror}.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ModelError(f"The lumped model {file} is not valid TOML: {error}.") from None
-    return parse_lumped(content, str(file))
+    return parse_lumped(read_toml(file, "lumped model"), str(file))

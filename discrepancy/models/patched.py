@@ -1,26 +1,34 @@
 """A model with a patch built in: a known addition, or an effect that was found."""
 
 from discrepancy.campaign import Quantity, Trial
-from fe.patch import ModelPatch
+from fe.patch import SENSORS, ModelPatch
 
 from .interface import Conditions, Model, Response
 from .wrapped import WrappedModel
 
 
 class PatchedModel(WrappedModel):
-    """A `Model` that adds a patch to every question; sensors in it are not its business.
+    """A `Model` that adds a patch to every question.
+
+    What the patch makes of the structure, its forces and loads is in the responses; sensors in it are applied
+    where those of a question are, in `discrepancy.sensing.observe`, and come first.
 
     Parameters
     ----------
     model : Model
         The model.
     patch : ModelPatch
-        What is added.
+        What is added; its sensors name outputs of the model as their channels.
     """
 
     def __init__(self, model: Model, patch: ModelPatch) -> None:
         super().__init__(model)
         self.patch = patch
+
+    @property
+    def sensors(self) -> ModelPatch:
+        """Sensor primitives of the inner model and of the patch."""
+        return super().sensors + self.patch.of(*SENSORS)
 
     def respond(
         self,

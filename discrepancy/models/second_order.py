@@ -5,19 +5,19 @@ the structural part of a patch, keeps it, and asks it for a `Motion`; rows of it
 `Response`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, eigh
 
-from discrepancy.campaign import Quantity, Release
+from discrepancy.campaign import Release
 from discrepancy.compiled_motion import compiled_kernel
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Response
+from discrepancy.models.free_motion import free_motion
+from discrepancy.models.second_order_motion import Motion
 from fe.errors import SolutionError
 from fe.motion import (
     Laws,
@@ -35,116 +35,6 @@ LEAST_PARTICIPATION = 0.03
 
 LEAST_LEAD = 1e-9
 """A first sample that is later than the begin by less than this share of the interval is at the begin."""
-
-
-@dataclass(frozen=True)
-class Motion:
-    """Motion at the samples of a trial.
-
-    Attributes
-    ----------
-    system : SecondOrderSystem
-        What moved.
-    time : (N,) ndarray
-        Times of the motion since the release or the begin of the force [s].
-    q, velocity : (N, M) ndarray
-        Modal coordinates and their rates (mass-normalised).
-    force : (N,) ndarray
-        Applied force [N].
-    input_row : (n,) ndarray
-        Where it acts.
-    port_forces : (N, J) ndarray
-        Internal forces.
-    lagged : (N, J) ndarray
-        Internal forces as omitted modes follow them.
-    laws : Laws
-        Their laws.
-    held : int
-        First samples that lie before the release, where the shape is held.
-    holding : float
-        Force that held the input point until the release [N].
-    """
-
-    system: "SecondOrderSystem"
-    time: FloatArray
-    q: FloatArray
-    velocity: FloatArray
-    force: FloatArray
-    input_row: FloatArray
-    port_forces: FloatArray
-    lagged: FloatArray
-    laws: Laws
-    held: int = 0
-    holding: float = 0.0
-
-    @cached_property
-    def acceleration(self) -> FloatArray:
-        """Second derivatives (N, M) of the modal coordinates, from the equation of motion."""
-        square = self.system.angular_frequency**2
-        modal = self.system.modal
-        acceleration = -self.q * square - self.velocity @ modal.damping.T
-        if self.laws.rate != 0.0:
-            acceleration -= self.laws.rate * self.time[:, None] * self.q * square
-        if len(self.laws):
-            acceleration -= self.port_forces @ self.laws.rows(modal.ports, self.q.shape[1])
-        if np.any(self.force):
-            acceleration += np.outer(self.force, self.input_row @ self.system.shapes)
-        acceleration[: self.held] = 0.0
-        return np.asarray(acceleration)
-
-    @property
-    def _fading(self) -> FloatArray:
-        """What is left of a holding force in omitted modes (n,), at the first samples where any is."""
-        lag = self.system.relaxation
-        count = int(np.searchsorted(self.time, 40.0 * lag, side="right"))
-        return np.asarray(np.exp(-np.maximum(self.time[:count], 0.0) / lag))
-
-    def values(self, rows: FloatArray) -> FloatArray:
-        """Return row . u (N, C) of rows (C, n).
-
-        Omitted modes follow applied forces without delay, and internal ones and the end of a holding force
-        with that of their damping.
-        """
-        values = self.q @ (rows @ self.system.shapes).T
-        if self.system.truncated:
-            if np.any(self.force):
-                values += np.outer(self.force, rows @ self.system.residual(self.input_row))
-            if len(self.laws):
-                port_rows = self.system.port_rows(self.laws)
-                values -= self.lagged @ (rows @ self.system.residual(port_rows.T)).T
-            if self.holding != 0.0 and self.system.relaxation > 0.0:
-                fading = self.holding * self._fading
-                count = len(fading)
-                values[:count] += np.outer(fading, rows @ self.system.residual(self.input_row))
-        return np.asarray(values)
-
-    def response(self, rows: FloatArray, quantities: Sequence[Quantity]) -> Response:
-        """Return what sensors at rows (C, n) show, and the rates.
-
-        Velocity and acceleration are derivatives of row . u, the other quantities row . u itself. Omitted
-        modes are part of values that are not derivatives only.
-        """
-        modal = rows @ self.system.shapes
-        values, rates = np.empty((2, len(self.q), len(rows)))
-        jerk: FloatArray | None = None
-        still = self.values(rows)
-        for column, quantity in enumerate(quantities):
-            if quantity is Quantity.VELOCITY:
-                values[:, column] = self.velocity @ modal[column]
-                rates[:, column] = self.acceleration @ modal[column]
-            elif quantity is Quantity.ACCELERATION:
-                if jerk is None:
-                    jerk = _slope(self.acceleration, self.time)
-                values[:, column] = self.acceleration @ modal[column]
-                rates[:, column] = jerk @ modal[column]
-            else:
-                values[:, column] = still[:, column]
-                rates[:, column] = self.velocity @ modal[column]
-        return Response(values, rates)
-
-
-def _slope(values: FloatArray, time: FloatArray) -> FloatArray:
-    return np.asarray(np.gradient(values, time, axis=0)) if len(time) > 1 else np.zeros_like(values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,7 +219,7 @@ class SecondOrderSystem:
             held = int(np.searchsorted(times, 0.0))  # samples before the release
         nothing = np.zeros(len(times))
         if laws.linear and not self.modal.coupled:
-            all_q, all_v = self._free(q, v, times)
+            all_q, all_v = free_motion(self.modal, q, v, times)
             if held:
                 all_q[:held], all_v[:held] = q, 0.0
             none = np.zeros((len(times), 0))
@@ -447,23 +337,6 @@ class SecondOrderSystem:
         deviation[0] = 0.0
         return acts / self.angular_frequency**2 + deviation, np.zeros(modes), memory, holding
 
-    def _free(self, q: FloatArray, v: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return free motion (N, M), displacement and velocity, of uncoupled modes in closed form.
-
-        `times` are evenly spaced.
-        """
-        half = 0.5 * np.diag(self.modal.damping)
-        w = self.angular_frequency
-        root = np.sqrt((half**2 - w**2).astype(complex))
-        root = np.where(np.abs(root) < 1e-6 * w, 1e-6 * w, root)  # critical: beside it, by 1e-12 of w^2
-        fast, slow = -half - root, -half + root
-        first = (v - fast * q) / (2.0 * root)  # q = first e^(slow t) + second e^(fast t)
-        if np.all(root.imag != 0.0):  # the two are conjugate
-            wave = 2.0 * first * _exponentials(slow, times)
-            return np.ascontiguousarray(wave.real), np.ascontiguousarray((slow * wave).real)
-        one, two = first * _exponentials(slow, times), (q - first) * _exponentials(fast, times)
-        return np.ascontiguousarray((one + two).real), np.ascontiguousarray((slow * one + fast * two).real)
-
     def _backwards(self, q: FloatArray, v: FloatArray, duration: float) -> tuple[FloatArray, FloatArray]:
         """Return the state a duration [s] earlier, without internal forces."""
         modes = len(q)
@@ -483,15 +356,3 @@ def _solve(
         return static_solution(laws, linear, compliance, memory=memory, start=start, kernel=compiled_kernel())
     except SolutionError as cause:
         raise ModelError(str(cause)) from cause
-
-
-def _exponentials(rates: NDArray[Any], times: FloatArray) -> NDArray[np.complex128]:
-    """Return e^(rate t) (N, M) at evenly spaced times, as products of few exponentials."""
-    count, block = len(times), 32
-    if count <= 2 * block:
-        return np.asarray(np.exp(np.outer(times, rates)))
-    interval = (times[-1] - times[0]) / (count - 1)
-    blocks = -(-count // block)
-    coarse = np.exp(np.outer(times[0] + interval * block * np.arange(blocks), rates))
-    fine = np.exp(np.outer(interval * np.arange(block), rates))
-    return np.asarray((coarse[:, None, :] * fine).reshape(blocks * block, -1)[:count])

@@ -1,12 +1,9 @@
 """The wing as a model: its reduced structure under patches, in static tests, flights and ring-downs."""
 
-from collections.abc import Hashable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from calibration.errors import CalibrationError
 from calibration.result import STATE, CalibrationResult
@@ -15,7 +12,7 @@ from discrepancy.compiled_motion import compiled_kernel
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
 from discrepancy.models.memory import Memory
-from discrepancy.models.second_order import SecondOrderSystem
+from discrepancy.models.wing_structure import MovingWing, Outputs, Stiffness, WingStructure
 from fe.design import load_design
 from fe.errors import FiniteElementError, InvalidPatchError, SolutionError
 from fe.motion import NO_LAWS, Laws, laws_of, static_solution
@@ -30,17 +27,14 @@ from fe.patch import (
     ModulusTemperature,
     PointMass,
     Primitive,
-    RootCompliance,
 )
 from fe.patch_arrays import PatchArrays
 from fe.patch_cache import patch_arrays
-from fe.patched_wing import LOAD_PLACE, PORTS, PatchedWing, Place, motion_basis, strain_gauge
+from fe.patched_wing import LOAD_PLACE, PORTS, PatchedWing
 from fe.reduced_arrays import PARAMETER_NAMES
 from fe.reduction import Progress
 
 FloatArray = NDArray[np.float64]
-Outputs = tuple[tuple[str, Quantity], ...]
-Key = Hashable
 
 SHIPPED_PRIOR = {
     "young_modulus_factor": (1.0073, 0.0103),
@@ -52,32 +46,6 @@ SHIPPED_PRIOR = {
 """Mean and standard deviation of the calibrated state of the shipped wing (docs/calibration.md): e of the
 paper, its masses, and the damping of the joint posterior, whose spread holds the measurement too."""
 DAMPING_LIMITS = {"damping_alpha": (0.0, 20.0), "damping_beta": (0.0, 1e-2)}
-MODE_COUNT = 6
-"""Modes that move in ring-downs and under forces; those of the FMU."""
-
-
-class _Stiffness:
-    """Factorised stiffness of the wing in one state, and what it answered so far."""
-
-    def __init__(self, matrix: FloatArray) -> None:
-        self.matrix = matrix
-        try:
-            self._factor = cho_factor(matrix, lower=True, check_finite=False)
-        except np.linalg.LinAlgError as cause:
-            raise ModelError(
-                f"The patched wing has no stiffness left in some direction ({cause})."
-            ) from cause
-
-    def solve(self, loads: FloatArray) -> FloatArray:
-        """Return K^-1 loads, (n,) or (n, k)."""
-        return np.asarray(cho_solve(self._factor, loads, check_finite=False))
-
-
-class _Moved(NamedTuple):
-    """The wing in a basis (n, k) of its first modes and some static shapes."""
-
-    basis: FloatArray
-    system: SecondOrderSystem
 
 
 class WingModel:
@@ -109,10 +77,8 @@ class WingModel:
         self._parameters = tuple(
             ModelParameter(item.name, *prior[item.name], item.unit, *limits[item.name]) for item in STATE
         )
-        self._ports = {port: self.wing.port_row(port) for port in PORTS}
-        self._port_rows = np.stack([self._ports[port] for port in PORTS])
-        self._stiffnesses, self._systems = Memory(), Memory()
-        self._rows, self._statics = Memory(), Memory(2048)
+        self._structure = WingStructure(self.wing)
+        self._statics = Memory(2048)
 
     @classmethod
     def shipped(cls, progress: Progress | None = None) -> "WingModel":
@@ -167,9 +133,7 @@ class WingModel:
 
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is, or None if the model has no such output."""
-        if self.wing.output_row(output) is None:
-            return None
-        return Quantity.STRAIN if output.startswith("strain") else Quantity.DISPLACEMENT
+        return self._structure.output_quantity(output)
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive; it can carry all."""
@@ -187,8 +151,8 @@ class WingModel:
         """Return the natural scales under a campaign, by the unpatched wing."""
         values = np.array([campaign.parameters.get(p.name, (p.mean, 0.0))[0] for p in self._parameters])
         empty = ModelPatch()
-        static = self._stiffness(values, (0.0, 0.0), empty, 0.0)
-        moved = self._moved(values, (0.0, 0.0), empty, 0.0, LOAD_PLACE)
+        static = self._structure.stiffness(values, (0.0, 0.0), empty, 0.0)
+        moved = self._structure.moving(values, (0.0, 0.0), empty, 0.0, LOAD_PLACE)
         tip = self.wing.arrays.load_tip
         first, shape = float(moved.system.angular_frequency[0]), moved.basis @ moved.system.shapes[:, 0]
         motions = {
@@ -198,7 +162,8 @@ class WingModel:
         fitted = [motions[trial.name] for trial in campaign.fitted if trial.is_dynamic]
         largest = np.max(list(motions.values()), axis=0, initial=0.0) * np.ones(len(PORTS))
         usual = np.max(fitted, axis=0) if fitted else largest
-        at_rest = 1.0 / np.einsum("pn,np->p", self._port_rows, static.solve(self._port_rows.T))
+        port_rows = self._structure.port_rows
+        at_rest = 1.0 / np.einsum("pn,np->p", port_rows, static.solve(port_rows.T))
         dynamic = [trial for trial in campaign.trials if trial.is_dynamic]
         begins = [
             trial.start if trial.is_dynamic else float(trial.time.min())
@@ -211,7 +176,7 @@ class WingModel:
             if len(trial.time)
         ]
         duration = max(ends) - min(begins) if ends else 0.0
-        by_first = self._port_rows @ shape
+        by_first = port_rows @ shape
         return Scales(
             length=self.wing.span,
             tip_stiffness=1.0 / float(tip @ static.solve(tip)),
@@ -258,7 +223,7 @@ class WingModel:
             )
         quantities = [quantity for _, quantity in outputs]
         try:
-            rows = self._output_rows(outputs, 0, patch.of(LocalStiffnessLoss))
+            rows = self._structure.output_rows(outputs, 0, patch.of(LocalStiffnessLoss))
             forces = patch.of(*INTERNAL_FORCES)
             laws = laws_of(forces, PORTS) if len(forces) else NO_LAWS
             if not trial.is_dynamic:
@@ -296,7 +261,8 @@ class WingModel:
         amounts = _amounts(trial, loads)
         blocks = [rows]
         if components:
-            blocks += [self._output_rows(outputs, number, patch.of(LocalStiffnessLoss)) for number in (1, 2)]
+            losses = patch.of(LocalStiffnessLoss)
+            blocks += [self._structure.output_rows(outputs, number, losses) for number in (1, 2)]
         values = np.empty((size, len(blocks) * len(outputs)))
         place = None if flight else trial.load_place
         memory: FloatArray | None = None
@@ -306,11 +272,11 @@ class WingModel:
         changes = np.flatnonzero(np.any(np.diff(acting, axis=0) != 0.0, axis=1)) + 1
         for end in (*changes.tolist(), size):
             z1, z2, warmer = acting[start]
-            key = self._stiffness_key(conditions.parameters, (z1, z2), structure, warmer)
-            stiffness = self._stiffness(conditions.parameters, (z1, z2), structure, warmer)
+            key = self._structure.stiffness_key(conditions.parameters, (z1, z2), structure, warmer)
+            stiffness = self._structure.stiffness(conditions.parameters, (z1, z2), structure, warmer)
             shown, at_ports, flexible, port_flexibility = self._statics.get(
                 (key, place, loads.primitives, outputs, components),
-                lambda stiffness=stiffness: self._static_units(stiffness, place, loads, blocks),  # type: ignore[misc]
+                lambda stiffness=stiffness: self._structure.static_units(stiffness, place, loads, blocks),  # type: ignore[misc]
             )
             part = amounts[start:end] @ shown
             if len(laws):
@@ -333,17 +299,6 @@ class WingModel:
             return Response(values)
         return Response(values[:, :count], None, values[:, count : 2 * count], values[:, 2 * count :])
 
-    def _static_units(
-        self, stiffness: _Stiffness, place: Place | None, loads: ModelPatch, blocks: list[FloatArray]
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return outputs (k, C) and port motions (k, 3) of unit loads, and the same of unit port forces."""
-        units = self.wing.load_parts(loads) if place is None else self.wing.force_row(place, loads)[None]
-        answer = stiffness.solve(np.concatenate((units, self._port_rows)).T)
-        shown = np.concatenate([rows @ answer for rows in blocks]).T
-        moved = (self._port_rows @ answer).T
-        count = len(units)
-        return shown[:count], moved[:count], shown[count:], moved[count:]
-
     def _moving(
         self,
         trial: Trial,
@@ -359,7 +314,7 @@ class WingModel:
         structure = patch.of(*STRUCTURE)
         z1, z2 = conditions.health[0]
         loads = patch.of(*LOADS)
-        basis, system = self._moved(
+        basis, system = self._structure.moving(
             conditions.parameters, (z1, z2), structure, float(trial.temperature[0]), trial.load_place
         )
         if trial.kind is TrialKind.RINGDOWN:
@@ -377,112 +332,28 @@ class WingModel:
         response = motion.response(rows @ basis, quantities)
         if not components:
             return response
+        losses = structure.of(LocalStiffnessLoss)
         across, shear = (
-            motion.values(self._output_rows(outputs, number, structure.of(LocalStiffnessLoss)) @ basis)
-            for number in (1, 2)
+            motion.values(self._structure.output_rows(outputs, number, losses) @ basis) for number in (1, 2)
         )
         return Response(response.values, response.rates, across, shear)
 
     # ------------------------------------------------------------ parts
 
-    def _output_rows(self, outputs: Outputs, component: int, losses: ModelPatch) -> FloatArray:
-        rows = self._rows.get((outputs, component), lambda: self._made_rows(outputs, component))
-        factors = self.wing.strain_factors(losses)
-        if factors is None:
-            return rows
-        gauges = self._rows.get(
-            (outputs, "gauges"), lambda: np.array([strain_gauge(output) for output, _ in outputs])
-        )
-        return rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
-
-    def _made_rows(self, outputs: Outputs, component: int) -> FloatArray:
-        rows = []
-        for output, quantity in outputs:
-            own = self.output_quantity(output)
-            row = self.wing.output_row(output, component)
-            if own is None or row is None:
-                raise ModelError(
-                    f"The wing has no output {output!r}; it has strain[1] to "
-                    f"strain[{self.wing.gauge_count}], tip_displacement, load_point_displacement and "
-                    f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction."
-                )
-            moving = own is Quantity.DISPLACEMENT and quantity in (Quantity.VELOCITY, Quantity.ACCELERATION)
-            if quantity not in (own, Quantity.SIGNAL) and not moving:
-                raise ModelError(
-                    f"The output {output!r} of the wing is a {own.value}, but a channel measures "
-                    f"{quantity.value}."
-                )
-            rows.append(row)
-        return np.array(rows).reshape(len(rows), self.wing.size)
-
-    @staticmethod
-    def _stiffness_key(
-        parameters: FloatArray, health: tuple[float, float], structure: ModelPatch, temperature: float
-    ) -> Key:
-        kept = structure.of(RootCompliance, LocalStiffnessLoss, ModulusTemperature)
-        if not any(isinstance(item, ModulusTemperature) for item in kept):
-            temperature = 0.0
-        return float(parameters[0]), float(health[0]), float(health[1]), kept.primitives, float(temperature)
-
-    def _stiffness(
-        self,
-        parameters: FloatArray,
-        health: tuple[float, float],
-        structure: ModelPatch,
-        temperature: float,
-    ) -> _Stiffness:
-        key = self._stiffness_key(parameters, health, structure, temperature)
-        return self._stiffnesses.get(
-            key,
-            lambda: _Stiffness(
-                self.wing.structure(float(parameters[0]), health, 0.0, 0.0, structure, temperature).stiffness
-            ),
-        )
-
-    def _moved(
-        self,
-        parameters: FloatArray,
-        health: tuple[float, float],
-        structure: ModelPatch,
-        temperature: float,
-        place: Place,
-    ) -> "_Moved":
-        """Return the wing as it moves when released from, or pushed at, a place."""
-        key = self._stiffness_key(parameters, health, structure, temperature)
-        masses = structure.of(PointMass)
-
-        def make() -> _Moved:
-            e, servo, pitot, alpha, beta = (float(value) for value in parameters)
-            stiffness = self._stiffness(parameters, health, structure, temperature)
-            mass = self.wing.structure(e, health, servo, pitot, masses).mass
-            still = stiffness.solve(np.vstack((self.wing.force_row(place), self._port_rows)).T)
-            basis = motion_basis(stiffness.solve, mass, self.wing.arrays.start_shapes, still)
-            small_mass, small = basis.T @ mass @ basis, basis.T @ stiffness.matrix @ basis
-            small_mass, small = 0.5 * (small_mass + small_mass.T), 0.5 * (small + small.T)
-            ports = {port: row @ basis for port, row in self._ports.items()}
-            return _Moved(
-                basis,
-                SecondOrderSystem(
-                    small_mass, alpha * small_mass + beta * small, small, ports, MODE_COUNT, beta
-                ),
-            )
-
-        return self._systems.get((key, masses.primitives, parameters[1:].tobytes(), place), make)
-
-    def _port_motion(self, trial: Trial, static: _Stiffness, moved: _Moved) -> FloatArray:
+    def _port_motion(self, trial: Trial, static: Stiffness, moved: MovingWing) -> FloatArray:
         """Motion (N, 3) of the ports in a trial by the unpatched wing."""
         empty = ModelPatch()
         if not trial.is_dynamic:
             place = None if trial.kind is TrialKind.FLIGHT else trial.load_place
-            units = self._static_units(static, place, empty, [self._port_rows])[1]
+            units = self._structure.static_units(static, place, empty, [self._structure.port_rows])[1]
             return np.asarray(_amounts(trial, empty) @ units)
         row = self.wing.force_row(trial.load_place)
         if trial.kind is TrialKind.FORCED:
             motion = moved.system.forced(row @ moved.basis, trial.force, trial.time, NO_LAWS)
-            return motion.values(self._port_rows @ moved.basis)
+            return motion.values(self._structure.port_rows @ moved.basis)
         shape = static.solve(row)
         size = trial.release.displacement if trial.release is not None else 0.0
-        return np.asarray(size / float(row @ shape) * (self._port_rows @ shape))[None]
+        return np.asarray(size / float(row @ shape) * (self._structure.port_rows @ shape))[None]
 
 
 def _amounts(trial: Trial, loads: ModelPatch) -> FloatArray:

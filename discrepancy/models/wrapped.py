@@ -1,7 +1,7 @@
 """What models around another model have in common: everything but the response is that of the inner one."""
 
 from discrepancy.campaign import Campaign, Quantity
-from fe.patch import Primitive
+from fe.patch import ModelPatch, Primitive
 
 from .interface import Model, ModelParameter, Scales
 
@@ -22,6 +22,11 @@ class WrappedModel:
     def name(self) -> str:
         """Name for people."""
         return self.inner.name
+
+    @property
+    def sensors(self) -> ModelPatch:
+        """Sensor primitives that are built in, their channels named by outputs; see `built_in_sensors`."""
+        return built_in_sensors(self.inner)
 
     @property
     def parameters(self) -> tuple[ModelParameter, ...]:
@@ -47,3 +52,12 @@ class WrappedModel:
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign."""
         return self.inner.scales(campaign)
+
+
+def built_in_sensors(model: Model) -> ModelPatch:
+    """Return the sensor primitives that a model has built in, their channels named by its outputs.
+
+    They are no part of its responses: `discrepancy.sensing.observe` applies them, since what sensors show
+    of a response depends on all of them together.
+    """
+    return model.sensors if isinstance(model, WrappedModel) else ModelPatch()

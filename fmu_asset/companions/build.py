@@ -6,30 +6,30 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import distribution, version
+from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from reporting.files import atomic_write_bytes
 
-from ..build import (
-    _PLACEHOLDER,
-    PYTHONFMU_VERSION,
-    _archive,
-    _check_start,
-    _filled,
-    _guid,
-    _hash,
-    _licence,
-    _named,
-    relative_imports,
-)
 from ..description import documentation_page, model_description
 from ..errors import FmuBuildError
+from ..packing import (
+    PLACEHOLDER,
+    archive_bytes,
+    check_start,
+    checked_target,
+    content_hash_of,
+    filled,
+    guid_of,
+    pythonfmu_members,
+    pythonfmu_version,
+)
 from ..variables import ENUMERATIONS, FmuVariable, Unit
 from . import damage_growth, strain_gauges
 
+_SHARED_FILES = ("base_slave.py", "variables.py")
 _OWN_FILES = ("slave.py", "table.py")
 _STATUS = tuple(enumeration for enumeration in ENUMERATIONS if enumeration.name == "Status")
 _UNITS = (
@@ -54,9 +54,9 @@ class Companion{tag}(CompanionSlave, Fmi2Slave):
 _ENTRY = '''"""Joins the slave, the behaviour and pythonfmu's base class."""
 import json
 
+from .base_slave import Contents
 from .companions import {name} as companion
 from .companions.slave import CompanionSlave as _CompanionSlave
-from .companions.slave import Contents
 from .pythonfmu.fmi2slave import Fmi2Slave
 
 __all__ = ["CompanionSlave", "Fmi2Slave", "keep_alive"]
@@ -147,14 +147,10 @@ def build_companion(
         If there is no such companion, a start value does not fit, the file exists, the suffix is wrong, or
         the wrong pythonfmu is installed.
     """
-    target = Path(path)
-    if target.suffix != ".fmu":
-        raise FmuBuildError(f"An FMU must have the suffix .fmu, but {target} was given.")
-    if target.exists() and not replace:
-        raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
+    target = checked_target(path, replace=replace)
     content, content_hash = companion_bytes(name, start=start, gauge_count=gauge_count)
     atomic_write_bytes(target, content)
-    return CompanionInfo(target, _guid(content_hash), content_hash)
+    return CompanionInfo(target, guid_of(content_hash), content_hash)
 
 
 def companion_bytes(
@@ -173,32 +169,25 @@ def companion_bytes(
         table = companion.variable_table(setting)
     except ValueError as error:
         raise FmuBuildError(f"The companion FMU {name} cannot be built: {error}.") from error
-    _check_start(table)
+    check_start(table)
     template = _members(companion, table, setting)
-    content_hash = _hash(template)
-    members = {_named(key, content_hash): _filled(key, data, content_hash) for key, data in template.items()}
-    return _archive(members), content_hash
+    content_hash = content_hash_of(template)
+    return archive_bytes(filled(template, content_hash)), content_hash
 
 
 def _members(
     companion: Companion, table: tuple[FmuVariable, ...], setting: Mapping[str, Any]
 ) -> dict[str, bytes]:
     """Return the files of the archive, with the placeholder wherever the content hash will stand."""
-    installed = version("pythonfmu")
-    if installed != PYTHONFMU_VERSION:
-        raise FmuBuildError(
-            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed} is installed."
-        )
-    # As installed, not as imported: an FMU in this process may have brought a pythonfmu of its own.
-    wrapper = Path(str(distribution("pythonfmu").locate_file("pythonfmu")))
+    installed = pythonfmu_version()
     own = files("fmu_asset")
-    module = f"{companion.name}_{_PLACEHOLDER}"
+    module = f"{companion.name}_{PLACEHOLDER}"
     runtime = f"resources/{module}_runtime"
     host = "It runs in any Python host; the standard library is enough."
     members = {
         "modelDescription.xml": model_description(
             identifier=module,
-            guid=_PLACEHOLDER,
+            guid=PLACEHOLDER,
             table=table,
             description=companion.description,
             version=version("uav-twin"),
@@ -208,22 +197,14 @@ def _members(
             enumerations=_STATUS,
             dependencies=companion.dependencies(setting),
         ),
-        f"binaries/linux64/{module}.so": (
-            wrapper / "resources/binaries/linux64/libpythonfmu-export.so"
-        ).read_bytes(),
-        f"binaries/win64/{module}.dll": (
-            wrapper / "resources/binaries/win64/pythonfmu-export.dll"
-        ).read_bytes(),
         "documentation/index.html": documentation_page(
             table, companion.description, model_name=companion.name, enumerations=_STATUS, host=host
         ),
-        "documentation/licenses/pythonfmu.txt": _licence("pythonfmu"),
         "resources/setting.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode(),
-        "resources/slavemodule.txt": module.encode(),
-        f"resources/{module}.py": _SCRIPT.format(module=module, tag=_PLACEHOLDER).encode(),
+        f"resources/{module}.py": _SCRIPT.format(module=module, tag=PLACEHOLDER).encode(),
         f"{runtime}/__init__.py": b'"""An FMU of uav-twin."""\n',
         f"{runtime}/entry.py": _ENTRY.format(name=companion.name).encode(),
-        f"{runtime}/variables.py": (own / "variables.py").read_bytes(),
+        **{f"{runtime}/{name}": (own / name).read_bytes() for name in _SHARED_FILES},
         f"{runtime}/companions/__init__.py": b'"""What the FMU does."""\n',
         f"{runtime}/pythonfmu/__init__.py": b'"""The base class of pythonfmu."""\n',
     }
@@ -231,8 +212,4 @@ def _members(
         f"{runtime}/companions/{name}": (own / "companions" / name).read_bytes()
         for name in (*_OWN_FILES, f"{companion.name}.py")
     }
-    members |= {
-        f"{runtime}/pythonfmu/{name}": (wrapper / name).read_bytes()
-        for name in relative_imports(wrapper, ["fmi2slave.py"])
-    }
-    return members
+    return members | pythonfmu_members(module, f"{runtime}/pythonfmu", ["fmi2slave.py"])

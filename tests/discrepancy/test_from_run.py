@@ -18,11 +18,14 @@ from discrepancy.candidate import Candidate
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.from_run import RunPlan, held_out_turns, run_campaign, run_model
+from discrepancy.model_choice import choice_of_run
 from discrepancy.models.interface import Conditions
+from discrepancy.models.memo import MemoModel
 from discrepancy.problem import Point, Problem
+from discrepancy.sensing import observe
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
-from fe.patch import ModelPatch, SensorDrift
+from fe.patch import ModelPatch, SensorDrift, SensorGain, SensorRotation
 
 TURNS = 24
 DRIFT = SensorDrift("strain[17]", -1.2e-3, float(TURNS))
@@ -79,6 +82,33 @@ def test_the_model_of_the_run_gives_the_strains_that_the_fmu_had(run: Path) -> N
     response[:, 16] += DRIFT.amplitude * trial.time / DRIFT.time
     truth = np.asarray(tree["truth"]["strain"].values)
     np.testing.assert_allclose(response, truth, atol=2e-4 * np.abs(truth).max())
+
+
+@pytest.mark.xdist_group("wing")
+def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path: Path) -> None:
+    known = (
+        SensorGain("strain[3]", -0.3), SensorRotation("strain[9]", 0.4),
+        SensorDrift("strain[17]", 4e-4, 1.0, exponent=0.0), SensorGain("*", 0.05, "strain"),
+    )  # fmt: skip
+    folder = tmp_path / "known"
+    fly_mission(folder, 7, known, known, turns=4)
+    tree, model = tree_of(folder), run_model(folder)
+    campaign = run_campaign(folder, RunPlan(held_out_share=0.0))
+    values = [1.0073 if item.name == "young_modulus_factor" else item.mean for item in model.parameters]
+    conditions = Conditions(np.array(values), health=np.asarray(tree["truth"]["state"].values))
+    truth = np.asarray(tree["truth"]["strain"].values)  # of the FMU, which has the effects too
+    shown = observe(model, campaign, campaign.trials[0], ModelPatch(), conditions).values
+    np.testing.assert_allclose(shown, truth, atol=2e-4 * np.abs(truth).max())
+    # those of a question come after them: a gauge that was turned back reads as the others do
+    back = ModelPatch((SensorRotation("g9", -0.4),))
+    again = observe(MemoModel(model), campaign, campaign.trials[0], back, conditions).values
+    outputs = tuple((f"strain[{number}]", Quantity.STRAIN) for number in range(1, 25))
+    plain = model.respond(campaign.trials[0], outputs, ModelPatch(), conditions).values
+    np.testing.assert_allclose(again[:, 8], 1.05 * plain[:, 8], rtol=1e-12)
+    np.testing.assert_array_equal(np.delete(again, 8, axis=1), np.delete(shown, 8, axis=1))
+    patched = choice_of_run(folder).source_hash
+    (folder / "asset" / "model_patch.json").unlink()
+    assert choice_of_run(folder).source_hash != patched
 
 
 @pytest.mark.xdist_group("wing")

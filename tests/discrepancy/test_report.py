@@ -382,7 +382,7 @@ def test_models_by_name_and_file(tmp_path: Path) -> None:
         ("missing.nc", "no model file"),
         ("wing.fmu", "is an FMU"),
         ("table.csv", "is no model"),
-        ("broken.toml", "cannot be read"),
+        ("broken.toml", "not valid TOML"),
         ("design.toml", "design"),
     ],
 )

@@ -11,10 +11,11 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import fe.cache
-from fe.cache import MODELLING_FILES, cache_folder, cache_key, reduced_model, wing_fields
+from fe.cache import MODELLING_FILES, cache_key, reduced_model, wing_fields
 from fe.design import WingDesign
 from fe.errors import ReducedModelFileError
 from fe.fields import WingFields, field_basis
+from fe.kept import cache_folder
 from fe.operators import AffineOperators
 from fe.reduction import Reduction
 from fe.reduction_settings import ReductionSettings

@@ -16,9 +16,10 @@ from fmpy.validation import validate_fmu
 
 from fe.reduced import RUNTIME_FILES, ReducedModel
 from fe.state import DigitalState
-from fmu_asset.build import build_fmu, recorded_content_hash, relative_imports
+from fmu_asset.build import build_fmu, recorded_content_hash
 from fmu_asset.check import check_fmu
 from fmu_asset.errors import FmuBuildError
+from fmu_asset.packing import relative_imports
 
 BIN = Path(sys.executable).parent
 ROOT = Path(__file__).parents[2]

@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from fe.damping import rayleigh_damping_ratio
 from fe.reduced import ReducedModel
 from fe.transient import ModalIntegrator, TransientState
+from fmu_asset.base_slave import Contents
 from fmu_asset.behaviour import Physics, WingBehaviour
-from fmu_asset.slave import Contents, WingSlave
+from fmu_asset.slave import WingSlave
 from fmu_asset.variables import (
     STATUS_BAD_CALL,
     STATUS_BAD_STATE,

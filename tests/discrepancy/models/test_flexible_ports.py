@@ -13,7 +13,8 @@ from scipy.optimize import brentq
 
 from discrepancy.campaign import Quantity, Release
 from discrepancy.compiled_motion import compiled_kernel
-from discrepancy.models.second_order import Motion, SecondOrderSystem
+from discrepancy.models.second_order import SecondOrderSystem
+from discrepancy.models.second_order_motion import Motion
 from fe.motion import ModalMotion, ModalSystem, laws_of, simulate, slip_displacements
 from fe.patch import (
     BoucWen,

@@ -16,6 +16,7 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.errors import ModelError
 from discrepancy.examples import example_campaign, plan_for
+from discrepancy.model_choice import choose_model
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.fmu_file import parse_fmu_model
 from discrepancy.models.interface import Conditions, Model
@@ -180,6 +181,30 @@ def test_is_a_model_with_what_its_file_says(rig: FmuModel) -> None:
         assert model.supports(carried)
     for refused in (StiffnessDrift, PointMass, LoadPlace, Washout, InertiaRelief):
         assert not model.supports(refused)
+
+
+def test_a_changed_binding_is_another_model(foreign_fmu: Any, tmp_path: Path) -> None:
+    binding = """
+[binding]
+name = "rig"
+step_size = 0.01
+[load.push]
+variable = "slide.force"
+unit = "N"
+maximum = 50.0
+[observation.place]
+variables = ["slide.position"]
+unit = "m"
+"""
+    fmu = foreign_fmu("rig2")
+    bare = choose_model(write(tmp_path, fmu))
+    assert bare.source_hash == choose_model(tmp_path / "rig.toml").source_hash
+    path = write(tmp_path, fmu, (f'fmu = "{fmu}"', f'fmu = "{fmu}"\nbinding = "rig_binding.toml"'))
+    hashes = [bare.source_hash]
+    for text in (binding, binding.replace("50.0", "40.0")):
+        (tmp_path / "rig_binding.toml").write_text(text, encoding="utf-8")
+        hashes.append(choose_model(path).source_hash)
+    assert len(set(hashes)) == 3
 
 
 def test_scales_are_those_of_the_rig(rig: FmuModel, lumped: LumpedModel) -> None:

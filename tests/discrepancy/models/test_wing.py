@@ -17,8 +17,8 @@ from discrepancy.campaign import Campaign, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
-from fe.cache import cache_folder
 from fe.design import load_design
+from fe.kept import cache_folder
 from fe.patch import (
     PRIMITIVES,
     LoadGain,
