@@ -85,8 +85,9 @@ def draw(found: Investigation, folder: Path) -> None:
         axis.plot(time, 1e6 * (trial.values - prediction)[:, 0], lw=0.8)
         axis.set_ylabel("residual, $\\mu$V")
         axis.set_title(label, fontsize=9)
+    axes[2].set_ylim(axes[1].get_ylim())
     axes[2].set_xlabel("time since the release, s")
-    figure.savefig(folder / "real_wing_residuals.png", dpi=60)
+    figure.savefig(folder / "real_wing_residuals.png", dpi=90)
     plt.close(figure)
 
 

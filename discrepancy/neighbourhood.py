@@ -15,6 +15,14 @@ NEIGHBOUR_ITERATIONS, NEIGHBOUR_GAIN = 8, 1.0
 """Steps of each fit, and the gain [nat] that counts."""
 
 
+def is_box(candidate: Candidate) -> bool:
+    """Whether an effect has more than one parameter that is no mere size, as a place and a length.
+
+    Its edges pass sensors and lines of the mesh, and optima on either side may fit within the noise.
+    """
+    return any(sum(not is_magnitude(item) for item in term.parameters) > 1 for term in candidate.terms)
+
+
 def around(problem: Problem, found: Fit) -> Fit:
     """Return the best fit of the same candidate beside an optimum, or the fit itself.
 

@@ -15,7 +15,7 @@ from .errors import FitError, ModelError
 from .fitting import Fit, fit
 from .gates import SHAPE_GAIN, absolute_gate
 from .hypotheses import LARGEST_SET, Hypotheses, key_of
-from .neighbourhood import around, free_shape
+from .neighbourhood import around, free_shape, is_box
 from .problem import Point, Problem
 from .promising import pairs, starts
 from .screening import Change, Screen, rescaled
@@ -164,8 +164,9 @@ class Search(Hypotheses):
         """Search: singles, one more at a time, all pairs where a single one does not do, deletion."""
         floor = self.score(self.none) - 6.0
         ranked = self.refine(self.scan(self.none, self.effects), floor)
-        for item in ranked[:RIDGES]:
-            if not self._misfits(item) and not absolute_gate(self.problem, item).passed:
+        for rank, item in enumerate(ranked[:RIDGES]):
+            fits = absolute_gate(self.problem, item).passed
+            if not self._misfits(item) and (not fits or (rank == 0 and is_box(item.candidate))):
                 self.keep(around(self.problem, item), exact=True)
         self._settle_steps()
         self._families()
@@ -271,15 +272,15 @@ class Search(Hypotheses):
         if len(best.candidate.terms) < 2:
             return
         for index in range(len(best.candidate.terms)):
+            # from here even a set that was fitted before may find a better optimum
             less = best.candidate.without(index)
-            if key_of(less) not in self.exact:
-                parts = best.candidate.parts(best.point.effect)
-                effect = np.concatenate(parts[:index] + parts[index + 1 :])
-                start = Point(best.point.shared, best.point.local, effect)
-                try:
-                    self.keep(fit(self.problem, less, start), exact=True)
-                except (FitError, ModelError):
-                    continue
+            parts = best.candidate.parts(best.point.effect)
+            effect = np.concatenate(parts[:index] + parts[index + 1 :])
+            try:
+                found = fit(self.problem, less, Point(best.point.shared, best.point.local, effect))
+            except (FitError, ModelError):
+                continue
+            self.keep(found, exact=True)
 
 
 def search(problem: Problem, effects: Sequence[Effect]) -> Search:
