@@ -21,7 +21,6 @@ from rich.console import Console
 from rich.progress import track
 
 from discrepancy.campaign_file import read_campaign
-from discrepancy.candidate import FREE_SHAPE
 from discrepancy.catalogue.library import library
 from discrepancy.errors import DiscrepancyError
 from discrepancy.models.interface import Model
@@ -66,7 +65,7 @@ def verdict_row(found: Investigation) -> dict[str, Any]:
         "sentence": verdict.sentence,
         "identifiers": sorted(item.identifier for item in verdict.effects) if verdict.kind in NAMING else [],
         "places": {item.identifier: item.place for item in verdict.effects},
-        "group": [member.replace(FREE_SHAPE, "") for member in verdict.group],
+        "group": list(verdict.group),
         "family": verdict.family,
         "probability": _finite(verdict.probability),
         "log_bayes_factor": _finite(verdict.log_bayes_factor),

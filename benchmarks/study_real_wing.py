@@ -17,6 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from discrepancy.fitting import Fit
 from discrepancy.models.wing import WingModel
 from discrepancy.naming import named_effects
 from discrepancy.problem import Problem
@@ -42,13 +43,18 @@ def alone(runs: Sequence[Investigation]) -> Table:
     for number, found in enumerate(runs):
         if found.search is None or found.problem is None:
             continue
-        for item in found.search.all().values():
-            if len(item.candidate.terms) > 1:
-                continue
+        best: dict[str, Fit] = {}
+        for item in found.search.all().values():  # of all places the most probable
             label = " ".join(item.candidate.identifiers) or "none"
+            if len(item.candidate.terms) < 2 and (
+                label not in best or found.search.score(best[label]) < found.search.score(item)
+            ):
+                best[label] = item
+        for label, item in best.items():
             shape = [u for part in named_effects(found.problem, item) for u in part.shape]
-            label_row = rows.setdefault(label, [""] * len(runs))
-            label_row[number] = f"{item.log_evidence:.1f}" + "".join(
+            place = "".join(f" {term.place}" for term in item.candidate.terms)
+            cells = rows.setdefault(label, [""] * len(runs))
+            cells[number] = f"{item.log_evidence:.1f}{place}" + "".join(
                 f" ({u.name} {u.value:.2f})" for u in shape
             )
             if number == 0:

@@ -23,6 +23,8 @@ CONVERGED = 1e-2
 """A step that promises less than this [nat] ends a fit."""
 STALLED = 1
 """So do more than this many steps in a row that gain less, whatever they promised."""
+WHOLE_STEP, LARGEST_DAMPING = 1e-2, 1.0
+"""Damping below which a step is nearly that of Gauss and Newton, and above which it is a mere trial."""
 STEP_SHARES = (1.0, 0.3)
 """Shares of a step that are tried before the damping grows; chord steps are rough and try the first only."""
 CREEPING, NEAR_END = 0.2, 30.0
@@ -188,7 +190,7 @@ def fit(
             step, promised = descent.step(state, damping)
         before = promised
         if promised < CONVERGED and fresh:
-            converged = True
+            converged = damping < LARGEST_DAMPING  # else only short steps are left to promise little
             break
         if promised < CONVERGED:
             state, fresh = descent.state(state.point), True
@@ -200,9 +202,9 @@ def fit(
             state, fresh = following, base is not None
             if gain < 0.7 * promised and base is None:  # derivatives have grown old
                 state, fresh = descent.state(state.point), True
-            if give_up is not None and state.objective - 2.0 * promised > give_up:
+            if give_up is not None and damping < WHOLE_STEP and state.objective - 2.0 * promised > give_up:
                 break
-            stalled = stalled + 1 if gain < CONVERGED and damping < 1e-2 else 0
+            stalled = stalled + 1 if gain < CONVERGED and damping < WHOLE_STEP else 0
             if stalled > STALLED and fresh:
                 converged = True
                 break
@@ -278,20 +280,21 @@ class _Descent:
         """Return the state after a step, or None if none better was found.
 
         Where the phases of a record bend the valley that the step follows, its end lies on the slope; a
-        second step with the same derivatives leads back to the bottom (the second-order correction of
-        Transtrum and Sethna 2012, arXiv:1201.5885, with the whole step as difference).
+        second step with the same derivatives by the nuisances leads back to the bottom (the second-order
+        correction of Transtrum and Sethna 2012, arXiv:1201.5885, with the whole step as difference).
         """
         for share in STEP_SHARES if self.base is None else STEP_SHARES[:1]:
             try:
                 ahead = _ahead(self.candidate, state.point, step, share)
                 proposal = self.state(ahead, derivatives=False)
-                if not proposal.objective < state.objective and np.isfinite(proposal.objective):
+                bent = not proposal.objective < state.objective and np.isfinite(proposal.objective)
+                if bent and share == 1.0:
                     correction, _ = self.step(self.state(ahead, known=state.parts), damping)
                     ahead = _ahead(self.candidate, ahead, correction)
                     proposal = self.state(ahead, derivatives=False)
                 if proposal.objective < state.objective:
                     return self.state(ahead, known=state.parts)
-            except ModelError:  # outside what the structure can carry: a shorter step
+            except (FitError, ModelError):  # outside what the structure can carry: a shorter step
                 continue
         return None
 
@@ -326,11 +329,11 @@ def _step(
         gradient_part = block.shared_gradient - block.cross.T @ inner_gradient
         np.add.at(gradient, block.index, gradient_part)
         eliminated.append((inner, inner_gradient))
-    matrix += damping * np.diag(damped_diagonal + prior)
     try:
-        factor = cho_factor(matrix)
-        step = np.zeros(size) if local_only else cho_solve(factor, gradient)
-        variance = np.diag(cho_solve(factor, np.eye(size)[:, shared_size:])[shared_size:])
+        effect = np.eye(size)[:, shared_size:]
+        variance = np.diag(cho_solve(cho_factor(matrix), effect)[shared_size:])
+        damped = matrix + damping * np.diag(damped_diagonal + prior)
+        step = np.zeros(size) if local_only else cho_solve(cho_factor(damped), gradient)
     except LinAlgError as cause:
         raise FitError("The normal equations of a fit are singular; a parameter has no influence.") from cause
     promised = 0.5 * float(gradient @ step)

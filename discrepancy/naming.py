@@ -73,7 +73,7 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         return verdict(VerdictKind.FAMILY, sentence, p_top, **more), found, drawn
 
     def unexplained(sentence: str, gates: tuple[Gate, ...]) -> tuple[Verdict, Search, Fit]:
-        more = {"gates": gates, "resembles": top}
+        more = {"gates": gates, "resembles": _plain(top)}
         return verdict(VerdictKind.UNEXPLAINED, sentence, p_top, **more), found, found.none
 
     none_gate = absolute_gate(problem, found.none)
@@ -99,11 +99,15 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
 
     # sets that hold the best one and more agree with it; they only leave a further effect open
     p_top = sum(p for names, p in probabilities.items() if set(_plain(top)) <= set(_plain(names)))
+    if best.candidate.is_family:  # reached from several members or places, it is one family
+        p_top = max(p_top, _family_probability(found, best.candidate.terms[0].effect.family))
     if p_top < SURE or bayes < BAYES_FACTOR:
         return _open(problem, found, probabilities, verdict, best)
     gate = absolute_gate(problem, best)
     if best.candidate.is_family:
-        return family_of(best, (gate,))
+        if gate.passed is not False:
+            return family_of(best, (gate,))
+        return unexplained(f"There is a gap that no effect of the catalogue fits. {gate.reason}", (gate,))
     shape, family = _shape(found, best)
     if gate.passed is not False and shape.passed:
         best = with_draws(problem, best)
@@ -146,6 +150,17 @@ def _members(probabilities: Mapping[tuple[str, ...], float]) -> list[tuple[str, 
     return members
 
 
+def _family_probability(found: Search, family: str) -> float:
+    """Return the probability of a family: of all single effects of it, named or of free shape."""
+    kept = found.all().values()
+    scores = np.array([found.score(item) for item in kept])
+    members = np.array(
+        [len(item.candidate.terms) == 1 and item.candidate.terms[0].effect.family == family for item in kept]
+    )
+    weights = np.exp(scores - scores.max())
+    return float(weights[members].sum() / weights.sum())
+
+
 def _plain(names: tuple[str, ...]) -> tuple[str, ...]:
     """Return identifiers without the mark of a free shape."""
     return tuple(name.removesuffix(FREE_SHAPE) for name in names)
@@ -163,7 +178,7 @@ def _open(
     total = sum(probabilities[names] for names in members)
     fits = [_best_of(found, names) for names in members]
     if () in members:
-        hints = sorted({name for names in members for name in names})
+        hints = sorted({name for names in members for name in _plain(names)})
         return (
             verdict(
                 VerdictKind.BELOW_LIMIT,
@@ -174,11 +189,14 @@ def _open(
             found, best,
         )  # fmt: skip
     gates = [absolute_gate(problem, item) for item in fits]
-    fitting = [
-        (names, item, each)
-        for names, item, each in zip(members, fits, gates, strict=True)
-        if each.passed is not False
-    ]
+    fitting: list[tuple[tuple[str, ...], Fit, Gate]] = []
+    together = 0.0
+    for names, item, each in zip(members, fits, gates, strict=True):
+        if each.passed is False:  # those that do not fit take their probability with them
+            continue
+        together += probabilities[names]
+        if _plain(names) not in [_plain(other) for other, _, _ in fitting]:  # else a law and its family
+            fitting.append((names, with_draws(problem, item), each))
     if not fitting or len(fitting) > LARGEST_GROUP:
         return (
             verdict(
@@ -186,19 +204,18 @@ def _open(
                 f"There is a gap that no effect of the catalogue fits. {gates[0].reason}"
                 if not fitting
                 else f"There is a gap, and {len(fitting)} explanations fit it alike.",
-                total, gates=(gates[0],), resembles=members[0],
+                total, gates=(gates[0],), resembles=_plain(members[0]),
             ),
             found, found.none,
         )  # fmt: skip
-    # those that do not fit take their probability with them
-    together = sum(probabilities[names] for names, _, _ in fitting)
-    group = tuple(dict.fromkeys(" + ".join(names) for names, _, _ in fitting))
+    group = tuple(" + ".join(_plain(names)) for names, _, _ in fitting)
+    labels = [" + ".join(names) for names, _, _ in fitting]
     effects = tuple(effect for _, item, _ in fitting for effect in named_effects(problem, item))
     _, nearest, gate = fitting[0]
     sentence = (
-        f"Either {', '.join(group[:-1])} or {group[-1]} is missing; these data cannot tell which."
+        f"Either {', '.join(labels[:-1])} or {labels[-1]} is missing; these data cannot tell which."
         if len(group) > 1
-        else f"There is a gap that {group[0]} fits, but not with the probability that a name needs."
+        else f"There is a gap that {labels[0]} fits, but not with the probability that a name needs."
     )
     return (
         verdict(VerdictKind.GROUP, sentence, together, effects=effects, group=group, gates=(gate,)),

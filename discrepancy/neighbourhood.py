@@ -11,8 +11,8 @@ from .screening import is_magnitude
 RIDGE_STEPS, PLACE_STEPS = (-0.8, -0.3, 0.3, 0.8), (-0.15, -0.05, 0.05, 0.15)
 """Steps along the direction that the data tell least of, and of parameters that are not mere sizes, in prior
 deviations."""
-NEIGHBOUR_ITERATIONS, NEIGHBOUR_GAIN = 8, 1.0
-"""Steps of each fit, and the gain [nat] that counts."""
+NEIGHBOUR_ITERATIONS, NEIGHBOUR_GAIN, ROUNDS = 8, 1.0, 5
+"""Steps of each fit, the gain of log evidence that counts [nat], and how often one leads to the next."""
 
 
 def is_box(candidate: Candidate) -> bool:
@@ -31,7 +31,7 @@ def around(problem: Problem, found: Fit) -> Fit:
     """
     parameters = [item for term in found.candidate.terms for item in term.parameters]
     free = [number for number, item in enumerate(parameters) if not is_magnitude(item)]
-    while True:
+    for _ in range(ROUNDS):
         moves = [step * axis for axis in np.eye(found.candidate.size)[free] for step in PLACE_STEPS]
         if found.candidate.size > 1:
             _, directions = np.linalg.eigh(found.effect_covariance)
@@ -45,11 +45,12 @@ def around(problem: Problem, found: Fit) -> Fit:
                 )
             except (FitError, ModelError):
                 continue
-            if item.objective < better.objective - NEIGHBOUR_GAIN:
+            if item.log_evidence > better.log_evidence + NEIGHBOUR_GAIN:
                 better = item
         if better is found:
-            return found
+            break
         found = better
+    return found
 
 
 def free_shape(problem: Problem, named: Fit, number: int, *, give_up: float | None = None) -> Fit | None:

@@ -24,7 +24,7 @@ MAINS = (50.0, 60.0, 400.0)
 MAINS_DEVIATION = 1e-3
 """Share of its frequency by which the mains may be off."""
 LINE_STEPS = 4
-"""Frequencies that are tried within the resolution of a record."""
+"""Frequencies that are looked at within the resolution of a record."""
 LARGEST_ORDER = 12
 WHITE_LEVEL = 1e-6
 """Noise is taken as white unless the Ljung-Box test of the record rejects it at this level.
@@ -129,7 +129,7 @@ def noise_model(channel: Channel, fallback: float) -> NoiseModel:
     if samples is None or interval is None or len(samples) < 50:
         return white
     rest, lines = without_lines(samples - samples.mean(), interval)
-    freedom = len(rest) - 1.0 - 2.0 * len(lines)
+    freedom = len(rest) - 1.0 - 3.0 * len(lines)  # cosine, sine and frequency
     deviation = float(np.sqrt(rest @ rest / freedom))
     if ljung_box(rest, 20) > WHITE_LEVEL:
         return NoiseModel(deviation, deviation, freedom, np.empty(0), interval, lines)
@@ -152,9 +152,7 @@ def without_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tup
         if shown < 2.0 * resolution or shown > 0.5 / interval - 2.0 * resolution:
             continue
         reach = MAINS_DEVIATION * frequency
-        tried = shown + np.linspace(-reach, reach, 2 * ceil(LINE_STEPS * reach / resolution) + 1)
-        tried = tried[(tried > resolution) & (tried < 0.5 / interval - resolution)]
-        line = _strongest_line(rest, interval, tried)
+        line = _strongest_line(rest, interval, shown - reach, shown + reach)
         left = rest - line
         # against the neighbourhood of the line, so that coloured noise is not taken for one
         spectrum = np.abs(np.fft.rfft(left)) ** 2
@@ -172,17 +170,21 @@ def without_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tup
     return rest, tuple(found)
 
 
-def _strongest_line(samples: FloatArray, interval: float, tried: FloatArray) -> FloatArray:
-    """Return the line of most power near the frequencies (T,) that are tried."""
+def _strongest_line(samples: FloatArray, interval: float, low: float, high: float) -> FloatArray:
+    """Return the line of most power between two frequencies [Hz]."""
+    count = LINE_STEPS * len(samples)
+    power = np.abs(np.fft.rfft(samples, count)) ** 2
+    step = 1.0 / (count * interval)
+    first = max(int(np.ceil(low / step)), 1)
+    inside = power[first : int(high / step) + 1]
+    best = step * (first + int(np.argmax(inside))) if inside.size else 0.5 * (low + high)
 
     def missed(frequency: float) -> float:
         line = _line(samples, interval, frequency)
         return -float(line @ line)
 
-    best = float(min(tried, key=missed))
-    if len(tried) > 1:
-        step = float(tried[1] - tried[0])
-        bounds = (best - step, best + step)
+    bounds = (max(best - step, low, step), min(best + step, high))
+    if bounds[1] > bounds[0]:
         best = float(
             minimize_scalar(missed, bounds=bounds, method="bounded", options={"xatol": 1e-3 * step}).x
         )

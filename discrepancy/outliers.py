@@ -19,8 +19,8 @@ LARGEST_SHARE = 0.03
 """Largest share of a record in time that may be left out; above it the record is at fault."""
 SIGNIFICANT = 5.0
 """A sample is an outlier if it is this many robust deviations off what its neighbours say."""
-GLITCH = 7.0
-"""The same beside what a model predicts."""
+WRONG_END = 8.0
+"""The same at the ends of a record, beside what a model predicts."""
 SIGNIFICANT_ROW = 8.0
 """The same for a row of a static or flight trial, in deviations of the noise record."""
 _SHAPES = ((3, 5), (4, 5), (6, 5), (9, 5), (13, 5), (18, 5), (6, 9), (9, 9), (9, 13), (13, 13), (18, 13))
@@ -130,29 +130,37 @@ def sample_outliers(values: FloatArray, used: BoolArray | None = None) -> BoolAr
     return result
 
 
-def glitches(residual: FloatArray, used: BoolArray) -> BoolArray:
-    """Return which samples of what a model leaves of an even record are single wrong readings, (N,).
+def wrong_ends(residual: FloatArray, used: BoolArray) -> BoolArray:
+    """Return which samples at the ends of a trial's records are single wrong readings, (N, C).
 
-    Judges what `sample_outliers` cannot: the ends of a record, and places where the motion is too fast for
-    neighbours to foretell a sample. A wrong model leaves waves, in which neighbours are alike.
+    `sample_outliers` cannot judge the ends; beside a model they can be. What several channels show at once,
+    or several samples in a row, is no single reading: a release, an impact, a trigger that came late.
 
     Parameters
     ----------
-    residual : (N,) ndarray
-        Measured less predicted.
-    used : (N,) ndarray of bool
+    residual : (N, C) ndarray
+        Measured less predicted; the model need not fit.
+    used : (N, C) ndarray of bool
         Samples that count.
     """
-    rows = np.flatnonzero(used)
-    found = np.zeros(len(residual), dtype=bool)
-    if len(rows) < 4 * _EDGE:
-        return found
-    rest = residual[rows]
-    around = np.stack([_shifted(rest, shift) for shift in (-2, -1, 1, 2)])
-    beside = rest - np.nanmedian(around, axis=0)
-    scale = max(_NORMAL * float(np.median(np.abs(beside))), 1e-300)
-    alone = np.abs(rest) > 2.0 * np.nanmax(np.abs(around), axis=0)
-    found[rows[alone & (np.abs(beside) > GLITCH * scale)]] = True
+    found = np.zeros(residual.shape, dtype=bool)
+    for column in range(residual.shape[1]):
+        rows = np.flatnonzero(used[:, column])
+        if len(rows) < 8 * _EDGE:
+            continue
+        rest = residual[rows, column]
+        around = np.stack([_shifted(rest, shift) for shift in (-2, -1, 1, 2)])
+        beside = rest - np.nanmedian(around, axis=0)
+        alone = np.abs(rest) > 2.0 * np.nanmax(np.abs(around), axis=0)
+        for end in (slice(0, _EDGE), slice(-_EDGE, None)):
+            # beside the roughness near that end, where the motion may be fastest
+            near = beside[: 4 * _NEAR] if end.stop else beside[-4 * _NEAR :]
+            scale = max(_NORMAL * float(np.median(np.abs(near))), 1e-300)
+            far = alone[end] & (np.abs(beside[end]) > WRONG_END * scale)
+            found[rows[end][far], column] = far.sum() == 1
+    for end in (slice(0, _EDGE), slice(-_EDGE, None)):
+        if found[end].any(axis=0).sum() > 1:
+            found[end] = False
     return found
 
 

@@ -25,8 +25,10 @@ LEAST_RISE = 0.6
 """Rise of the misfit [nat] at the ends of a Gaussian 90 % interval below which the posterior is drawn from;
 NINETY^2 / 2 = 1.35 is expected."""
 SEED = 20211
-WALKERS, SWEEPS, SETTLING, LARGEST_STRETCH = 12, 50, 15, 2.0
-"""Of the ensemble: members, moves of each, those of them that are left out, and the largest stretch."""
+WALKERS, SWEEPS, BLOCKS, LARGEST_STRETCH = 12, 50, 5, 2.0
+"""Of the ensemble: members, moves of each in a block, largest number of blocks, and the largest stretch."""
+SETTLED = 0.15
+"""Share of its width by which an interval may differ between the last two blocks."""
 DOUBLINGS = 8
 
 
@@ -83,10 +85,13 @@ def ensemble(
     centre: FloatArray,
     axes: FloatArray,
     *,
-    sweeps: int = SWEEPS,
     seed: int = SEED,
 ) -> FloatArray:
     """Return draws by stretch moves of an ensemble (Goodman and Weare 2010, CAMCoS 5 (1), 65-80).
+
+    Blocks of moves are added until the central 90 % of the last two agree in every coordinate, at most
+    `BLOCKS`. Along a ridge that is bent and a hundred times longer than wide five blocks are too few, and
+    draws cover a part of it.
 
     Parameters
     ----------
@@ -96,15 +101,13 @@ def ensemble(
         Where the ensemble begins.
     axes : (E, E) ndarray
         Columns along which it is spread at first.
-    sweeps : int
-        Moves of each member; the first `SETTLING` are left out.
     seed : int
         Of the moves.
 
     Returns
     -------
     (N, E) ndarray
-        Draws of all members after they have settled.
+        Draws of all members in the last block.
     """
     generator = np.random.default_rng(seed)
     size = len(centre)
@@ -113,19 +116,29 @@ def ensemble(
     values = np.array([energy(walker) for walker in walkers])
     stranded = ~np.isfinite(values)
     walkers[stranded], values[stranded] = centre, energy(centre)
-    kept = []
     half = count // 2
-    for sweep in range(sweeps):
-        for moving, others in ((slice(0, half), slice(half, count)), (slice(half, count), slice(0, half))):
-            for index in range(count)[moving]:
-                other = walkers[generator.integers(*others.indices(count)[:2])]
-                root = np.sqrt(LARGEST_STRETCH)
-                stretch = (1.0 / root + generator.random() * (root - 1.0 / root)) ** 2
-                proposal = other + stretch * (walkers[index] - other)
-                value = energy(proposal)
-                chance = (size - 1) * np.log(stretch) + values[index] - value
-                if np.log(generator.random()) < chance:
-                    walkers[index], values[index] = proposal, value
-        if sweep >= SETTLING:
+    block = np.empty((0, size))
+    for _ in range(BLOCKS):
+        before, kept = block, []
+        for _ in range(SWEEPS):
+            for moving, others in ((range(half), (half, count)), (range(half, count), (0, half))):
+                for index in moving:
+                    other = walkers[generator.integers(*others)]
+                    root = np.sqrt(LARGEST_STRETCH)
+                    stretch = (1.0 / root + generator.random() * (root - 1.0 / root)) ** 2
+                    proposal = other + stretch * (walkers[index] - other)
+                    value = energy(proposal)
+                    chance = (size - 1) * np.log(stretch) + values[index] - value
+                    if np.log(generator.random()) < chance:
+                        walkers[index], values[index] = proposal, value
             kept.append(walkers.copy())
-    return np.concatenate(kept)
+        block = np.concatenate(kept)
+        if len(before) and _agree(before, block):
+            break
+    return block
+
+
+def _agree(first: FloatArray, second: FloatArray) -> bool:
+    """Whether two samples have nearly the same central 90 % in every coordinate."""
+    ends, others = (np.quantile(draws, (0.05, 0.95), axis=0) for draws in (first, second))
+    return bool(np.all(np.abs(ends - others) <= SETTLED * (others[1] - others[0])))

@@ -309,8 +309,9 @@ class Problem:
         known : Linearisation, optional
             Derivatives by shared and local unknowns that are near enough.
         effect_steps : (E,) ndarray, optional
-            Deviations of the effect parameters. Differences over about one deviation average over the kinks
-            of friction and hysteresis, and do not reach beyond where the parameters may lie.
+            Deviations of the effect parameters. Differences over one of them, at most a hundredth of the
+            prior's, average over the kinks of friction and hysteresis and do not reach beyond where the
+            parameters may lie.
         """
         data = self.trials[number]
         kind = data.trial.kind

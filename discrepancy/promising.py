@@ -6,9 +6,12 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
+from fe.patch import SENSORS
+
 from .candidate import Term
-from .catalogue.entry import Effect
-from .screening import Change, Screen, rescaled
+from .catalogue.entry import Effect, Setting
+from .errors import ModelError
+from .screening import FIRST_ORDER, Change, Screen, rescaled
 
 FloatArray = NDArray[np.float64]
 
@@ -19,18 +22,35 @@ FEW_PLACES = 3
 
 
 def starts(screen: Screen, effect: Effect, count: int = STARTS) -> list[Change]:
-    """Return the most promising changes of an effect; more of them where its place is a parameter."""
+    """Return the most promising changes of an effect; more of them where a box is to be placed."""
     if sum(not item.magnitude for item in effect.parameters) > 1:
         count *= 3
     found: list[Change] = []
     places = effect.places(screen.problem.setting)
     for place in places:
         best: list[Change] = []
-        for change in screen.changes(Term(effect, place), fine=len(places) <= FEW_PLACES):
-            if change.size > 0.0:
-                best = sorted([*best, change], key=_worth)[:count]
+        few = len(places) <= FEW_PLACES
+        for change in screen.changes(Term(effect, place), fine=few):
+            tried = [change]
+            if few and change.size > FIRST_ORDER and acts_within(effect, screen.problem.setting):
+                tried.append(_in_small(screen, change))
+            best = sorted([*best, *(item for item in tried if item.size > 0.0)], key=_worth)[:count]
         found.extend(best)
     return sorted(found, key=_worth)[:count]
+
+
+def _in_small(screen: Screen, change: Change) -> Change:
+    try:
+        return screen.shrunk(change)[0]
+    except ModelError:
+        return change
+
+
+def acts_within(effect: Effect, setting: Setting) -> bool:
+    """Whether an effect acts within the structure or on its loads, not on readings only."""
+    term = Term(effect, effect.places(setting)[0])
+    patch = effect.patch(setting, term.values(term.start() + 1.0), term.place)
+    return not all(isinstance(item, SENSORS) for item in patch)
 
 
 def _worth(change: Change) -> float:
@@ -53,6 +73,11 @@ def pairs(changes: dict[str, list[Change]], sign: FloatArray) -> Iterator[tuple[
                     if np.linalg.cond(gram) > 1e8:
                         continue
                     scale = np.linalg.solve(gram, fits)
+                    if any(
+                        size < 0.0 and not change.may_turn
+                        for size, change in zip(scale, (first, second), strict=True)
+                    ):
+                        continue  # a size that cannot be negative: the other one alone
                     misfit = -0.5 * float(fits @ scale)
                     if best is None or misfit < best[0]:
                         best = (misfit, _scaled(first, scale[0]), _scaled(second, scale[1]))

@@ -40,6 +40,8 @@ LINEAR = 0.05
 """Signed magnitudes are tried at one prior deviation and at this share of it: what moves phases (clock,
 drift) leaves the range of first order before its shared part is taken up by the nuisances."""
 
+FIRST_ORDER = 25.0
+"""Squared change of all readings [sigma^2] to which effects are shrunk to see their direction."""
 PADDED, PEAKS = 4, 3
 """Zero padding of spectra, and peaks that are tried."""
 
@@ -76,12 +78,13 @@ class Change:
     @property
     def gain(self) -> float:
         """Decrease of the misfit at the best scale [nat]; none where a positive size would turn negative."""
-        if self.fits < 0.0 and not self._may_turn:
+        if self.fits < 0.0 and not self.may_turn:
             return 0.0
         return 0.5 * self.fits * self.scale
 
     @property
-    def _may_turn(self) -> bool:
+    def may_turn(self) -> bool:
+        """Whether its scale may be negative."""
         sizes = [item.prior.shape for item in self.term.parameters if is_magnitude(item)]
         return not sizes or any(shape != "log_normal" for shape in sizes)
 
@@ -197,6 +200,22 @@ class Screen:
         square -= float(y @ y)
         return np.concatenate((*parts, *tail, y)), fits, square
 
+    def shrunk(self, change: Change) -> tuple[Change, float]:
+        """Return a change made so small that it is of first order, and by which factor.
+
+        Effects that move a frequency turn phases by many radians at their medians, which says nothing of what
+        they do in small.
+        """
+        whole = float((change.vector[self.sign > 0.0] ** 2).sum())  # before the nuisances take their share
+        factor = sqrt(FIRST_ORDER / whole) if whole > 0.0 else 1.0
+        if factor >= 1.0:
+            return change, 1.0
+        start = change.start.copy()
+        for number, item in enumerate(change.term.parameters):
+            if is_magnitude(item):
+                start[number] = item.prior.normal(factor * item.prior.value(float(start[number])))
+        return self.change(change.term, start), factor
+
     def _peaks(self, term: Term) -> tuple[float, ...]:
         """Return peaks of the residuals' mean spectrum at a term's channel, over the first frequency."""
         if not term.effect.spectral:
@@ -233,7 +252,8 @@ class Screen:
     def changes(self, term: Term, *, fine: bool = True) -> Iterator[Change]:
         """Yield the changes of a term over the grid of its parameters, where the model can follow.
 
-        Without `fine`, signed magnitudes are tried at one size only: enough for what is linear in them.
+        Without `fine`, signed magnitudes are tried at one size only, enough for what is linear in them,
+        unless they ask for levels of their own.
         """
         for start in grid(term, self._peaks(term), fine=fine):
             try:
@@ -251,7 +271,7 @@ def _channels_of(patch: ModelPatch) -> frozenset[str]:
 
 
 def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Iterator[FloatArray]:
-    """Yield scaled parameters to try: magnitudes at one value, since changes scale with them.
+    """Yield scaled parameters to try: magnitudes at one value or at levels of theirs, since changes scale.
 
     A spectral parameter is tried at the given peaks.
     """

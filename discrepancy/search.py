@@ -17,7 +17,7 @@ from .gates import SHAPE_GAIN, absolute_gate
 from .hypotheses import LARGEST_SET, Hypotheses, key_of
 from .neighbourhood import around, free_shape, is_box
 from .problem import Point, Problem
-from .promising import pairs, starts
+from .promising import acts_within, pairs, starts
 from .screening import Change, Screen, rescaled
 
 FloatArray = NDArray[np.float64]
@@ -75,8 +75,10 @@ class Search(Hypotheses):
         Close to the truth one linearisation serves all (chord steps). Far from it phases slip over a long
         record, so that the beginnings of the records are fitted first, and the whole ones from there.
         """
-        effects = tuple(effects)
-        found = [] if self._misfits(base) else self._scan_near(base, effects)
+        effects = near = tuple(effects)
+        if self._misfits(base):  # what acts on readings only turns no phases
+            near = tuple(effect for effect in effects if not acts_within(effect, self.problem.setting))
+        found = self._scan_near(base, near)
         if self._far(base) and not any(absolute_gate(self.problem, item).passed for item in found):
             found += self.beginnings.scan(base, effects)
         best: dict[tuple[str, ...], Fit] = {}
@@ -102,29 +104,31 @@ class Search(Hypotheses):
         enough = PROMISING * max((change.gain for change in ranked[0]), default=0.0) if ranked else 0.0
         prospect = base.objective - (least if base.candidate.terms else 0.0)
         for changes in ranked:
-            fits = []
+            fits: list[Fit] = []
             for change in changes:
                 if change.gain < least:
                     continue
                 candidate = base.candidate.plus(change.term)
                 try:
-                    fits.append(self.roughly(base, candidate, rescaled(change), give_up=prospect))
+                    rough = self.roughly(base, candidate, rescaled(change), give_up=prospect)
                 except (FitError, ModelError):  # the best scale is more than the structure can carry
                     continue
-                prospect = min(prospect, fits[-1].objective + OUT_OF_REACH)
+                delivered = base.objective - rough.objective
+                reached = max((base.objective - item.objective for item in fits), default=0.0)
+                if change.gain >= enough and max(delivered, reached) < DELIVERED * change.gain:
+                    rough = self._followed(rough, base, rescaled(change))
+                fits.append(rough)
+                prospect = min(prospect, rough.objective + OUT_OF_REACH)
             if fits:
-                best = max(fits, key=self.score)
-                gain = max(change.gain for change in changes)
-                if gain >= enough and base.objective - best.objective < DELIVERED * gain:
-                    best = self._followed(best)
-                found.append(best)
+                found.append(max(fits, key=self.score))
         return found
 
-    def _followed(self, rough: Fit) -> Fit:
-        """Fit on from chord steps that did not reach what the screen promised: shared unknowns move far."""
+    def _followed(self, rough: Fit, base: Fit, added: FloatArray) -> Fit:
+        """Fit anew where chord steps did not reach what the screen promised: shared unknowns move far."""
+        start = Point(base.point.shared, base.point.local, np.concatenate((base.point.effect, added)))
         try:
             return max(
-                rough, fit(self.problem, rough.candidate, rough.point, iterations=SHORT_STEPS), key=self.score
+                rough, fit(self.problem, rough.candidate, start, iterations=SHORT_STEPS), key=self.score
             )
         except (FitError, ModelError):
             return rough
@@ -165,13 +169,14 @@ class Search(Hypotheses):
         floor = self.score(self.none) - 6.0
         ranked = self.refine(self.scan(self.none, self.effects), floor)
         for rank, item in enumerate(ranked[:RIDGES]):
-            fits = absolute_gate(self.problem, item).passed
-            if not self._misfits(item) and (not fits or (rank == 0 and is_box(item.candidate))):
+            misses = absolute_gate(self.problem, item).passed is False
+            if not self._misfits(item) and (misses or (rank == 0 and is_box(item.candidate))):
                 self.keep(around(self.problem, item), exact=True)
         self._settle_steps()
         self._families()
         current = self.best()
-        if current.candidate.is_family:
+        if current.candidate.is_family:  # a second effect beside a law that is free would be anything
+            self._settle_steps()
             return
         while current.candidate.terms and len(current.candidate.terms) < LARGEST_SET:
             if len(current.candidate.terms) > 1 and self._far(current):
@@ -206,7 +211,7 @@ class Search(Hypotheses):
             if family is None or family.log_evidence - named.log_evidence <= SHAPE_GAIN:
                 continue
             (term,) = family.candidate.terms
-            key = (term.effect.family, term.place)  # members of a family are the same law once it is free
+            key = (term.effect.family, term.place)  # one verdict; the member from which it is reached best
             better = key not in kept or self.score(kept[key]) < self.score(family)
             if better and absolute_gate(self.problem, family).passed is not False:
                 kept[key] = family

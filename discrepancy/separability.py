@@ -28,9 +28,6 @@ DETECTED = 25.0
 """Squared distance from the model [sigma^2] at which an effect is found: 3 nats of Bayes factor, the cost of
 its parameters and of its place in the catalogue."""
 
-FIRST_ORDER = 25.0
-"""Squared distance from the model [sigma^2] to which effects are shrunk to compare their directions."""
-
 
 @dataclass(frozen=True)
 class Detectability:
@@ -160,12 +157,12 @@ def separability(
         best = max(central, key=_size)
         if best.size < DETECTED:  # its median place may be where nothing is measured
             best = max([best, *(change for change in options if _at_reference(change))], key=_size)
-        little, factor = _shrunk(screen, best)
+        little, factor = screen.shrunk(best)
         rows.append(_detectability(effect, best, min(best.size, little.size / factor**2)))
         if best.size > 1e-6:
             changes[effect.identifier] = [best, *options]
     names = tuple(changes)
-    small = {name: [_shrunk(screen, change) for change in changes[name]] for name in names}
+    small = {name: [screen.shrunk(change) for change in changes[name]] for name in names}
     distance = np.zeros((len(names), len(names)))
     for i, one in enumerate(names):
         target, (little, factor) = changes[one][0], small[one][0]
@@ -208,23 +205,6 @@ def _at_reference(change: Change) -> bool:
         for item, u in zip(change.term.parameters, change.start, strict=True)
         if isinstance(item, EffectParameter) and item.magnitude
     )
-
-
-def _shrunk(screen: Screen, change: Change) -> tuple[Change, float]:
-    """Return a change made so small that it is of first order, and by which factor.
-
-    Effects that move a frequency alike are far apart at their medians, since phases slip by different angles,
-    but each can take the other's frequency.
-    """
-    whole = float((change.vector[screen.sign > 0.0] ** 2).sum())  # before the nuisances take their share
-    factor = sqrt(FIRST_ORDER / whole) if whole > 0.0 else 1.0
-    if factor >= 1.0:
-        return change, 1.0
-    start = change.start.copy()
-    for number, item in enumerate(change.term.parameters):
-        if isinstance(item, EffectParameter) and item.magnitude:
-            start[number] = item.prior.normal(factor * item.prior.value(float(start[number])))
-    return screen.change(change.term, start), factor
 
 
 def _detectability(effect: Effect, change: Change, distance: float) -> Detectability:

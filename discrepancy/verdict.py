@@ -177,8 +177,8 @@ class Verdict:
         It in one sentence.
     probability : float
         Among the hypotheses compared: of the named set with all that hold it, of the group together, of
-        'none' (nothing missing), of the candidates with 'none' (below detectability). Of a family: that of
-        its member in the catalogue, since families are not compared. Of an unexplained gap it says nothing.
+        'none' (nothing missing), of the candidates with 'none' (below detectability). Of a family: of it
+        and its members; where only the shape gate found it, of its member. Of an unexplained gap nothing.
     log_bayes_factor : float
         ln of evidence of the best hypothesis over that of 'none'.
     effects : tuple of NamedEffect

@@ -24,7 +24,7 @@ from .locate import Location, locate
 from .models.interface import Model
 from .naming import name
 from .next_experiment import next_experiments
-from .outliers import LARGEST_SHARE, glitches
+from .outliers import wrong_ends
 from .predictive import residual_set
 from .problem import Point, Problem
 from .proof import prove
@@ -143,7 +143,7 @@ def investigate(
     setting = Setting(campaign, model, model.scales(campaign))
     with stage("Fitting what is known, and searching the catalogue", "name"):
         problem = Problem(campaign, model, setting)
-        cleaned = without_glitches(problem)
+        cleaned = without_wrong_ends(problem)
         if cleaned is not campaign:
             campaign, setting = cleaned, replace(setting, campaign=cleaned)
             problem = Problem(campaign, model, setting)
@@ -204,10 +204,10 @@ def checked(campaign: Campaign, model: Model) -> tuple[Campaign, tuple[DataFault
     return choose_held_out(campaign), faults
 
 
-def without_glitches(problem: Problem) -> Campaign:
-    """Return a problem's campaign without single readings that are far off what the model predicts.
+def without_wrong_ends(problem: Problem) -> Campaign:
+    """Return a problem's campaign without single wrong readings at the ends of its records in time.
 
-    The model as it is need not fit: see `outliers.glitches`.
+    The model as it is need not fit: see `outliers.wrong_ends`.
     """
     none = fit_to(problem, Candidate(), problem.start(Candidate()), evidence=False)
     fits = [(problem, none)]
@@ -223,16 +223,13 @@ def without_glitches(problem: Problem) -> Campaign:
             trial = trials[data.trial.name]
             if not trial.is_dynamic:
                 continue
-            used = trial.used.copy()
-            for number, channel in enumerate(trial.channels):
-                found = glitches(residual[:, number], data.weight[:, number] > 0.0)
-                if found.any() and found.sum() <= LARGEST_SHARE * len(found):
-                    used[found, number] = False
-                    remarks.append(
-                        f"{found.sum()} of {len(found)} readings of {channel!r} in the trial {trial.name!r} "
-                        "are far off what the model and their neighbours say, and left out."
-                    )
-            trials[trial.name] = replace(trial, used=used)
+            found = wrong_ends(residual, data.weight > 0.0)
+            for number in np.flatnonzero(found.any(axis=0)):
+                remarks.append(
+                    f"{found[:, number].sum()} of {len(found)} readings of {trial.channels[number]!r} in the "
+                    f"trial {trial.name!r}, at its ends, are far off model and neighbours and left out."
+                )
+            trials[trial.name] = replace(trial, used=trial.used & ~found)
     if len(remarks) == len(problem.campaign.remarks):
         return problem.campaign
     return replace(problem.campaign, trials=tuple(trials.values()), remarks=tuple(remarks))

@@ -42,5 +42,5 @@ def sampled(values: FloatArray, step: float, times: FloatArray, derivatives: Seq
             own = CubicSpline(grid, slope)
             shown[:, column] = own(at, order - 1)
             rates[:, column] = own(at, order)
-            shown[before, column] = 0.0
+            shown[before, column] = rates[before, column] = 0.0
     return Response(np.ascontiguousarray(shown), np.ascontiguousarray(rates))

@@ -70,9 +70,9 @@ def add_verdict(page: Page, content: ReportInput) -> None:
             rows,
         ),
         {
-            VerdictKind.NAMED: "Posterior medians and 90 % intervals.",
-            VerdictKind.FAMILY: "Posterior medians and 90 % intervals; the shape was fitted.",
-        }.get(verdict.kind, "Posterior medians and 90 % intervals of each candidate, were it there alone."),
+            VerdictKind.NAMED: "Most probable values and 90 % intervals.",
+            VerdictKind.FAMILY: "Most probable values and 90 % intervals; the shape was fitted.",
+        }.get(verdict.kind, "Most probable values and 90 % intervals of each, were it there alone."),
         title="What is added" if verdict.kind is VerdictKind.NAMED else "What could be added",
     )  # fmt: skip
     _add_primitives(page, content)

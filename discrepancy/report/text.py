@@ -127,8 +127,13 @@ def hypothesis_name(hypothesis: Hypothesis) -> str:
     if not hypothesis.effects:
         return "nothing missing"
     return " + ".join(
-        effect.name + (f" ({effect.place})" if effect.place else "") for effect in hypothesis.effects
+        _with_place(effect.name, effect.place, free_shape=bool(effect.shape)) for effect in hypothesis.effects
     )
+
+
+def _with_place(name: str, place: str, *, free_shape: bool) -> str:
+    marks = [mark for mark in (place, "free shape" if free_shape else "") if mark]
+    return name + (f" ({', '.join(marks)})" if marks else "")
 
 
 def added_label(investigation: Investigation) -> str:
@@ -137,7 +142,7 @@ def added_label(investigation: Investigation) -> str:
     if fit is None or not fit.candidate.terms:
         return ""
     return " + ".join(
-        term.effect.name + (f" ({term.place})" if term.place else "") for term in fit.candidate.terms
+        _with_place(term.effect.name, term.place, free_shape=term.free_shape) for term in fit.candidate.terms
     )
 
 
