@@ -79,7 +79,8 @@ class Search(Hypotheses):
         if self._misfits(base):  # what acts on readings only turns no phases
             near = tuple(effect for effect in effects if not acts_within(effect, self.problem.setting))
         found = self._scan_near(base, near)
-        if self._far(base) and not any(absolute_gate(self.problem, item).passed for item in found):
+        explained = any(absolute_gate(self.problem, item).passed for item in found)
+        if self._misfits(base) or (self._far(base) and not explained):
             found += self.beginnings.scan(base, effects)
         best: dict[tuple[str, ...], Fit] = {}
         for item in sorted(found, key=self.score):
