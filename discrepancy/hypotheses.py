@@ -87,7 +87,7 @@ class Hypotheses:
         sums = {identifiers: float(logsumexp(values)) for identifiers, values in scores.items()}
         total = float(logsumexp(list(sums.values())))
         ordered = sorted(sums.items(), key=lambda item: -item[1])
-        return {identifiers: exp(value - total) for identifiers, value in ordered}
+        return {identifiers: min(exp(value - total), 1.0) for identifiers, value in ordered}
 
     def keep(self, found: Fit, *, exact: bool) -> None:
         """Keep a fit if it is better than what is known of the same candidate."""

@@ -98,7 +98,7 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         )  # fmt: skip
 
     # sets that hold the best one and more agree with it; they only leave a further effect open
-    p_top = sum(p for names, p in probabilities.items() if set(_plain(top)) <= set(_plain(names)))
+    p_top = min(sum(p for names, p in probabilities.items() if set(_plain(top)) <= set(_plain(names))), 1.0)
     if best.candidate.is_family:  # reached from several members or places, it is one family
         p_top = max(p_top, _family_probability(found, best.candidate.terms[0].effect.family))
     if p_top < SURE or bayes < BAYES_FACTOR:

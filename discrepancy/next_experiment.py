@@ -192,13 +192,13 @@ def _ringdowns(
         return replace(trial, name=name, release=changed)
 
     for trial, factor, words in (
-        (smallest, 0.5, "half the smallest"),
-        (largest, 2.0, "twice the largest"),
-        (largest, -1.0, "the largest, to the other side"),
+        (smallest, 0.5, "at half the smallest amplitude so far"),
+        (largest, 2.0, "at twice the largest amplitude so far"),
+        (largest, -1.0, "to the other side, at the largest amplitude so far"),
     ):
         yield Proposal(
-            at(trial, factor, f"release at {words}"),
-            f"Release at {words} amplitude so far ({abs(factor) * release(trial):.3g} at the release point).",
+            at(trial, factor, f"release {words}"),
+            f"Release {words} ({abs(factor) * release(trial):.3g} at its point, SI).",
             "Linear effects scale with the amplitude, friction, slip and stiffening do not.",
             1.0,
         )

@@ -150,6 +150,11 @@ def investigate(
         verdict, search, fit = name(problem, load_catalogue() if effects is None else effects)
     remarks = [fault.sentence for fault in faults] + list(campaign.remarks)
     remarks += strained(problem, fit)
+    if not model.parameters:
+        remarks.append(
+            f"The model {model.name!r} has no uncertain parameter, so a stiffness or damping a little "
+            "off can be taken for an effect: give it some with their deviations."
+        )
     if fit.candidate.terms and not fit.converged:
         remarks.append(
             "The fit of the verdict had not settled when it ended: its intervals may be too narrow."
