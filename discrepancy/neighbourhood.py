@@ -11,6 +11,8 @@ from .screening import is_magnitude
 RIDGE_STEPS, PLACE_STEPS = (-0.8, -0.3, 0.3, 0.8), (-0.15, -0.05, 0.05, 0.15)
 """Steps along the direction that the data tell least of, and of parameters that are not mere sizes, in prior
 deviations."""
+SHAPE_ITERATIONS = 40
+"""Steps of a fit with a free shape, whose valleys are long."""
 NEIGHBOUR_ITERATIONS, NEIGHBOUR_GAIN, ROUNDS = 8, 1.0, 5
 """Steps of each fit, the gain of log evidence that counts [nat], and how often one leads to the next."""
 
@@ -80,6 +82,6 @@ def free_shape(problem: Problem, named: Fit, number: int, *, give_up: float | No
     parts[number] = np.append(parts[number], [item.prior.normal(item.canonical) for item in effect.shape])
     start = Point(named.point.shared, named.point.local, np.concatenate(parts))
     try:
-        return fit(problem, Candidate(tuple(terms)), start, give_up=give_up)
+        return fit(problem, Candidate(tuple(terms)), start, iterations=SHAPE_ITERATIONS, give_up=give_up)
     except (FitError, ModelError):
         return None

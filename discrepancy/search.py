@@ -205,10 +205,11 @@ class Search(Hypotheses):
             singles = [item for item in fitting if self.score(item) > close]
             if len(singles) == 1 or absolute_gate(self.problem, self.none).passed is not False:
                 return
+        # a rival that fits is followed to its end; one that does not has to promise more than the best
+        give_up = None if fitting else self.best().objective
         kept: dict[tuple[str, str], Fit] = {}
         for named in singles:
-            reach = named.objective if not kept else min(item.objective for item in kept.values()) + CLOSE
-            family = free_shape(self.problem, named, 0, give_up=min(reach, self.best().objective))
+            family = free_shape(self.problem, named, 0, give_up=give_up)
             if family is None or family.log_evidence - named.log_evidence <= SHAPE_GAIN:
                 continue
             (term,) = family.candidate.terms
