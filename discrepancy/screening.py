@@ -325,18 +325,3 @@ def rescaled(change: Change) -> FloatArray:
             value = max(value, prior.value(-0.7 * LARGEST_EFFECT))
         start[number] = np.clip(prior.normal(value), -0.7 * LARGEST_EFFECT, LARGEST_START)
     return start
-
-
-def separation(first: Change, second: Change, sign: FloatArray) -> float:
-    """Return d^2, the squared distance of `first` from the nearest multiple of `second` [sigma^2]."""
-    if second.size <= 0.0:
-        return first.size
-    overlap = float(first.vector * sign @ second.vector)
-    return max(first.size - overlap**2 / second.size, 0.0)
-
-
-def cosine(first: Change, second: Change, sign: FloatArray) -> float:
-    """Return the cosine of the angle between two changes, nuisances projected out."""
-    if first.size <= 0.0 or second.size <= 0.0:
-        return 0.0
-    return float(first.vector * sign @ second.vector) / sqrt(first.size * second.size)

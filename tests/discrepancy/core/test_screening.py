@@ -2,13 +2,30 @@
 
 from __future__ import annotations
 
+from math import sqrt
+
 import numpy as np
 import pytest
 
 from discrepancy.candidate import Candidate, Term
 from discrepancy.fitting import fit
 from discrepancy.promising import pairs
-from discrepancy.screening import LINEAR, Screen, cosine, grid, rescaled, separation
+from discrepancy.screening import LINEAR, Change, Screen, grid, rescaled
+
+
+def separation(first: Change, second: Change, sign: np.ndarray) -> float:
+    """Return d^2, the squared distance of `first` from the nearest multiple of `second` [sigma^2]."""
+    if second.size <= 0.0:
+        return first.size
+    overlap = float(first.vector * sign @ second.vector)
+    return max(first.size - overlap**2 / second.size, 0.0)
+
+
+def cosine(first: Change, second: Change, sign: np.ndarray) -> float:
+    """Return the cosine of the angle between two changes, nuisances projected out."""
+    if first.size <= 0.0 or second.size <= 0.0:
+        return 0.0
+    return float(first.vector * sign @ second.vector) / sqrt(first.size * second.size)
 
 
 @pytest.fixture(scope="module")
