@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from .candidate import Candidate
+from .derivatives import TrialDerivatives
 from .errors import FitError, ModelError
 from .problem import Base, Linearisation, Point, Problem
 
@@ -41,7 +42,14 @@ class TrialBlock:
     shared: FloatArray  # (K, K)
     local_gradient: FloatArray  # (L,)
     shared_gradient: FloatArray  # (K,)
-    index: IntArray  # (K,)
+    derivatives: TrialDerivatives
+    products: FloatArray  # (C, M, M) of the derivatives of each channel
+    precision: FloatArray  # (C,) of each channel
+
+    @property
+    def index(self) -> IntArray:
+        """Which shared unknowns (K,) the trial knows."""
+        return self.derivatives.index
 
 
 @dataclass(frozen=True)
@@ -115,25 +123,25 @@ def trial_block(
     candidate: Candidate,
     residual: FloatArray,
     precision: FloatArray,
-) -> tuple[TrialBlock, FloatArray, FloatArray]:
-    """Return the normal equations of a trial, and the weighted derivatives they are made of."""
+) -> TrialBlock:
+    """Return the normal equations of a trial."""
     data = problem.trials[number]
-    local, shared, index = problem.jacobian(number, point, parts, candidate)
-    root = np.sqrt(precision[data.groups])
-    weights = np.broadcast_to(root, residual.shape).ravel()
-    local, shared = local * weights, shared * weights
-    weighted = residual.ravel() * weights
-    u = point.local[number]
-    prior = data.unknowns.precision
-    block = TrialBlock(
-        local=local @ local.T + np.diag(prior + 1e-12),
-        cross=local @ shared.T,
-        shared=shared @ shared.T,
-        local_gradient=local @ weighted - prior * u,
-        shared_gradient=shared @ weighted,
-        index=index,
+    derivatives = problem.derivatives(number, point, parts, candidate)
+    products = derivatives.products()
+    weights = precision[data.groups]
+    normal = derivatives.normal(products, weights)
+    gradient = derivatives.onto(residual.T * weights[:, np.newaxis])
+    u, prior, count = point.local[number], data.unknowns.precision, derivatives.local_size
+    return TrialBlock(
+        local=normal[:count, :count] + np.diag(prior + 1e-12),
+        cross=normal[:count, count:],
+        shared=normal[count:, count:],
+        local_gradient=gradient[:count] - prior * u,
+        shared_gradient=gradient[count:],
+        derivatives=derivatives,
+        products=products,
+        precision=weights,
     )
-    return block, local, shared
 
 
 def fit(
@@ -302,7 +310,7 @@ class _Descent:
 def _blocks(problem: Problem, candidate: Candidate, state: _State) -> list[TrialBlock]:
     precision = problem.precisions(state.sums)
     return [
-        trial_block(problem, n, state.point, state.parts[n], candidate, state.residuals[n], precision)[0]
+        trial_block(problem, n, state.point, state.parts[n], candidate, state.residuals[n], precision)
         for n in range(len(problem.trials))
     ]
 
@@ -356,27 +364,29 @@ def _finished(problem: Problem, candidate: Candidate, state: _State, converged: 
         pieces = []
         log_determinant = 0.0
         for n in range(len(problem.trials)):
-            block, local, shared = trial_block(
+            block = trial_block(
                 problem, n, state.point, state.parts[n], candidate, state.residuals[n], precision
             )
             factor = cho_factor(block.local)
             inner = cho_solve(factor, block.cross)
             matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
             log_determinant += 2.0 * float(np.log(np.diag(factor[0])).sum())
-            pieces.append((block, factor, inner, local, shared))
+            pieces.append((block, factor, inner))
         factor = cho_factor(matrix)
         log_determinant += 2.0 * float(np.log(np.diag(factor[0])).sum())
         covariance = cho_solve(factor, np.eye(size))
         log_evidence -= 0.5 * log_determinant
-        for n, (block, local_factor, inner, local, shared) in enumerate(pieces):
-            # leverage of each sample: trace of J Cov J^T by column
-            projected = shared - inner.T @ local
-            leverage = np.einsum(
-                "kn,kn->n", projected, covariance[np.ix_(block.index, block.index)] @ projected
-            )
-            leverage += np.einsum("ln,ln->n", local, cho_solve(local_factor, local))
-            data = problem.trials[n]
-            np.add.at(spent, data.groups, leverage.reshape(state.residuals[n].shape).sum(axis=0))
+        for n, (block, local_factor, inner) in enumerate(pieces):
+            # leverage of each channel: trace of J Cov J^T; local unknowns follow the shared ones
+            count = len(block.local)
+            known = covariance[np.ix_(block.index, block.index)]
+            joint = np.empty((count + len(known), count + len(known)))
+            followed = inner @ known
+            joint[:count, :count] = cho_solve(local_factor, np.eye(count)) + followed @ inner.T
+            joint[:count, count:], joint[count:, :count] = -followed, -followed.T
+            joint[count:, count:] = known
+            leverage = block.derivatives.spread(block.products, block.precision, joint)
+            np.add.at(spent, problem.trials[n].groups, leverage)
     return Fit(
         candidate,
         state.point,

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from .campaign import Trial
-from .fitting import Fit, fit, trial_block
+from .fitting import Fit, TrialBlock, fit, trial_block
 from .problem import Point, Problem
 from .residuals import FittedTrial, ResidualSet
 
@@ -42,10 +42,11 @@ def _fitted(problem: Problem, found: Fit, *, sensitivities: bool) -> list[Fitted
     at, items = shared_size, []
     ones = np.ones(len(problem.channel_names))
     for number, data in enumerate(problem.trials):
-        block, local, shared = trial_block(
+        block = trial_block(
             problem, number, found.point, found.linearisations[number], found.candidate,
             found.residuals[number], ones,
         )  # fmt: skip
+        local, shared = _halves(block)
         factor = cho_factor(block.local, lower=True)
         own = solve_triangular(np.tril(factor[0]), local, lower=True)
         # local unknowns follow the shared ones: J_s - J_l A^-1 B, then what is their own
@@ -64,6 +65,12 @@ def _fitted(problem: Problem, found: Fit, *, sensitivities: bool) -> list[Fitted
     return items
 
 
+def _halves(block: TrialBlock) -> tuple[FloatArray, FloatArray]:
+    """Return the derivatives (L, N C) and (K, N C) by the trial's own and by the shared unknowns."""
+    dense = block.derivatives.dense()
+    return dense[: len(block.local)], dense[len(block.local) :]
+
+
 def _held_out(problem: Problem, found: Fit, trials: tuple[Trial, ...]) -> list[FittedTrial]:
     """Predict held-out trials: what is shared stays as fitted, their own nuisances adapt to them."""
     there = problem.with_trials(trials)
@@ -74,10 +81,11 @@ def _held_out(problem: Problem, found: Fit, trials: tuple[Trial, ...]) -> list[F
     items = []
     ones = np.ones(len(there.channel_names))
     for number in range(len(there.trials)):
-        block, local, shared = trial_block(
+        block = trial_block(
             there, number, adapted.point, adapted.linearisations[number], adapted.candidate,
             adapted.residuals[number], ones,
         )  # fmt: skip
+        local, shared = _halves(block)
         factor = cho_factor(block.local, lower=True)
         follow = shared - cho_solve(factor, block.cross).T @ local
         own = np.einsum("kn,kn->n", local, cho_solve(factor, local))

@@ -18,6 +18,7 @@ from fe.patch import ModelPatch
 from .campaign import Campaign, Trial
 from .candidate import Candidate
 from .catalogue.entry import Setting
+from .derivatives import TrialDerivatives
 from .errors import CampaignDataError
 from .models.interface import Model
 from .models.memo import MemoModel
@@ -66,21 +67,26 @@ class TrialData:
 
     @cached_property
     def by_zero(self) -> FloatArray:
-        """Standardised derivatives (Z, N C) by the zeros; they never change."""
-        zeros = np.zeros((self.unknowns.zeros, *self.weight.shape))
-        rows = np.arange(self.unknowns.zeros)
-        zeros[rows, :, self.unknowns.zero_columns] = self.unknowns.zero_scale[:, np.newaxis]
-        return self.standardised(zeros).reshape(len(zeros), self.weight.size)
+        """Standardised derivatives (C, N) by each channel's zero, nought without one; they never change."""
+        scale = np.zeros(len(self.deviation))
+        scale[self.unknowns.zero_columns] = self.unknowns.zero_scale
+        return np.ascontiguousarray(self.standardised(np.broadcast_to(scale, self.weight.shape)).T)
 
-    def standardised(self, columns: FloatArray) -> FloatArray:
-        """Return columns (..., N, C) over s0, whitened in time, zero where a sample does not count."""
-        scaled = columns / self.deviation
+    def standardised(self, columns: FloatArray, channels: Sequence[int] | None = None) -> FloatArray:
+        """Return columns (..., N, C) over s0, whitened in time, zero where a sample does not count.
+
+        With `channels`, the columns are theirs only.
+        """
+        chosen = range(len(self.deviation)) if channels is None else channels
+        at = slice(None) if channels is None else list(channels)
+        scaled = columns / self.deviation[at]
         if self.trial.is_dynamic:
             interval = self.trial.interval
-            for number, noise in enumerate(self.noise):
+            for number, channel in enumerate(chosen):
+                noise = self.noise[channel]
                 if noise.applies(interval):
                     scaled[..., number] = noise.whiten(scaled[..., number], interval)
-        return np.asarray(scaled * self.weight)
+        return np.asarray(scaled * self.weight[:, at])
 
 
 @dataclass(frozen=True)
@@ -412,29 +418,51 @@ class Problem:
         index : (K,) ndarray of int
             Which these are: global unknowns first, then effect parameters.
         """
+        found = self.derivatives(number, point, parts, candidate)
+        dense = found.dense()
+        return dense[: found.local_size], dense[found.local_size :], found.index
+
+    def derivatives(
+        self, number: int, point: Point, parts: Linearisation, candidate: Candidate
+    ) -> TrialDerivatives:
+        """Return standardised derivatives of the prediction of a trial, channel by channel."""
         data = self.trials[number]
-        channels = data.trial.channels
+        channels, zeros = data.trial.channels, data.unknowns.zeros
         gains = 1.0 + self.shared.gains(point.shared, channels)
-        size = parts.response.size
-        count = len(self.shared.parameter_mean)
         position, column = self._gain_entries(channels)
-        by_gain = np.zeros((len(position), *parts.response.shape))
-        by_gain[np.arange(len(position)), :, column] = (
-            self.shared.gain_scale[position, np.newaxis] * parts.response.T[column]
-        )
         acting = [k for k in range(candidate.size) if data.trial.kind in candidate.acting(k)]
-        blocks = [parts.parameters * gains, by_gain]
+        own, count = len(parts.local), len(parts.parameters)
+        blocks = [parts.local * gains, parts.parameters * gains]
         if acting:
             blocks.append(parts.effect[acting] * gains)
-        local = data.by_zero
-        if len(parts.local):
-            own = data.standardised(parts.local * gains).reshape(len(parts.local), size)
-            local = np.concatenate((local, own))
-        shared = data.standardised(np.concatenate(blocks))
+        if len(position):
+            scale = np.zeros(len(channels))
+            scale[column] = self.shared.gain_scale[position]
+            blocks.append((parts.response * scale)[np.newaxis])
+        dense = data.standardised(np.concatenate(blocks))
+
+        # order of the unknowns: zeros, own, calibrated parameters, gains, effect; rows: zero, own,
+        # calibrated parameters, effect, gain
+        local = zeros + own
+        first_effect = local + count + len(position)
+        size = first_effect + len(acting)
+        everywhere = np.array(
+            [*range(zeros, local), *range(local, local + count), *range(first_effect, size)], dtype=np.int64
+        )
+        head = int(zeros > 0)
+        rows = np.empty((len(channels), head + len(dense), dense.shape[1]))
+        owners = np.full(rows.shape[:2], size)
+        if head:
+            rows[:, 0] = data.by_zero
+            owners[data.unknowns.zero_columns, 0] = np.arange(zeros)
+        rows[:, head:] = dense.transpose(2, 0, 1)
+        owners[:, head : head + len(everywhere)] = everywhere
+        if len(position):
+            owners[column, -1] = local + count + np.arange(len(position))
         index = np.array(
             [*range(count), *(count + position), *(self.shared.size + k for k in acting)], dtype=np.int64
         )
-        return local, shared.reshape(len(shared), size), index
+        return TrialDerivatives(rows, owners, local, index)
 
     def _gain_entries(self, channels: tuple[str, ...]) -> tuple[IntArray, IntArray]:
         """Return which gains act in a trial, and on which of its columns."""

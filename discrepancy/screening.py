@@ -25,6 +25,7 @@ from fe.patch import EVERY_CHANNEL, SENSORS, ModelPatch
 from .campaign import TrialKind
 from .candidate import Candidate, Term
 from .catalogue.entry import EffectParameter, ShapeParameter
+from .derivatives import TrialDerivatives
 from .errors import ModelError
 from .fitting import LARGEST_EFFECT, Fit, trial_block
 from .problem import Problem
@@ -90,13 +91,13 @@ class Change:
 
 
 class _Piece(NamedTuple):
-    """One trial of a screen: projections on its own and on shared unknowns, weights, residual, gradient."""
+    """One trial of a screen."""
 
-    local: FloatArray  # (L, N C)
-    shared: FloatArray  # (K, N C)
-    rows: NDArray[np.int64]  # (K,)
-    root: FloatArray  # (N C,)
-    residual: FloatArray  # (N C,)
+    derivatives: TrialDerivatives
+    own: FloatArray  # (L, L): what a change leaves to the trial's own unknowns
+    followed: FloatArray  # (K, L): what these take from the shared ones
+    root: FloatArray  # (C, 1), weights
+    residual: FloatArray  # (C, N), weighted
     gradient: FloatArray  # (L,)
 
 
@@ -124,7 +125,7 @@ class Screen:
         gradient = -problem.shared.precision * fit.point.shared
         self._pieces: list[_Piece] = []
         for number in range(len(problem.trials)):
-            block, local, shared = trial_block(
+            block = trial_block(
                 problem, number, fit.point, fit.linearisations[number], candidate,
                 fit.residuals[number], precision,
             )  # fmt: skip
@@ -132,19 +133,16 @@ class Screen:
             inner = cho_solve(factor, block.cross)
             matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
             np.add.at(gradient, block.index, block.shared_gradient - inner.T @ block.local_gradient)
-            root = np.broadcast_to(
-                np.sqrt(precision[problem.trials[number].groups]), fit.residuals[number].shape
-            ).ravel()
-            lower = np.tril(factor[0])
+            root = np.sqrt(block.precision)[:, np.newaxis]
+            own = solve_triangular(np.tril(factor[0]), np.eye(len(block.local)), lower=True)
             self._pieces.append(
                 _Piece(
-                    # what a change leaves to the trial's own unknowns, and to the shared ones
-                    solve_triangular(lower, local, lower=True),
-                    shared - inner.T @ local,
-                    block.index,
+                    block.derivatives,
+                    own,
+                    inner.T,
                     root,
-                    fit.residuals[number].ravel() * root,
-                    solve_triangular(lower, block.local_gradient, lower=True),
+                    np.ascontiguousarray(fit.residuals[number].T) * root,
+                    own @ block.local_gradient,
                 )
             )
         lower = np.tril(cho_factor(matrix, lower=True)[0])
@@ -180,20 +178,27 @@ class Screen:
         parts, fits, square = [], 0.0, 0.0
         tail = []
         for number, (data, piece) in enumerate(zip(problem.trials, self._pieces, strict=True)):
-            if data.trial.kind not in acting or (channels and channels.isdisjoint(data.trial.channels)):
-                parts.append(np.zeros(len(piece.root)))
-                tail.append(np.zeros(len(piece.local)))
+            touched = None
+            if channels:
+                touched = [column for column, name in enumerate(data.trial.channels) if name in channels]
+            change = np.zeros(piece.residual.shape)
+            parts.append(change.reshape(-1))
+            if data.trial.kind not in acting or touched == []:
+                tail.append(np.zeros(len(piece.own)))
                 continue
+            at = slice(None) if touched is None else touched
             patch = candidate.patch(problem.setting, effect)
             response, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch)
             gains = 1.0 + problem.shared.gains(fit.point.shared, data.trial.channels)
-            moved = gains * (response - fit.responses[number])
-            d = data.standardised(moved).ravel() * piece.root
-            z = piece.local @ d
-            total[piece.rows] += piece.shared @ d
-            fits += float(piece.residual @ d) - float(piece.gradient @ z)
-            square += float(d @ d) - float(z @ z)
-            parts.append(d)
+            moved = gains[at] * (response[:, at] - fit.responses[number][:, at])
+            d = data.standardised(moved, touched).T * piece.root[at]
+            change[at] = d
+            onto = piece.derivatives.onto(d * piece.root[at], touched)
+            local = onto[: len(piece.own)]
+            z = piece.own @ local
+            total[piece.derivatives.index] += onto[len(piece.own) :] - piece.followed @ local
+            fits += float(np.vdot(piece.residual[at], d)) - float(piece.gradient @ z)
+            square += float(np.vdot(d, d)) - float(z @ z)
             tail.append(z)
         y = self._inverse @ total
         fits -= float(self._gradient @ y)
@@ -245,8 +250,8 @@ class Screen:
     @property
     def sign(self) -> FloatArray:
         """Signs (D,) of the inner product: changes count, their projections are taken off."""
-        samples = sum(len(piece.root) for piece in self._pieces)
-        rest = sum(len(piece.local) for piece in self._pieces) + self._size
+        samples = sum(piece.residual.size for piece in self._pieces)
+        rest = sum(len(piece.own) for piece in self._pieces) + self._size
         return np.concatenate((np.ones(samples), -np.ones(rest)))
 
     def changes(self, term: Term, *, fine: bool = True) -> Iterator[Change]:
