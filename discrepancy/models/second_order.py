@@ -11,7 +11,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, eigh
+from scipy.linalg import cho_factor, eigh
+from scipy.linalg.lapack import dpotrs
 
 from discrepancy.campaign import Release
 from discrepancy.compiled_motion import compiled_kernel
@@ -126,7 +127,9 @@ class SecondOrderSystem:
 
     def flexibility(self, loads: FloatArray) -> FloatArray:
         """Return K^-1 loads, for loads (n,) or (n, k)."""
-        return np.asarray(cho_solve(self._factor, loads))
+        # the LAPACK routine itself: checks of its arguments would take ten times as long
+        solution, _ = dpotrs(self._factor[0], loads, lower=self._factor[1])
+        return np.asarray(solution)
 
     def residual(self, loads: FloatArray) -> FloatArray:
         """Return the part of K^-1 loads, (n,) or (n, k), that the modes leave out."""
