@@ -1,9 +1,6 @@
 """Rest and motion of an FMU: superposed where it proves to be linear, stepped with the laws where not."""
 
-from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
-from hashlib import blake2b
 from math import ceil, log2
 
 import numpy as np
@@ -12,10 +9,11 @@ from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign import Trial, TrialKind
 from discrepancy.errors import ModelError
+from discrepancy.models.fmu_excitation import Excitation, Loads, State
 from discrepancy.models.fmu_file import FmuModelDescription
+from discrepancy.models.fmu_ports import LINEAR, FmuPorts
 from discrepancy.models.fmu_runs import FmuRuns, is_affine
 from discrepancy.models.port_coupling import LawStepper, PortMotion, coupled_motion
-from discrepancy.models.port_system import PortSystem, port_system
 from fe.motion import Laws
 from fmu_asset.session import FmiAsset
 
@@ -23,54 +21,11 @@ FloatArray = NDArray[np.float64]
 
 PHASE = {TrialKind.RINGDOWN: 0.1, TrialKind.FORCED: 0.05}
 """Longest communication step without laws: radians of the first mode."""
-LINEAR = 1e-6
-"""Largest deviation from superposition, as a share of the motion, of an FMU that is taken as linear."""
 CONVERGED = 1e-4
 """Largest rms change of a motion with laws when steps are halved, as a share of the largest motion."""
 MOST_REFINEMENT = 64
 """Steps that do not converge at this refinement are given up."""
-RECORD = 600
-"""Steps of the answer to a port's force that are recorded."""
-KEPT_SYSTEMS = 64
 
-
-@dataclass(frozen=True)
-class State:
-    """Parameters and constant inputs of a run, sorted by name; by keys of the binding and the FMU's names."""
-
-    parameters: tuple[tuple[str, float], ...]
-    inputs: tuple[tuple[str, float], ...]
-
-
-@dataclass(frozen=True)
-class Excitation:
-    """What moves the FMU, per unit of a factor.
-
-    Attributes
-    ----------
-    kind : str
-        "displacement", "velocity": parameters of the release; "hold": a force is let go that had brought the
-        release point to the displacement; "input": an input.
-    name : str
-        The input.
-    series : (N,) ndarray
-        Its values, each held over a step.
-    begin : float
-        Its value before the motion, under which the FMU is at rest.
-    """
-
-    kind: str
-    name: str = ""
-    series: FloatArray = field(default_factory=lambda: np.zeros(0))
-    begin: float = 0.0
-
-    @property
-    def key(self) -> Hashable:
-        """What tells it from others."""
-        return self.kind, self.name, blake2b(self.series.tobytes(), digest_size=16).digest(), self.begin
-
-
-Loads = Sequence[tuple[Excitation, float]]
 Excite = Callable[[int], tuple[float, int, list[tuple[Excitation, float]]]]
 
 
@@ -91,19 +46,13 @@ class FmuMotion:
         self.nominal = nominal
         self._description, self._runs = description, runs
         self._ports = description.port
-        self._forces = [runs.variable(port.force) for port in self._ports]
-        self._x = [runs.columns[f"port.{port.name}.displacement"] for port in self._ports]
-        self._v = [runs.columns.get(f"port.{port.name}.velocity", -1) for port in self._ports]
+        self.ports = FmuPorts(description, runs, self._run)
         self._zero_inputs = dict.fromkeys(runs.asset.binding.load, 0.0)
         self._linear: dict[Hashable, bool] = {}
         self._units: dict[Hashable, float] = {}
-        self._systems: OrderedDict[Hashable, PortSystem | None] = OrderedDict()
         self._refinements: dict[Hashable, tuple[int, float]] = {}
         self._frequencies: dict[Hashable, float] = {}
-        self._port_linear: bool | None = None
-        self._refinable: bool | None = None
         self._silent: dict[Hashable, bool] = {}
-        self._quiet = False
         self._free_linear: dict[Hashable, bool] = {}
         self._resting: State | None = None
 
@@ -159,9 +108,9 @@ class FmuMotion:
     def measured_frequency(self, trial: Trial, state: State) -> float:
         """Return what `angular_frequency` does, measured in a state at a trial's interval."""
         step = self._description.motion.step or trial.interval
-        system = self.system(state, step, len(trial.time)) if self._ports else None
+        system = self.ports.system(state, step, len(trial.time)) if self._ports else None
         if system is not None:
-            frequency, shape = system.modes(system.outputs[self._x[0]], 0)
+            frequency, shape = system.modes(system.outputs[self.ports.x[0]], 0)
             if len(frequency):
                 return float(frequency[np.argmax(shape / frequency**2)])
         way = self._description.release
@@ -170,7 +119,7 @@ class FmuMotion:
             size = trial.release.displacement if trial.release is not None else 1e-3
             loads: Loads = [(Excitation(kind), size)]
         else:
-            name = self._forces[0] if self._forces else next(iter(self._zero_inputs))
+            name = self.ports.forces[0] if self.ports.forces else next(iter(self._zero_inputs))
             loads = [(Excitation("input", name, np.eye(1, len(trial.time)).ravel()), 1.0)]
         values = self.free(state, step, len(trial.time), loads)
         moving = values - values[-len(values) // 4 :].mean(axis=0)
@@ -314,91 +263,6 @@ class FmuMotion:
             result += value / size * (part - zero)
         return result
 
-    # ------------------------------------------------------------ ports
-
-    def system(self, state: State, step: float, steps: int, refinement: int = 1) -> PortSystem | None:
-        """Return what forces at the ports do in a linear FMU; None if it is not linear.
-
-        Where the FMU confirms it once, the system of a `refinement` is computed from that of the larger step.
-        """
-        if not self._description.superposition or self._port_linear is False:
-            return None
-        key = (state, step)
-        if refinement > 1 and self._refinable is not False and key not in self._systems:
-            base = self.system(state, step * refinement, ceil(steps / refinement))
-            if base is not None:
-                self._systems[key] = finer = base.refined(refinement)
-                if self._refinable is None:
-                    self._refinable = self._confirmed(finer, state, step, max(min(steps, RECORD), 64))
-                    if not self._refinable:
-                        del self._systems[key]
-        if key in self._systems:
-            self._systems.move_to_end(key)
-            return self._systems[key]
-        count = max(min(steps, RECORD), 64)
-        records = self._records(state, step, count)
-        system = port_system(records, self._x, step)
-        if system is not None and self._port_linear is None:
-            self._port_linear = self._confirmed(system, state, step, count)
-            system = system if self._port_linear else None
-        self._systems[key] = system
-        if len(self._systems) > KEPT_SYSTEMS:
-            self._systems.popitem(last=False)
-        return system
-
-    def _size(self, number: int) -> float:
-        return min(1.0, 0.1 * self._runs.input_limit(self._ports[number].force))
-
-    def _records(self, state: State, step: float, count: int) -> FloatArray:
-        """Return the outputs (count, C, P) after unit forces over the first step, less those without."""
-        zero: FloatArray | float = 0.0
-        if not self._quiet:
-            zero = self._run(state, step, count, [])
-            self._quiet = not np.any(zero)
-        pulse = np.eye(1, count).ravel()
-        parts = []
-        for number, name in enumerate(self._forces):
-            size = self._size(number)
-            moved = self._run(state, step, count, [(Excitation("input", name, pulse), size)])
-            parts.append((moved - zero)[1:] / size)
-        return np.stack(parts, axis=2)
-
-    def _confirmed(self, system: PortSystem, state: State, step: float, count: int) -> bool:
-        """Whether the FMU answers to many forces as the system says that was made of single ones."""
-        signs = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(self._ports)))
-        sizes = np.array([self._size(number) for number in range(len(self._ports))])
-        loads = [
-            (Excitation("input", name, signs[:, number].copy()), float(sizes[number]))
-            for number, name in enumerate(self._forces)
-        ]
-        moved = self._run(state, step, count, loads) - self._run(state, step, count, [])
-        expected = system.motion(signs * sizes)
-        error = np.max(np.abs(moved - expected), axis=0)
-        return bool(np.all(error <= LINEAR * np.max(np.abs(moved), axis=0) + 1e-300))
-
-    def stiffness(self, number: int, state: State, step: float) -> tuple[float, float]:
-        """Return the stiffness of the first mode and the one at rest at a port [N/m or N m/rad]."""
-        system = self.system(state, step, RECORD)
-        column = self._x[number]
-        if system is None:
-            size = self._size(number)
-            inputs = self._zero_inputs | dict(state.inputs)
-            still = [
-                self._runs.started(
-                    step, dict(state.parameters),
-                    inputs | {self._forces[number]: inputs[self._forces[number]] + force}, settle=True,
-                )[1][column]
-                for force in (0.0, size)
-            ]  # fmt: skip
-            stiffness = size / float(still[1] - still[0])
-            return stiffness, stiffness
-        at_rest = 1.0 / float(system.gain()[column, number])
-        frequency, shape = system.modes(system.outputs[column], number)
-        if not len(frequency) or np.max(shape / frequency**2) * at_rest < 1e-6:
-            return at_rest, at_rest
-        first = int(np.argmax(shape / frequency**2))
-        return float(frequency[first] ** 2 / shape[first]), at_rest
-
     # ------------------------------------------------------------ laws
 
     def with_laws(
@@ -458,23 +322,23 @@ class FmuMotion:
     ) -> FloatArray:
         free = self._refined_free(state, step, steps, loads, refinement)
         port_of = [[port.name for port in self._ports].index(name) for name in laws.ports]
-        system = self.system(state, step, steps, refinement)
+        system = self.ports.system(state, step, steps, refinement)
         if system is None:
             return self._stepped(laws, port_of, state, step, steps, loads, free)
-        x_rows, x_direct = system.outputs[self._x], system.direct[self._x]
+        x_rows, x_direct = system.outputs[self.ports.x], system.direct[self.ports.x]
         v_rows, v_direct, velocity = (
             x_rows @ system.generator,
             np.zeros_like(x_direct),
             np.empty((steps + 1, 0)),
         )
         grid = step * np.arange(steps + 1)
-        velocity = CubicSpline(grid, free[:, self._x])(grid, 1)
-        for number, column in enumerate(self._v):
+        velocity = CubicSpline(grid, free[:, self.ports.x])(grid, 1)
+        for number, column in enumerate(self.ports.v):
             if column >= 0:
                 v_rows[number], v_direct[number] = system.outputs[column], system.direct[column]
                 velocity[:, number] = free[:, column]
         gain = v_rows @ system.drive + v_direct
-        motion = PortMotion(free[:, self._x], velocity, gain)
+        motion = PortMotion(free[:, self.ports.x], velocity, gain)
         with np.errstate(all="ignore"):
             states, applied = coupled_motion(
                 system, motion, x_rows, x_direct, v_rows, v_direct, laws, port_of
@@ -490,7 +354,10 @@ class FmuMotion:
         kind_names = tuple((part.kind, part.name) for part, _ in loads)
         released = all(name in ("displacement", "velocity", "hold") for name in kind)
         possible = (
-            refinement > 1 and released and self._quiet and self._linear.get(("free", kind_names)) is True
+            refinement > 1
+            and released
+            and self.ports.quiet
+            and self._linear.get(("free", kind_names)) is True
         )
         if not possible or not self._free_linear.get(kind, True):
             return self.free(state, step, steps, loads)
@@ -499,9 +366,9 @@ class FmuMotion:
             size = self._units[part.kind, part.name]
 
             def moved(part: Excitation = part, size: float = size) -> FloatArray:
-                base = self.system(state, step * refinement, ceil(steps / refinement))
-                fine = self.system(state, step, steps, refinement)
-                if base is None or fine is None or not self._refinable:
+                base = self.ports.system(state, step * refinement, ceil(steps / refinement))
+                fine = self.ports.system(state, step, steps, refinement)
+                if base is None or fine is None or not self.ports.refinable:
                     return np.zeros(0)
                 coarse = self.free(state, step * refinement, ceil(steps / refinement), [(part, size)])
                 start = base.start_of(coarse, LINEAR)
@@ -527,24 +394,24 @@ class FmuMotion:
         free: FloatArray,
     ) -> FloatArray:
         """Return the outputs of the FMU stepped with the laws beside it."""
-        without = [self._ports[p].name for p in port_of if self._v[p] < 0]
+        without = [self._ports[p].name for p in port_of if self.ports.v[p] < 0]
         if without:
             raise ModelError(
                 f"The FMU model {self._description.name!r} is not linear, so its port {without[0]!r} needs a "
                 f"velocity output; name it in [[port]]."
             )
         key = ("gain", state, step)
-        gain = self._runs.remembered(key, lambda: self._records(state, step, 1)[0])[self._v]
-        push = (free[1] - free[0])[self._v] / step
-        stepper = LawStepper(laws, port_of, gain, step, free[0, self._x], push)
+        gain = self._runs.remembered(key, lambda: self.ports.records(state, step, 1)[0])[self.ports.v]
+        push = (free[1] - free[0])[self.ports.v] / step
+        stepper = LawStepper(laws, port_of, gain, step, free[0, self.ports.x], push)
         asset, first, histories = self._begin(state, step, steps, loads)
         values = np.empty((steps + 1, len(first)))
         values[0] = first
         names = list(histories)
         rows = np.column_stack([histories[name] for name in names])
-        at = [names.index(name) for name in self._forces]
+        at = [names.index(name) for name in self.ports.forces]
         for k in range(steps):
             now = rows[k].copy()
-            np.add.at(now, at, stepper.forces(values[k, self._x], values[k, self._v]))
+            np.add.at(now, at, stepper.forces(values[k, self.ports.x], values[k, self.ports.v]))
             values[k + 1] = self._runs.stepped(asset, dict(zip(names, now.tolist(), strict=True)))
         return values

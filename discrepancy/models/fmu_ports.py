@@ -1,0 +1,142 @@
+"""What forces at the ports of an FMU do; as a system of its own where the FMU proves to be linear."""
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.models.fmu_excitation import Excitation, Loads, State
+from discrepancy.models.fmu_file import FmuModelDescription
+from discrepancy.models.fmu_runs import FmuRuns
+from discrepancy.models.port_system import PortSystem, port_system
+
+FloatArray = NDArray[np.float64]
+Run = Callable[[State, float, int, Loads], FloatArray]
+
+LINEAR = 1e-6
+"""Largest deviation from superposition, as a share of the motion, of an FMU that is taken as linear."""
+RECORD = 600
+"""Steps of the answer to a port's force that are recorded."""
+KEPT_SYSTEMS = 64
+
+
+class FmuPorts:
+    """The ports of an FMU.
+
+    Parameters
+    ----------
+    description : FmuModelDescription
+        The model's file.
+    runs : FmuRuns
+        Its FMU.
+    run : callable
+        Takes a state, a step [s], the number of steps and excitations; returns the outputs (steps + 1, C).
+
+    Attributes
+    ----------
+    forces : list of str
+        Inputs of the ports' forces.
+    x, v : list of int
+        Columns of the ports' displacements and velocities; -1: there is no velocity.
+    quiet : bool
+        Whether the FMU was seen to show nothing without excitation.
+    refinable : bool or None
+        Whether systems of smaller steps may be computed from larger ones; None: not tried yet.
+    """
+
+    def __init__(self, description: FmuModelDescription, runs: FmuRuns, run: Run) -> None:
+        self._description, self._runs, self._run = description, runs, run
+        self._ports = description.port
+        self.forces = [runs.variable(port.force) for port in self._ports]
+        self.x = [runs.columns[f"port.{port.name}.displacement"] for port in self._ports]
+        self.v = [runs.columns.get(f"port.{port.name}.velocity", -1) for port in self._ports]
+        self.quiet = False
+        self.refinable: bool | None = None
+        self._zero_inputs = dict.fromkeys(runs.asset.binding.load, 0.0)
+        self._systems: OrderedDict[Hashable, PortSystem | None] = OrderedDict()
+        self._linear: bool | None = None
+
+    def system(self, state: State, step: float, steps: int, refinement: int = 1) -> PortSystem | None:
+        """Return what forces at the ports do in a linear FMU; None if it is not linear.
+
+        Where the FMU confirms it once, the system of a `refinement` is computed from that of the larger step.
+        """
+        if not self._description.superposition or self._linear is False:
+            return None
+        key = (state, step)
+        if refinement > 1 and self.refinable is not False and key not in self._systems:
+            base = self.system(state, step * refinement, ceil(steps / refinement))
+            if base is not None:
+                self._systems[key] = finer = base.refined(refinement)
+                if self.refinable is None:
+                    self.refinable = self._confirmed(finer, state, step, max(min(steps, RECORD), 64))
+                    if not self.refinable:
+                        del self._systems[key]
+        if key in self._systems:
+            self._systems.move_to_end(key)
+            return self._systems[key]
+        count = max(min(steps, RECORD), 64)
+        records = self.records(state, step, count)
+        system = port_system(records, self.x, step)
+        if system is not None and self._linear is None:
+            self._linear = self._confirmed(system, state, step, count)
+            system = system if self._linear else None
+        self._systems[key] = system
+        if len(self._systems) > KEPT_SYSTEMS:
+            self._systems.popitem(last=False)
+        return system
+
+    def _size(self, number: int) -> float:
+        return min(1.0, 0.1 * self._runs.input_limit(self._ports[number].force))
+
+    def records(self, state: State, step: float, count: int) -> FloatArray:
+        """Return the outputs (count, C, P) after unit forces over the first step, less those without."""
+        zero: FloatArray | float = 0.0
+        if not self.quiet:
+            zero = self._run(state, step, count, [])
+            self.quiet = not np.any(zero)
+        pulse = np.eye(1, count).ravel()
+        parts = []
+        for number, name in enumerate(self.forces):
+            size = self._size(number)
+            moved = self._run(state, step, count, [(Excitation("input", name, pulse), size)])
+            parts.append((moved - zero)[1:] / size)
+        return np.stack(parts, axis=2)
+
+    def _confirmed(self, system: PortSystem, state: State, step: float, count: int) -> bool:
+        """Whether the FMU answers to many forces as the system says that was made of single ones."""
+        signs = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(self._ports)))
+        sizes = np.array([self._size(number) for number in range(len(self._ports))])
+        loads = [
+            (Excitation("input", name, signs[:, number].copy()), float(sizes[number]))
+            for number, name in enumerate(self.forces)
+        ]
+        moved = self._run(state, step, count, loads) - self._run(state, step, count, [])
+        expected = system.motion(signs * sizes)
+        error = np.max(np.abs(moved - expected), axis=0)
+        return bool(np.all(error <= LINEAR * np.max(np.abs(moved), axis=0) + 1e-300))
+
+    def stiffness(self, number: int, state: State, step: float) -> tuple[float, float]:
+        """Return the stiffness of the first mode and the one at rest at a port [N/m or N m/rad]."""
+        system = self.system(state, step, RECORD)
+        column = self.x[number]
+        if system is None:
+            size = self._size(number)
+            inputs = self._zero_inputs | dict(state.inputs)
+            still = [
+                self._runs.started(
+                    step, dict(state.parameters),
+                    inputs | {self.forces[number]: inputs[self.forces[number]] + force}, settle=True,
+                )[1][column]
+                for force in (0.0, size)
+            ]  # fmt: skip
+            stiffness = size / float(still[1] - still[0])
+            return stiffness, stiffness
+        at_rest = 1.0 / float(system.gain()[column, number])
+        frequency, shape = system.modes(system.outputs[column], number)
+        if not len(frequency) or np.max(shape / frequency**2) * at_rest < 1e-6:
+            return at_rest, at_rest
+        first = int(np.argmax(shape / frequency**2))
+        return float(frequency[first] ** 2 / shape[first]), at_rest

@@ -1,0 +1,176 @@
+"""What a trial asks of an FMU: parameters and constant inputs, loads at rest, what excites a motion."""
+
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign import Trial, TrialKind
+from discrepancy.errors import ModelError
+from discrepancy.models.fmu_excitation import Excitation, State
+from discrepancy.models.fmu_file import FmuModelDescription
+from discrepancy.models.fmu_motion import FmuMotion
+from discrepancy.models.fmu_patch import SortedPatch
+from discrepancy.models.fmu_runs import FmuRuns
+from discrepancy.models.interface import Conditions
+
+FloatArray = NDArray[np.float64]
+
+DEFAULT_PLACE = "tip_load"
+
+
+class FmuTrials:
+    """Trials in the names and units of an FMU.
+
+    Parameters
+    ----------
+    description : FmuModelDescription
+        The model's file.
+    runs : FmuRuns
+        Its FMU.
+    """
+
+    def __init__(self, description: FmuModelDescription, runs: FmuRuns) -> None:
+        self._description, self._runs, self._name = description, runs, description.name
+        self._keys = [runs.parameter(item.variable or item.name) for item in description.parameter]
+        self._forces = {place: runs.variable(name) for place, name in description.inputs.forces.items()}
+
+    @property
+    def forces(self) -> tuple[str, ...]:
+        """The FMU's inputs of applied forces."""
+        return tuple(self._forces.values())
+
+    def excitations(
+        self, trial: Trial, conditions: Conditions, patch: SortedPatch, motion: FmuMotion, refinement: int
+    ) -> tuple[float, int, list[tuple[Excitation, float]]]:
+        """Return step, number of steps, and what excites the FMU, each with its factor."""
+        step = motion.step(trial, refinement)
+        rate, zero = conditions.clock
+        end = max((1.0 + rate) * float(trial.time[-1]) + zero, float(trial.time[-1]))
+        # a little longer, so that a clock that is being fitted does not ask for another run
+        steps = ceil(end / step * (1.0 + 2e-9) - 1e-6) + (0 if (rate, zero) == (0.0, 0.0) else 1)
+        if trial.kind is TrialKind.RINGDOWN:
+            return step, steps, self._release(trial, conditions, motion)
+        return step, steps, self._forced(trial, patch, step, steps)
+
+    def _release(
+        self, trial: Trial, conditions: Conditions, motion: FmuMotion
+    ) -> list[tuple[Excitation, float]]:
+        release, way = trial.release, self._description.release
+        if release is None:
+            raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
+        if way is None:
+            raise ModelError(
+                f"The FMU model {self._name!r} cannot ring down: state in [release] the FMU's parameter of "
+                f"the release displacement, or the force that holds it."
+            )
+        first = conditions.initial[0] if len(conditions.initial) else np.zeros(2)
+        if release.at_rest:
+            size = release.displacement * (1.0 + float(first[0]))
+            kind = "hold" if way.displacement is None else "displacement"
+            return [(Excitation(kind), size)]
+        if way.displacement is None or way.velocity is None:
+            raise ModelError(
+                f"The ring-down {trial.name!r} does not begin at rest, which the FMU model {self._name!r} "
+                f"can follow only if [release] names parameters of displacement and velocity."
+            )
+        unit = release.displacement
+        speed = motion.angular_frequency(trial)
+        return [
+            (Excitation("displacement"), unit * float(first[0])),
+            (Excitation("velocity"), unit * speed * float(first[1])),
+        ]
+
+    def _forced(
+        self, trial: Trial, patch: SortedPatch, step: float, steps: int
+    ) -> list[tuple[Excitation, float]]:
+        at_ends = np.interp(step * np.arange(steps + 1), trial.time, trial.force)
+        held = 0.5 * (at_ends[1:] + at_ends[:-1])
+        on = (at_ends[1:] != 0.0) | (at_ends[:-1] != 0.0)
+        name = self._input_of(trial.load_place)
+        loads = [(Excitation("input", name, held, float(trial.force[0])), 1.0 + patch.gain)]
+        if patch.tare:
+            loads.append(
+                (Excitation("input", name, on.astype(float), float(trial.force[0] != 0.0)), patch.tare)
+            )
+        inputs = self._description.inputs
+        for lever, moment in (
+            (patch.along_span, inputs.bending_moment),
+            (patch.along_chord, inputs.torque),
+        ):
+            if lever and moment is not None:
+                begin, variable = float(trial.force[0]), self._runs.variable(moment)
+                loads.append((Excitation("input", variable, held, begin), (1.0 + patch.gain) * lever))
+                if patch.tare:
+                    loads.append(
+                        (
+                            Excitation("input", variable, on.astype(float), float(begin != 0.0)),
+                            patch.tare * lever,
+                        )
+                    )
+        return loads
+
+    def loads_at_rest(self, trial: Trial, patch: SortedPatch) -> list[dict[str, float]]:
+        """Return the inputs of each row of a static trial or a flight.
+
+        Raises
+        ------
+        ModelError
+            If the FMU has no input for the load.
+        """
+        inputs = self._description.inputs
+        flight = trial.kind is TrialKind.FLIGHT
+        if flight and inputs.load_factor is None:
+            raise ModelError(
+                f"The trial {trial.name!r} is a flight, but the FMU model {self._name!r} names no "
+                f"load_factor in [inputs]; leave it out."
+            )
+        count = len(trial.force)
+        loads: list[dict[str, float]] = []
+        for row in range(count):
+            if flight:
+                loads.append({self._runs.variable(str(inputs.load_factor)): float(trial.load_factor[row])})
+                continue
+            recorded = float(trial.force[row])
+            acting = recorded * (1.0 + patch.gain) + patch.tare * (recorded != 0.0)
+            given = {self._input_of(trial.load_place): acting}
+            for lever, moment in (
+                (patch.along_span, inputs.bending_moment),
+                (patch.along_chord, inputs.torque),
+            ):
+                if lever and moment is not None:
+                    given[self._runs.variable(moment)] = acting * lever
+            loads.append(given)
+        return loads
+
+    def state(
+        self, trial: Trial, conditions: Conditions, settings: tuple[tuple[str, float], ...], row: int
+    ) -> State:
+        """Return parameters and constant inputs of a row of a trial."""
+        wanted = self._description.inputs
+        inputs: dict[str, float] = {}
+        health = conditions.health[min(row, len(conditions.health) - 1)]
+        for name, value in ((wanted.z1, health[0]), (wanted.z2, health[1])):
+            if name is not None:
+                inputs[self._runs.variable(name)] = float(value)
+        if wanted.temperature is not None:
+            base = wanted.temperature_reference or 0.0
+            at = 0 if trial.is_dynamic else row
+            inputs[self._runs.variable(wanted.temperature)] = base + float(trial.temperature[at])
+        table = self._description.motion if trial.is_dynamic else self._description.static
+        parameters = {self._runs.parameter(name): value for name, value in table.parameters.items()}
+        for key, value in zip(self._keys, conditions.parameters, strict=True):
+            parameters[key] = float(value)
+        parameters |= dict(settings)
+        return State(tuple(sorted(parameters.items())), tuple(sorted(inputs.items())))
+
+    def _input_of(self, place: str | tuple[float, float]) -> str:
+        if place == DEFAULT_PLACE and place not in self._forces and len(self._forces) == 1:
+            return next(iter(self._forces.values()))
+        if not isinstance(place, str) or place not in self._forces:
+            known = ", ".join(self._forces) or "none"
+            raise ModelError(
+                f"The load place {place!r} has no force input in the FMU model {self._name!r}; it has "
+                f"{known}."
+            )
+        return self._forces[place]
