@@ -2,18 +2,20 @@
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
+from itertools import product
 from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
-from .candidate import Candidate
+from .candidate import Candidate, Term
 from .catalogue.entry import Effect
 from .errors import FitError, ModelError
-from .fitting import Fit, fit
+from .fitting import Fit, fit, objective
 from .gates import absolute_gate
 from .problem import Point, Problem, shortened
-from .promising import FAR_STARTS, starts
+from .promising import FAR_STARTS, FEW_PLACES, starts
 from .screening import Change, Screen, rescaled
 
 FloatArray = NDArray[np.float64]
@@ -29,6 +31,12 @@ SHORT_STEPS, FAR_STEPS = 12, 6
 """Steps on the beginnings, and then on whole records, before candidates are compared."""
 FAR_FITS, FAR_EXTENSIONS = 6, 4
 """Candidates that go on from the beginnings to whole records: single effects, and longer sets."""
+
+
+RELATED_LEVELS = {1: 5, 2: 5, 3: 5, 4: 3}
+"""Levels of each parameter, by their number, at which relatives of a fitted effect are tried."""
+RELATED_STARTS = 2
+"""Of these, how many begin a fit."""
 
 
 class Beginnings:
@@ -107,10 +115,48 @@ class Beginnings:
     ) -> Fit | None:
         """Fit a candidate to the beginnings, or return None where the structure cannot follow."""
         start = Point(near.point.shared, near.point.local, np.concatenate((near.point.effect, added)))
+        return self._fitted(candidate, start, give_up)
+
+    def _fitted(self, candidate: Candidate, start: Point, give_up: float | None = None) -> Fit | None:
         try:
             return fit(self.short, candidate, start, iterations=SHORT_STEPS, evidence=False, give_up=give_up)
         except (FitError, ModelError):
             return None
+
+    def related(self, found: Fit, effects: Iterable[Effect]) -> list[Fit]:
+        """Fit effects in place of the single one of a fit, from where that brought the nuisances.
+
+        Phases that slip keep an effect from its optimum while the nuisances are those of no effect; one that
+        does nearly the same has brought them close to where they belong.
+        """
+        (term,) = found.candidate.terms
+        begun = []
+        for effect in effects:
+            places = tuple(effect.places(self.problem.setting))
+            if term.place in places:
+                places = (term.place,)
+            best = None
+            for place in places if len(places) <= FEW_PLACES else ():
+                for start in self._tried(found, Candidate((Term(effect, place),))):
+                    item = self._fitted(Candidate((Term(effect, place),)), start)
+                    if item is not None and (best is None or item.objective < best.objective):
+                        best = item
+            if best is not None:
+                begun.append(best)
+        return self.whole(begun, found.objective)
+
+    def _tried(self, found: Fit, candidate: Candidate) -> list[Point]:
+        """Return the most promising points of a grid of a candidate's parameters, nuisances as fitted."""
+        count = RELATED_LEVELS.get(candidate.size, 0)
+        levels = ndtri((np.arange(count) + 0.5) / max(count, 1))
+        tried = []
+        for effect in product(levels, repeat=candidate.size):
+            point = Point(found.point.shared, found.point.local, np.array(effect))
+            try:
+                tried.append((objective(self.short, candidate, point), point))
+            except ModelError:  # more than the structure can carry
+                continue
+        return [point for _, point in sorted(tried, key=lambda item: item[0])[:RELATED_STARTS]]
 
     def whole(self, begun: Sequence[Fit], least: float) -> list[Fit]:
         """Fit the most promising candidates to whole records from where the beginnings led."""

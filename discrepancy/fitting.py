@@ -227,6 +227,17 @@ def fit(
     return _finished(problem, candidate, state, converged, evidence)
 
 
+def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
+    """Return -ln posterior of a candidate at a point, up to a constant shared by all candidates [nat].
+
+    Raises
+    ------
+    ModelError
+        If the structure cannot carry the effects.
+    """
+    return _Descent(problem, candidate, None, False).state(_bounded(point), derivatives=False).objective
+
+
 @dataclass(frozen=True)
 class _State:
     point: Point

@@ -53,6 +53,14 @@ def acts_within(effect: Effect, setting: Setting) -> bool:
     return not all(isinstance(item, SENSORS) for item in patch)
 
 
+def are_related(one: Effect, other: Effect) -> bool:
+    """Whether one of two different effects is easily taken for the other."""
+    if one.identifier == other.identifier:
+        return False
+    named = one.identifier in other.confusable or other.identifier in one.confusable
+    return named or one.family == other.family
+
+
 def _worth(change: Change) -> float:
     """Order of changes: misfit gained, less what the scale costs in the prior."""
     scaled = rescaled(change)

@@ -17,7 +17,7 @@ from .gates import SHAPE_GAIN, absolute_gate
 from .hypotheses import LARGEST_SET, Hypotheses, key_of
 from .neighbourhood import around, free_shape, is_box
 from .problem import Point, Problem
-from .promising import acts_within, pairs, starts
+from .promising import acts_within, are_related, pairs, starts
 from .screening import Change, Screen, rescaled
 
 FloatArray = NDArray[np.float64]
@@ -173,6 +173,8 @@ class Search(Hypotheses):
             misses = absolute_gate(self.problem, item).passed is False
             if not self._misfits(item) and (misses or (rank == 0 and is_box(item.candidate))):
                 self.keep(around(self.problem, item), exact=True)
+        if ranked and absolute_gate(self.problem, self.best()).passed is False and self._misfits(self.none):
+            self._relatives()
         self._settle_steps()
         self._families()
         current = self.best()
@@ -190,6 +192,18 @@ class Search(Hypotheses):
             self.fit_pairs()
         self._deletions()
         self._settle_steps()
+
+    def _relatives(self) -> None:
+        """Fit effects that are easily taken for the best one, from where it stands."""
+        best = self.best()
+        if len(best.candidate.terms) != 1:
+            return
+        (term,) = best.candidate.terms
+        related = [effect for effect in self.effects if are_related(effect, term.effect)]
+        for item in self.beginnings.related(best, related):
+            self.keep(item, exact=False)
+            if self.score(item) > self.score(best) - CLOSE:
+                self.exactly(item)
 
     def _families(self) -> None:
         """Fit the free-shape families of single effects that come close, and keep those that fit.

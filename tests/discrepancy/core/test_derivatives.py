@@ -157,3 +157,41 @@ def test_samples_that_do_not_count_change_nothing(kit) -> None:  # type: ignore[
             for p in (problem, other)
         )
         np.testing.assert_allclose(first, second, atol=1e-9)
+
+
+def test_products_by_channel_are_those_of_all_readings(kit) -> None:  # type: ignore[no-untyped-def]
+    """J W J^T, J d and the trace of J^T covariance J by channel, beside the same with dense matrices."""
+    noise = coloured_record(0.02, 0.01)
+    problem = kit.closed_problem(
+        bent=True, noise=noise, gain_deviation=0.1, health=True, time_zero=0.003, left_out={1: ((3, 1),)},
+        samples=80,
+    )  # fmt: skip
+    candidate = Candidate((Term(kit.offset_effect(), "y1"), Term(kit.drift_effect(), "y2")))
+    generator = np.random.default_rng(2)
+    point = kit.Linear(problem, candidate).point(
+        generator.standard_normal(kit.Linear(problem, candidate).size)
+    )
+    for number, data in enumerate(problem.trials):
+        found = problem.derivatives(number, point, problem.linearise(number, point, candidate), candidate)
+        dense = found.dense()
+        count = len(data.trial.channels)
+        weights = generator.uniform(0.5, 2.0, count)
+        products = found.products()
+        every = np.tile(weights, dense.shape[1] // count)
+        np.testing.assert_allclose(
+            found.normal(products, weights), (dense * every) @ dense.T, rtol=1e-12, atol=1e-9
+        )
+        readings = generator.standard_normal((count, dense.shape[1] // count))
+        np.testing.assert_allclose(found.onto(readings), dense @ readings.T.ravel(), rtol=1e-12, atol=1e-9)
+        only = np.zeros_like(readings)
+        only[1] = readings[1]
+        np.testing.assert_allclose(
+            found.onto(readings[1:2], [1]), dense @ only.T.ravel(), rtol=1e-12, atol=1e-9
+        )
+        root = generator.standard_normal((found.size, found.size))
+        covariance = root @ root.T
+        leverage = np.einsum("kn,kl,ln->n", dense, covariance, dense) * every
+        np.testing.assert_allclose(
+            found.spread(products, weights, covariance),
+            leverage.reshape(-1, count).sum(axis=0), rtol=1e-10, atol=1e-9,
+        )  # fmt: skip
