@@ -67,10 +67,10 @@ class PatchArrays:
         Distance of the static test's load from the root [m].
     stations : (P,) ndarray
         Sections: mesh lines and the middles between them [m from the root], P odd.
-    line_chord : (2,) ndarray
-        Chord fractions of the elastic line and of the other line.
-    line_rows : (4, P, n) ndarray
-        Displacement of the elastic line along x, y and z and of the other line along z.
+    line_chord : (L,) ndarray
+        Chord fractions of the elastic line and of the other lines, ascending; L at least 2.
+    line_rows : (L + 2, P, n) ndarray
+        Displacement of the elastic line along x, y and z and of the other lines along z.
     station_weights : (P,) ndarray
         Share of the planform's area; sums to one.
     load_tip : (n,) ndarray
@@ -177,8 +177,8 @@ class PatchArrays:
             "term_of": (t,),
             "flap_row": (n,),
             "stations": (p,),
-            "line_chord": (2,),
-            "line_rows": (4, p, n),
+            "line_chord": (max(len(self.line_chord), 2),),
+            "line_rows": (len(self.line_chord) + 2, p, n),
             "station_weights": (p,),
             "load_tip": (n,),
             "load_lift": (n,),

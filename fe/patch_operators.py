@@ -1,10 +1,11 @@
 """Full operators of the primitives of `fe.patch`: what a missing effect does to the wing, before reduction.
 
 Stations are the sections of the mesh that hold nodes: its lines along the span and the middles between them.
-Forces and displacements of a section are those of two lines along the span, the elastic line (the chord line
-of the static test) and another web behind or before it; between and beyond them the section moves as a
-straight line, and a force goes to the two lines by the law of the lever. A force between two webs therefore
-does not dent the thin skin; nor would one in a test, where a clamp or a cord around the section takes it.
+Forces and displacements of a section are those of lines along the span, the elastic line (the chord line of
+the static test) and the webs; between two of them the section moves as a straight line, beyond the outermost
+as the straight line through the last two, and a force goes to two lines by the law of the lever. A force
+between two webs therefore does not dent the thin skin; nor would one in a test, where a clamp or a cord
+around the section takes it.
 """
 
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ IntArray = NDArray[np.int64]
 SKIN_REGIONS = (SKIN, DEFECT_1, DEFECT_2)
 """Regions of the skin, in the order of the first three stiffness terms."""
 LEAST_LINE_DISTANCE = 0.1
-"""Least distance between the two lines of a section, as a fraction of the chord."""
+"""Least distance between lines of a section, as a fraction of the chord."""
 
 
 class TurnedStrain(Discretisation):
@@ -74,10 +75,10 @@ class PatchOperators:
         The wing that they belong to.
     stations : (P,) m
         Distances of the sections from the root, ascending.
-    line_chord : (2,)
-        Chord fractions of the elastic line and of the other line.
-    line_rows : tuple of csr (P, n)
-        Displacement of the elastic line along x, y and z, and of the other line along z, at the stations.
+    line_chord : (L,)
+        Chord fractions of the elastic line and of the other lines, ascending.
+    line_rows : tuple of L + 2 csr (P, n)
+        Displacement of the elastic line along x, y and z, and of the other lines along z, at the stations.
     lift_rows : csr (P, n) N
         Load of load factor 1 without the weight, by stations of its nodes.
     weight : (n,) N
@@ -112,13 +113,15 @@ class PatchOperators:
     flap_spring: float
 
 
-def section_lines(design: WingDesign) -> tuple[float, float]:
-    """Return the chord fractions of the elastic line and of the other line of a section."""
+def section_lines(design: WingDesign) -> tuple[float, ...]:
+    """Return the chord fractions of the elastic line and of the webs that are other lines, ascending."""
     elastic = design.tip_load.chord
-    webs = [web.chord for web in design.webs]
-    behind = [chord for chord in webs if chord >= elastic + LEAST_LINE_DISTANCE]
-    before = [chord for chord in webs if chord <= elastic - LEAST_LINE_DISTANCE]
-    return elastic, min(behind) if behind else max(before)
+    webs = sorted((web.chord for web in design.webs), key=lambda chord: abs(chord - elastic))
+    lines = [elastic]
+    for chord in webs:  # the nearest first: what is too near to one gives no lever
+        if min(abs(chord - line) for line in lines) >= LEAST_LINE_DISTANCE:
+            lines.append(chord)
+    return elastic, *sorted(lines[1:])
 
 
 def strip_edges(lines: FloatArray, count: int) -> FloatArray:
@@ -189,7 +192,10 @@ def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) 
         operators=operators,
         stations=stations,
         line_chord=np.array(chords),
-        line_rows=(*(rows(chords[0], component) for component in range(3)), rows(chords[1], 2)),
+        line_rows=(
+            *(rows(chords[0], component) for component in range(3)),
+            *(rows(chord, 2) for chord in chords[1:]),
+        ),
         lift_rows=sparse.csr_array(by_station @ expansion),
         weight=weight,
         strain_rows=(across, sparse.csr_array(2.0 * diagonal - along - across)),

@@ -118,7 +118,7 @@ def _responses(full: PatchOperators, norm: Norm, settings: PatchSettings, *, mai
     step = max(1, stations // 13)
     lines = [
         full.line_rows[2][2 : None : 1 if main else step].toarray(),  # where point masses may sit
-        full.line_rows[3][step::step].toarray(),
+        *(rows[step::step].toarray() for rows in full.line_rows[3:]),
         *(rows[2 * step :: 2 * step].toarray() for rows in full.line_rows[:2]),
     ]
     flap = np.zeros(operators.unknowns)
@@ -344,7 +344,7 @@ def _patched_state(
     *,
     plain: bool,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return stiffness, mass and loads (N, 7) of a random state; `plain`: of the wing as it was."""
+    """Return stiffness, mass and loads (N, 3 + 2 L) of a random state; `plain`: of the wing as it was."""
     ranges, span = settings.ranges, arrays.semi_span
     e, z1, z2, servo, pitot = (
         float(generator.uniform(*pair))
@@ -390,8 +390,8 @@ def _patched_state(
             (stations / span) ** exponent @ arrays.lift_rows,
             arrays.weight,
             arrays.line_rows[2, outboard],
-            arrays.line_rows[3, outboard],
-            arrays.line_rows[3, -1],
+            *arrays.line_rows[3:, outboard],
+            *arrays.line_rows[3:, -1],
         ),
         axis=1,
     )

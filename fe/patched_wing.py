@@ -276,6 +276,11 @@ class PatchedWing:
 
     # ------------------------------------------------------------ loads and rows
 
+    @cached_property
+    def _line_order(self) -> IntArray:
+        """Numbers (L,) of the lines of a section from the leading edge to the trailing edge."""
+        return np.argsort(self.arrays.line_chord)
+
     def _along(self, y: float) -> FloatArray:
         """Weights (P,) of the stations at `y` m from the root: the parabola of the mesh cell."""
         stations, span = self.arrays.stations, self.span
@@ -298,19 +303,33 @@ class PatchedWing:
         )
         return weights
 
-    def displacement_row(self, y: float, chord: float) -> FloatArray:
+    def displacement_row(self, y: float, chord: float, beside: float | None = None) -> FloatArray:
         """Return the row (n,) of the upward displacement of a section at a chord fraction.
+
+        Parameters
+        ----------
+        y : float
+            Distance from the root [m].
+        chord : float
+            Chord fraction.
+        beside : float, optional
+            The section is straight through the two lines beside this chord fraction; `chord` by default.
 
         Raises
         ------
         InvalidPatchError
-            If `y` [m from the root] lies off the wing.
+            If `y` lies off the wing.
         """
         along = self._along(y)
-        elastic, other = self.arrays.line_chord
-        share = (chord - elastic) / (other - elastic)
-        row = (1.0 - share) * (along @ self.arrays.line_rows[2])
-        return np.asarray(row + share * (along @ self.arrays.line_rows[3]) if share != 0.0 else row)
+        chords, order = self.arrays.line_chord, self._line_order
+        within = chord if beside is None else beside
+        number = int(np.searchsorted(chords[order], within, side="right"))
+        behind = min(max(number, 1), len(order) - 1)
+        first, last = order[behind - 1], order[behind]
+        share = (chord - chords[first]) / (chords[last] - chords[first])
+        rows = self.arrays.line_rows[2:]
+        row = (1.0 - share) * (along @ rows[first])
+        return np.asarray(row + share * (along @ rows[last]) if share != 0.0 else row)
 
     def force_row(self, place: Place, patch: ModelPatch = EMPTY) -> FloatArray:
         """Return the load (n,) of 1 N at a place; as a row, the displacement there.
@@ -351,7 +370,8 @@ class PatchedWing:
         aft = (chord - arrays.straight_chord_line) * chord_at(y) + along_chord
         moved = y + along_span
         moved_chord = arrays.straight_chord_line + aft / chord_at(moved)
-        shift = self.displacement_row(moved, moved_chord) - self.displacement_row(y, chord)
+        # the clamp grips the same two lines wherever it pulls, else the response had a kink at each web
+        shift = self.displacement_row(moved, moved_chord, chord) - self.displacement_row(y, chord)
         return np.asarray(row + shift)
 
     def load(self, load_factor: float, patch: ModelPatch = EMPTY) -> FloatArray:

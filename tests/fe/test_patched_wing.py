@@ -254,7 +254,8 @@ def test_load_place_along_the_chord_follows_the_lever(
 ) -> None:
     wing, operators = coarse_patched_wing, coarse_operators
     place, plan = wing.arrays.load_place, coarse_design.planform
-    elastic, other = wing.arrays.line_chord
+    elastic, other = 0.3, 0.6
+    assert {elastic, other} < set(wing.arrays.line_chord.tolist())
     aft = 0.04
     share = aft / ((other - elastic) * plan.chord(place / plan.semi_span))
     full = (1.0 - share) * _section_force(operators, place, elastic) + share * _section_force(
@@ -265,6 +266,34 @@ def test_load_place_along_the_chord_follows_the_lever(
     compare(wing, u, operators, solved(operators, full))
     # the work of the force is the same on both ways, and the section twists tail up
     assert wing.displacement_row(1.8, 0.9) @ u > wing.displacement_row(1.8, 0.3) @ u
+
+
+@pytest.mark.parametrize(("chord", "share"), [(0.03, 0.0), (0.15, 12.0 / 27.0), (0.9, 1.0 - 1.0 / 31.0)])
+def test_a_force_before_or_behind_goes_to_the_webs_beside_it(
+    coarse_patched_wing: PatchedWing, coarse_operators: AffineOperators, chord: float, share: float
+) -> None:
+    wing, operators = coarse_patched_wing, coarse_operators
+    place = wing.arrays.load_place
+    webs = (0.03, 0.3) if chord < 0.3 else (0.6, 0.91)
+    full = (1.0 - share) * _section_force(operators, place, webs[0]) + share * _section_force(
+        operators, place, webs[1]
+    )
+    solution = solved(operators, full)
+    row = wing.force_row((place, chord))
+    u = wing.structure(*STATE, *MASSES).static(row)
+    compare(wing, u, operators, solution)
+    # the place itself yields by what the trailing edge gives way under the force, too
+    assert float(row @ u) == pytest.approx(float(full @ solution), rel=3e-3)
+
+
+@pytest.mark.parametrize("place", ["tip_load", (1.778, 0.6), (1.778, 0.9)])
+def test_a_displaced_force_has_no_kink_at_a_web(
+    coarse_patched_wing: PatchedWing, place: str | tuple[float, float]
+) -> None:
+    wing = coarse_patched_wing
+    nominal = wing.force_row(place)
+    before, behind = (wing.force_row(place, patched(LoadPlace(0.0, aft))) - nominal for aft in (-0.02, 0.02))
+    assert np.abs(before + behind).max() < 1e-9 * np.abs(behind).max()
 
 
 def test_a_named_place_and_its_coordinates_are_the_same(coarse_patched_wing: PatchedWing) -> None:
