@@ -181,7 +181,8 @@ def fit(
     FitError
         If the model gives numbers that are not finite at the start.
     """
-    descent = _Descent(problem, candidate, base, local_only)
+    # without evidence the step needs a direction only: one side is half the work
+    descent = _Descent(problem, candidate, base, local_only, central=evidence)
     damping = 1e-3
     state = descent.state(_bounded(start))
     if not np.isfinite(state.objective):
@@ -256,6 +257,7 @@ class _Descent:
     candidate: Candidate
     base: Base | None
     local_only: bool
+    central: bool = True
     deviation: FloatArray | None = None  # (E,) of the effect parameters, once known
 
     def state(
@@ -269,6 +271,7 @@ class _Descent:
             part = problem.linearise(
                 number, point, self.candidate, self.base, derivatives=derivatives,
                 known=None if known is None else known[number], effect_steps=self.deviation,
+                central=self.central,
             )  # fmt: skip
             parts.append(part)
             responses.append(part.response)

@@ -30,7 +30,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 PARAMETER_STEP = 1e-2
-"""Step of the forward differences in scaled variables."""
+"""Step of the differences in scaled variables."""
 LEAST_STEP = 1e-4
 """Least step by effect parameters, above the rounding of the integration."""
 SHARED_STEP = 1e-3
@@ -296,6 +296,7 @@ class Problem:
         derivatives: bool = True,
         known: Linearisation | None = None,
         effect_steps: FloatArray | None = None,
+        central: bool = True,
     ) -> Linearisation:
         """Return response and derivatives of a trial.
 
@@ -318,6 +319,14 @@ class Problem:
             Deviations of the effect parameters. Differences over one of them, at most a hundredth of the
             prior's, average over the kinks of friction and hysteresis and do not reach beyond where the
             parameters may lie.
+        central : bool
+            Whether derivatives by effect parameters are central differences; never so with a base.
+
+        Notes
+        -----
+        What nuisances can do as well is left of a derivative by an effect once these are fitted: a
+        ten-thousandth where the effect moves frequencies. The curvature in a one-sided difference is more
+        than that, and would count as information.
         """
         data = self.trials[number]
         kind = data.trial.kind
@@ -348,8 +357,13 @@ class Problem:
             steps = np.clip(effect_steps, LEAST_STEP, PARAMETER_STEP)
         for k in range(candidate.size):
             if kind in candidate.acting(k):
-                moved = candidate.patch(self.setting, _moved(point.effect, k, steps[k]))
-                effect[k] = (self.response(number, shared, local, moved)[0] - at_base) / steps[k]
+                sides = (1.0, -1.0) if central and base is None else (1.0,)
+                ends = []
+                for side in sides:
+                    moved = candidate.patch(self.setting, _moved(point.effect, k, side * steps[k]))
+                    ends.append(self.response(number, shared, local, moved)[0])
+                other, width = (ends[1], 2.0) if len(ends) == 2 else (at_base, 1.0)
+                effect[k] = (ends[0] - other) / (width * steps[k])
         return Linearisation(response, parameters, by_local, effect)
 
     def _by_parameters(

@@ -6,16 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from discrepancy.campaign import NoiseRecord
 from discrepancy.candidate import Candidate, Term
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier
 from discrepancy.fitting import fit
-from discrepancy.problem import Problem
+from discrepancy.problem import PARAMETER_STEP, Problem
+
+FloatArray = NDArray[np.float64]
 
 STEP = 1e-4
-TOLERANCE = 0.03  # of the column's norm: the code's one-sided step is 1e-2 of a prior deviation
+TOLERANCE = 0.03  # of the column's norm: the code's one-sided step by nuisances is 1e-2 of a prior deviation
 
 
 def coloured_record(deviation: float, interval: float) -> NoiseRecord:
@@ -195,3 +198,25 @@ def test_products_by_channel_are_those_of_all_readings(kit) -> None:  # type: ig
             found.spread(products, weights, covariance),
             leverage.reshape(-1, count).sum(axis=0), rtol=1e-10, atol=1e-9,
         )  # fmt: skip
+
+
+def test_derivatives_by_an_effect_have_no_curvature_in_them(bench, catalogue) -> None:  # type: ignore[no-untyped-def]
+    """Of an effect on frequencies nuisances leave less than a one-sided difference errs by."""
+    problem = bench.problem(bench.measured(4, bench.patch("root_compliance", {"compliance_share": 0.3})))
+    effect = next(item for item in catalogue if item.identifier == "root_compliance")
+    candidate = Candidate((Term(effect),))
+    point = problem.start(candidate)
+
+    def response(number: int, move: float) -> FloatArray:
+        patch = candidate.patch(problem.setting, point.effect + move)
+        return problem.response(number, point.shared, point.local[number], patch)[0]
+
+    rings = [n for n, data in enumerate(problem.trials) if data.trial.is_dynamic]
+    assert rings
+    for number in rings:
+        exact = (response(number, STEP) - response(number, -STEP)) / (2.0 * STEP)
+        one_sided = (response(number, PARAMETER_STEP) - response(number, 0.0)) / PARAMETER_STEP
+        found = problem.linearise(number, point, candidate).effect[0]
+        size = np.linalg.norm(exact)
+        assert np.linalg.norm(one_sided - exact) > 2e-3 * size
+        assert np.linalg.norm(found - exact) < 1e-4 * size
