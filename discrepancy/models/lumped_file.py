@@ -1,11 +1,12 @@
 """A lumped model as a TOML file: matrices, named vectors and calibrated parameters, checked strictly."""
 
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from discrepancy.errors import ModelError
 from discrepancy.models.model_file import (
@@ -16,7 +17,9 @@ from discrepancy.models.model_file import (
     check_unique,
     checked,
     read_toml,
+    shown,
 )
+from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
@@ -24,14 +27,45 @@ SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"
 """Models that come with the package, by file name without the ending."""
 
 Name = Annotated[str, Field(min_length=1, max_length=100)]
-Vector = tuple[Number, ...]
-Matrix = tuple[Vector, ...]
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+
+
+def _numbers(value: object) -> tuple[float, ...]:
+    """Return one number, or a list of them, as numbers: with one unknown nobody needs brackets."""
+    found = value if isinstance(value, list | tuple) else (value,)
+    if not found or not all(_is_number(item) for item in found):
+        raise ValueError(
+            f"a list of finite numbers such as [1.0, 0.0] is expected, or one number, but {shown(value)} came"
+        )
+    return tuple(float(item) for item in found)
+
+
+def _matrix(value: object) -> tuple[tuple[float, ...], ...] | tuple[float, ...]:
+    """Return a matrix by rows, a diagonal, or one number as what it is."""
+    if isinstance(value, list | tuple) and value and all(isinstance(row, list | tuple) for row in value):
+        if all(row and all(_is_number(item) for item in row) for row in value):
+            return tuple(tuple(float(item) for item in row) for row in value)
+    elif not isinstance(value, list | tuple) or value:
+        found = value if isinstance(value, list | tuple) else (value,)
+        if all(_is_number(item) for item in found):
+            return tuple(float(item) for item in found)
+    raise ValueError(
+        "a matrix of finite numbers by rows such as [[2.0, -1.0], [-1.0, 2.0]] is expected, or its diagonal, "
+        f"or one number, but {shown(value)} came"
+    )
+
+
+Vector = Annotated[tuple[Number, ...], BeforeValidator(_numbers)]
+Matrix = Annotated[tuple[tuple[Number, ...], ...] | tuple[Number, ...], BeforeValidator(_matrix)]
 
 
 class Damping(Section):
     """`[damping]`: exactly one of modal ratios, a matrix, or Rayleigh coefficients alpha M + beta K."""
 
-    ratios: tuple[NotNegative, ...] | None = None
+    ratios: Annotated[tuple[NotNegative, ...], BeforeValidator(_numbers)] | None = None
     matrix: Matrix | None = None
     alpha: NotNegative | None = None
     beta: NotNegative | None = None
@@ -121,7 +155,7 @@ class LumpedDescription(Section):
         1.
     name : str
         For people.
-    mass, stiffness : (n, n) matrix, or (n,) vector of a diagonal
+    mass, stiffness : (n, n) matrix, (n,) vector of a diagonal, or for n = 1 a number
         SI.
     damping : Damping
         See there.
@@ -131,8 +165,8 @@ class LumpedDescription(Section):
 
     format: Literal[1]
     name: Name
-    mass: Matrix | Vector
-    stiffness: Matrix | Vector
+    mass: Matrix
+    stiffness: Matrix
     damping: Damping
     characteristic_length: Positive | None = None
     mass_part: tuple[Part, ...] = ()
@@ -162,7 +196,8 @@ class LumpedDescription(Section):
             lengths = {len(row) for row in rows if row is not None}
             if len(content) != n or (lengths and lengths != {n}):
                 raise ValueError(
-                    f"{where} must be a {n} x {n} matrix (or {n} diagonal values), as mass has {n} rows"
+                    f"{where} must be a {n} x {n} matrix (or {counted(n, 'diagonal value')}), as mass has "
+                    f"{counted(n, 'row')}"
                 )
             full = matrix_of(content)
             if np.max(np.abs(full - full.T)) > 1e-9 * max(float(np.max(np.abs(full))), 1e-300):
@@ -181,17 +216,19 @@ class LumpedDescription(Section):
                 for key in ("vector", "station_derivative", "chord_derivative"):
                     vector = getattr(item, key, None)
                     if vector is not None and len(vector) != n:
+                        came = counted(len(vector), "entry", "entries")
                         raise ValueError(
-                            f"{key} of {kind} {item.name!r} has {len(vector)} entries, but the model has {n} "
-                            f"unknowns"
+                            f"{key} of {kind} {item.name!r} has {came}, but the model has "
+                            f"{counted(n, 'unknown')}"
                         )
                 if not any(item.vector):
                     raise ValueError(f"vector of {kind} {item.name!r} is zero")
             check_unique(kind, [item.name for item in items])
         if self.root is not None and (len(self.root.lever) != n or not any(self.root.lever)):
-            raise ValueError(f"lever of root must have {n} entries that are not all zero")
+            raise ValueError(f"lever of root needs {counted(n, 'entry', 'entries')}, not all zero")
         if self.damping.ratios is not None and len(self.damping.ratios) != n:
-            raise ValueError(f"damping.ratios needs one value for each of the {n} modes")
+            came = counted(len(self.damping.ratios), "value")
+            raise ValueError(f"damping.ratios needs one value for each mode, {n} in all, but {came} came")
         check_unique("place station", [f"{place.station:g}" for place in self.place])
         parts = [part.name for part in (*self.mass_part, *self.stiffness_part)]
         check_unique("part", [*parts, "mass", "stiffness", "damping"])
@@ -219,7 +256,7 @@ class LumpedDescription(Section):
         return self
 
 
-def matrix_of(content: Matrix | Vector) -> FloatArray:
+def matrix_of(content: Matrix) -> FloatArray:
     """Return a matrix from rows or from its diagonal."""
     array = np.array(content, dtype=np.float64)
     return np.diag(array) if array.ndim == 1 else array

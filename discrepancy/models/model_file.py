@@ -1,5 +1,6 @@
 """What the TOML files of models share: strict tables, kinds of numbers, one sentence for what is wrong."""
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -11,6 +12,21 @@ from discrepancy.errors import ModelError
 Number = Annotated[float, Field(allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0)]
 Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0)]
+
+_SHOWN_LENGTH = 60
+_EXPECTED = {
+    "tuple_type": "a list",
+    "dict_type": "a table",
+    "model_type": "a table",
+    "string_type": "a text in quotes",
+    "string_too_short": "a text that is not empty",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "finite_number": "a finite number",
+}
+"""What is expected, by pydantic's type of error, where its own words are those of Python."""
 
 
 class Section(BaseModel):
@@ -70,6 +86,12 @@ def checked(description: type[_Description], content: dict[str, Any], source: st
         raise ModelError(f"{source}: {_sentence(error, what)}.") from None
 
 
+def shown(value: object) -> str:
+    """Return a value as it can stand in a sentence, shortened if it is long."""
+    text = repr(value)
+    return text if len(text) <= _SHOWN_LENGTH else f"{text[: _SHOWN_LENGTH - 3]}..."
+
+
 def check_unique(kind: str, names: list[str]) -> None:
     """Refuse a name that is there twice; raises `ValueError`."""
     for name in names:
@@ -78,13 +100,29 @@ def check_unique(kind: str, names: list[str]) -> None:
 
 
 def _sentence(error: ValidationError, what: str) -> str:
-    details = error.errors()
-    # Of a matrix that may also be a diagonal both readings are reported; the other one says too little.
-    first = next((detail for detail in details if detail["type"] != "tuple_type"), details[0])
-    place = ".".join(str(part) for part in first["loc"] if "tuple[" not in str(part))
+    first = error.errors()[0]
+    place = _written(first["loc"])
     if first["type"] == "extra_forbidden":
         return f"{place!r} is not a key of {what}; remove it or correct its spelling"
     if first["type"] == "missing":
         return f"{place!r} is missing"
-    message = first["msg"].removeprefix("Value error, ")
-    return f"{place + ': ' if place else ''}{message[0].lower() + message[1:]}"
+    if first["type"] == "value_error":
+        return f"{place + ': ' if place else ''}{first['ctx']['error']}"
+    if first["type"] == "tuple_type" and isinstance(first["input"], dict):
+        return f"there can be several of {place!r}, so write [[{place}]] for each, not [{place}]"
+    if first["type"] in _EXPECTED:
+        message = f"{_EXPECTED[first['type']]} is expected"
+    else:
+        message = first["msg"][0].lower() + first["msg"][1:]
+    return f"{place + ': ' if place else ''}{message}, but {shown(first['input'])} came"
+
+
+def _written(location: tuple[int | str, ...]) -> str:
+    """Return a place as people count, from one, without pydantic's names of types."""
+    text = ""
+    for part in location:
+        if isinstance(part, int):
+            text += f"[{part + 1}]"
+        elif not re.search(r"[^\w]|^constrained", part):
+            text += f".{part}" if text else part
+    return text

@@ -1,6 +1,7 @@
 """Lumped models against matrices inverted by hand and general integrators of their equations of motion."""
 
 import tomllib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -466,7 +467,7 @@ vector = [0.0, 1.0]
         ("mass = [1.0, 2.0]", "mass = [1.0, -2.0]", "mass .* must be positive definite"),
         ("[-1.0, 1.0]]", "[-1.0, 0.3]]", "a structure that can float away has no static response"),
         ("[-1.0, 1.0]]", "[-0.9, 1.0]]", "stiffness must be symmetric"),
-        ("ratios = [0.01, 0.01]", "ratios = [0.01]", "one value for each of the 2 modes"),
+        ("ratios = [0.01, 0.01]", "ratios = [0.01]", "one value for each mode, 2 in all, but 1 value came"),
         ("ratios = [0.01, 0.01]", "", "exactly one of ratios, matrix"),
         ("ratios = [0.01, 0.01]", "matrix = [[-1.0, 0.0], [0.0, 1.0]]", "must not feed energy"),
         ("format = 1", "format = 2", "format"),
@@ -475,7 +476,7 @@ vector = [0.0, 1.0]
             'name = "x"\nvector = [0.0, 0.0]',
             "vector of output 'x' is zero",
         ),
-        ('name = "x"\nvector = [0.0, 1.0]', 'name = "x"\nvector = [1.0]', "1 entries, but the model has 2"),
+        ('name = "x"\nvector = [0.0, 1.0]', 'name = "x"\nvector = [1.0]', "1 entry, but the model has 2"),
         ("[[output]]", "[[outputs]]", "'outputs' is not a key|'output' is missing"),
         (
             "[[output]]",
@@ -489,6 +490,16 @@ vector = [0.0, 1.0]
         ),
         ("[[output]]", '[[input]]\nname = "in"\nvector = [1.0, 0.0]\n[[output]]', "two of input 'in'"),
         ("mass = [1.0, 2.0]", "mass = [1.0, nan]", "finite"),
+        ("mass = [1.0, 2.0]", "mass = 2.0", r"stiffness must be a 1 x 1 matrix \(or 1 diagonal value\)"),
+        ("mass = [1.0, 2.0]", "mass = '2'", "mass: a matrix of finite numbers by rows .* but '2' came"),
+        ("mass = [1.0, 2.0]", "mass = []", r"mass: a matrix .* but \[\] came"),
+        ("mass = [1.0, 2.0]", "mass = [true, 2.0]", r"mass: a matrix .* but \[True, 2.0\] came"),
+        ("mass = [1.0, 2.0]", "mass = [[1.0, 0.0], 2.0]", "mass: a matrix of finite numbers by rows"),
+        ('"x"\nvector = [0.0, 1.0]', '"x"\nvector = "up"', r"output\[1\].vector: a list .* but 'up' came"),
+        ("ratios = [0.01, 0.01]", "ratios = [0.01, -0.2]", r"damping.ratios\[2\]: .* but -0.2 came"),
+        ("[damping]\nratios = [0.01, 0.01]", "", "'damping' is missing"),
+        ("[damping]\nratios = [0.01, 0.01]", "[[damping]]", "damping: a table is expected"),
+        ("[[output]]", "[output]", r"write \[\[output\]\] for each, not \[output\]"),
     ],
 )
 def test_a_file_that_is_no_model_is_refused_in_a_sentence(
@@ -502,6 +513,62 @@ def test_a_file_that_is_no_model_is_refused_in_a_sentence(
     with pytest.raises(ModelError, match=sentence) as caught:
         LumpedModel.load(file)
     assert str(file) in str(caught.value)
+
+
+ONE_MASS = """
+format = 1
+name = "one mass"
+mass = MASS
+stiffness = STIFFNESS
+characteristic_length = 0.1
+[damping]
+KIND = RATIO
+[[mass_part]]
+name = "bolt"
+matrix = BOLT
+[[stiffness_part]]
+name = "second spring"
+matrix = SPRING
+[[input]]
+name = "mass"
+vector = ROW
+station_derivative = ROW
+[[output]]
+name = "x"
+vector = ROW
+[[port]]
+name = "slide"
+vector = ROW
+[[place]]
+name = "mass"
+vector = ROW
+station = 0.1
+[root]
+lever = ROW
+"""
+
+
+@pytest.mark.parametrize("damping", ["ratios", "matrix"])
+def test_with_one_unknown_a_number_is_a_matrix_and_a_vector(tmp_path: Path, damping: str) -> None:
+    numbers = {"MASS": 2.0, "STIFFNESS": 800.0, "RATIO": 0.01, "BOLT": 0.1, "SPRING": 25, "ROW": 1.0}
+
+    def model(form: Callable[[str, float], str]) -> LumpedModel:
+        text = ONE_MASS.replace("KIND", damping)
+        for word, value in numbers.items():
+            text = text.replace(word, form(word, value))
+        file = tmp_path / "model.toml"
+        file.write_text(text)
+        return LumpedModel.load(file)
+
+    def nested(word: str, value: float) -> str:
+        return f"[{value}]" if word == "ROW" or (word, damping) == ("RATIO", "ratios") else f"[[{value}]]"
+
+    bare = model(lambda _, value: str(value))
+    assert bare.description == model(lambda _, value: f"[{value}]").description
+    pulled = static([1.65], load_place="mass")
+    for other in (bare, model(nested)):
+        response = other.respond(pulled, (("x", Quantity.DISPLACEMENT),), patch(), Conditions(np.ones(0)))
+        assert response.values[0, 0] == pytest.approx(1.65 / 825.0, rel=1e-12)
 
 
 def test_a_missing_or_broken_file_is_refused(tmp_path: Path) -> None:

@@ -1,0 +1,16 @@
+"""Numbers beside their nouns, for sentences."""
+
+
+def counted(count: int, noun: str, plural: str | None = None) -> str:
+    """Return a count with its noun: "1 trial", "2 trials".
+
+    Parameters
+    ----------
+    count : int
+        How many.
+    noun : str
+        Of one.
+    plural : str, optional
+        Of any other number; `noun` with an "s" if left out.
+    """
+    return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
