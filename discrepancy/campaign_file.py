@@ -27,6 +27,7 @@ from discrepancy.noise_records import pre_trigger_record, with_noise
 from discrepancy.sampling import check_sampling
 from discrepancy.units import difference, si_value
 from reporting.provenance import hash_file, hash_record
+from reporting.words import be, counted
 
 FloatArray = NDArray[np.float64]
 
@@ -219,14 +220,13 @@ def _readings(
         values[~used] = np.interp(rows[~used], rows[used], values[used])
         remarks.append(
             f"{int((~used).sum())} of {len(values)} readings of {channel.name!r} in the trial "
-            f"{section.name!r} "
-            "are empty and left out."
+            f"{section.name!r} {be(int((~used).sum()))} empty and left out."
         )
     for row in section.left_out.get(channel.name, ()):
         if row > len(values):
             raise CampaignFileError(
                 f"The trial {section.name!r} leaves out row {row} of {channel.name!r}, and {table.name} has "
-                f"{len(values)} rows."
+                f"{counted(len(values), 'row')}."
             )
         used[row - 1] = False
     return values, used

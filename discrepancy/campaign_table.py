@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.errors import CampaignDataError, CampaignFileError
+from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
@@ -148,7 +149,8 @@ def parse_table(text: str, name: str) -> Table:
     for row, line in zip(rows[1:], lines[1:], strict=True):
         if len(row) != len(header):
             raise CampaignFileError(
-                f"{name}, line {line}: {len(row)} cells came, and the header has {len(header)} columns."
+                f"{name}, line {line}: {counted(len(row), 'cell')} came, and the header has "
+                f"{counted(len(header), 'column')}."
             )
     cells = tuple(zip(*rows[1:], strict=True))
     return Table(name, dict(zip(header, cells, strict=True)), tuple(lines[1:]))

@@ -21,6 +21,7 @@ from fmu_asset.errors import FmuError
 from fmu_asset.patch_file import load_patch
 from fmu_asset.patched_runtime import output_channels
 from reporting.provenance import hash_file
+from reporting.words import counted
 
 from .campaign import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from .errors import CampaignDataError, CampaignFileError
@@ -151,10 +152,14 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
         parameters=_calibrated(run),
         data_hash=hash_file(folder / RUN_FILE),
         remarks=(
-            f"Flight of {size} turns read from a run folder; health in each turn: {plan.health} with a "
-            f"deviation of {plan.health_deviation:g} or more.",
+            f"Flight of {counted(size, 'turn')} read from a run folder; health in each turn: "
+            f"{plan.health} with a deviation of {plan.health_deviation:g} or more.",
             f"Noise of a gauge: {1e6 * noise:.4g} microstrain, {source}.",
-            *((f"{lost} of {size * gauges} readings were lost.",) if lost else ()),
+            *(
+                (f"{lost} of {size * gauges} readings {'was' if lost == 1 else 'were'} lost.",)
+                if lost
+                else ()
+            ),
         ),
     )
 

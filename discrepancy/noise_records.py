@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign import Channel, NoiseRecord, Trial
 from discrepancy.errors import CampaignDataError
+from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
@@ -36,8 +37,8 @@ def pre_trigger_record(samples: FloatArray, interval: float, name: str, source: 
     """
     if len(samples) < _LEAST_DEGREES + 1:
         raise CampaignDataError(
-            f"{source} holds {len(samples)} samples of the channel {name!r}: a noise record needs at least "
-            f"{_LEAST_DEGREES + 1}; record more before the trigger or leave the column out."
+            f"{source} holds {counted(len(samples), 'sample')} of the channel {name!r}: a noise record needs "
+            f"at least {_LEAST_DEGREES + 1}; record more before the trigger or leave the column out."
         )
     mean, spread = float(np.mean(samples)), float(np.std(samples, ddof=1))
     if np.ptp(samples) == 0.0:

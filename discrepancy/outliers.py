@@ -54,8 +54,9 @@ def mark_outliers(campaign: Campaign) -> Campaign:
         used = trial.used.copy()
         used[found, trial.channels.index(channel)] = False
         trials[name] = replace(trial, used=used)
+        said = "is an outlier" if count == 1 else "are outliers"
         remarks.append(
-            f"{count} of {total} readings of {channel!r} in the trial {name!r} are outliers and left out."
+            f"{count} of {total} readings of {channel!r} in the trial {name!r} {said} and left out."
         )
     return replace(campaign, trials=tuple(trials.values()), remarks=tuple(remarks))
 

@@ -14,6 +14,7 @@ from calibration.errors import CalibrationError
 from calibration.experiments import LoadDisplacementData, read_measurements
 from calibration.ringdown_records import RingDownRecord, read_records
 from reporting.provenance import hash_record
+from reporting.words import be, counted
 
 from .campaign import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from .campaign_file import read_campaign
@@ -155,7 +156,7 @@ def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
         hash_record([[*trial.values.ravel().tolist()] for trial in trials]),
         (
             f"Ring-downs: {records[0].source} to {records[-1].source}, from {plan.begin:g} s after the "
-            f"release; {plan.columns} columns of the plot averaged into a sample of "
+            f"release; {counted(plan.columns, 'column')} of the plot averaged into a sample of "
             f"{1e3 * _interval(windows):.3g} ms.",
             f"Noise of the signal: scatter between the trials, {1e6 * spread:.3g} microvolt, and "
             f"the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
@@ -209,8 +210,8 @@ def _windowed(record: RingDownRecord, zero: FloatArray, plan: RecordPlan) -> tup
     count = len(inside) // plan.columns
     if count < 60:
         raise CampaignDataError(
-            f"{record.source}: {count} samples are left between {plan.begin:g} and {plan.end:g} s; 60 are "
-            "needed."
+            f"{record.source}: {counted(count, 'sample')} {be(count)} left between {plan.begin:g} and {plan.end:g} s; 60 "
+            "are needed."
         )
     kept = inside[: count * plan.columns].reshape(count, plan.columns)
     time = record.time[kept].mean(axis=1)

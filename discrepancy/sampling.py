@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.errors import CampaignDataError
+from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
@@ -41,7 +42,8 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
     count = len(time)
     if count < LEAST_SAMPLES:
         raise CampaignDataError(
-            f"{file} holds {count} samples of {user}: a record in time needs at least {LEAST_SAMPLES}."
+            f"{file} holds {counted(count, 'sample')} of {user}: a record in time needs at least "
+            f"{LEAST_SAMPLES}."
         )
     steps = np.diff(time)
     back = int(np.argmin(steps))

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from fe.patch import ModelPatch
+from reporting.words import be
 
 from .campaign import Campaign
 from .candidate import Candidate
@@ -230,9 +231,10 @@ def without_wrong_ends(problem: Problem) -> Campaign:
                 continue
             found = wrong_ends(residual, data.weight > 0.0)
             for number in np.flatnonzero(found.any(axis=0)):
+                count = int(found[:, number].sum())
                 remarks.append(
-                    f"{found[:, number].sum()} of {len(found)} readings of {trial.channels[number]!r} in the "
-                    f"trial {trial.name!r}, at its ends, are far off model and neighbours and left out."
+                    f"{count} of {len(found)} readings of {trial.channels[number]!r} in the trial "
+                    f"{trial.name!r}, at its ends, {be(count)} far off model and neighbours and left out."
                 )
             trials[trial.name] = replace(trial, used=trial.used & ~found)
     if len(remarks) == len(problem.campaign.remarks):

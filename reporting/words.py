@@ -14,3 +14,8 @@ def counted(count: int, noun: str, plural: str | None = None) -> str:
         Of any other number; `noun` with an "s" if left out.
     """
     return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
+
+
+def be(count: int) -> str:
+    """Return "is" for one and "are" for any other count."""
+    return "is" if count == 1 else "are"

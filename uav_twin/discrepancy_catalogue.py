@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from reporting.words import counted
+
 if TYPE_CHECKING:
     from discrepancy.campaign import Campaign
     from discrepancy.catalogue.entry import Effect
@@ -43,7 +45,7 @@ def effects(
     for effect in catalogue:
         table.add_row(effect.identifier, effect.name, effect.family, formula(effect.equation))
     console.print(table)
-    console.print(f"{len(catalogue)} effects; --show ID tells everything about one.")
+    console.print(f"{counted(len(catalogue), 'effect')}; --show ID tells everything about one.")
 
 
 def _show(effect: Effect, console: object) -> None:
@@ -126,7 +128,8 @@ def example(
     hidden = ", ".join(effect) if effect else "nothing"
     named = "" if model is None else f" --model {shlex.quote(model)}"
     typer.echo(
-        f"Wrote {out}: {len(campaign.trials)} trials, {len(campaign.channels)} channels; hidden: {hidden}."
+        f"Wrote {out}: {counted(len(campaign.trials), 'trial')}, "
+        f"{counted(len(campaign.channels), 'channel')}; hidden: {hidden}."
     )
     typer.echo(f"Next: uav-twin discrepancy check {shlex.quote(str(out))}{named}")
     typer.echo(f"Then: uav-twin discrepancy run {shlex.quote(str(out))}{named}")
@@ -184,7 +187,8 @@ def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> d
 
     if len(parts) > len(names):
         raise CatalogueError(
-            f"{identifier} has {len(names)} parameters ({', '.join(names)}), but {len(parts)} values came."
+            f"{identifier} has {counted(len(names), 'parameter')} ({', '.join(names)}), but "
+            f"{counted(len(parts), 'value')} came."
         )
     values = {}
     for position, part in enumerate(parts):
@@ -210,4 +214,4 @@ def convert(
     from discrepancy.real_wing import write_wing_campaign
 
     campaign = write_wing_campaign(data, out)
-    typer.echo(f"{campaign.name}: {len(campaign.trials)} trials in {out}")
+    typer.echo(f"{campaign.name}: {counted(len(campaign.trials), 'trial')} in {out}")

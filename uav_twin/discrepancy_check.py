@@ -31,6 +31,7 @@ def check(
     from discrepancy.separability import separability
     from discrepancy.workflow import checked
     from reporting.progress import RichProgress
+    from reporting.words import counted
 
     data = read_campaign(campaign)
     catalogue = load_catalogue(effects or ())
@@ -40,8 +41,8 @@ def check(
     console = Console(highlight=False, markup=False)
     held = [trial.name for trial in data.trials if trial.held_out]
     console.print(
-        f"{data.name}: {len(data.trials)} trials, {len(data.channels)} channels, beside {choice.model.name}; "
-        f"held out: {', '.join(held) or 'none'}.",
+        f"{data.name}: {counted(len(data.trials), 'trial')}, {counted(len(data.channels), 'channel')}, "
+        f"beside {choice.model.name}; held out: {', '.join(held) or 'none'}.",
         soft_wrap=True,
     )
     for fault in faults:

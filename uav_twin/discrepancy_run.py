@@ -195,6 +195,7 @@ def _show(found: Investigation, tried: SelfCalibration | None, report: Path, con
 
     from discrepancy.report.text import estimate_text, headline, percent, probability_text, unit_text
     from discrepancy.verdict import VerdictKind
+    from reporting.words import counted
 
     verdict, proof = found.verdict, found.proof
     console.print(f"Verdict: {verdict.kind.value}", style="bold")
@@ -243,7 +244,6 @@ def _show(found: Investigation, tried: SelfCalibration | None, report: Path, con
         false = tried.share("wrong", null=True)
         console.print(
             f"Simulated campaigns: {right.count} of {right.total} hidden effects named, {wrong.count} "
-            "wrongly; "
-            f"{false.count} false names where nothing was hidden ({false.total})."
+            f"wrongly; {counted(false.count, 'false name')} where nothing was hidden ({false.total})."
         )
     console.print(f"Report: {report}", soft_wrap=True)

@@ -22,6 +22,7 @@ from fe.patch import (
     ModelPatch,
     Primitive,
 )
+from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
@@ -211,7 +212,7 @@ class FmuModel:
         """
         if conditions.parameters.shape != (len(self._parameters),):
             raise ModelError(
-                f"The FMU model {self.name!r} has {len(self._parameters)} parameters, but "
+                f"The FMU model {self.name!r} has {counted(len(self._parameters), 'parameter')}, but "
                 f"{conditions.parameters.size} came."
             )
         columns = self._columns(outputs)

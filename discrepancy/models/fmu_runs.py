@@ -13,6 +13,7 @@ from discrepancy.models.fmu_file import FmuModelDescription
 from fmu_asset.binding import Binding, Input, Parameter, Vector, expand, load_binding
 from fmu_asset.errors import FmuError
 from fmu_asset.session import FmiAsset
+from reporting.words import counted
 from scenarios import binding_files
 
 FloatArray = NDArray[np.float64]
@@ -130,8 +131,8 @@ class FmuRuns:
             variables = expand(item.variable or item.name)
             if len(names) != len(variables):
                 raise ModelError(
-                    f"The FMU model {given.name!r}: the output {item.name!r} stands for {len(names)} names, "
-                    f"but its variable for {len(variables)}; give as many."
+                    f"The FMU model {given.name!r}: the output {item.name!r} stands for "
+                    f"{counted(len(names), 'name')}, but its variable for {len(variables)}; give as many."
                 )
             for name, variable in zip(names, variables, strict=True):
                 unit = _UNITS.get(item.quantity, "")

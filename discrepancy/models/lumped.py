@@ -27,6 +27,7 @@ from fe.patch import (
     RootCompliance,
     StiffnessDrift,
 )
+from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
@@ -307,7 +308,7 @@ class LumpedModel:
         description = self.description
         if parameters.shape != (len(self._parameters),):
             raise ModelError(
-                f"The lumped model {self.name!r} has {len(self._parameters)} parameters, but "
+                f"The lumped model {self.name!r} has {counted(len(self._parameters), 'parameter')}, but "
                 f"{parameters.size} came."
             )
         factors: dict[str, float] = {}

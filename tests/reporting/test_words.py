@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reporting.words import counted
+from reporting.words import be, counted
 
 
 @pytest.mark.parametrize(
@@ -16,3 +16,7 @@ def test_one_is_singular(count: int, text: str) -> None:
 def test_an_irregular_plural_is_given() -> None:
     assert counted(1, "entry", "entries") == "1 entry"
     assert counted(3, "entry", "entries") == "3 entries"
+
+
+def test_the_verb_agrees() -> None:
+    assert [be(count) for count in (0, 1, 2)] == ["are", "is", "are"]

@@ -98,7 +98,7 @@ def test_everything_comes_out_in_si(tmp_path: Path) -> None:
     up, release, turn = campaign.trials
     assert up.values.tolist() == [[5e-7, 1e-4], [1.2025e-4, 7.3e-3], [1.2025e-4, 1.46e-2]]
     assert up.used.tolist() == [[True, True], [True, True], [False, True]]
-    assert "1 of 3 readings of 'g17' in the trial 'tip load up' are empty" in campaign.remarks[0]
+    assert "1 of 3 readings of 'g17' in the trial 'tip load up' is empty" in campaign.remarks[0]
     assert up.time.tolist() == [30.0] * 3
     assert up.load_place == (1.0, 0.35)
     assert up.health.tolist() == [[0.2, 0.0]] * 3
