@@ -210,8 +210,8 @@ def _windowed(record: RingDownRecord, zero: FloatArray, plan: RecordPlan) -> tup
     count = len(inside) // plan.columns
     if count < 60:
         raise CampaignDataError(
-            f"{record.source}: {counted(count, 'sample')} {be(count)} left between {plan.begin:g} and {plan.end:g} s; 60 "
-            "are needed."
+            f"{record.source}: {counted(count, 'sample')} {be(count)} left between {plan.begin:g} and "
+            f"{plan.end:g} s; 60 are needed."
         )
     kept = inside[: count * plan.columns].reshape(count, plan.columns)
     time = record.time[kept].mean(axis=1)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from reporting.words import counted
+from uav_twin.console_table import console_table
 
 if TYPE_CHECKING:
     from discrepancy.campaign import Campaign
@@ -27,9 +28,7 @@ def effects(
     ] = None,
 ) -> None:
     """List the effects that can be named."""
-    from rich import box
     from rich.console import Console
-    from rich.table import Table
 
     from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
     from discrepancy.report.text import formula
@@ -39,17 +38,12 @@ def effects(
     if show is not None:
         _show(effect_by_identifier(show, catalogue), console)
         return
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("id", "name", "family", "equation"):
-        table.add_column(heading, overflow="fold")
-    for effect in catalogue:
-        table.add_row(effect.identifier, effect.name, effect.family, formula(effect.equation))
-    console.print(table)
+    rows = [(effect.identifier, effect.name, effect.family, formula(effect.equation)) for effect in catalogue]
+    console.print(console_table(("id", "name", "family", "equation"), rows, console.width))
     console.print(f"{counted(len(catalogue), 'effect')}; --show ID tells everything about one.")
 
 
 def _show(effect: Effect, console: object) -> None:
-    from rich import box
     from rich.console import Console
     from rich.table import Table
 
@@ -71,21 +65,15 @@ def _show(effect: Effect, console: object) -> None:
     ):
         facts.add_row(name, value)
     console.print(facts)
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("parameter", "symbol", "prior (90 %)", "unit", "meaning"):
-        table.add_column(heading, overflow="fold")
+    rows = []
     for item in effect.parameters:
         prior = f"{item.prior.low:g} to {item.prior.high:g}, {item.prior.shape.replace('_', '-')}"
-        table.add_row(item.name, item.symbol, prior, unit_text(item.unit), item.description)
+        rows.append((item.name, item.symbol, prior, unit_text(item.unit), item.description))
     for shape in effect.shape:
-        table.add_row(
-            shape.name,
-            shape.symbol,
-            f"{shape.canonical:g}; freed: {shape.prior.low:g} to {shape.prior.high:g}",
-            "",
-            shape.description,
-        )
-    console.print(table)
+        freed = f"{shape.canonical:g}; freed: {shape.prior.low:g} to {shape.prior.high:g}"
+        rows.append((shape.name, shape.symbol, freed, "", shape.description))
+    headings = ("parameter", "symbol", "prior (90 %)", "unit", "meaning")
+    console.print(console_table(headings, rows, console.width))
 
 
 def example(

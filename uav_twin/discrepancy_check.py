@@ -19,19 +19,25 @@ def check(
     ] = None,
 ) -> None:
     """Say what is wrong with the data, which effects they can show, and which they cannot tell apart."""
-    from rich import box
     from rich.console import Console
-    from rich.table import Table
 
     from discrepancy.campaign_file import read_campaign
     from discrepancy.catalogue.entry import Setting
     from discrepancy.catalogue.library import load_catalogue
     from discrepancy.model_choice import choose_model
-    from discrepancy.report.check_tables import HEADINGS, group_lines, needs, rows_of
+    from discrepancy.report.check_tables import (
+        HEADINGS,
+        confused_lines,
+        group_lines,
+        needs,
+        rows_of,
+        untested_lines,
+    )
     from discrepancy.separability import separability
     from discrepancy.workflow import checked
     from reporting.progress import RichProgress
     from reporting.words import counted
+    from uav_twin.console_table import console_table
 
     data = read_campaign(campaign)
     catalogue = load_catalogue(effects or ())
@@ -54,17 +60,13 @@ def check(
         able = separability(
             data, choice.model, Setting(data, choice.model, choice.model.scales(data)), catalogue
         )
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in (heading for heading in HEADINGS if heading != "testable"):
-        table.add_column(heading, overflow="fold")
-    for row, item in zip(rows_of(able), able.detectability, strict=True):
-        if not item.reason:
-            table.add_row(
-                *(cell for heading, cell in zip(HEADINGS, row, strict=True) if heading != "testable")
-            )
-    console.print(table)
-    for item in able.detectability:
-        if item.reason:
-            console.print(f"Not testable: {item.effect.identifier}. {item.reason}", soft_wrap=True)
-    for line in (*group_lines(able), *needs(able, data, catalogue)):
+    shown = [at for at, title in enumerate(HEADINGS) if title not in ("testable", "confused with")]
+    rows = [
+        [row[at] for at in shown]
+        for row, item in zip(rows_of(able), able.detectability, strict=True)
+        if not item.reason
+    ]
+    console.print(console_table([HEADINGS[at] for at in shown], rows, console.width))
+    told = group_lines(able, "to which is said above")
+    for line in (*untested_lines(able), *confused_lines(able), *told, *needs(able, data, catalogue)):
         console.print(line, soft_wrap=True)

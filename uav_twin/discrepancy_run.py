@@ -190,12 +190,10 @@ def _packing(choice: ModelChoice, progress: Progress) -> Pack:
 
 
 def _show(found: Investigation, tried: SelfCalibration | None, report: Path, console: Console) -> None:
-    from rich import box
-    from rich.table import Table
-
     from discrepancy.report.text import estimate_text, headline, percent, probability_text, unit_text
     from discrepancy.verdict import VerdictKind
     from reporting.words import counted
+    from uav_twin.console_table import console_table
 
     verdict, proof = found.verdict, found.proof
     console.print(f"Verdict: {verdict.kind.value}", style="bold")
@@ -205,21 +203,16 @@ def _show(found: Investigation, tried: SelfCalibration | None, report: Path, con
         none = verdict.kind is VerdictKind.NOTHING_MISSING
         console.print(f"Probability {probability_text(verdict.probability)}{'' if none else against}.")
     if verdict.effects:
-        table = Table(box=box.SIMPLE_HEAD)
-        for heading in ("effect", "place", "parameter", "value", "90 % interval", "unit"):
-            table.add_column(heading, overflow="fold")
-        for effect in verdict.effects:
-            for item in (*effect.parameters, *effect.shape):
-                value, interval = estimate_text(item)
-                table.add_row(
-                    effect.identifier,
-                    effect.place,
-                    item.name.replace("_", " "),
-                    value,
-                    interval,
-                    unit_text(item.unit),
-                )
-        console.print(table)
+        headings = ("effect", "place", "parameter", "value", "90 % interval", "unit")
+        rows = [
+            (
+                effect.identifier, effect.place, item.name.replace("_", " "), *estimate_text(item),
+                unit_text(item.unit),
+            )
+            for effect in verdict.effects
+            for item in (*effect.parameters, *effect.shape)
+        ]  # fmt: skip
+        console.print(console_table(headings, rows, console.width))
     if proof is not None:
         first, second, where = proof.fitted_before, proof.fitted_after, "fitted trials (none is held out)"
         if proof.held_out_before is not None and proof.held_out_after is not None:

@@ -75,8 +75,25 @@ def can_decide_table(found: Separability) -> Table:
     )
 
 
-def group_lines(found: Separability) -> list[str]:
-    """Return one sentence for each confusion group, or one that there is none."""
+def confused_lines(found: Separability) -> list[str]:
+    """Return one sentence for each effect that these data cannot tell from others."""
+    pairs = [
+        (item.effect.identifier, neighbours(found, item.effect.identifier)) for item in found.detectability
+    ]
+    return [f"Confused: {name} with {listing(others)}." for name, others in pairs if others]
+
+
+def untested_lines(found: Separability) -> list[str]:
+    """Return one sentence for each reason why effects cannot be tested."""
+    by_reason: dict[str, list[str]] = {}
+    for item in found.detectability:
+        if item.reason:
+            by_reason.setdefault(item.reason, []).append(item.effect.identifier)
+    return [f"Not testable: {listing(names)}. {reason}" for reason, names in by_reason.items()]
+
+
+def group_lines(found: Separability, told: str = "the table says to which") -> list[str]:
+    """Return one sentence for each confusion group, or one that there is none; `told`: where to look."""
     if not found.groups:
         return ["Every effect that can be tested here can be told from every other at its prior median."]
     lines = []
@@ -85,10 +102,7 @@ def group_lines(found: Separability) -> list[str]:
         if len(names) == 2:
             lines.append(f"These data cannot tell {names[0]} from {names[1]}.")
         else:
-            lines.append(
-                "Confusion group, each close to at least one other (the table says to which): "
-                f"{listing(names)}."
-            )
+            lines.append(f"Confusion group, each close to at least one other ({told}): {listing(names)}.")
     return lines
 
 

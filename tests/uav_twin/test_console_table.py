@@ -1,0 +1,47 @@
+"""Tables on the terminal."""
+
+from io import StringIO
+
+import pytest
+from rich.console import Console
+
+from discrepancy.catalogue.library import load_catalogue
+from uav_twin.console_table import broken, console_table
+
+
+def printed(headings: tuple[str, ...], rows: list[tuple[str, ...]], width: int) -> list[str]:
+    console = Console(file=StringIO(), width=width, highlight=False, markup=False)
+    console.print(console_table(headings, rows, width))
+    assert isinstance(console.file, StringIO)
+    return console.file.getvalue().splitlines()
+
+
+@pytest.mark.parametrize(
+    ("text", "lines"),
+    [
+        ("coulomb_friction", ["coulomb_friction"]),
+        ("temperature_dependent_modulus", ["temperature_", "dependent_modulus"]),
+        ("temperature-dependent modulus", ["temperature-", "dependent modulus"]),
+        ("a_verylongwordwithoutanybreak", ["a_", "verylongwordwithoutanybreak"]),
+        ("", [""]),
+    ],
+)
+def test_long_words_break_where_a_reader_expects_it(text: str, lines: list[str]) -> None:
+    assert broken(text, 20).split("\n") == lines
+
+
+@pytest.mark.parametrize("width", [80, 200])
+def test_every_identifier_can_be_read_in_the_first_column(width: int) -> None:
+    catalogue = load_catalogue()
+    rows = [(item.identifier, item.name, "0.0000123 K", "a place, upper skin") for item in catalogue]
+    lines = printed(("effect", "name", "detectable from", "shows best at"), rows, width)
+    assert max(map(len, lines)) <= width
+    first = "\n".join(line.split(" ", 2)[1] for line in lines if len(line) > 2)
+    for item in catalogue:
+        assert (item.identifier if width > 80 else broken(item.identifier, 20)) in first
+
+
+def test_columns_without_any_entry_are_left_out() -> None:
+    rows = [("mass ratio", "", "1"), ("length", "", "2")]
+    assert "unit" not in "".join(printed(("parameter", "unit", "value"), rows, 80))
+    assert "unit" in "".join(printed(("parameter", "unit", "value"), [("length", "m", "2")], 80))
