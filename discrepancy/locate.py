@@ -220,8 +220,10 @@ def _disagreements(
     frequencies: Sequence[float] | None,
 ) -> tuple[Disagreement, ...]:
     found: list[Disagreement] = []
+    excess: dict[str, float] = {}
     for name, members in kinds(residuals).items():
         items = [residuals.trials[number] for number in members]
+        excess[name] = sum(_excess(item) for item in items)
         rows = [row for row in explained if row.trials == name and row.dependence != "whole"]
         told = _smallest_sufficient(rows)
         if told is None:
@@ -248,7 +250,14 @@ def _disagreements(
                 pattern.trials, pattern.meaning, "channels", pattern.share, pattern.p_value, pattern.sentence
             )
         )
-    return tuple(sorted(found, key=lambda item: -item.share))
+    # Shares are of one kind of trial; what explains most of the whole gap is told first.
+    return tuple(sorted(found, key=lambda item: -item.share * excess[item.trials]))
+
+
+def _excess(item: FittedTrial) -> float:
+    """Return the sum of squares of a trial's residuals beyond what noise would leave."""
+    square = float(np.nansum(item.standardised**2) - item.expected_variance[item.used].sum())
+    return max(square, 0.0)
 
 
 def _subject(

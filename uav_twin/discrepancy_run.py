@@ -190,6 +190,8 @@ def _packing(choice: ModelChoice, progress: Progress) -> Pack:
 
 
 def _show(found: Investigation, tried: SelfCalibration | None, report: Path, console: Console) -> None:
+    from discrepancy.patch_file import PATCH_NAME, read_patch
+    from discrepancy.report.sizes import size_sentence
     from discrepancy.report.text import estimate_text, headline, percent, probability_text, unit_text
     from discrepancy.verdict import VerdictKind
     from reporting.words import counted
@@ -198,6 +200,10 @@ def _show(found: Investigation, tried: SelfCalibration | None, report: Path, con
     verdict, proof = found.verdict, found.proof
     console.print(f"Verdict: {verdict.kind.value}", style="bold")
     console.print(headline(verdict), soft_wrap=True)
+    if (patch_file := report.parent / PATCH_NAME).is_file():
+        stored = read_patch(patch_file)
+        if sizes := size_sentence(found, stored.effects, stored.intervals):
+            console.print(sizes, soft_wrap=True)
     if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
         against = f", ln Bayes factor against nothing missing {verdict.log_bayes_factor:.1f}"
         none = verdict.kind is VerdictKind.NOTHING_MISSING
@@ -216,7 +222,8 @@ def _show(found: Investigation, tried: SelfCalibration | None, report: Path, con
     if proof is not None:
         first, second, where = proof.fitted_before, proof.fitted_after, "fitted trials (none is held out)"
         if proof.held_out_before is not None and proof.held_out_after is not None:
-            first, second, where = proof.held_out_before, proof.held_out_after, "held-out trials"
+            first, second = proof.held_out_before, proof.held_out_after
+            where = f"held-out trials ({', '.join(trial.name for trial in found.campaign.held_out)})"
         closed = f", {percent(proof.gap_closed)} % of the gap closed" if isfinite(proof.gap_closed) else ""
         why = f" {proof.gap_reason}" if proof.held_out_before is not None and proof.gap_reason else ""
         scores = (

@@ -1,6 +1,6 @@
 """The figures of the report with their captions, as far as the data allow them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from matplotlib.figure import Figure
 
@@ -18,6 +18,8 @@ from discrepancy.report.motion_figures import (
     worst_record,
 )
 from discrepancy.report.residual_figures import heat_figure, load_figure, planform_figure
+from discrepancy.report.text import listing
+from discrepancy.residuals import ResidualSet
 from discrepancy.separability import CONFUSED
 from discrepancy.workflow import Investigation
 from reporting.figures import to_svg
@@ -49,13 +51,13 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
                 "colour is "
                 "the root mean square of the residual over all trials, in units of what noise would "
                 "leave: 1 is "
-                f"noise.{scale} Broken outlines are the regions whose stiffness loss the model knows.",
+                f"noise. {_held_out_words(before)}{scale} Broken outlines are the regions whose "
+                "stiffness loss the model knows.",
             )  # fmt: skip
         add(
             "residual_table", heat_figure(before, after), "Residuals by channel and trial",
-            "Root mean square of the residual in units of what noise would leave: 1 is noise. Trials with "
-            "* are "
-            f"held out: nothing was fitted to them.{scale}",
+            "Root mean square of the residual in units of what noise would leave: 1 is noise. "
+            f"{_held_out_words(before)}{scale}",
         )  # fmt: skip
         add(
             "load", load_figure(before, after), "Residuals over the load",
@@ -65,12 +67,12 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
         )  # fmt: skip
         worst = worst_record(before)
         if worst is not None:
-            role = "held out" if before.trials[worst.trial].trial.held_out else "fitted"
+            trial = before.trials[worst.trial].trial
+            role = "held out" if trial.held_out else "fitted"
             add(
                 "history", history_figure(before, after, worst), "The record with the largest gap",
-                f"Channel {worst.channel} ({role} trial). The grey band is two standard deviations of the "
-                "noise "
-                "record.",
+                f"Channel {worst.channel} in the trial {trial.name} ({role}). The grey band is two "
+                "standard deviations of the noise record.",
             )  # fmt: skip
             add(
                 "spectrum", spectrum_figure(before, after, worst), "Spectra of the residuals",
@@ -147,6 +149,18 @@ def _add_evidence(content: ReportInput, add: Callable[[str, Figure | None, str, 
             "What was hidden and what the verdict was, on campaigns simulated with this model, these inputs, "
             "channels and noise; counts.",
         )  # fmt: skip
+
+
+def _held_out_words(residuals: ResidualSet) -> str:
+    """Return a sentence on which trials are held out."""
+    names = [item.trial.name for item in residuals.trials if item.trial.held_out]
+    if not names:
+        return "No trial is held out."
+    return f"Held out: {listing(names)}; nothing but release and zero was fitted to {_them(names)}."
+
+
+def _them(names: Sequence[str]) -> str:
+    return "it" if len(names) == 1 else "them"
 
 
 def after_of(investigation: Investigation):  # type: ignore[no-untyped-def]

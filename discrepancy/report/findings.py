@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 from math import isfinite, isnan
 
+from discrepancy.naming import named_effects
 from discrepancy.report.content import ReportInput
+from discrepancy.report.sizes import size_sentence
 from discrepancy.report.text import (
     added_label,
     catalogue_of,
@@ -34,6 +36,10 @@ def add_verdict(page: Page, content: ReportInput) -> None:
     investigation = content.investigation
     verdict = investigation.verdict
     page.add_notice(headline(verdict))
+    if content.intervals and investigation.problem is not None and investigation.fit is not None:
+        effects = named_effects(investigation.problem, investigation.fit)
+        if sentence := size_sentence(investigation, effects, content.intervals):
+            page.add_paragraph(sentence)
     page.add_paragraph(meaning(verdict))
     _add_highlights(page, investigation)
     catalogue = catalogue_of(investigation)
@@ -142,7 +148,9 @@ def _add_highlights(page: Page, investigation: Investigation) -> None:
             items.append((f"{percent(proof.gap_closed)} %", "of the gap closed on held-out trials"))
     elif verdict.gates and isfinite(verdict.gates[0].statistic):
         gate = verdict.gates[0]
-        items.append((number(gate.statistic), f"p of the {gate.name}; limit {number(gate.limit)}"))
+        items.append(
+            (number(gate.statistic), f"p of the {gate.name}; a fit has at least {number(gate.limit)}")
+        )
     if items:
         page.add_highlights(items)
 

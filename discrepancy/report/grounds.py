@@ -1,7 +1,7 @@
 """Sections on what it rests on: gates, proof, what the campaign can decide, data, provenance."""
 
 from collections.abc import Callable, Sequence
-from math import isfinite
+from math import isfinite, isnan
 
 from discrepancy.document_file import Origin
 from discrepancy.report.check_tables import can_decide_table, group_lines
@@ -16,7 +16,7 @@ from discrepancy.report.text import (
     probability_text,
 )
 from discrepancy.self_calibration import Share, outcomes
-from discrepancy.verdict import Proof, Scores, VerdictKind
+from discrepancy.verdict import Gate, Proof, Scores, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Column, Page, Table
 
@@ -29,15 +29,13 @@ def add_gates(page: Page, investigation: Investigation) -> None:
     page.add_table(
         Table(
             (
-                Column("gate"), Column("passed"), Column("statistic", numeric=True),
-                Column("limit", numeric=True),
-                Column("reason"),
+                Column("gate"), Column("passed"), Column("compared"), Column("passes if"), Column("reason"),
             ),
             [
                 (
                     gate.name,
                     "not applied" if gate.passed is None else "yes" if gate.passed else "no",
-                    number(gate.statistic), number(gate.limit), gate.reason,
+                    *_compared(gate), gate.reason,
                 )
                 for gate in gates
             ],
@@ -46,6 +44,16 @@ def add_gates(page: Page, investigation: Investigation) -> None:
         "two nats.",
         title="Gates",
     )  # fmt: skip
+
+
+def _compared(gate: Gate) -> tuple[str, str]:
+    """Return what a gate compares, and with what: a p-value, or a gain in evidence."""
+    if isnan(gate.statistic):
+        return "\N{EN DASH}", "\N{EN DASH}"
+    if gate.name == "shape":
+        return f"gain {number(gate.statistic)} nat", f"at most {number(gate.limit)} nat"
+    text = p_value_text(gate.statistic)
+    return f"p {text}" if text.startswith("<") else f"p = {text}", f"p at least {number(gate.limit)}"
 
 
 def add_inclusion(page: Page, investigation: Investigation) -> None:

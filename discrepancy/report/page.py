@@ -11,6 +11,7 @@ from discrepancy.report.grounds import (
     add_self_calibration,
     add_separability,
 )
+from discrepancy.report.parameter_table import add_parameters
 from discrepancy.verdict import VerdictKind
 from reporting.page import Page
 
@@ -62,6 +63,7 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
     add_gates(page, investigation)
     show("evidence")
     add_inclusion(page, investigation)
+    add_parameters(page, investigation)
     if investigation.proof is not None:
         page.add_section("Proof on held-out trials")
         add_proof(page, investigation, investigation.proof)

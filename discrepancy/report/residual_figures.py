@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
-from discrepancy.campaign import Channel, Quantity, TrialKind
+from discrepancy.campaign import Channel, Quantity, Trial, TrialKind
 from discrepancy.residuals import FittedTrial, ResidualSet
 from fe.design import WingDesign
 from reporting.figures import (
@@ -69,8 +69,12 @@ def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray
     for place, item in enumerate(residuals.trials):
         for column, name in enumerate(item.trial.channels):
             table[channels.index(name), place] = size(item, column)
-    trials = [item.trial.name + (" *" if item.trial.held_out else "") for item in residuals.trials]
-    return channels, trials, table
+    return channels, [_with_role(item.trial) for item in residuals.trials], table
+
+
+def _with_role(trial: Trial) -> str:
+    """Return the name of a trial, which says whether it is held out."""
+    return f"{trial.name} (held out)" if trial.held_out and "held out" not in trial.name else trial.name
 
 
 def scale_of(values: Sequence[float] | FloatArray) -> Normalize:

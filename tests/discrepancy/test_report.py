@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from discrepancy.campaign import Campaign
+from discrepancy.campaign import Campaign, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.document_file import Origin
@@ -22,11 +22,21 @@ from discrepancy.errors import FitError, ModelError
 from discrepancy.examples import example_campaign, plan_for
 from discrepancy.model_choice import ModelKind, choose_model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.patch_file import read_patch
-from discrepancy.report.check_tables import group_lines, needs, neighbours, rows_of
+from discrepancy.naming import named_effects
+from discrepancy.patch_file import primitive_intervals, read_patch
+from discrepancy.report.check_tables import (
+    confused_lines,
+    group_lines,
+    needs,
+    neighbours,
+    rows_of,
+    untested_lines,
+)
 from discrepancy.report.content import ReportInput
 from discrepancy.report.figures import draw, report_figures
+from discrepancy.report.grounds import add_gates
 from discrepancy.report.page import render_report
+from discrepancy.report.parameter_table import parameter_rows
 from discrepancy.report.residual_figures import (
     gauge_places,
     planform_figure,
@@ -34,6 +44,7 @@ from discrepancy.report.residual_figures import (
     size_by_channel,
     size_table,
 )
+from discrepancy.report.sizes import si_sizes, size_sentence
 from discrepancy.report.text import formula, headline, listing, probability_text, rounded
 from discrepancy.residual_file import read_residuals
 from discrepancy.residuals import ResidualSet
@@ -49,10 +60,19 @@ from discrepancy.simulated_campaigns import Simulator
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.verdict_file import read_verdict
 from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
-from discrepancy.workflow import Investigation, investigate
+from discrepancy.workflow import Investigation, investigate, patch_draws
 from fe.design import load_design
-from fe.patch import ModelPatch
+from fe.patch import (
+    ModelPatch,
+    PointMass,
+    PowerDamping,
+    PowerStiffness,
+    Primitive,
+    SensorDrift,
+    SensorGain,
+)
 from reporting.errors import FileNotWrittenError
+from reporting.page import Page
 from reporting.provenance import collect_provenance
 
 MODEL = "single_mass_rig"
@@ -264,7 +284,104 @@ def test_a_failure_while_writing_leaves_the_old_folder(
     assert [path.name for path in tmp_path.iterdir()] == ["v"]
 
 
+# ---------------------------------------------------------------- sizes and parameters
+
+
+@pytest.mark.parametrize(
+    ("primitive", "text"),
+    [
+        (PowerDamping("slide", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.5000 N"),
+        (PowerDamping("slide", 0.5, 2.0, 0.0, 0.25, 1.0), "force 0.5000 N at 0.25 m/s"),
+        (PowerStiffness("slide", 3.0, 3.0, 0, 0.01), "force 3.000 N at 0.01 m"),
+        (PointMass(0.2, 0.4), "mass 0.200 kg at 0.4 m"),
+        (SensorGain("displacement", 0.02), ""),
+        (SensorDrift("displacement", 0.002, 10.0), "amplitude 0.002 m"),
+        (SensorDrift("leaf_strain", 0.002, 10.0), ""),
+        (PowerDamping("elsewhere", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N or N m"),
+    ],
+)
+def test_sizes_have_the_unit_of_their_port_or_channel(
+    drag: Investigation, primitive: Primitive, text: str
+) -> None:
+    patch = ModelPatch((primitive,))
+    found = si_sizes(patch, primitive_intervals(patch), drag.model, drag.campaign)
+    assert re.sub(r"(\d\.\d*?)0+(?= )", r"\1", found) == re.sub(r"(\d\.\d*?)0+(?= )", r"\1", text)
+
+
+def test_the_headline_size_is_that_of_the_patch(drag: Investigation) -> None:
+    assert drag.problem is not None
+    assert drag.fit is not None
+    effects = named_effects(drag.problem, drag.fit)
+    draws = patch_draws(drag.problem, drag.fit, 0)
+    intervals = [primitive_intervals(e.patch, d) for e, d in zip(effects, draws, strict=True)]
+    sentence = size_sentence(drag, effects, intervals)
+    force, low, high = (float(text) for text in re.findall(r"\d+\.\d+", sentence)[:3])
+    (law,) = effects[0].patch
+    assert isinstance(law, PowerDamping)
+    assert force == pytest.approx(law.coefficient, rel=1e-2)
+    assert low < force < high
+    assert "m/s; 90 % intervals" in sentence
+
+
+def test_parameters_are_shown_before_and_after(drag: Investigation) -> None:
+    rows = parameter_rows(drag)
+    assert [row[0] for row in rows] == ["stiffness factor", "damping factor"]
+    assert drag.fit is not None
+    fitted = drag.problem.shared.parameters(drag.fit.point.shared)  # type: ignore[union-attr]
+    for row, item, value in zip(rows, drag.model.parameters, fitted, strict=True):
+        moments = [[float(part) for part in cell.split(" ± ")] for cell in row[2:]]
+        assert moments[0] == pytest.approx([item.mean, norm.ppf(0.95) * item.deviation], rel=0.03)
+        assert moments[2][0] == pytest.approx(value, abs=0.06 * moments[2][1])
+        assert moments[2][1] < moments[0][1]
+    nothing = replace(drag, fit=drag.search.none)  # type: ignore[union-attr]
+    assert [row[:4] for row in parameter_rows(nothing)] == [row[:4] for row in rows]
+    assert {len(row) for row in parameter_rows(nothing)} == {4}
+
+
 # ---------------------------------------------------------------- what a campaign can decide
+
+
+def test_gates_say_what_they_compare(drag: Investigation) -> None:
+    page = Page("a", "b")
+    page.add_section("c")
+    add_gates(page, drag)
+    text = page.render()
+    absolute, shape = drag.verdict.gates
+    assert f"p = {absolute.statistic:.2g}</td>" in text
+    assert f"p at least {absolute.limit:g}</td>" in text
+    assert f"at most {shape.limit:g} nat</td>" in text
+
+
+def test_a_reader_sees_which_trial_is_held_out(drag: Investigation) -> None:
+    assert drag.before is not None
+    _, names, _ = size_table(drag.before)
+    trials = drag.campaign.trials
+    assert names == [f"{t.name} (held out)" if t.held_out else t.name for t in trials]
+    assert any(trial.held_out for trial in trials)
+    caption = report_figures(ReportInput(drag, ORIGIN))["residual_table"].caption
+    assert f"Held out: {listing(trial.name for trial in trials if trial.held_out)};" in caption
+
+
+def test_what_explains_most_of_the_gap_is_told_first(drag: Investigation) -> None:
+    assert drag.location is not None
+    assert drag.before is not None
+    gap = {"static": 0.0, "ring-down": 0.0}
+    for item in drag.before.trials:
+        if not item.trial.held_out:
+            kind = "static" if item.trial.kind is TrialKind.STATIC else "ring-down"
+            gap[kind] += float(np.nansum(item.standardised**2) - item.expected_variance[item.used].sum())
+    told = [item.share * max(gap[item.trials], 0.0) for item in drag.location.disagreements]
+    assert len(told) > 1
+    assert told == sorted(told, reverse=True)
+
+
+def test_each_reason_is_given_once_and_each_confusion_by_name(able: Separability) -> None:
+    assert untested_lines(able) == ["Not testable: washout. The campaign has no flight trial to fit."]
+    lines = confused_lines(able)
+    assert len(lines) == sum(bool(neighbours(able, name)) for name in able.identifiers)
+    for line in lines:
+        name = line.split()[1]
+        assert all(other in line for other in neighbours(able, name))
 
 
 def test_rows_of_what_can_be_decided(drag: Investigation, able: Separability) -> None:

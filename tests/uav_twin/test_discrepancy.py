@@ -43,7 +43,7 @@ def test_from_an_example_to_a_verdict(
     assert call(monkeypatch, "check", str(campaign), *RIG) == 0
     shown = capsys.readouterr().out
     assert "seating_offset" in shown
-    assert "Not testable: washout. The campaign has no flight trial to fit." in shown
+    assert "Not testable: washout and inertia_relief. The campaign has no flight trial to fit." in shown
     assert "Hold out a trial" in shown or "held out" in shown
     out = tmp_path / "verdict"
     assert call(monkeypatch, "run", str(campaign), *RIG, "--out", str(out), "--calibrate", "1") == 0

@@ -1,0 +1,53 @@
+"""Calibrated parameters: what the calibration believed, and what each model makes of the data."""
+
+import numpy as np
+
+from discrepancy.report.text import added_label, rounded, unit_text
+from discrepancy.workflow import Investigation
+from reporting.page import Column, Page, Table
+
+NINETY = 1.6449
+"""Normal quantile at 95 %: half of a 90 % interval in standard deviations."""
+
+
+def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
+    """Return name, unit, and values with 90 % half-widths: calibration, model as it was, with the effect.
+
+    Without an effect the last column is left out; without parameters there are no rows.
+    """
+    problem, search, fit = investigation.problem, investigation.search, investigation.fit
+    if problem is None or search is None or fit is None:
+        return []
+    layout = problem.shared
+    fits = [search.none] + ([fit] if fit.candidate.terms else [])
+    rows = []
+    for number, item in enumerate(investigation.model.parameters):
+        mean, scale = float(layout.parameter_mean[number]), float(layout.parameter_scale[number])
+        cells = [_beside(mean, scale)]
+        for one in fits:
+            deviation = scale * float(np.sqrt(max(one.covariance[number, number], 0.0)))
+            cells.append(_beside(float(layout.parameters(one.point.shared)[number]), deviation))
+        rows.append((item.name.replace("_", " "), unit_text(item.unit), *cells))
+    return rows
+
+
+def _beside(value: float, deviation: float) -> str:
+    show = rounded(value, NINETY * deviation)
+    return f"{show(value)} ± {show(NINETY * deviation)}" if deviation > 0.0 else f"{value:.6g}, exact"
+
+
+def add_parameters(page: Page, investigation: Investigation) -> None:
+    """Add the table, where the model has calibrated parameters."""
+    rows = parameter_rows(investigation)
+    if not rows:
+        return
+    heads = [Column("parameter"), Column("unit"), Column("calibration", numeric=True)]
+    heads += [Column("model as it was", numeric=True), Column("with the effect", numeric=True)]
+    added = added_label(investigation)
+    page.add_table(
+        Table(heads[: len(rows[0])], rows),
+        "Values with the half-width of their 90 % intervals: as the calibration states them, and fitted to "
+        f"these data {f'without and with {added}' if added else 'without any effect'}. Where the model as it "
+        "was moves a parameter by several deviations, the parameter has taken up what the model lacks.",
+        title="Calibrated parameters before and after",
+    )

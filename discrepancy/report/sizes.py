@@ -1,0 +1,140 @@
+"""Sizes of what a patch changes, in SI units, as they stand in the headline."""
+
+from collections.abc import Sequence
+from math import isfinite
+
+import numpy as np
+
+from discrepancy.campaign import Campaign, Quantity
+from discrepancy.file_models import CHANNEL_UNIT, PRIMITIVE_UNITS
+from discrepancy.models.interface import Model
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.wing import WingModel
+from discrepancy.patch_file import PrimitiveInterval
+from discrepancy.report.text import rounded, unit_text
+from discrepancy.verdict import NamedEffect, VerdictKind
+from discrepancy.workflow import Investigation
+from fe.patch import ModelPatch, Primitive
+
+BESIDE = ("reference_velocity", "reference_displacement", "time", "start", "length", "station")
+"""Where or at what a size holds; no sizes themselves."""
+ROTATING_PORT = "root"
+"""Port of the wing that turns; its others move up and down."""
+SI_UNITS = {
+    Quantity.STRAIN: "",
+    Quantity.DISPLACEMENT: "m",
+    Quantity.VELOCITY: "m/s",
+    Quantity.ACCELERATION: "m/s2",
+    Quantity.SIGNAL: "",
+}
+
+
+def si_sizes(
+    patch: ModelPatch, intervals: Sequence[PrimitiveInterval], model: Model, campaign: Campaign
+) -> str:
+    """Return the sizes of a patch that have a unit, "slip force 0.53 N (0.52 to 0.54)"; empty without.
+
+    Parameters
+    ----------
+    patch : ModelPatch
+        Of one effect.
+    intervals : sequence of PrimitiveInterval
+        Of its numbers.
+    model : Model
+        Says whether a port moves or turns.
+    campaign : Campaign
+        Says what a channel measures.
+    """
+    found = []
+    for item in intervals:
+        primitive = patch.primitives[item.primitive]
+        unit = _unit(item.unit, primitive, model, campaign)
+        if not unit or item.parameter in BESIDE or item.value == 0.0:
+            continue
+        known = isfinite(item.low) and isfinite(item.high) and item.low < item.high
+        show = rounded(item.value, 0.5 * (item.high - item.low) if known else 0.0)
+        between = f" ({show(item.low)} to {show(item.high)})" if known else ""
+        words = _words(item.parameter, primitive)
+        text = (
+            f"{words} {show(item.value)} {unit}{between}{_where(primitive, item.parameter, model, campaign)}"
+        )
+        if text not in found:
+            found.append(text)
+    return ", ".join(found)
+
+
+def size_sentence(
+    investigation: Investigation,
+    effects: Sequence[NamedEffect],
+    intervals: Sequence[Sequence[PrimitiveInterval]],
+) -> str:
+    """Return the sizes of the effects of a patch in one sentence; empty where none has a unit."""
+    model, campaign = investigation.model, investigation.campaign
+    sizes = [si_sizes(e.patch, row, model, campaign) for e, row in zip(effects, intervals, strict=True)]
+    named = investigation.verdict.kind is VerdictKind.NAMED
+    parts = [
+        size if named and len(effects) == 1 else f"{effect.name} {size}"
+        for effect, size in zip(effects, sizes, strict=True)
+        if size
+    ]
+    if not parts:
+        return ""
+    words = "In SI units" if named else "In SI units, were it the most probable member, which is not named"
+    return f"{words}: {'; '.join(parts)}; 90 % intervals in brackets."
+
+
+def _words(parameter: str, primitive: Primitive) -> str:
+    if parameter == "coefficient" and primitive.kind in ("power_damping", "power_stiffness"):
+        return "force"
+    return parameter.replace("_", " ")
+
+
+def _where(primitive: Primitive, parameter: str, model: Model, campaign: Campaign) -> str:
+    """Return at which speed or displacement a force has its size, or where a mass sits."""
+    if primitive.kind == "point_mass" and parameter == "mass":
+        return f" at {getattr(primitive, 'station'):.3g} m"  # noqa: B009
+    if parameter != "coefficient":
+        return ""
+    marks = []
+    for exponent, reference in (
+        ("velocity_exponent", "reference_velocity"),
+        ("displacement_exponent", "reference_displacement"),
+        ("exponent", "reference_displacement"),
+    ):
+        value = getattr(primitive, reference, None)
+        if value is not None and getattr(primitive, exponent, 0.0) != 0.0:
+            unit = _unit(PRIMITIVE_UNITS[primitive.kind][reference], primitive, model, campaign)
+            marks.append(f"{value:.3g} {unit}")
+    return f" at {' and '.join(marks)}" if marks else ""
+
+
+def _unit(unit: str, primitive: Primitive, model: Model, campaign: Campaign) -> str:
+    """Return the unit of a number, made definite as far as port and channel say it."""
+    if unit.startswith(CHANNEL_UNIT):
+        names = campaign.channels if (name := getattr(primitive, "channel", "*")) == "*" else (name,)
+        units = {SI_UNITS[campaign.channels[name].quantity] for name in names if name in campaign.channels}
+        return unit_text(units.pop()) if len(units) == 1 and unit == CHANNEL_UNIT else ""
+    if " or " in unit:
+        moving, turning = unit.split(" or ")
+        return {True: turning, False: moving, None: unit}[_turns(str(getattr(primitive, "port", "")), model)]
+    return unit_text(unit)
+
+
+def _turns(port: str, model: Model) -> bool | None:
+    """Return whether a port turns; None where the model does not say it.
+
+    A port of a lumped model moves if it is a sum or difference of unknowns measured as displacements.
+    """
+    if isinstance(model, WingModel):
+        return port == ROTATING_PORT
+    if not isinstance(model, LumpedModel):
+        return None
+    vectors = [np.array(item.vector) for item in model.description.port if item.name == port]
+    if not vectors or not np.all(np.isin(vectors[0], (-1.0, 0.0, 1.0))):
+        return None
+    measured = {
+        int(np.argmax(item.vector))
+        for item in model.description.output
+        if item.quantity == "displacement" and np.count_nonzero(item.vector) == 1 and max(item.vector) == 1.0
+    }
+    return False if set(np.flatnonzero(vectors[0])) <= measured else None
