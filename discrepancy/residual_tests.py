@@ -212,7 +212,8 @@ def variance_test(residuals: ResidualSet) -> OmnibusTest:
     p = combine(of_groups)
     if len(of_places) > 1:
         p = min(1.0, 2.0 * min(p, len(of_places) * min(of_places)))
-    return OmnibusTest("variance", p, total / weight, worst[0])
+    # Far from the truth the fit may leave no degree of freedom to the whole, but some to a trial.
+    return OmnibusTest("variance", p, total / weight if weight > 0.0 else np.nan, worst[0])
 
 
 def _by_kind(residuals: ResidualSet) -> tuple[ResidualSet, ...]:

@@ -13,6 +13,7 @@ from reporting.words import be
 
 from .campaign import Campaign
 from .candidate import Candidate
+from .catalogue.building import NO_PORT
 from .catalogue.entry import Effect, Setting
 from .catalogue.library import load_catalogue
 from .data_fault import DataFault
@@ -23,6 +24,7 @@ from .fitting import fit as fit_to
 from .held_out import choose_held_out
 from .locate import Location, locate
 from .models.interface import Model
+from .models.lumped import LumpedModel
 from .naming import name
 from .next_experiment import next_experiments
 from .outliers import wrong_ends
@@ -148,9 +150,11 @@ def investigate(
         if cleaned is not campaign:
             campaign, setting = cleaned, replace(setting, campaign=cleaned)
             problem = Problem(campaign, model, setting)
-        verdict, search, fit = name(problem, load_catalogue() if effects is None else effects)
+        catalogue = load_catalogue() if effects is None else effects
+        verdict, search, fit = name(problem, catalogue)
     remarks = [fault.sentence for fault in faults] + list(campaign.remarks)
     remarks += strained(problem, fit)
+    remarks += without_port(setting, catalogue)
     if not model.parameters:
         remarks.append(
             f"The model {model.name!r} has no uncertain parameter, so a stiffness or damping a little "
@@ -257,6 +261,20 @@ def strained(problem: Problem, fit: Fit) -> list[str]:
         for name, u, precision in rows
         if precision > 0.0 and abs(u) > IMPLAUSIBLE
     ]
+
+
+def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
+    """Return a sentence on the effects that were not tested because the model has no port, if there are."""
+    names = [effect.name for effect in effects if NO_PORT in (effect.unavailable(setting) or "")]
+    if not names:
+        return []
+    what = "a [[port]] in the model's file"
+    if isinstance(setting.model, LumpedModel):
+        first = setting.model.description.input[0]
+        vector = ", ".join(f"{value:g}" for value in first.vector)
+        what += f", such as vector = [{vector}] between the ground and {first.name!r}"
+    listed = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    return [f"Not tested for lack of a port: {listed}; declare {what} where such a force may act."]
 
 
 def open_hypotheses(search: Search, count: int = 5) -> list[tuple[Fit, float]]:

@@ -14,7 +14,7 @@ from discrepancy.campaign import Campaign, Channel, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import PortScale
-from fe.patch import EVERY_CHANNEL, Primitive
+from fe.patch import EVERY_CHANNEL, INTERNAL_FORCES, Primitive, StiffnessDrift
 
 Check = Callable[[Setting], str | None]
 Places = Callable[[Setting], tuple[str, ...]]
@@ -26,6 +26,11 @@ KIND_NAMES = {
     TrialKind.FLIGHT: "flight",
 }
 """How a kind of trial is called in a sentence."""
+
+NO_PORT = "has no port where an internal force can act"
+"""Reason against effects that are forces within a structure or between it and the ground."""
+
+_AT_PORTS = tuple(item for item in INTERNAL_FORCES if item is not StiffnessDrift)
 
 EVERY_TRIAL = frozenset(TrialKind)
 DYNAMIC = frozenset({TrialKind.RINGDOWN, TrialKind.FORCED})
@@ -203,6 +208,8 @@ def carried(*primitives: type[Primitive]) -> Check:
 def _cannot_carry(primitives: tuple[type[Primitive], ...], setting: Setting) -> str | None:
     for primitive in primitives:
         if not setting.model.supports(primitive):
+            if primitive in _AT_PORTS and not setting.model.ports():
+                return f"The model {setting.model.name!r} {NO_PORT}."
             return f"The model {setting.model.name!r} cannot carry the primitive {primitive.kind!r}."
     return None
 
@@ -211,7 +218,7 @@ def has_port(setting: Setting) -> str | None:
     """Return why no internal force can act, None if one can."""
     if setting.model.ports():
         return None
-    return f"The model {setting.model.name!r} has no port where an internal force can act."
+    return f"The model {setting.model.name!r} {NO_PORT}."
 
 
 def has_stations(setting: Setting) -> str | None:

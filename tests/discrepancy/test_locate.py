@@ -140,6 +140,26 @@ def test_variance_test_counts_only_what_the_fit_leaves(make_bench) -> None:
     assert np.mean(squares) == pytest.approx(1.0, abs=0.02)
 
 
+def test_a_fit_far_from_the_truth_that_leaves_no_degree_of_freedom_is_no_crash(make_bench) -> None:
+    # One reading in each of two kinds of trial, and a posterior that is much too wide: 0.02 degrees of
+    # freedom are left to both together, one to each.
+    fitted = make_bench(count=40).fit(np.random.default_rng(1))
+    trials = []
+    for item in fitted.trials:
+        used = np.zeros_like(item.used)
+        used[0, 0] = True
+        wide = np.full((*item.residual.shape, 1), np.sqrt(0.9))
+        trial = replace(item.trial, used=used)
+        trials.append(
+            replace(item, trial=trial, leverage=np.full(item.residual.shape, 0.9), sensitivity=wide)
+        )
+    kinds = {item.trial.kind: item for item in trials if not item.trial.held_out}
+    assert len(kinds) == 2
+    found = variance_test(replace(fitted, trials=tuple(kinds.values())))
+    assert np.isnan(found.statistic)
+    assert 0.0 <= found.p_value <= 1.0
+
+
 # ---------------------------------------------------------------- known disagreements
 
 

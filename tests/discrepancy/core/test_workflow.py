@@ -9,10 +9,13 @@ import pytest
 
 from discrepancy.candidate import Candidate
 from discrepancy.catalogue.entry import Setting
+from discrepancy.catalogue.library import library
 from discrepancy.errors import CampaignDataError
+from discrepancy.examples import example_campaign, plan_for
+from discrepancy.models.lumped import LumpedModel
 from discrepancy.separability import as_predicted
 from discrepancy.verdict import VerdictKind
-from discrepancy.workflow import investigate, open_hypotheses, patch_draws, solver_share
+from discrepancy.workflow import investigate, open_hypotheses, patch_draws, solver_share, without_port
 
 
 @pytest.fixture(scope="module")
@@ -159,3 +162,19 @@ def test_data_without_any_noise_end_with_a_verdict(laboratory, effects) -> None:
     found = investigate(replace(exact, trials=trials, channels=channels), laboratory.model, effects)
     assert found.verdict.kind is VerdictKind.NOTHING_MISSING
     assert "No noise record" in found.verdict.sentence
+
+
+def test_effects_that_lack_a_port_are_remarked_on_with_the_port_to_declare() -> None:
+    chain = LumpedModel.load("three_mass_chain")
+    plan = plan_for(chain, ("x3", "x1"), "end")
+    campaign = example_campaign(chain, "ringdown", 1, plan)
+    assert without_port(Setting(campaign, chain, chain.scales(campaign)), library()) == []
+    bare = LumpedModel(chain.description.model_copy(update={"port": ()}))
+    (remark,) = without_port(Setting(campaign, bare, bare.scales(campaign)), library())
+    assert remark.startswith("Not tested for lack of a port: Coulomb friction, ")
+    assert "joint micro-slip (Iwan) and Bouc-Wen hysteresis; declare a [[port]]" in remark
+    assert "vector = [0, 0, 1] between the ground and 'end'" in remark
+    assert "drift" not in remark
+    static = example_campaign(chain, "static", 1, plan)
+    (remark,) = without_port(Setting(static, bare, bare.scales(static)), library())
+    assert "Coulomb" not in remark  # a port would not help: there is no motion
