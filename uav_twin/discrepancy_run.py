@@ -192,7 +192,14 @@ def _packing(choice: ModelChoice, progress: Progress) -> Pack:
 def _show(found: Investigation, tried: SelfCalibration | None, report: Path, console: Console) -> None:
     from discrepancy.patch_file import PATCH_NAME, read_patch
     from discrepancy.report.sizes import size_sentence
-    from discrepancy.report.text import estimate_text, headline, percent, probability_text, unit_text
+    from discrepancy.report.text import (
+        estimate_text,
+        headline,
+        number,
+        percent,
+        probability_text,
+        unit_text,
+    )
     from discrepancy.verdict import VerdictKind
     from reporting.words import counted
     from uav_twin.console_table import console_table
@@ -227,8 +234,8 @@ def _show(found: Investigation, tried: SelfCalibration | None, report: Path, con
         closed = f", {percent(proof.gap_closed)} % of the gap closed" if isfinite(proof.gap_closed) else ""
         why = f" {proof.gap_reason}" if proof.held_out_before is not None and proof.gap_reason else ""
         scores = (
-            f"χ²/dof on {where}: {first.chi_square_per_dof:.3g} before, {second.chi_square_per_dof:.3g} with "
-            f"the effect{closed}.{why}"
+            f"χ²/dof on {where}: {number(first.chi_square_per_dof)} before, "
+            f"{number(second.chi_square_per_dof)} with the effect{closed}.{why}"
         )
         console.print(scores if isfinite(first.chi_square_per_dof) else proof.remaining, soft_wrap=True)
     for experiment in verdict.next_experiments[:SHOWN_EXPERIMENTS]:

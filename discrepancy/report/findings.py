@@ -5,7 +5,7 @@ from math import isfinite, isnan
 
 from discrepancy.naming import named_effects
 from discrepancy.report.content import ReportInput
-from discrepancy.report.sizes import size_sentence
+from discrepancy.report.sizes import definite_unit, size_sentence
 from discrepancy.report.text import (
     added_label,
     catalogue_of,
@@ -95,8 +95,14 @@ def _distinct(effects: Sequence[NamedEffect]) -> list[NamedEffect]:
 
 def _add_primitives(page: Page, content: ReportInput) -> None:
     rows = []
-    for effect in content.intervals:
-        for item in effect:
+    found = content.investigation
+    if not content.intervals or found.problem is None or found.fit is None:
+        return
+    effects = named_effects(found.problem, found.fit)
+    for effect, intervals in zip(effects, content.intervals, strict=True):
+        for item in intervals:
+            primitive = effect.patch.primitives[item.primitive]
+            unit = definite_unit(item.unit, primitive, found.model, found.campaign) or unit_text(item.unit)
             if item.parameter in ("velocity_exponent", "displacement_exponent", "reference_velocity",
                                   "reference_displacement", "element_count"):  # fmt: skip
                 continue
@@ -105,7 +111,7 @@ def _add_primitives(page: Page, content: ReportInput) -> None:
             else:
                 form = rounded(item.value, 0.5 * (item.high - item.low))
                 value, interval = form(item.value), f"{form(item.low)} to {form(item.high)}"
-            rows.append((item.parameter.replace("_", " "), value, interval, unit_text(item.unit)))
+            rows.append((item.parameter.replace("_", " "), value, interval, unit))
     if not rows:
         return
     marked = "" if content.investigation.verdict.kind is VerdictKind.NAMED else (

@@ -48,7 +48,7 @@ def si_sizes(
     found = []
     for item in intervals:
         primitive = patch.primitives[item.primitive]
-        unit = _unit(item.unit, primitive, model, campaign)
+        unit = definite_unit(item.unit, primitive, model, campaign)
         if not unit or item.parameter in BESIDE or item.value == 0.0:
             continue
         known = isfinite(item.low) and isfinite(item.high) and item.low < item.high
@@ -103,12 +103,12 @@ def _where(primitive: Primitive, parameter: str, model: Model, campaign: Campaig
     ):
         value = getattr(primitive, reference, None)
         if value is not None and getattr(primitive, exponent, 0.0) != 0.0:
-            unit = _unit(PRIMITIVE_UNITS[primitive.kind][reference], primitive, model, campaign)
+            unit = definite_unit(PRIMITIVE_UNITS[primitive.kind][reference], primitive, model, campaign)
             marks.append(f"{value:.3g} {unit}")
     return f" at {' and '.join(marks)}" if marks else ""
 
 
-def _unit(unit: str, primitive: Primitive, model: Model, campaign: Campaign) -> str:
+def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campaign) -> str:
     """Return the unit of a number, made definite as far as port and channel say it."""
     if unit.startswith(CHANNEL_UNIT):
         names = campaign.channels if (name := getattr(primitive, "channel", "*")) == "*" else (name,)

@@ -31,6 +31,9 @@ UNJUDGED = {
 }
 """The same, where the absolute fit could not be judged: no noise record, or too few readings."""
 
+LARGEST_PLAIN = 1e6
+"""Numbers from here on have a power of ten."""
+
 SHORT_UNITS = {"1": "", "m/s2": "m/s²"}
 
 
@@ -89,7 +92,12 @@ def p_value_text(p: float) -> str:
 
 def number(value: float, digits: int = 3) -> str:
     """Return a number with significant digits, or a dash where it is not known."""
-    return "\N{EN DASH}" if isnan(value) else f"{value:.{digits}g}".replace("-", "\N{MINUS SIGN}")
+    if isnan(value):
+        return "\N{EN DASH}"
+    text = f"{value:.{digits}g}"
+    if "e+0" in text and abs(value) < LARGEST_PLAIN:
+        text = f"{float(text):,.0f}"
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
 def unit_text(unit: str) -> str:

@@ -45,7 +45,7 @@ from discrepancy.report.residual_figures import (
     size_table,
 )
 from discrepancy.report.sizes import si_sizes, size_sentence
-from discrepancy.report.text import formula, headline, listing, probability_text, rounded
+from discrepancy.report.text import formula, headline, listing, number, probability_text, rounded
 from discrepancy.residual_file import read_residuals
 from discrepancy.residuals import ResidualSet
 from discrepancy.self_calibration import (
@@ -132,6 +132,14 @@ def test_numbers_that_nobody_should_read_as_certain() -> None:
     assert probability_text(1e-200) == "< 1e-99"
     assert probability_text(float("nan")) == "not known"
     assert rounded(float("nan"), 1.0)(float("nan")) == "not known"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1582.6, "1,580"), (-11424.0, "\N{MINUS SIGN}11,400"), (0.98, "0.98"), (2e6, "2e+06"), (999.6, "1,000")],
+)
+def test_large_numbers_are_written_out(value: float, text: str) -> None:
+    assert number(value) == text
 
 
 def test_formulas_and_lists() -> None:
@@ -389,9 +397,9 @@ def test_rows_of_what_can_be_decided(drag: Investigation, able: Separability) ->
     assert set(rows) == {effect.identifier for effect in FEW}
     assert rows["washout"][1] == "no"
     assert rows["quadratic_damping"][1] == "yes"
-    for number, name in enumerate(able.identifiers):
-        near = np.minimum(able.distance[number], able.distance[:, number]) < CONFUSED
-        near[number] = False
+    for row, name in enumerate(able.identifiers):
+        near = np.minimum(able.distance[row], able.distance[:, row]) < CONFUSED
+        near[row] = False
         assert neighbours(able, name) == [able.identifiers[place] for place in np.flatnonzero(near)]
     assert group_lines(able)
     text = " ".join(needs(able, drag.campaign, FEW))
