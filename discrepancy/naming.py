@@ -6,6 +6,7 @@ import numpy as np
 
 from .candidate import FREE_SHAPE, Candidate
 from .catalogue.entry import NINETY, Effect
+from .consistency_gate import consistency_gate
 from .fitting import Fit
 from .gates import SHAPE_GAIN, absolute_gate, shape_gate
 from .neighbourhood import free_shape
@@ -103,26 +104,39 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         p_top = max(p_top, _family_probability(found, best.candidate.terms[0].effect.family))
     if p_top < SURE or bayes < BAYES_FACTOR:
         return _open(problem, found, probabilities, verdict, best)
-    gate = absolute_gate(problem, best)
+    gate, consistent = absolute_gate(problem, best), consistency_gate(problem, best)
     if best.candidate.is_family:
-        if gate.passed is not False:
-            return family_of(best, (gate,))
-        return unexplained(f"There is a gap that no effect of the catalogue fits. {gate.reason}", (gate,))
+        if _pass(gate, consistent):
+            return family_of(best, (gate, consistent))
+        reason = _failing(gate, consistent).reason
+        return unexplained(
+            f"There is a gap that no effect of the catalogue fits. {reason}", (gate, consistent)
+        )
     shape, family = _shape(found, best)
-    if gate.passed is not False and shape.passed:
+    if _pass(gate, shape, consistent):
         best = with_draws(problem, best)
         named = named_effects(problem, best)
-        more = {"effects": named, "gates": (gate, shape)}
+        more = {"effects": named, "gates": (gate, shape, consistent)}
         return verdict(VerdictKind.NAMED, _named_sentence(named, p_top, gate), p_top, **more), found, best
     if family is not None and not shape.passed:
-        gate = absolute_gate(problem, family)
-        if gate.passed is not False:
-            return family_of(family, (gate, shape))
+        gate, consistent = absolute_gate(problem, family), consistency_gate(problem, family)
+        if _pass(gate, consistent):
+            return family_of(family, (gate, shape, consistent))
+    reason = _failing(gate, consistent).reason
     return unexplained(
         f"There is a gap that no effect of the catalogue fits; the nearest is {' with '.join(top)}, but "
-        f"{gate.reason[0].lower()}{gate.reason[1:]}",
-        (gate, shape),
+        f"{reason[0].lower()}{reason[1:]}",
+        (gate, shape, consistent),
     )
+
+
+def _pass(*gates: Gate) -> bool:
+    return all(gate.passed is not False for gate in gates)
+
+
+def _failing(absolute: Gate, consistent: Gate) -> Gate:
+    """Return the gate that says why; the absolute one where it failed too."""
+    return consistent if absolute.passed is not False and consistent.passed is False else absolute
 
 
 def _settled_probabilities(found: Search) -> dict[tuple[str, ...], float]:

@@ -1,0 +1,157 @@
+"""The gate of consistency: its statistic against dense least squares, its level, its power."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf
+
+import numpy as np
+import pytest
+from scipy.stats import binom, kstest
+
+from discrepancy.campaign import NoiseRecord, TrialKind
+from discrepancy.candidate import Candidate, Term
+from discrepancy.catalogue.entry import Setting
+from discrepancy.consistency_gate import (
+    CONSISTENCY_LEVEL,
+    consistency_gate,
+    consistency_tests,
+    score_tests,
+)
+from discrepancy.fitting import fit
+from discrepancy.gates import absolute_gate
+from discrepancy.naming import name
+from discrepancy.problem import Problem
+from discrepancy.verdict import VerdictKind
+
+STATIONS = {"y1": 0.2, "y2": 0.6, "y3": 0.9}
+
+
+def changed(problem, *, record=None, size=None, place="middle"):  # type: ignore[no-untyped-def]
+    """Return the problem with stations, its second static trial under another load place.
+
+    `record` replaces the channels' noise records; `size` multiplies the readings of channels in that trial.
+    """
+    campaign = problem.campaign
+    channels = {
+        key: replace(item, station=STATIONS[key], noise=record or item.noise)
+        for key, item in campaign.channels.items()
+    }
+    trials = []
+    for trial in campaign.trials:
+        if trial.kind is TrialKind.STATIC and trial.run == "B":
+            values = trial.values * [(size or {}).get(key, 1.0) for key in trial.channels]
+            trial = replace(trial, load_place=place, values=values)
+        trials.append(trial)
+    campaign = replace(campaign, channels=channels, trials=tuple(trials))
+    return Problem(campaign, problem.model, Setting(campaign, problem.model, problem.model.scales(campaign)))
+
+
+def fitted(problem, effect, place):  # type: ignore[no-untyped-def]
+    candidate = Candidate((Term(effect, place),))
+    return fit(problem, candidate, problem.start(candidate), iterations=40)
+
+
+def test_statistic_is_the_fall_of_the_penalised_sum_of_squares(kit) -> None:  # type: ignore[no-untyped-def]
+    """Dense least squares with and without the directions; the effect without its prior in both."""
+    problem = kit.closed_problem(seed=3, effect=0.4, samples=30, noise=NoiseRecord(0.02, inf))
+    found = fitted(problem, kit.offset_effect(), "y1")
+    generator = np.random.default_rng(5)
+    columns = [
+        {0: 0.02 * generator.standard_normal(problem.trials[0].weight.shape)},
+        {n: 0.02 * generator.standard_normal(problem.trials[n].weight.shape) for n in (1, 2, 3)},
+    ]
+    (test,) = score_tests(problem, found, {"both": {"a": columns[0], "b": columns[1]}})
+    dense = kit.Linear(problem, found.candidate)
+    y, matrix = dense.dense()
+    extra = np.zeros((len(y), 2))
+    ends = np.cumsum([0, *(int((data.weight > 0.0).sum()) for data in problem.trials)])
+    for k, direction in enumerate(columns):
+        for number, column in direction.items():
+            data = problem.trials[number]
+            extra[ends[number] : ends[number + 1], k] = data.standardised(column)[data.weight > 0.0]
+    precision = dense.precision.copy()
+    shared = problem.shared.size
+    precision[shared : shared + found.candidate.size] = 0.0
+    left = []
+    for a, p in ((matrix, precision), (np.hstack((matrix, extra)), np.concatenate((precision, [0.0, 0.0])))):
+        x = np.linalg.solve(a.T @ a + np.diag(p), a.T @ y)
+        left.append(float(np.sum((y - a @ x) ** 2) + p @ x**2))
+    assert test.count == 2
+    assert test.statistic == pytest.approx(left[0] - left[1], rel=1e-5)
+
+
+@pytest.mark.parametrize("freedom", [inf, 30.0])
+def test_p_values_are_uniform_where_the_name_is_right(kit, freedom: float) -> None:  # type: ignore[no-untyped-def]
+    """100 campaigns with the effect that is named: Kolmogorov-Smirnov, and the rejections at 5 %."""
+    generator = np.random.default_rng(11)
+    effect = kit.offset_effect()
+    found: dict[str, list[float]] = {"static loads": [], "channel y1": []}
+    for seed in range(100):
+        scale = 1.0 if freedom == inf else float(np.sqrt(generator.chisquare(freedom) / freedom))
+        drawn = kit.closed_problem(
+            seed=seed, effect=0.3 * generator.standard_normal(), samples=20, noise=NoiseRecord(0.02, inf)
+        )
+        problem = changed(drawn, record=NoiseRecord(0.02 * scale, freedom))
+        for test in consistency_tests(problem, fitted(problem, effect, "y1")):
+            found[test.name].append(test.p_value)
+    for values in found.values():
+        assert len(values) == 100
+        assert kstest(values, "uniform").pvalue > 1e-3
+        assert sum(p < 0.05 for p in values) <= binom.isf(1e-3, 100, 0.05)
+
+
+def test_a_channel_is_tested_where_the_effect_has_one(kit) -> None:  # type: ignore[no-untyped-def]
+    """Drift of y2 named where y2 reads 15 % more under one of two loads, among many samples of motion."""
+    problem = changed(kit.closed_problem(seed=2, samples=1500), size={"y2": 1.15})
+    found = fitted(problem, kit.drift_effect(), "y2")
+    assert absolute_gate(problem, found).passed
+    gate = consistency_gate(problem, found)
+    assert gate.passed is False
+    assert "channel y2" in gate.reason
+    assert "middle" in gate.reason
+    assert {test.name for test in consistency_tests(problem, found)} == {"static loads", "channel y2"}
+
+
+def test_a_load_that_differs_by_place_is_seen(kit) -> None:  # type: ignore[no-untyped-def]
+    """A load 5 % too large at one of two places: the sum of squares of all samples does not show it."""
+    truth = kit.closed_problem(seed=4, effect=0.5, samples=1500)
+    right = changed(truth)
+    assert consistency_gate(right, fitted(right, kit.offset_effect(), "y1")).passed
+    wrong = changed(truth, size=dict.fromkeys(STATIONS, 1.05))
+    found = fitted(wrong, kit.offset_effect(), "y1")
+    assert absolute_gate(wrong, found).passed
+    gate = consistency_gate(wrong, found)
+    assert gate.passed is False
+    assert gate.statistic < CONSISTENCY_LEVEL
+    assert "static loads" in gate.reason
+
+
+def test_what_fails_the_gate_is_not_named(kit) -> None:  # type: ignore[no-untyped-def]
+    truth = kit.closed_problem(seed=4, effect=0.5, samples=1500)
+    effects = (kit.offset_effect(),)
+    verdict, _, _ = name(changed(truth), effects)
+    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
+    assert [gate.name for gate in verdict.gates] == ["absolute fit", "shape", "consistency"]
+    verdict, _, _ = name(changed(truth, size=dict.fromkeys(STATIONS, 1.05)), effects)
+    assert verdict.kind is VerdictKind.UNEXPLAINED, verdict.sentence
+    assert "static loads" in verdict.sentence
+    assert verdict.effects == ()
+
+
+def test_without_loads_the_gate_is_not_applied(kit) -> None:  # type: ignore[no-untyped-def]
+    problem = kit.closed_problem(seed=1, kinds=("ringdown",))
+    found = fit(problem, Candidate(), problem.start(Candidate()))
+    gate = consistency_gate(problem, found)
+    assert gate.passed is None
+    assert np.isnan(gate.statistic)
+
+
+def test_what_is_free_already_is_no_direction(kit) -> None:  # type: ignore[no-untyped-def]
+    """The derivative by the effect itself, whatever its prior, and a direction that is nothing."""
+    problem = kit.closed_problem(seed=3, effect=0.4, samples=30)
+    found = fitted(problem, kit.offset_effect(), "y1")
+    own = {n: part.effect[0] for n, part in enumerate(found.linearisations) if np.any(part.effect)}
+    nothing = {0: np.zeros_like(problem.trials[0].weight)}
+    assert score_tests(problem, found, {"own": {"offset": own}, "nothing": {"zero": nothing}}) == []
+    assert score_tests(problem, found, {}) == []
