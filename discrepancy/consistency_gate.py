@@ -1,4 +1,4 @@
-"""The gate of consistency: what a named effect leaves must not follow the loads, nor its own channel.
+"""The gate of consistency: what a named effect leaves must not follow loads, runs, or its own channel.
 
 An effect that is not in the catalogue can be imitated by one that is, closely enough for the sum of squares
 of many thousand samples. The difference then lies along few directions: the response of one kind of test has
@@ -66,7 +66,7 @@ Direction = Mapping[int, FloatArray]
 
 
 def consistency_gate(problem: Problem, fit: Fit) -> Gate:
-    """Judge whether what is left departs along the loads or the channel of the effect.
+    """Judge whether what is left departs along loads, runs or the channel of the effect.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def consistency_gate(problem: Problem, fit: Fit) -> Gate:
         return Gate("consistency", False, statistic, CONSISTENCY_LEVEL, reason)
     return Gate(
         "consistency", True, statistic, CONSISTENCY_LEVEL,
-        "What is left follows neither the loads nor the effect's own channel.",
+        "What is left follows neither loads, runs nor the effect's own channel.",
     )  # fmt: skip
 
 
@@ -105,12 +105,13 @@ def consistency_tests(problem: Problem, fit: Fit) -> list[ScoreTest]:
     """Return the tests of the gate that can be made.
 
     Static trials: size, zero and slope over the span of the response, for each load place. Flights: size and
-    slope over the span. Effects of single channels: size of each such channel's response by load place and
-    kind of trial, and a zero that moves in time.
+    slope over the span. Runs of static trials: a zero for each quantity. Effects of single channels: size of
+    each such channel's response by load place and kind of trial, and a zero that moves in time.
     """
     groups = {
         "static loads": _by_load(problem, fit, TrialKind.STATIC),
         "loads of flight": _by_load(problem, fit, TrialKind.FLIGHT),
+        "zeros of the static runs": _by_run(problem),
     }
     for term in fit.candidate.terms:
         channel = _own_channel(problem, term)
@@ -258,6 +259,20 @@ def _by_load(problem: Problem, fit: Fit, kind: TrialKind) -> dict[str, Direction
         along = _along_span(problem, data)
         if along is not None:
             found.setdefault(f"the slope over the span {where}", {})[number] = response * along
+    return dict(found)
+
+
+def _by_run(problem: Problem) -> dict[str, Direction]:
+    """Return a zero that all channels of a quantity share in the static trials of a run."""
+    found: dict[str, dict[int, FloatArray]] = {}
+    for number, data in enumerate(problem.trials):
+        if data.trial.kind is not TrialKind.STATIC:
+            continue
+        quantities = [problem.campaign.channels[name].quantity for name in data.trial.channels]
+        for quantity in sorted(set(quantities)):
+            columns = np.array([item is quantity for item in quantities])
+            zero = np.broadcast_to(columns * data.deviation[columns].mean(), data.weight.shape)
+            found.setdefault(f"the zero of {quantity.value} in run {data.trial.run}", {})[number] = zero
     return dict(found)
 
 

@@ -1,4 +1,4 @@
-"""The two gates that a name must pass: absolute fit against the noise record, shape against its family."""
+"""Gates that a name must pass: absolute fit against the noise record, shape against its family."""
 
 from math import isinf
 

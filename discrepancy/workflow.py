@@ -23,6 +23,7 @@ from .fitting import Fit
 from .fitting import fit as fit_to
 from .held_out import choose_held_out
 from .locate import Location, locate
+from .look_alikes import look_alike_remark
 from .models.interface import Model
 from .models.lumped import LumpedModel
 from .naming import name
@@ -155,6 +156,8 @@ def investigate(
     remarks = [fault.sentence for fault in faults] + list(campaign.remarks)
     remarks += strained(problem, fit)
     remarks += without_port(setting, catalogue)
+    alike = look_alike_remark(verdict, search.effects)
+    remarks += [] if alike is None else [alike]
     if not model.parameters:
         remarks.append(
             f"The model {model.name!r} has no uncertain parameter, so a stiffness or damping a little "

@@ -40,8 +40,8 @@ def add_gates(page: Page, investigation: Investigation) -> None:
                 for gate in gates
             ],
         ),
-        "A name must fit the noise record (absolute fit), and freeing its shape must not gain more than "
-        "two nats.",
+        "A name must fit the noise record (absolute fit), freeing its shape must not gain more than two "
+        "nats, and what it leaves must follow neither loads, runs nor its own channel (consistency).",
         title="Gates",
     )  # fmt: skip
 

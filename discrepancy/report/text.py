@@ -11,7 +11,7 @@ from discrepancy.workflow import Investigation
 MEANING = {
     VerdictKind.NOTHING_MISSING: "No effect of the catalogue is needed: what the model leaves is noise.",
     VerdictKind.NAMED: "The name has the probability, the evidence and the fit that a name needs: it passed "
-    "both gates.",
+    "every gate that could be applied.",
     VerdictKind.FAMILY: "The kind of the effect is known, its exact law is not one of the catalogue: the "
     "shape below was fitted.",
     VerdictKind.GROUP: "Something is missing. Each member of the group fits the data; the figures after "
@@ -126,7 +126,7 @@ def headline(verdict: Verdict) -> str:
 
 def meaning(verdict: Verdict) -> str:
     """Return what the verdict means, in a sentence."""
-    judged = all(gate.passed is not None for gate in verdict.gates)
+    judged = all(gate.passed is not None for gate in verdict.gates if gate.name == "absolute fit")
     return MEANING[verdict.kind] if judged else UNJUDGED.get(verdict.kind, MEANING[verdict.kind])
 
 

@@ -27,10 +27,11 @@ from discrepancy.verdict import VerdictKind
 STATIONS = {"y1": 0.2, "y2": 0.6, "y3": 0.9}
 
 
-def changed(problem, *, record=None, size=None, place="middle"):  # type: ignore[no-untyped-def]
+def changed(problem, *, record=None, size=None, shift=0.0, place="middle"):  # type: ignore[no-untyped-def]
     """Return the problem with stations, its second static trial under another load place.
 
-    `record` replaces the channels' noise records; `size` multiplies the readings of channels in that trial.
+    `record` replaces the channels' noise records; `size` multiplies the readings of channels in that trial,
+    `shift` is added to all of them.
     """
     campaign = problem.campaign
     channels = {
@@ -40,7 +41,7 @@ def changed(problem, *, record=None, size=None, place="middle"):  # type: ignore
     trials = []
     for trial in campaign.trials:
         if trial.kind is TrialKind.STATIC and trial.run == "B":
-            values = trial.values * [(size or {}).get(key, 1.0) for key in trial.channels]
+            values = trial.values * [(size or {}).get(key, 1.0) for key in trial.channels] + shift
             trial = replace(trial, load_place=place, values=values)
         trials.append(trial)
     campaign = replace(campaign, channels=channels, trials=tuple(trials))
@@ -86,7 +87,7 @@ def test_p_values_are_uniform_where_the_name_is_right(kit, freedom: float) -> No
     """100 campaigns with the effect that is named: Kolmogorov-Smirnov, and the rejections at 5 %."""
     generator = np.random.default_rng(11)
     effect = kit.offset_effect()
-    found: dict[str, list[float]] = {"static loads": [], "channel y1": []}
+    found: dict[str, list[float]] = {"static loads": [], "zeros of the static runs": [], "channel y1": []}
     for seed in range(100):
         scale = 1.0 if freedom == inf else float(np.sqrt(generator.chisquare(freedom) / freedom))
         drawn = kit.closed_problem(
@@ -110,7 +111,8 @@ def test_a_channel_is_tested_where_the_effect_has_one(kit) -> None:  # type: ign
     assert gate.passed is False
     assert "channel y2" in gate.reason
     assert "middle" in gate.reason
-    assert {test.name for test in consistency_tests(problem, found)} == {"static loads", "channel y2"}
+    names = [test.name for test in consistency_tests(problem, found)]
+    assert names == ["static loads", "zeros of the static runs", "channel y2"]
 
 
 def test_a_load_that_differs_by_place_is_seen(kit) -> None:  # type: ignore[no-untyped-def]
@@ -125,6 +127,17 @@ def test_a_load_that_differs_by_place_is_seen(kit) -> None:  # type: ignore[no-u
     assert gate.passed is False
     assert gate.statistic < CONSISTENCY_LEVEL
     assert "static loads" in gate.reason
+
+
+def test_a_run_with_another_zero_is_seen(kit) -> None:  # type: ignore[no-untyped-def]
+    """All three displacements of one run off by four deviations, with zeros that are known to be small."""
+    truth = kit.closed_problem(seed=4, effect=0.5, samples=1500, offset_deviation=0.005)
+    problem = changed(truth, shift=0.08)
+    found = fitted(problem, kit.offset_effect(), "y1")
+    assert absolute_gate(problem, found).passed
+    gate = consistency_gate(problem, found)
+    assert gate.passed is False
+    assert "the zero of displacement in run B" in gate.reason
 
 
 def test_what_fails_the_gate_is_not_named(kit) -> None:  # type: ignore[no-untyped-def]
