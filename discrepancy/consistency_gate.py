@@ -218,20 +218,28 @@ def _projected(
     weights = problem.precisions(fit.sums)
     for number, data in enumerate(problem.trials):
         residual = fit.residuals[number]
-        block, local, shared = trial_block(
+        block = trial_block(
             problem, number, fit.point, fit.linearisations[number], fit.candidate, residual, weights
         )
-        root = np.broadcast_to(np.sqrt(weights[data.groups]), residual.shape).ravel()
-        acting = [k for k, direction in enumerate(directions) if number in direction]
-        if acting:
-            extra = np.stack([data.standardised(directions[k][number]).ravel() * root for k in acting])
-            whole[acting] += np.einsum("kn,kn->k", extra, extra)
-            shared = np.concatenate((shared, extra))
-        index = np.concatenate((block.index, size + np.array(acting, dtype=np.int64)))
-        cross = local @ shared.T
+        acting = np.array([k for k, item in enumerate(directions) if number in item], dtype=np.int64)
+        extra = [data.standardised(directions[k][number]) for k in acting]
+        weighted = [column * weights[data.groups] for column in extra]
+        products = np.array([[np.vdot(a, b) for b in weighted] for a in extra]).reshape(2 * (len(acting),))
+        whole[acting] += np.diag(products)
+        local_size = len(block.local)
+        onto = np.array([block.derivatives.onto(column.T) for column in weighted])
+        onto = onto.reshape(len(acting), block.derivatives.size).T
+        cross = np.concatenate((block.cross, onto[:local_size]), axis=1)
+        between = onto[local_size:]
+        shared = np.block([[block.shared, between], [between.T, products]])
+        along = np.array([np.vdot(residual, column) for column in weighted])
+        index = np.concatenate((block.index, size + acting))
         inner = cho_solve(cho_factor(block.local), cross)
-        matrix[np.ix_(index, index)] += shared @ shared.T - cross.T @ inner
-        np.add.at(gradient, index, shared @ (residual.ravel() * root) - inner.T @ block.local_gradient)
+        matrix[np.ix_(index, index)] += shared - cross.T @ inner
+        np.add.at(
+            gradient, index,
+            np.concatenate((block.shared_gradient, along)) - inner.T @ block.local_gradient,
+        )  # fmt: skip
     known, between = matrix[:size, :size], matrix[:size, size:]
     scale = 1.0 / np.sqrt(np.diag(known))
     factor = cho_factor(known * np.outer(scale, scale) + 1e-12 * np.eye(size))
