@@ -80,7 +80,10 @@ def outcome(truth: Mapping[str, Any], verdict: Mapping[str, Any]) -> Outcome:
     if kind == "group":
         if not hidden or outside:
             return Outcome.OPEN
-        return Outcome.GROUP if hidden & (set(verdict.get("group") or ()) | named) else Outcome.WRONG
+        # members may be sets, written "one + other": none of a set's effects may be foreign to the truth
+        members = [set(str(item).split(" + ")) for item in verdict.get("group") or ()]
+        members += [{item} for item in named]
+        return Outcome.GROUP if any(member <= hidden for member in members) else Outcome.WRONG
     if kind == "family":
         word = str(verdict.get("family", ""))
         families = {FAMILIES.get(name, name) for name in hidden}

@@ -163,7 +163,8 @@ class WingRig:
 
         moved = y + changes.shift_span
         arm = 0.3 * plan.chord(moved / plan.semi_span)
-        couple = (split(moved, 1) - split(moved, 0)) * changes.shift_chord / arm
+        ahead = min(chord, 1)  # of the two webs beside the force
+        couple = (split(moved, ahead + 1) - split(moved, ahead)) * changes.shift_chord / arm
         return np.asarray(nominal + split(moved, chord) - split(y, chord) + couple)
 
     def flight_load(self, load_factor: float, changes: Changes) -> FloatArray:
