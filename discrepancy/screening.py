@@ -99,6 +99,7 @@ class _Piece(NamedTuple):
     root: FloatArray  # (C, 1), weights
     residual: FloatArray  # (C, N), weighted
     gradient: FloatArray  # (L,)
+    nothing: FloatArray  # (C N,), no change
 
 
 class Screen:
@@ -143,6 +144,7 @@ class Screen:
                     root,
                     np.ascontiguousarray(fit.residuals[number].T) * root,
                     own @ block.local_gradient,
+                    np.zeros(fit.residuals[number].size),
                 )
             )
         lower = np.tril(cho_factor(matrix, lower=True)[0])
@@ -177,17 +179,18 @@ class Screen:
         total = np.zeros(self._size)
         parts, fits, square = [], 0.0, 0.0
         tail = []
+        patch = candidate.patch(problem.setting, effect)
         for number, (data, piece) in enumerate(zip(problem.trials, self._pieces, strict=True)):
             touched = None
             if channels:
                 touched = [column for column, name in enumerate(data.trial.channels) if name in channels]
-            change = np.zeros(piece.residual.shape)
-            parts.append(change.reshape(-1))
             if data.trial.kind not in acting or touched == []:
+                parts.append(piece.nothing)
                 tail.append(np.zeros(len(piece.own)))
                 continue
+            change = np.zeros(piece.residual.shape)
+            parts.append(change.reshape(-1))
             at = slice(None) if touched is None else touched
-            patch = candidate.patch(problem.setting, effect)
             response, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch)
             gains = 1.0 + problem.shared.gains(fit.point.shared, data.trial.channels)
             moved = gains[at] * (response[:, at] - fit.responses[number][:, at])

@@ -354,9 +354,10 @@ def test_gates_say_what_they_compare(drag: Investigation) -> None:
     page.add_section("c")
     add_gates(page, drag)
     text = page.render()
-    absolute, shape = drag.verdict.gates
-    assert f"p = {absolute.statistic:.2g}</td>" in text
-    assert f"p at least {absolute.limit:g}</td>" in text
+    absolute, consistency, shape = drag.verdict.gates
+    for gate in (absolute, consistency):
+        assert f"p = {gate.statistic:.2g}</td>" in text
+        assert f"p at least {gate.limit:g}</td>" in text
     assert f"at most {shape.limit:g} nat</td>" in text
 
 
