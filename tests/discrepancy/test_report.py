@@ -354,7 +354,7 @@ def test_gates_say_what_they_compare(drag: Investigation) -> None:
     page.add_section("c")
     add_gates(page, drag)
     text = page.render()
-    absolute, consistency, shape = drag.verdict.gates
+    absolute, shape, consistency = drag.verdict.gates
     for gate in (absolute, consistency):
         assert f"p = {gate.statistic:.2g}</td>" in text
         assert f"p at least {gate.limit:g}</td>" in text
