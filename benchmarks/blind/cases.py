@@ -216,10 +216,20 @@ def make_case(order: Order, folder: Path | None = None) -> Case:
     known = reference(work.rig, work.plan, chance)
     if order.kind == "trap":
         return _trap(order, work, generator, chance, known)
-    hidden, changes, distances = _drawn(order.identifiers, work, generator, known)
-    signals = true_signals(work.rig, work.plan, chance, changes) if hidden else known.nominal
+    for _ in range(ATTEMPTS):
+        hidden, changes, distances = _drawn(order.identifiers, work, generator, known)
+        with np.errstate(invalid="ignore", over="ignore"):  # motion that runs away is looked for below
+            signals = true_signals(work.rig, work.plan, chance, changes) if hidden else known.nominal
+        if _finite(signals):
+            break
+    else:  # together they may take more stiffness from a joint than it has
+        raise RuntimeError(f"{order.identifiers} cannot act together in {ATTEMPTS} attempts")
     measured = measure(generator, work.plan, signals, changes)
     return Case(order, work.plan, measured, _truth(order, hidden, distances, chance))
+
+
+def _finite(signals: Signals) -> bool:
+    return all(bool(np.isfinite(values).all()) for values in signals.values())
 
 
 def _drawn(
@@ -230,7 +240,7 @@ def _drawn(
         for _ in range(ATTEMPTS):
             effect = DRAWS[identifier](generator, work.bench)
             signals = true_signals(work.rig, work.plan, known.chance, effect.changes)
-            if not all(np.isfinite(values).all() for values in signals.values()):
+            if not _finite(signals):
                 continue
             distance = known.distance(signals)
             if distance >= DETECTABLE:
