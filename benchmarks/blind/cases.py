@@ -218,9 +218,8 @@ def make_case(order: Order, folder: Path | None = None) -> Case:
         return _trap(order, work, generator, chance, known)
     for _ in range(ATTEMPTS):
         hidden, changes, distances = _drawn(order.identifiers, work, generator, known)
-        with np.errstate(invalid="ignore", over="ignore"):  # motion that runs away is looked for below
-            signals = true_signals(work.rig, work.plan, chance, changes) if hidden else known.nominal
-        if _finite(signals):
+        signals = _signals(work, chance, changes) if hidden else known.nominal
+        if signals is not None:
             break
     else:  # together they may take more stiffness from a joint than it has
         raise RuntimeError(f"{order.identifiers} cannot act together in {ATTEMPTS} attempts")
@@ -228,8 +227,15 @@ def make_case(order: Order, folder: Path | None = None) -> Case:
     return Case(order, work.plan, measured, _truth(order, hidden, distances, chance))
 
 
-def _finite(signals: Signals) -> bool:
-    return all(bool(np.isfinite(values).all()) for values in signals.values())
+def _signals(work: Workbench, chance: Chance, changes: Changes) -> Signals | None:
+    """Return what channels without noise show, or None where the motion runs away."""
+    try:
+        with np.errstate(invalid="ignore", over="ignore"):
+            signals = true_signals(work.rig, work.plan, chance, changes)
+    except np.linalg.LinAlgError:
+        return None
+    finite = all(bool(np.isfinite(values).all()) for values in signals.values())
+    return signals if finite else None
 
 
 def _drawn(
@@ -239,8 +245,8 @@ def _drawn(
     for identifier in identifiers:
         for _ in range(ATTEMPTS):
             effect = DRAWS[identifier](generator, work.bench)
-            signals = true_signals(work.rig, work.plan, known.chance, effect.changes)
-            if not _finite(signals):
+            signals = _signals(work, known.chance, effect.changes)
+            if signals is None:
                 continue
             distance = known.distance(signals)
             if distance >= DETECTABLE:
