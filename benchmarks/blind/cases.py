@@ -218,7 +218,7 @@ def make_case(order: Order, folder: Path | None = None) -> Case:
         return _trap(order, work, generator, chance, known)
     for _ in range(ATTEMPTS):
         hidden, changes, distances = _drawn(order.identifiers, work, generator, known)
-        signals = _signals(work, chance, changes) if hidden else known.nominal
+        signals = finite_signals(work, chance, changes) if hidden else known.nominal
         if signals is not None:
             break
     else:  # together they may take more stiffness from a joint than it has
@@ -227,7 +227,7 @@ def make_case(order: Order, folder: Path | None = None) -> Case:
     return Case(order, work.plan, measured, _truth(order, hidden, distances, chance))
 
 
-def _signals(work: Workbench, chance: Chance, changes: Changes) -> Signals | None:
+def finite_signals(work: Workbench, chance: Chance, changes: Changes) -> Signals | None:
     """Return what channels without noise show, or None where the motion runs away."""
     try:
         with np.errstate(invalid="ignore", over="ignore"):
@@ -245,7 +245,7 @@ def _drawn(
     for identifier in identifiers:
         for _ in range(ATTEMPTS):
             effect = DRAWS[identifier](generator, work.bench)
-            signals = _signals(work, known.chance, effect.changes)
+            signals = finite_signals(work, known.chance, effect.changes)
             if signals is None:
                 continue
             distance = known.distance(signals)

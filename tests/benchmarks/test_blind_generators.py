@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import benchmarks.blind
-from benchmarks.blind.cases import DETECTABLE, KINDS, Order, make_case, orders, workbench
+from benchmarks.blind.cases import DETECTABLE, KINDS, Order, finite_signals, make_case, orders, workbench
 from benchmarks.blind.changes import Changes, Fault
 from benchmarks.blind.detectability import reference
 from benchmarks.blind.effects import DRAWS, LUMPED, jenkins
@@ -453,3 +453,13 @@ def test_chance_stays_within_reach_of_the_prior() -> None:
         chance: Chance = draw_chance(np.random.default_rng(seed), plan)
         for name, (mean, deviation) in plan.priors.items():
             assert abs(chance.parameters[name] - mean) <= 2.5 * deviation
+
+
+@pytest.mark.parametrize(("share", "runs_away"), [(0.5, False), (3.0, True)])
+def test_motion_that_runs_away_is_no_campaign(share: float, runs_away: bool) -> None:
+    """A law that takes more stiffness from a joint than it has lets it snap."""
+    work = workbench("lumped")
+    joint = work.bench.joint
+    law = Law(joint.port, BOUC_WEN, (share * joint.stiffness, 0.3 * joint.displacement, 1.0))
+    chance = draw_chance(np.random.default_rng(1), work.plan)
+    assert (finite_signals(work, chance, Changes(laws=(law,))) is None) is runs_away

@@ -180,12 +180,3 @@ def test_cases_of_the_wing_repeat(
     for name, values in one.measured.values.items():
         assert np.isfinite(values).all()
         np.testing.assert_array_equal(values, two.measured.values[name])
-
-
-def test_effects_that_take_more_stiffness_than_a_joint_has_are_drawn_again(
-    work: Workbench, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    """The first draw of this order gives a compliant root whose joint is softer than what slips there."""
-    order = Order("case-0086", "pair", "wing", ("bouc_wen_hysteresis", "root_compliance"), 200092)
-    case = make_case(order, tmp_path_factory.getbasetemp() / "blind")
-    assert all(np.isfinite(values).all() for values in case.measured.values.values())
