@@ -38,7 +38,7 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     }
     text = (
         f"A cause that the catalogue lacks and that acts on these trials as {' and '.join(named.values())} "
-        "does, within the noise, would be given the same name."
+        f"{'does' if len(named) == 1 else 'do together'}, within the noise, would be given the same name."
     )
     tried, untried = sorted(alike & effects.keys()), sorted(alike - effects.keys())
     if tried:

@@ -40,6 +40,7 @@ def test_likeness_counts_both_ways(catalogue) -> None:  # type: ignore[no-untype
 def test_members_of_a_set_are_no_likenesses_of_each_other(catalogue) -> None:  # type: ignore[no-untyped-def]
     text = look_alike_remark(verdict_on(catalogue, "inertia_relief", "washout"), catalogue)
     assert text is not None
+    assert " do together, within the noise" in text
     compared = text.split("look alike,")[1]
     assert "washout" not in compared
     assert "inertia_relief" not in compared
