@@ -280,7 +280,8 @@ def _by_run(problem: Problem) -> dict[str, Direction]:
         for quantity in sorted(set(quantities)):
             columns = np.array([item is quantity for item in quantities])
             zero = np.broadcast_to(columns * data.deviation[columns].mean(), data.weight.shape)
-            found.setdefault(f"the zero of {quantity.value} in run {data.trial.run}", {})[number] = zero
+            where = f"in run {data.trial.run}" if data.trial.run else "in the runs without a label"
+            found.setdefault(f"the zero of {quantity.value} {where}", {})[number] = zero
     return dict(found)
 
 

@@ -138,6 +138,13 @@ def test_a_run_with_another_zero_is_seen(kit) -> None:  # type: ignore[no-untype
     gate = consistency_gate(problem, found)
     assert gate.passed is False
     assert "the zero of displacement in run B" in gate.reason
+    unlabelled = replace(
+        problem.campaign, trials=tuple(replace(trial, run="") for trial in problem.campaign.trials)
+    )
+    whole = Problem(unlabelled, problem.model, problem.setting)
+    tests = consistency_tests(whole, fitted(whole, kit.offset_effect(), "y1"))
+    (zeros,) = (test for test in tests if test.name == "zeros of the static runs")
+    assert zeros.strongest.startswith("the zero of displacement in the runs without a label (")
 
 
 def test_what_fails_the_gate_is_not_named(kit) -> None:  # type: ignore[no-untyped-def]
