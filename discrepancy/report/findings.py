@@ -152,10 +152,9 @@ def _add_highlights(page: Page, investigation: Investigation) -> None:
         )
         if isfinite(proof.gap_closed):
             items.append((f"{percent(proof.gap_closed)} %", "of the gap closed on held-out trials"))
-    elif verdict.gates and isfinite(verdict.gates[0].statistic):
+    elif judged := [gate for gate in verdict.gates if gate.name != "shape" and isfinite(gate.statistic)]:
         # of gates whose statistic is a p-value, the one that decided
-        decided = [gate for gate in verdict.gates if gate.passed is False and gate.name != "shape"]
-        gate = decided[0] if decided else verdict.gates[0]
+        gate = next((gate for gate in judged if gate.passed is False), judged[0])
         items.append(
             (number(gate.statistic), f"p of the {gate.name}; a fit has at least {number(gate.limit)}")
         )

@@ -34,6 +34,7 @@ from discrepancy.report.check_tables import (
 )
 from discrepancy.report.content import ReportInput
 from discrepancy.report.figures import draw, report_figures
+from discrepancy.report.findings import add_verdict
 from discrepancy.report.grounds import add_gates
 from discrepancy.report.page import render_report
 from discrepancy.report.parameter_table import parameter_rows
@@ -359,6 +360,21 @@ def test_gates_say_what_they_compare(drag: Investigation) -> None:
         assert f"p = {gate.statistic:.2g}</td>" in text
         assert f"p at least {gate.limit:g}</td>" in text
     assert f"at most {shape.limit:g} nat</td>" in text
+
+
+def test_the_gate_that_decided_stands_out_where_the_absolute_fit_could_not_be_judged(
+    drag: Investigation,
+) -> None:
+    absolute, shape, consistency = drag.verdict.gates
+    gates = (
+        replace(absolute, passed=None, statistic=float("nan")), shape,
+        replace(consistency, passed=False, statistic=2e-5),
+    )  # fmt: skip
+    verdict = replace(drag.verdict, kind=VerdictKind.UNEXPLAINED, effects=(), gates=gates)
+    page = Page("a", "b")
+    page.add_section("c")
+    add_verdict(page, ReportInput(replace(drag, verdict=verdict, proof=None), ORIGIN))
+    assert "p of the consistency; a fit has at least 0.001" in page.render()
 
 
 def test_a_reader_sees_which_trial_is_held_out(drag: Investigation) -> None:
