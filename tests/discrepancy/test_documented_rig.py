@@ -12,9 +12,11 @@ import pytest
 from discrepancy.campaign_file import read_campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
+from discrepancy.look_alikes import look_alike_remark
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.verdict import VerdictKind
+from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import checked, investigate, without_port
+from fe.patch import ModelPatch
 
 PAGE = Path(__file__).parents[2] / "docs" / "rig_in_ten_minutes.md"
 RIVALS = ("coulomb_friction", "structural_damping", "quadratic_damping", "clock_error")
@@ -54,6 +56,17 @@ def test_without_a_port_the_remark_is_the_one_shown(text: str, rig: Path) -> Non
     campaign, faults = checked(read_campaign(rig / "my_rig"), model)
     assert faults == ()
     (remark,) = without_port(Setting(campaign, model, model.scales(campaign)), library())
+    assert f"Note: {remark}" in text
+
+
+def test_with_the_port_the_remark_on_look_alikes_is_the_one_shown(text: str, rig: Path) -> None:
+    model = LumpedModel.load(rig / "with_port.toml")
+    campaign, _ = checked(read_campaign(rig / "my_rig"), model)
+    setting = Setting(campaign, model, model.scales(campaign))
+    able = [effect for effect in library() if effect.unavailable(setting) is None]
+    (friction,) = (effect for effect in able if effect.identifier == "coulomb_friction")
+    named = NamedEffect(friction.identifier, friction.name, "slide", friction.family, (), (), ModelPatch())
+    remark = look_alike_remark(Verdict(VerdictKind.NAMED, "-", 1.0, 1.0, effects=(named,)), able)
     assert f"Note: {remark}" in text
 
 
