@@ -17,7 +17,7 @@ from scipy.stats import chi2, f
 
 from fe.patch import SENSORS
 
-from .campaign import TrialKind
+from .campaign import Quantity, TrialKind
 from .candidate import Candidate, Term
 from .fitting import Fit, trial_block
 from .problem import Problem, TrialData
@@ -279,7 +279,7 @@ def _by_run(problem: Problem) -> dict[str, Direction]:
         quantities = [problem.campaign.channels[name].quantity for name in data.trial.channels]
         for quantity in sorted(set(quantities)):
             columns = np.array([item is quantity for item in quantities])
-            zero = np.broadcast_to(columns * data.deviation[columns].mean(), data.weight.shape)
+            zero = np.broadcast_to(columns * _scale(problem, quantity), data.weight.shape)
             where = f"in run {data.trial.run}" if data.trial.run else "in the runs without a label"
             found.setdefault(f"the zero of {quantity.value} {where}", {})[number] = zero
     return dict(found)
@@ -289,13 +289,14 @@ def _by_channel(problem: Problem, fit: Fit, channel: str) -> dict[str, Direction
     """Return the size of a channel's response by kind of trial and load place, and its drift."""
     found: dict[str, dict[int, FloatArray]] = {}
     last = max(abs(data.trial.start) for data in problem.trials) or 1.0
+    scale = _scale(problem, problem.campaign.channels[channel].quantity)
     for number, data in enumerate(problem.trials):
         if channel not in data.trial.channels:
             continue
         column = data.trial.channels.index(channel)
         size, drift = np.zeros(data.weight.shape), np.zeros(data.weight.shape)
         size[:, column] = _response(problem, fit, number)[:, column]
-        drift[:, column] = data.deviation[column] * data.trial.start / last
+        drift[:, column] = scale * data.trial.start / last
         static = data.trial.kind is TrialKind.STATIC
         where = f"under load at {_place(data)}" if static else f"in the trials {data.trial.kind.value}"
         found.setdefault(f"the size {where}", {})[number] = size
@@ -309,6 +310,12 @@ def _response(problem: Problem, fit: Fit, number: int) -> FloatArray:
     if trial.kind is TrialKind.STATIC:  # temperature and the offset of a run are no response to the load
         response = response - response[np.argmin(np.abs(trial.force))]
     return np.asarray((1.0 + problem.shared.gains(fit.point.shared, trial.channels)) * response)
+
+
+def _scale(problem: Problem, quantity: Quantity) -> float:
+    """Return a size for zeros, the same in all trials, however noisy each was."""
+    channels = problem.campaign.channels.values()
+    return min(problem.noise[item.name].static_deviation for item in channels if item.quantity is quantity)
 
 
 def _place(data: TrialData) -> str:

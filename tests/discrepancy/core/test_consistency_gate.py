@@ -14,6 +14,8 @@ from discrepancy.candidate import Candidate, Term
 from discrepancy.catalogue.entry import Setting
 from discrepancy.consistency_gate import (
     CONSISTENCY_LEVEL,
+    _by_channel,
+    _by_run,
     consistency_gate,
     consistency_tests,
     score_tests,
@@ -145,6 +147,26 @@ def test_a_run_with_another_zero_is_seen(kit) -> None:  # type: ignore[no-untype
     tests = consistency_tests(whole, fitted(whole, kit.offset_effect(), "y1"))
     (zeros,) = (test for test in tests if test.name == "zeros of the static runs")
     assert zeros.strongest.startswith("the zero of displacement in the runs without a label (")
+
+
+def test_a_zero_that_moves_is_as_large_in_a_noisy_trial(kit) -> None:  # type: ignore[no-untyped-def]
+    """The second ring-down has 1.5 times the noise; two static trials of one run have other channels."""
+    problem = changed(kit.closed_problem(seed=4, effect=0.5))
+    assert {data.trial.noise_factor for data in problem.trials} == {1.0, 1.5}
+    directions = _by_channel(problem, fitted(problem, kit.offset_effect(), "y1"), "y1")
+    starts = {n: data.trial.start for n, data in enumerate(problem.trials)}
+    assert len(set(starts.values())) == 4
+    drift = {n: column.max() for n, column in directions["the zero over time"].items()}
+    assert drift == pytest.approx({n: drift[3] * start / starts[3] for n, start in starts.items()})
+
+    channels = dict(problem.campaign.channels)
+    channels["y3"] = replace(channels["y3"], noise=NoiseRecord(0.1, inf))
+    first, second, *others = (replace(trial, run="A") for trial in problem.campaign.trials)
+    kept = {"channels": second.channels[1:], "values": second.values[:, 1:], "used": second.used[:, 1:]}
+    assert "y3" not in kept["channels"]
+    campaign = replace(problem.campaign, channels=channels, trials=(first, replace(second, **kept), *others))
+    (zeros,) = _by_run(Problem(campaign, problem.model, problem.setting)).values()
+    assert {float(value) for column in zeros.values() for value in column.ravel()} == {0.02}
 
 
 def test_what_fails_the_gate_is_not_named(kit) -> None:  # type: ignore[no-untyped-def]
