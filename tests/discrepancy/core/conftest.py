@@ -75,12 +75,13 @@ class ClosedForm:
     ) -> Response:
         columns = [OUTPUTS.index(output) for output, _ in outputs]
         theta = conditions.parameters
-        if trial.kind is TrialKind.STATIC:
-            values = sum(theta[p] * np.outer(trial.force ** (p + 1), STATIC_SHAPES[p]) for p in range(2))
+        if not trial.is_dynamic:
+            force = trial.load_factor if trial.kind is TrialKind.FLIGHT else trial.force
+            values = sum(theta[p] * np.outer(force ** (p + 1), STATIC_SHAPES[p]) for p in range(2))
             if self.bent:
                 values = values * (1.0 + conditions.health @ HEALTH_SHAPES)
             else:
-                values = values + np.outer(trial.force, np.ones(3)) * (conditions.health @ HEALTH_SHAPES)
+                values = values + np.outer(force, np.ones(3)) * (conditions.health @ HEALTH_SHAPES)
             return Response(np.asarray(values)[:, columns])
         assert trial.release is not None
         rate, zero = conditions.clock

@@ -29,8 +29,8 @@ from discrepancy.verdict import VerdictKind
 STATIONS = {"y1": 0.2, "y2": 0.6, "y3": 0.9}
 
 
-def changed(problem, *, record=None, size=None, shift=0.0, place="middle"):  # type: ignore[no-untyped-def]
-    """Return the problem with stations, its second static trial under another load place.
+def changed(problem, *, record=None, size=None, shift=0.0, place="middle", flight=False):  # type: ignore[no-untyped-def]
+    """Return the problem with stations, its second static trial under another load place or in flight.
 
     `record` replaces the channels' noise records; `size` multiplies the readings of channels in that trial,
     `shift` is added to all of them.
@@ -45,6 +45,10 @@ def changed(problem, *, record=None, size=None, shift=0.0, place="middle"):  # t
         if trial.kind is TrialKind.STATIC and trial.run == "B":
             values = trial.values * [(size or {}).get(key, 1.0) for key in trial.channels] + shift
             trial = replace(trial, load_place=place, values=values)
+            if flight:
+                trial = replace(
+                    trial, kind=TrialKind.FLIGHT, load_factor=trial.force, force=0.0 * trial.force
+                )
         trials.append(trial)
     campaign = replace(campaign, channels=channels, trials=tuple(trials))
     return Problem(campaign, problem.model, Setting(campaign, problem.model, problem.model.scales(campaign)))
@@ -129,6 +133,25 @@ def test_a_load_that_differs_by_place_is_seen(kit) -> None:  # type: ignore[no-u
     assert gate.passed is False
     assert gate.statistic < CONSISTENCY_LEVEL
     assert "static loads" in gate.reason
+
+
+def test_a_slope_of_the_load_over_the_span_is_seen_in_flight(kit) -> None:  # type: ignore[no-untyped-def]
+    """Lift 4 % too small inboard and too large outboard, which a size alone does not hold."""
+    truth = kit.closed_problem(seed=4, effect=0.5, samples=1500)
+    right = changed(truth, flight=True)
+    found = fitted(right, kit.offset_effect(), "y1")
+    names = [test.name for test in consistency_tests(right, found)]
+    assert names == ["static loads", "loads of flight", "zeros of the static runs", "channel y1"]
+    assert consistency_gate(right, found).passed
+    middle = np.mean(list(STATIONS.values()))
+    slope = {name: 1.0 + 0.12 * (station - middle) for name, station in STATIONS.items()}
+    wrong = changed(truth, flight=True, size=slope)
+    found = fitted(wrong, kit.offset_effect(), "y1")
+    assert absolute_gate(wrong, found).passed
+    gate = consistency_gate(wrong, found)
+    assert gate.passed is False
+    assert "loads of flight" in gate.reason
+    assert "the slope over the span in flight" in gate.reason
 
 
 def test_a_run_with_another_zero_is_seen(kit) -> None:  # type: ignore[no-untyped-def]
