@@ -80,7 +80,8 @@ def size_sentence(
     if not parts:
         return ""
     words = "In SI units" if named else "In SI units, were it the most probable member, which is not named"
-    return f"{words}: {'; '.join(parts)}; 90 % intervals in brackets."
+    brackets = "; 90 % intervals in brackets" if any(" to " in part for part in parts) else ""
+    return f"{words}: {'; '.join(parts)}{brackets}."
 
 
 def _words(parameter: str, primitive: Primitive) -> str:
