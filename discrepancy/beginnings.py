@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from .candidate import Candidate, Term
-from .catalogue.entry import Effect
+from .catalogue.entry import Effect, Setting
 from .errors import FitError, ModelError
 from .fitting import Fit, fit, objective
 from .gates import absolute_gate
@@ -68,6 +68,11 @@ class Beginnings:
         """Take time steps so many times smaller than the model's own."""
         if "short" in self.__dict__:
             self.short.refinement = refinement
+
+    def set_up(self, setting: Setting) -> None:
+        """Build effects for another setting."""
+        if "short" in self.__dict__:
+            self.short.setting = setting
 
     def scan(self, base: Fit, effects: Iterable[Effect]) -> list[Fit]:
         """Fit effects in addition to those of `base`, beginnings first; return the most promising ones."""

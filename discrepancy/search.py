@@ -1,12 +1,12 @@
 """The search for the set of effects that explains a campaign: screen, fit, add, take away, try pairs."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.patch import ModelPatch
+from fe.patch import MicroSlip, ModelPatch
 
 from .beginnings import CLOSE, PROMISING, SHORT_STEPS, Beginnings
 from .candidate import Candidate
@@ -39,7 +39,10 @@ SOLVER_SHARE, FINEST = 0.1, 8
 """Largest share of the noise that the time steps may cost (rms over a channel of a trial), and how much
 smaller than the model's own they may become for it."""
 REFITTED = 3
-"""Candidates that are fitted again with smaller steps."""
+"""Candidates that are fitted again with smaller steps or more elements."""
+FINE_JOINT = 96
+"""Elements of joints that slip in what is named. Fewer serve the search; but along the ridge of slip force
+and stiffness the misfit of few elements has dents of its own, which would count as knowledge."""
 DELIVERED = 0.7
 """Share of the screened gain that chord steps must reach."""
 FAR = 1.5
@@ -176,6 +179,7 @@ class Search(Hypotheses):
         if ranked and absolute_gate(self.problem, self.best()).passed is False and self._misfits(self.none):
             self._relatives()
         self._settle_steps()
+        self._settle_joints()
         self._families()
         current = self.best()
         if current.candidate.is_family:  # a second effect beside a law that is free would be anything
@@ -191,6 +195,7 @@ class Search(Hypotheses):
         if not absolute_gate(self.problem, self.best()).passed and len(self.effects) > 1:
             self.fit_pairs()
         self._deletions()
+        self._settle_joints()
         self._settle_steps()
 
     def _relatives(self) -> None:
@@ -247,6 +252,23 @@ class Search(Hypotheses):
                     except (FitError, ModelError):  # the rough one stands
                         continue
                     self.exact[key_of(item.candidate)] = again
+
+    def _settle_joints(self) -> None:
+        """Divide a joint that slips more finely where the best candidate has one; fit the best ones again."""
+        setting = self.problem.setting
+        if setting.joint_elements >= FINE_JOINT or not _slips(self.problem, self.best()):
+            return
+        ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))
+        self.problem.setting = replace(setting, joint_elements=FINE_JOINT)
+        self.beginnings.set_up(self.problem.setting)
+        for item in [item for item in ranked if _slips(self.problem, item)][:REFITTED]:
+            try:
+                again = fit(self.problem, item.candidate, item.point)
+            except (FitError, ModelError):  # the rough one stands
+                continue
+            self.exact[key_of(item.candidate)] = again
+        if _slips(self.problem, self.best()):
+            self.keep(around(self.problem, self.best()), exact=True)
 
     def _extended(self, current: Fit) -> Fit | None:
         """Return a better set with one more effect, or None."""
@@ -324,6 +346,12 @@ def search(problem: Problem, effects: Sequence[Effect]) -> Search:
     found = Search(problem, usable, none)
     found.run()
     return found
+
+
+def _slips(problem: Problem, found: Fit) -> bool:
+    """Whether a fit has a joint that slips."""
+    patch = found.candidate.patch(problem.setting, found.point.effect) if found.candidate.terms else ()
+    return any(isinstance(item, MicroSlip) for item in patch)
 
 
 def solver_share(problem: Problem, fit: Fit) -> float:

@@ -113,11 +113,15 @@ class ShapeParameter:
 
 @dataclass(frozen=True)
 class Setting:
-    """Where an effect is to be built: campaign, model, natural scales."""
+    """Where an effect is to be built: campaign, model, natural scales.
+
+    `joint_elements` is how many elements stand for the continuous distribution of a joint that slips.
+    """
 
     campaign: Campaign
     model: Model
     scales: Scales
+    joint_elements: int = 24
 
 
 Build = Callable[[Setting, Mapping[str, float], str], ModelPatch]

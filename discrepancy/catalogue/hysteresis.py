@@ -15,10 +15,9 @@ from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting,
 from fe.patch import BoucWen, MicroSlip, ModelPatch
 
 FAMILY = "rate-independent hysteresis"
-ELEMENTS = 24
-"""Jenkins elements of a joint. At chi = -0.5 the loss of a cycle is that of a continuous distribution within
-2 % from a twentieth of the largest slip displacement on and within 13 % at a hundredth; at chi = -0.2
-within 6 % and 73 %."""
+# With 24 Jenkins elements and chi = -0.5 the loss of a cycle is that of a continuous distribution within 2 %
+# from a twentieth of the largest slip displacement on and within 13 % at a hundredth; at chi = -0.2 within
+# 6 % and 73 %. What is named has more of them (`search.FINE_JOINT`).
 
 
 def _micro_slip(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
@@ -27,7 +26,7 @@ def _micro_slip(setting: Setting, values: Mapping[str, float], place: str) -> Mo
     if stiffness == 0.0:
         return ModelPatch()  # a joint without stiffness of its own carries nothing that could slip
     slip_force = values["slip_ratio"] * stiffness * scale.displacement
-    return ModelPatch((MicroSlip(place, slip_force, stiffness, values["chi"], ELEMENTS),))
+    return ModelPatch((MicroSlip(place, slip_force, stiffness, values["chi"], setting.joint_elements),))
 
 
 def _bouc_wen(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
