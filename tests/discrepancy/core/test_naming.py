@@ -14,6 +14,7 @@ from discrepancy.fitting import fit
 from discrepancy.gates import SHAPE_GAIN
 from discrepancy.hypotheses import key_of
 from discrepancy.naming import _open, name
+from discrepancy.search import FINE_JOINT
 from discrepancy.verdict import Verdict, VerdictKind
 from fe.patch import ModelPatch, PowerDamping
 
@@ -72,6 +73,24 @@ def test_an_effect_is_named_with_intervals_that_hold_it(small, effects, catalogu
         assert abs(truth - middle) <= 2.0 * half + 0.005 * abs(truth), estimate
     assert fit.candidate.identifiers == (identifier,)
     assert sum(found.set_probabilities().values()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("slip_ratio", [0.3, 1.5])
+def test_a_joint_that_slips_is_named_with_many_elements(small, catalogue, slip_ratio: float) -> None:  # type: ignore[no-untyped-def]
+    """A joint of 400 elements; with few of its own the model would take their dents for knowledge."""
+    values = {"stiffness_share": 0.3, "slip_ratio": slip_ratio}
+    (joint,) = small.patch("joint_micro_slip", values, "joint")
+    problem = small.problem(small.measured(5, ModelPatch((replace(joint, element_count=400),))))
+    laws = [item for item in catalogue if item.family == "rate-independent hysteresis"]
+    verdict, _, _ = name(problem, laws)
+    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
+    (effect,) = verdict.effects
+    assert effect.identifier == "joint_micro_slip"
+    (found,) = effect.patch
+    assert found.element_count == FINE_JOINT
+    for estimate in effect.parameters:
+        middle, half = 0.5 * (estimate.low + estimate.high), 0.5 * (estimate.high - estimate.low)
+        assert abs(values[estimate.name] - middle) <= 2.0 * half, estimate
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
