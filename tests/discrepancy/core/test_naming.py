@@ -93,6 +93,16 @@ def test_a_joint_that_slips_is_named_with_many_elements(small, catalogue, slip_r
         assert abs(values[estimate.name] - middle) <= 2.0 * half, estimate
 
 
+def test_a_law_that_has_become_another_one_is_not_named(small, catalogue) -> None:  # type: ignore[no-untyped-def]
+    """A joint that slips at a ten-thousandth of its motion is a soft one; micro-slip alone fits it."""
+    soft = small.patch("joint_micro_slip", {"stiffness_share": 0.2, "slip_ratio": 1e-4}, "joint")
+    problem = small.problem(small.measured(11, soft))
+    alone = [item for item in catalogue if item.identifier == "joint_micro_slip"]
+    verdict, _, _ = name(problem, alone)
+    assert verdict.kind is VerdictKind.UNEXPLAINED, verdict.sentence
+    assert "slip_ratio of joint_micro_slip beside its prior" in verdict.sentence
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
 def test_nothing_is_missing_where_nothing_is(small, catalogue, seed: int) -> None:  # type: ignore[no-untyped-def]
     """With the whole catalogue."""
