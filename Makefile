@@ -45,8 +45,8 @@ fmu: $(VENV)/.runtime ## Build the wing as an FMU into runs/wing.fmu
 
 .PHONY: lock
 lock: $(VENV)/.dev ## Renew both lock files from pyproject.toml
-	$(BIN)/pip-compile -q --generate-hashes --strip-extras --allow-unsafe --no-emit-index-url --no-emit-trusted-host --no-emit-find-links --no-header --upgrade --extra build -o requirements.lock pyproject.toml
-	$(BIN)/pip-compile -q --generate-hashes --strip-extras --allow-unsafe --no-emit-index-url --no-emit-trusted-host --no-emit-find-links --no-header --extra build --extra dev -c requirements.lock -o requirements-dev.lock pyproject.toml
+	$(BIN)/pip-compile -q --upgrade --extra build -o requirements.lock pyproject.toml
+	$(BIN)/pip-compile -q --extra build --extra dev -c requirements.lock -o requirements-dev.lock pyproject.toml
 
 .PHONY: clean
 clean: ## Remove .venv, runs and caches of this folder

@@ -31,8 +31,6 @@ SHORT_STEPS, FAR_STEPS = 12, 6
 """Steps on the beginnings, and then on whole records, before candidates are compared."""
 FAR_FITS, FAR_EXTENSIONS = 6, 4
 """Candidates that go on from the beginnings to whole records: single effects, and longer sets."""
-
-
 RELATED_LEVELS = {1: 5, 2: 5, 3: 5, 4: 3}
 """Levels of each parameter, by their number, at which relatives of a fitted effect are tried."""
 RELATED_STARTS = 2
@@ -142,8 +140,9 @@ class Beginnings:
                 places = (term.place,)
             best = None
             for place in places if len(places) <= FEW_PLACES else ():
-                for start in self._tried(found, Candidate((Term(effect, place),))):
-                    item = self._fitted(Candidate((Term(effect, place),)), start)
+                candidate = Candidate((Term(effect, place),))
+                for start in self._tried(found, candidate):
+                    item = self._fitted(candidate, start)
                     if item is not None and (best is None or item.objective < best.objective):
                         best = item
             if best is not None:

@@ -183,6 +183,7 @@ class Search(Hypotheses):
         self._families()
         current = self.best()
         if current.candidate.is_family:  # a second effect beside a law that is free would be anything
+            self._settle_joints()
             self._settle_steps()
             return
         while current.candidate.terms and len(current.candidate.terms) < LARGEST_SET:
