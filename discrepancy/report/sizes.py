@@ -54,7 +54,7 @@ def si_sizes(
         known = isfinite(item.low) and isfinite(item.high) and item.low < item.high
         show = rounded(item.value, 0.5 * (item.high - item.low) if known else 0.0)
         between = f" ({show(item.low)} to {show(item.high)})" if known else ""
-        words = _words(item.parameter, primitive)
+        words = _words(item.parameter, primitive, unit)
         text = (
             f"{words} {show(item.value)} {unit}{between}{_where(primitive, item.parameter, model, campaign)}"
         )
@@ -84,10 +84,11 @@ def size_sentence(
     return f"{words}: {'; '.join(parts)}{brackets}."
 
 
-def _words(parameter: str, primitive: Primitive) -> str:
+def _words(parameter: str, primitive: Primitive, unit: str) -> str:
+    words = parameter.replace("_", " ")
     if parameter == "coefficient" and primitive.kind in ("power_damping", "power_stiffness"):
-        return "force"
-    return parameter.replace("_", " ")
+        words = "force"
+    return words.replace("force", "moment") if unit == "N m" else words  # at a port that turns
 
 
 def _where(primitive: Primitive, parameter: str, model: Model, campaign: Campaign) -> str:

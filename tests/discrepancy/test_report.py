@@ -22,6 +22,7 @@ from discrepancy.errors import FitError, ModelError
 from discrepancy.examples import example_campaign, plan_for
 from discrepancy.model_choice import ModelKind, choose_model
 from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.wing import WingModel
 from discrepancy.naming import named_effects
 from discrepancy.patch_file import primitive_intervals, read_patch
 from discrepancy.report.check_tables import (
@@ -315,6 +316,13 @@ def test_sizes_have_the_unit_of_their_port_or_channel(
     patch = ModelPatch((primitive,))
     found = si_sizes(patch, primitive_intervals(patch), drag.model, drag.campaign)
     assert re.sub(r"(\d\.\d*?)0+(?= )", r"\1", found) == re.sub(r"(\d\.\d*?)0+(?= )", r"\1", text)
+
+
+def test_a_port_that_turns_has_a_moment(drag: Investigation) -> None:
+    wing = WingModel.shipped()
+    for port, text in (("root", "moment 0.500 N m"), ("tip", "force 0.500 N")):
+        patch = ModelPatch((PowerDamping(port, 0.5, 0.0, 0.0, 1.0, 1.0),))
+        assert si_sizes(patch, primitive_intervals(patch), wing, drag.campaign) == text
 
 
 def test_the_headline_size_is_that_of_the_patch(drag: Investigation) -> None:
