@@ -88,7 +88,8 @@ class StiffnessDrift(Primitive):
 # Each acts against the motion x of a port (displacement [m] or rotation [rad]): -F on x, F in N or N m.
 # Ports of the wing: "root" (flapping rotation of the root), "tip" (upward displacement of the tip's load
 # point), "span" (upward displacement of all stations, weighted by the share of planform area; the weights
-# sum to one). A lumped model declares its own.
+# sum to one), "planform" (the law acts at every place on the place's own upward displacement, with a force by
+# the place's share of the area: `fe.planform_forces`). A lumped model declares its own.
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,6 +336,8 @@ PRIMITIVES: dict[str, type[Primitive]] = {
 
 STRUCTURE = (PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature)
 """Primitives that change the linear structure: it is solved anew."""
+PortForce = PowerDamping | PowerStiffness | FreePlay | MicroSlip | BoucWen
+"""Primitives that act at a port."""
 INTERNAL_FORCES = (PowerDamping, PowerStiffness, FreePlay, MicroSlip, BoucWen, StiffnessDrift)
 """Primitives that act as forces inside the structure while it moves."""
 LOADS = (LoadPlace, LoadGain, Washout, InertiaRelief)

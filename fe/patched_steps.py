@@ -93,7 +93,7 @@ class PatchedSteps:
         self._state = (young_modulus_factor, stiffness_loss, servo_mass, pitot_mass)
         self._rayleigh = damping_alpha, damping_beta
         self._loads = patch.of(*LOADS)
-        self._laws: Laws = laws_of(patch, PORTS)
+        self._laws: Laws = laws_of(wing.internal_forces(patch), wing.port_rows)
         self._patched = wing.structure(*self._state, patch, temperature)
         arrays = wing.arrays
         factors = wing.strain_factors(patch)
@@ -107,8 +107,8 @@ class PatchedSteps:
         self._units = np.vstack(
             (wing.load_parts(patch.of(*LOADS, PointMass)), wing.force_row(LOAD_PLACE, self._loads))
         )
-        ports = {name: wing.port_row(name) for name in PORTS}
-        self._port_rows = self._laws.rows(ports, wing.size)
+        self._held_ports = wing.held_ports(self._laws.ports)
+        self._port_rows = self._laws.rows(wing.port_rows, wing.size)
 
     def _acting(self, load_factor: float, tip_force: float) -> FloatArray:
         """Factors (3,) of the patched unit loads: load factor, its square, force at the load point."""
@@ -184,7 +184,7 @@ class PatchedSteps:
 
     def _modes_of(self, structure: PatchedStructure) -> _Modes:
         arrays = self._wing.arrays
-        held = np.vstack((arrays.load_tip, *(self._wing.port_row(name) for name in PORTS)))
+        held = np.vstack((arrays.load_tip, *self._held_ports.values()))
         solutions = structure.static(held.T)
         basis = motion_basis(structure.static, structure.mass, arrays.start_shapes, solutions)
         # M x = K x / w^2: the low modes are the largest eigenvalues, which keep all their digits
@@ -208,15 +208,16 @@ class PatchedSteps:
     def _system(self) -> ModalSystem:
         alpha, beta = self._rayleigh
         omega = self._modes.frequency
-        rows = np.stack([self._wing.port_row(name) for name in PORTS])
+        names = self._held_ports
+        rows = np.stack(list(names.values()))
         modal = rows @ self._modes.shapes
         whole = np.einsum("pn,np->p", rows, self._patched.static(rows.T))
         left_out = whole - np.sum((modal / omega) ** 2, axis=1)
         return ModalSystem(
             omega,
             np.diag(alpha + beta * omega**2),
-            dict(zip(PORTS, modal, strict=True)),
-            np.where(left_out > 1e-9 * whole, left_out, 0.0),
+            dict(zip(names, modal, strict=True)),
+            np.where((left_out > 1e-9 * whole) & [name in PORTS for name in names], left_out, 0.0),
             beta,
         )
 

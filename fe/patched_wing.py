@@ -16,28 +16,35 @@ import numpy.typing as npt
 from .errors import InvalidPatchError
 from .local_loss import boxes_of, remaining_skin, strain_factors
 from .patch import (
+    INTERNAL_FORCES,
     InertiaRelief,
     LoadPlace,
     ModelPatch,
     ModulusTemperature,
     PointMass,
+    PortForce,
     RootCompliance,
     Washout,
 )
 from .patch_arrays import PatchArrays
+from .planform_forces import PLANFORM, STATION_PORTS, PlanformStations, at_stations, planform_stations
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Place = str | tuple[float, float]
 
-PATCH_RUNTIME_FILES = ("patch.py", "patch_arrays.py", "local_loss.py", "patched_wing.py")
+PATCH_RUNTIME_FILES = (
+    "patch.py", "patch_arrays.py", "local_loss.py", "planform_forces.py", "patched_wing.py",
+)  # fmt: skip
 """Files of this package that evaluate a wing with changes, besides `fe.reduced.RUNTIME_FILES`."""
 LOAD_PLACE = "tip_load"
 """Name of the place of the static test."""
 OVERHANG = 0.15
 """How far beyond the tip a place may lie, as a share of the semi-span."""
 PORTS = ("root", "tip", "span")
-"""Ports where internal forces act."""
+"""Ports where internal forces act on the motion of one place, or of the mean."""
+KNOWN_PORTS = (*PORTS, PLANFORM)
+"""All places that an internal force may name."""
 _STRAIN = re.compile(r"strain\[(\d+)\]")
 _NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
 _DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
@@ -397,15 +404,60 @@ class PatchedWing:
                 parts[0] -= STANDARD_GRAVITY * item.mass * (self._along(item.station) @ arrays.line_rows[2])
         return parts
 
+    @cached_property
+    def planform(self) -> PlanformStations:
+        """Stations of forces that are spread over the planform."""
+        arrays = self.arrays
+        return planform_stations(arrays.semi_span, arrays.root_chord, arrays.tip_chord)
+
+    def internal_forces(self, patch: ModelPatch) -> ModelPatch:
+        """Return the internal forces of a patch by the ports of `port_row`, those of the planform by station.
+
+        Raises
+        ------
+        InvalidPatchError
+            If a force acts at a place that the wing does not have.
+        """
+        forces = patch.of(*INTERNAL_FORCES)
+        for item in forces:
+            if isinstance(item, PortForce) and item.port not in KNOWN_PORTS:
+                raise InvalidPatchError(
+                    f"The primitive {item.kind!r} acts on the port {item.port!r}, which this model does not "
+                    f"have; it has {', '.join(KNOWN_PORTS)}."
+                )
+        return at_stations(forces, self.planform.share)
+
+    @cached_property
+    def port_rows(self) -> dict[str, FloatArray]:
+        """Rows (n,) of all ports of `internal_forces`: `PORTS`, then the stations of the planform."""
+        return {name: self.port_row(name) for name in (*PORTS, *STATION_PORTS)}
+
+    def held_ports(self, ports: tuple[str, ...]) -> dict[str, FloatArray]:
+        """Return the rows (n,) of the ports whose static shapes a motion with forces on `ports` holds.
+
+        They are `PORTS`, and the stations of the planform where forces act on these.
+        """
+        spread = any(port in STATION_PORTS for port in ports)
+        return {name: row for name, row in self.port_rows.items() if spread or name in PORTS}
+
     def port_row(self, name: str) -> FloatArray:
-        """Return the row (n,) of a port: "root" [rad], "tip" or "span" [m]; raises `InvalidPatchError`."""
+        """Return the row (n,) of a port: "root" [rad], "tip", "span" or a station of the planform [m].
+
+        Raises
+        ------
+        InvalidPatchError
+            If there is no such port.
+        """
         if name == "root":
             return self.arrays.flap_row
         if name == "tip":
             return self.arrays.load_tip
         if name == "span":
             return np.asarray(self.arrays.station_weights @ self.arrays.line_rows[2])
-        raise InvalidPatchError(f"The wing has no port {name!r}; it has {', '.join(PORTS)}.")
+        if name in STATION_PORTS:
+            distance = float(self.planform.distance[STATION_PORTS.index(name)])
+            return np.asarray(self._along(distance) @ self.arrays.line_rows[2])
+        raise InvalidPatchError(f"The wing has no port {name!r}; it has {', '.join(KNOWN_PORTS)}.")
 
     def output_row(self, name: str, component: int = 0, patch: ModelPatch = EMPTY) -> FloatArray | None:
         """Return the row (n,) of an output, None if there is no such output.

@@ -37,6 +37,7 @@ STRUCTURE_FILES = (
     "motion.py",
     "motion_kernel.py",
     "local_loss.py",
+    "planform_forces.py",
     "patch_arrays.py",
     "patched_wing.py",
     "patched_steps.py",

@@ -211,6 +211,7 @@ def quadratic_damping(generator: np.random.Generator, bench: Bench) -> Hidden:
     cube = float(bench.strip_shares @ np.abs(bench.strip_motion) ** 3)
     drag = at_free * bench.port_motion["tip"] ** 3 / cube
     values = {f"{truth}@{port}": drag * cube / motion**3 for port, motion in bench.port_motion.items()}
+    values[f"{truth}@planform"] = drag
     return Hidden("quadratic_damping", Changes(drag=drag), values, "span")
 
 
@@ -235,6 +236,7 @@ def spread_cubic_stiffness(generator: np.random.Generator, bench: Bench) -> Hidd
     spread = at_tip * bench.port_motion["tip"] ** 4 / fourth
     truth = "cubic_stiffness.coefficient"
     values = {f"{truth}@{port}": spread * fourth / m**4 for port, m in bench.port_motion.items()}
+    values[f"{truth}@planform"] = spread
     return Hidden("cubic_stiffness", Changes(spread_cubic=spread), values, "span")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,6 @@ FloatArray = NDArray[np.float64]
 
 MODES = 16
 """Modes that move with inertia; records reach 125 Hz, the twelfth mode 143 Hz."""
-STRIPS = 10
 LOAD_POINT, TIP, MIDDLE = range(3)
 
 
@@ -86,23 +84,16 @@ class WingRig:
     def laws(self, changes: Changes) -> tuple[Law, ...]:
         """Return the laws of the forces inside, those that are spread over the wing included."""
         laws = list(changes.laws)
-        for k, share in zip(self.strips, self.area_shares(), strict=True):
+        for k, share in enumerate(self.area_shares().tolist()):
             if changes.drag:
                 laws.append(Law(f"line{k}", DRAG, (changes.drag * share,)))
             if changes.spread_cubic:
                 laws.append(Law(f"line{k}", POWER, (changes.spread_cubic * share, 3.0, 0.0)))
         return tuple(laws)
 
-    @cached_property
-    def strips(self) -> tuple[int, ...]:
-        """Stations of the basis at which forces spread over the wing act."""
-        stations = self.store.basis().stations
-        wanted = np.linspace(stations[0], stations[-1], STRIPS)
-        return tuple(int(np.abs(stations - place).argmin()) for place in wanted)
-
     def area_shares(self) -> FloatArray:
-        """Shares (S,) of the planform's area, by strip; inboard of the first there is more."""
-        stations, plan = self.store.basis().stations[list(self.strips)], self.design.planform
+        """Shares (S,) of the planform's area, by station; inboard of the first there is more."""
+        stations, plan = self.store.basis().stations, self.design.planform
         chord = plan.root_chord + (plan.tip_chord - plan.root_chord) * stations / plan.semi_span
         width = np.zeros(len(stations))
         gaps = np.diff(stations)
@@ -226,4 +217,5 @@ class WingRig:
 
     def line_motion(self, structure: Structure) -> FloatArray:
         """Motion of the first mode (S,) at the stations of the basis."""
-        return np.array([structure.ports[f"line{k}"] @ structure.shapes[:, 0] for k in self.strips])
+        count = len(self.store.basis().stations)
+        return np.array([structure.ports[f"line{k}"] @ structure.shapes[:, 0] for k in range(count)])

@@ -15,6 +15,7 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import PortScale
 from fe.patch import EVERY_CHANNEL, INTERNAL_FORCES, Primitive, StiffnessDrift
+from fe.planform_forces import PLANFORM
 
 Check = Callable[[Setting], str | None]
 Places = Callable[[Setting], tuple[str, ...]]
@@ -159,6 +160,13 @@ def at_ports(*preferred: str) -> Places:
 def _ports(preferred: tuple[str, ...], setting: Setting) -> tuple[str, ...]:
     known = setting.model.ports()
     return tuple(port for port in preferred if port in known) or known
+
+
+def over_the_planform(setting: Setting) -> tuple[str, ...]:
+    """Return the place of a force that is spread over the structure; where it has none, its ports."""
+    if PLANFORM in setting.scales.ports:
+        return (PLANFORM,)
+    return _ports(("span",), setting)
 
 
 def at_gauges(setting: Setting) -> tuple[str, ...]:

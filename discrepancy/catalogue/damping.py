@@ -11,6 +11,9 @@ losses give the equivalent viscous ratio zeta_eq = F_0 B / (pi k A):
 At a stiff port k is far above the stiffness at rest k_0, and a force of k_0 A holds it still: no more than
 0.9 of it is built.
 
+Spread over a wing, F acts at each place by its share w of the area, on the place's motion r x, x the mean's:
+the loss is sum w r^(p + a + 1) times as large.
+
 Where the exponents are free, the loss at the amplitude A is kept, so that they change the shape alone.
 """
 
@@ -27,6 +30,7 @@ from discrepancy.catalogue.building import (
     carried,
     has_port,
     needs,
+    over_the_planform,
     port_scale,
     trial_of,
 )
@@ -44,7 +48,8 @@ def loss_integral(velocity_exponent: float, displacement_exponent: float) -> flo
 def _damping(setting: Setting, values: Mapping[str, float], port: str, equivalent_ratio: float) -> ModelPatch:
     scale = port_scale(setting, port)
     p, a = at_least_zero(values, "velocity_exponent"), at_least_zero(values, "displacement_exponent")
-    force = pi * equivalent_ratio * scale.stiffness * scale.displacement / loss_integral(p, a)
+    loss = loss_integral(p, a) * scale.mean_power(p + a + 1.0)
+    force = pi * equivalent_ratio * scale.stiffness * scale.displacement / loss
     if scale.static_stiffness is not None:  # a stronger one holds a stiff port still
         force = min(force, LARGEST_SHARE * scale.static_stiffness * scale.displacement)
     speed = scale.displacement * scale.angular_frequency
@@ -155,7 +160,7 @@ QUADRATIC_DAMPING = Effect(
     ),
     build=_quadratic,
     shape=_exponents(2.0, 0.0),
-    places=at_ports("span"),
+    places=over_the_planform,
     unavailable=_AVAILABLE,
     confusable=("joint_micro_slip", "structural_damping", "bouc_wen_hysteresis"),
 )

@@ -31,8 +31,9 @@ def _cubic(setting: Setting, values: Mapping[str, float], place: str) -> ModelPa
     scale = port_scale(setting, place)
     # in all trials: a softening that a ring-down bears may leave nothing of the stiffness in flight
     largest = scale.displacement if scale.largest_displacement is None else scale.largest_displacement
-    force = values["stiffening"] * scale.stiffness * largest
     exponent, asymmetry = values["exponent"], values["asymmetry"]
+    # spread over a wing: the force of the first mode
+    force = values["stiffening"] * scale.stiffness * largest / scale.mean_power(exponent + 1.0)
     if asymmetry == 0.0:
         return ModelPatch((PowerStiffness(place, force, exponent, 0, largest),))
     return ModelPatch(

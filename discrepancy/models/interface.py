@@ -55,6 +55,9 @@ class PortScale:
         small part of `stiffness`, and no effect can take away more. None: not known, taken as `stiffness`.
     largest_displacement : float or None
         The largest motion of the port in all trials, flights too [m or rad]. None: taken as `displacement`.
+    spread : tuple of (float, float)
+        Where a force at the port acts: its share, and the motion there over that of the port, by place. A
+        force that is spread over the wing acts on the motion of each place, and A is the mean's.
     """
 
     displacement: float
@@ -62,6 +65,11 @@ class PortScale:
     angular_frequency: float
     static_stiffness: float | None = None
     largest_displacement: float | None = None
+    spread: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
+
+    def mean_power(self, exponent: float) -> float:
+        """Return the mean of |motion / A|^exponent over the places where a force at the port acts."""
+        return sum((share * float(abs(motion) ** exponent) for share, motion in self.spread), 0.0)
 
 
 @dataclass(frozen=True)

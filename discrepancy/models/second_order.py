@@ -52,6 +52,8 @@ class SecondOrderSystem:
         Modes that move; the others follow without inertia.
     relaxation : float
         Factor of the part of the damping that goes with the stiffness, for the modes without inertia [s].
+    on_modes : frozenset of str
+        Ports whose position is that of the modes that move alone.
     """
 
     mass: FloatArray
@@ -60,6 +62,7 @@ class SecondOrderSystem:
     ports: Mapping[str, FloatArray]
     mode_count: int = 8
     relaxation: float = 0.0
+    on_modes: frozenset[str] = frozenset()
 
     @cached_property
     def _modes(self) -> tuple[FloatArray, FloatArray]:
@@ -112,7 +115,8 @@ class SecondOrderSystem:
         rows = np.array(list(self.ports.values()))
         left_out = np.einsum("pn,np->p", rows, self.residual(rows.T))
         whole = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
-        return np.where(left_out > 1e-9 * whole, left_out, 0.0)  # less is rounding
+        flexible = [name not in self.on_modes for name in self.ports]
+        return np.where((left_out > 1e-9 * whole) & flexible, left_out, 0.0)  # less is rounding
 
     def _feed(self, row: FloatArray, laws: Laws) -> FloatArray:
         """Return positions (J,) of the laws' ports by a unit force at a row that the modes leave out."""

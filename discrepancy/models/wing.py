@@ -1,5 +1,6 @@
 """The wing as a model: its reduced structure under patches, in static tests, flights and ring-downs."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ from fe.patch import (
 from fe.patch_arrays import PatchArrays
 from fe.patch_cache import patch_arrays
 from fe.patched_wing import LOAD_PLACE, PORTS, PatchedWing
+from fe.planform_forces import PLANFORM, STATION_PORTS
 from fe.reduced_arrays import PARAMETER_NAMES
 from fe.reduction import Progress
 
@@ -177,6 +179,16 @@ class WingModel:
         ]
         duration = max(ends) - min(begins) if ends else 0.0
         by_first = port_rows @ shape
+        ports = {
+            port: PortScale(
+                float(size) or float(most) or 1.0,
+                first**2 / float(by) ** 2,
+                first,
+                float(still),
+                float(most) or 1.0,
+            )
+            for port, size, by, still, most in zip(PORTS, usual, by_first, at_rest, largest, strict=True)
+        }
         return Scales(
             length=self.wing.span,
             tip_stiffness=1.0 / float(tip @ static.solve(tip)),
@@ -188,17 +200,15 @@ class WingModel:
             ),
             duration=max((float(t.time[-1] - t.time[0]) for t in dynamic), default=1.0),
             campaign_time=duration if duration > 0.0 else 1.0,
-            ports={
-                port: PortScale(
-                    float(size) or float(most) or 1.0,
-                    first**2 / float(by) ** 2,
-                    first,
-                    float(still),
-                    float(most) or 1.0,
-                )
-                for port, size, by, still, most in zip(PORTS, usual, by_first, at_rest, largest, strict=True)
-            },
+            ports=ports | {PLANFORM: self._planform_scale(ports["span"], shape)},
         )
+
+    def _planform_scale(self, mean: PortScale, shape: FloatArray) -> PortScale:
+        """Return the scales of a force over the planform, from those of its mean and the first mode."""
+        share = self.wing.planform.share
+        motion = np.array([self.wing.port_rows[port] @ shape for port in STATION_PORTS])
+        ratio = motion / float(share @ motion)
+        return replace(mean, spread=tuple(zip(share.tolist(), ratio.tolist(), strict=True)))
 
     # ------------------------------------------------------------ response
 
@@ -225,7 +235,7 @@ class WingModel:
         try:
             rows = self._structure.output_rows(outputs, 0, patch.of(LocalStiffnessLoss))
             forces = patch.of(*INTERNAL_FORCES)
-            laws = laws_of(forces, PORTS) if len(forces) else NO_LAWS
+            laws = laws_of(self.wing.internal_forces(forces), self.wing.port_rows) if len(forces) else NO_LAWS
             if not trial.is_dynamic:
                 return self._at_rest(trial, outputs, rows, patch, conditions, laws, components)
             return self._moving(
@@ -265,6 +275,7 @@ class WingModel:
             blocks += [self._structure.output_rows(outputs, number, losses) for number in (1, 2)]
         values = np.empty((size, len(blocks) * len(outputs)))
         place = None if flight else trial.load_place
+        port_rows = laws.rows(self.wing.port_rows, self.wing.size)
         memory: FloatArray | None = None
         before = np.zeros(len(laws))
         start = 0
@@ -275,23 +286,24 @@ class WingModel:
             key = self._structure.stiffness_key(conditions.parameters, (z1, z2), structure, warmer)
             stiffness = self._structure.stiffness(conditions.parameters, (z1, z2), structure, warmer)
             shown, at_ports, flexible, port_flexibility = self._statics.get(
-                (key, place, loads.primitives, outputs, components),
-                lambda stiffness=stiffness: self._structure.static_units(stiffness, place, loads, blocks),  # type: ignore[misc]
+                (key, place, loads.primitives, outputs, components, laws.ports),
+                lambda stiffness=stiffness: self._structure.static_units(  # type: ignore[misc]
+                    stiffness, place, loads, blocks, port_rows
+                ),
             )
             part = amounts[start:end] @ shown
             if len(laws):
-                index = [PORTS.index(port) for port in laws.ports]
-                linear = amounts[start:end] @ at_ports[:, index]
+                linear = amounts[start:end] @ at_ports
                 solution = static_solution(
                     laws,
                     linear,
-                    port_flexibility[np.ix_(index, index)],
+                    port_flexibility,
                     memory=memory,
-                    start=before @ at_ports[:, index] if start else None,
+                    start=before @ at_ports if start else None,
                     kernel=compiled_kernel(),
                 )
                 memory = solution.memory
-                part = part - solution.forces @ flexible[index]
+                part = part - solution.forces @ flexible
             values[start:end] = part
             before, start = amounts[end - 1], end
         count = len(outputs)
@@ -315,7 +327,12 @@ class WingModel:
         z1, z2 = conditions.health[0]
         loads = patch.of(*LOADS)
         basis, system = self._structure.moving(
-            conditions.parameters, (z1, z2), structure, float(trial.temperature[0]), trial.load_place
+            conditions.parameters,
+            (z1, z2),
+            structure,
+            float(trial.temperature[0]),
+            trial.load_place,
+            laws.ports,
         )
         if trial.kind is TrialKind.RINGDOWN:
             if trial.release is None:
@@ -345,7 +362,8 @@ class WingModel:
         empty = ModelPatch()
         if not trial.is_dynamic:
             place = None if trial.kind is TrialKind.FLIGHT else trial.load_place
-            units = self._structure.static_units(static, place, empty, [self._structure.port_rows])[1]
+            port_rows = self._structure.port_rows
+            units = self._structure.static_units(static, place, empty, [port_rows], port_rows)[1]
             return np.asarray(_amounts(trial, empty) @ units)
         row = self.wing.force_row(trial.load_place)
         if trial.kind is TrialKind.FORCED:

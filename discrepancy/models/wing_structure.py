@@ -13,6 +13,7 @@ from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
 from fe.patch import LocalStiffnessLoss, ModelPatch, ModulusTemperature, PointMass, RootCompliance
 from fe.patched_wing import PORTS, PatchedWing, Place, motion_basis, strain_gauge
+from fe.planform_forces import STATION_PORTS
 
 FloatArray = NDArray[np.float64]
 Outputs = tuple[tuple[str, Quantity], ...]
@@ -62,8 +63,7 @@ class WingStructure:
 
     def __init__(self, wing: PatchedWing) -> None:
         self.wing = wing
-        self._ports = {port: wing.port_row(port) for port in PORTS}
-        self.port_rows = np.stack([self._ports[port] for port in PORTS])
+        self.port_rows = np.stack([wing.port_rows[port] for port in PORTS])
         self._stiffnesses, self._systems = Memory(), Memory()
         self._rows = Memory()
 
@@ -143,8 +143,9 @@ class WingStructure:
         structure: ModelPatch,
         temperature: float,
         place: Place,
+        ports: tuple[str, ...] = (),
     ) -> MovingWing:
-        """Return the wing as it moves when released from, or pushed at, a place."""
+        """Return the wing as it moves when released from, or pushed at, a place, with forces at `ports`."""
         key = self.stiffness_key(parameters, health, structure, temperature)
         masses = structure.of(PointMass)
 
@@ -152,27 +153,53 @@ class WingStructure:
             e, servo, pitot, alpha, beta = (float(value) for value in parameters)
             stiffness = self.stiffness(parameters, health, structure, temperature)
             mass = self.wing.structure(e, health, servo, pitot, masses).mass
-            still = stiffness.solve(np.vstack((self.wing.force_row(place), self.port_rows)).T)
+            rows = self.wing.held_ports(ports)
+            still = stiffness.solve(np.vstack((self.wing.force_row(place), *rows.values())).T)
             basis = motion_basis(stiffness.solve, mass, self.wing.arrays.start_shapes, still)
             small_mass, small = basis.T @ mass @ basis, basis.T @ stiffness.matrix @ basis
             small_mass, small = 0.5 * (small_mass + small_mass.T), 0.5 * (small + small.T)
-            ports = {port: row @ basis for port, row in self._ports.items()}
             return MovingWing(
                 basis,
                 SecondOrderSystem(
-                    small_mass, alpha * small_mass + beta * small, small, ports, MODE_COUNT, beta
+                    small_mass,
+                    alpha * small_mass + beta * small,
+                    small,
+                    {port: row @ basis for port, row in rows.items()},
+                    MODE_COUNT,
+                    beta,
+                    frozenset(STATION_PORTS),
                 ),
             )
 
-        return self._systems.get((key, masses.primitives, parameters[1:].tobytes(), place), make)
+        held = tuple(self.wing.held_ports(ports))
+        return self._systems.get((key, masses.primitives, parameters[1:].tobytes(), place, held), make)
 
     def static_units(
-        self, stiffness: Stiffness, place: Place | None, loads: ModelPatch, blocks: list[FloatArray]
+        self,
+        stiffness: Stiffness,
+        place: Place | None,
+        loads: ModelPatch,
+        blocks: list[FloatArray],
+        port_rows: FloatArray,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return outputs (k, C) and port motions (k, 3) of unit loads, and the same of unit port forces."""
+        """Return outputs (k, C) and motions (k, J) of ports of unit loads, and the same of unit port forces.
+
+        Parameters
+        ----------
+        stiffness : Stiffness
+            Of the wing.
+        place : str or tuple of float, optional
+            Of a force of 1 N; left out, the loads are the parts of the lift.
+        loads : ModelPatch
+            What changes them.
+        blocks : list of (C, n) ndarray
+            Rows of outputs.
+        port_rows : (J, n) ndarray
+            Rows of the ports.
+        """
         units = self.wing.load_parts(loads) if place is None else self.wing.force_row(place, loads)[None]
-        answer = stiffness.solve(np.concatenate((units, self.port_rows)).T)
+        answer = stiffness.solve(np.concatenate((units, port_rows)).T)
         shown = np.concatenate([rows @ answer for rows in blocks]).T
-        moved = (self.port_rows @ answer).T
+        moved = (port_rows @ answer).T
         count = len(units)
         return shown[:count], moved[:count], shown[count:], moved[count:]

@@ -63,6 +63,7 @@ EFFECTS: dict[str, tuple[Primitive, ...]] = {
     "friction": (PowerDamping("tip", 3.0, 0.0, 0.0, 1.0, 1.0),),
     "structural_damping": (PowerDamping("tip", 4.0, 0.0, 1.0, 1.0, 0.02),),
     "air": (PowerDamping("span", 1.0, 2.0, 0.0, 0.5, 1.0),),
+    "air_everywhere": (PowerDamping("planform", 1.0, 2.0, 0.0, 0.5, 1.0),),
     "cubic": (PowerStiffness("tip", 40.0, 3.0, 0, 0.02),),
     "crack": (PowerStiffness("root", -200.0, 1.0, -1, 0.01),),
     "play": (FreePlay("tip", 900.0, 0.004),),

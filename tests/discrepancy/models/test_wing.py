@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 
@@ -28,6 +29,7 @@ from fe.patch import (
     ModelPatch,
     ModulusTemperature,
     PointMass,
+    PowerDamping,
     PowerStiffness,
     RootCompliance,
     SensorGain,
@@ -223,6 +225,61 @@ def test_ring_down_is_the_modal_sum_of_all_unknowns(
     late = RING.time > 0.03  # what more than six modes do has died out
     assert np.abs((values - wanted)[late] / scale).max() < 1e-3
     assert np.abs(values - wanted)[:, 3:5].max() < 3e-3 * scale[3]
+
+
+def test_drag_over_the_planform_is_the_integral_over_the_area(
+    model: WingModel, conditions: Conditions
+) -> None:
+    """Against the modes with drag at every station of the mesh, by a general integrator."""
+    drag = 4.0  # N at 1 m/s everywhere
+    stiffness, mass, _ = matrices(model, conditions)
+    square, shapes = eigh(stiffness, mass, subset_by_index=[0, 5])
+    alpha, beta = conditions.parameters[3:]
+    arrays = model.wing.arrays
+    rows = arrays.line_rows[2] @ shapes
+
+    def rates(_: float, state: Any) -> Any:
+        q, v = state[:6], state[6:]
+        speed = rows @ v
+        push = (
+            -(alpha + beta * square) * v
+            - square * q
+            - drag * (arrays.station_weights * np.abs(speed) * speed) @ rows
+        )
+        return np.concatenate((v, push))
+
+    held = np.linalg.solve(stiffness, model.wing.force_row("tip_load"))
+    start = shapes.T @ mass @ (0.03 / float(model.wing.force_row("tip_load") @ held) * held)
+    moved = solve_ivp(
+        rates, (0.0, float(RING.time[-1])), np.concatenate((start, np.zeros(6))), t_eval=RING.time, rtol=1e-9,
+        atol=1e-12,
+    )  # fmt: skip
+    wanted = moved.y[:6].T @ (output_rows(model) @ shapes).T
+
+    def off(port: str, size: float) -> float:
+        patch = ModelPatch((PowerDamping(port, size, 2.0, 0.0, 1.0, 1.0),))
+        values = model.respond(RING, OUTPUTS, patch, conditions).values
+        late = RING.time > 0.03  # what more than six modes do has died out
+        return float(np.abs((values - wanted)[late] / np.abs(wanted).max(axis=0)).max())
+
+    assert off("planform", drag) < 2e-3
+    assert off("planform", 0.0) > 0.1
+
+
+def test_a_force_over_the_planform_has_its_share_in_the_first_mode(
+    model: WingModel, conditions: Conditions
+) -> None:
+    campaign = Campaign("lab", {}, (STATIC, replace(RING, start=10.0)), None, {}, "")
+    scale = model.scales(campaign).ports["planform"]
+    stiffness, mass, _ = matrices(model, conditions)
+    _, shapes = eigh(stiffness, mass, subset_by_index=[0, 0])
+    arrays = model.wing.arrays
+    motion = arrays.line_rows[2] @ shapes[:, 0]
+    mean = float(arrays.station_weights @ motion)
+    wanted = float(arrays.station_weights @ np.abs(motion / mean) ** 3)
+    assert scale.mean_power(1.0) == pytest.approx(1.0)
+    assert scale.mean_power(3.0) == pytest.approx(wanted, rel=1e-2)
+    assert model.scales(campaign).ports["tip"].mean_power(3.0) == 1.0
 
 
 def test_a_harmonic_force_reaches_the_frequency_response(model: WingModel, conditions: Conditions) -> None:
