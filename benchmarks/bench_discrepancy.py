@@ -30,7 +30,7 @@ def run() -> list[Measurement]:
     cases = {
         "nothing hidden": ModelPatch(),
         "compliant root hidden": ModelPatch((RootCompliance(5e-6),)),
-        "quadratic drag hidden": ModelPatch((PowerDamping("planform", 0.043, 2.0, 0.0, 1.0, 1.0),)),
+        "quadratic drag hidden": ModelPatch((PowerDamping("planform", 2.0, 2.0, 0.0, 1.0, 1.0),)),
     }
     _problem(model, ModelPatch(), SEED)  # compiles
     search(_problem(model, cases["quadratic drag hidden"], SEED), library())
@@ -76,7 +76,7 @@ def _one_ringdown(model: WingModel) -> float:
     problem = _problem(model, ModelPatch(), SEED)
     number = next(n for n, data in enumerate(problem.trials) if data.trial.kind is TrialKind.RINGDOWN)
     data = problem.trials[number]
-    patch = ModelPatch((PowerDamping("planform", 0.043, 2.0, 0.0, 1.0, 1.0),))
+    patch = ModelPatch((PowerDamping("planform", 2.0, 2.0, 0.0, 1.0, 1.0),))
     point = problem.start(Candidate())
     conditions = data.unknowns.conditions(
         data.trial, problem.shared.parameters(point.shared), point.local[number]

@@ -217,7 +217,7 @@ def quadratic_damping(generator: np.random.Generator, bench: Bench) -> Hidden:
 
 def cubic_stiffness(generator: np.random.Generator, bench: Bench) -> Hidden:
     """Hide a cubic spring where the structure moves most; sized at the largest motion of the campaign."""
-    # Softer than -0.15 the tangent at the largest motion nearly vanishes.
+    # Softer than -4/27 nothing holds the largest load; where none does, the effect is drawn again.
     hard = generator.random() < 0.6
     ratio = log_uniform(generator, 0.02, 0.3) if hard else -log_uniform(generator, 0.02, 0.15)
     force = ratio * bench.free.stiffness / bench.largest**2

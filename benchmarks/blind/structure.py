@@ -36,12 +36,15 @@ def _static_path(linear, flexibility, kinds, numbers, slip, stiffness, z, bouc, 
 
     x + G F(x) = x_linear, by Newton's method with differences, in `steps` increments from row to row and
     from rest to the first. `z` (P, E) and `bouc` (P,) are the state of the hysteresis; they are advanced.
+    From the row on that a softening structure cannot hold, forces are NaN: the stiffness along the path is
+    used up there, and what Newton's method may find is another branch.
     """
     rows, p = linear.shape
     forces = np.zeros((rows, p))
     x, x0, before = np.zeros(p), np.zeros(p), np.zeros(p)
     force = np.zeros(p)
     matrix = np.zeros((p, p))
+    forces[:] = np.nan
     for row in range(rows):
         for step in range(1, steps + 1):
             target = before + (linear[row] - before) * (step / steps)
@@ -64,6 +67,15 @@ def _static_path(linear, flexibility, kinds, numbers, slip, stiffness, z, bouc, 
                         matrix[i, j] = flexibility[i, j] * slope
                     matrix[j, j] += 1.0
                 x = x - np.linalg.solve(matrix, residual)
+            for j in range(p):
+                h = 1e-6 * (np.abs(target).max() + 1e-9)
+                up = _path_force(kinds[j], numbers[j], slip[j], stiffness[j], x[j] + h, x0[j], z[j], bouc[j])
+                at = _path_force(kinds[j], numbers[j], slip[j], stiffness[j], x[j], x0[j], z[j], bouc[j])
+                for i in range(p):
+                    matrix[i, j] = flexibility[i, j] * (up - at) / h
+                matrix[j, j] += 1.0
+            if np.abs(residual).max() > 1e-6 * np.abs(target).max() + 1e-12 or np.linalg.det(matrix) <= 0.0:
+                return forces
             for j in range(p):
                 if kinds[j] == BOUC_WEN:
                     bouc[j] = _bouc_wen_after(numbers[j], x[j], x0[j], bouc[j])

@@ -463,3 +463,18 @@ def test_motion_that_runs_away_is_no_campaign(share: float, runs_away: bool) -> 
     law = Law(joint.port, BOUC_WEN, (share * joint.stiffness, 0.3 * joint.displacement, 1.0))
     chance = draw_chance(np.random.default_rng(1), work.plan)
     assert (finite_signals(work, chance, Changes(laws=(law,))) is None) is runs_away
+
+
+@pytest.mark.parametrize("share", [0.5, 0.97, 1.03, 3.0])
+def test_a_softening_spring_holds_loads_up_to_its_limit(share: float) -> None:
+    """k x - c x^3 = F has a state on the way from rest up to F = 2/3 k sqrt(k / (3 c))."""
+    cubic = 4e5
+    limit = 2.0 / 3.0 * STIFFNESS * np.sqrt(STIFFNESS / (3.0 * cubic))
+    law = Law("x", POWER, (-cubic, 3.0, 0.0))
+    (at_half,), (at_share,) = oscillator().static(np.array([[0.5 * limit, share * limit]]), (law,))
+    assert STIFFNESS * at_half - cubic * at_half**3 == pytest.approx(0.5 * limit)
+    if share > 1.0:
+        assert np.isnan(at_share)
+    else:
+        assert STIFFNESS * at_share - cubic * at_share**3 == pytest.approx(share * limit)
+        assert 0.0 < at_share < np.sqrt(STIFFNESS / (3.0 * cubic))
