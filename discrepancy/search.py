@@ -185,7 +185,9 @@ class Search(Hypotheses):
         if current.candidate.is_family:  # a second effect beside a law that is free would be anything
             self._settle_joints()
             self._settle_steps()
-            return
+            current = self.best()  # finely divided, the joint may have the shape of the name
+            if current.candidate.is_family:
+                return
         while current.candidate.terms and len(current.candidate.terms) < LARGEST_SET:
             if len(current.candidate.terms) > 1 and self._far(current):
                 break  # a third effect is looked for only where two nearly do

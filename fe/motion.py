@@ -16,6 +16,7 @@ from . import motion_kernel
 from .errors import InvalidPatchError, SolutionError
 from .motion_kernel import BOUC_WEN, FREE_PLAY, HEAD, MICRO_SLIP, POWER_DAMPING, POWER_STIFFNESS
 from .patch import BoucWen, FreePlay, MicroSlip, ModelPatch, PowerDamping, PowerStiffness, StiffnessDrift
+from .planform_forces import place_of
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -508,8 +509,9 @@ def static_solution(
             forces,
         )
         if level >= 0:
+            places = ", ".join(dict.fromkeys(map(place_of, laws.ports)))
             raise SolutionError(
                 f"The static state at load level {level + 1} was not found: an internal force at "
-                f"{', '.join(dict.fromkeys(laws.ports))} takes more stiffness than the structure has there."
+                f"{places} takes more stiffness than the structure has there."
             )
     return StaticSolution(positions, forces, memory)

@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from math import isfinite
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 from .errors import InvalidPatchError
 
@@ -338,7 +338,7 @@ STRUCTURE = (PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature)
 """Primitives that change the linear structure: it is solved anew."""
 PortForce = PowerDamping | PowerStiffness | FreePlay | MicroSlip | BoucWen
 """Primitives that act at a port."""
-INTERNAL_FORCES = (PowerDamping, PowerStiffness, FreePlay, MicroSlip, BoucWen, StiffnessDrift)
+INTERNAL_FORCES = (*get_args(PortForce), StiffnessDrift)
 """Primitives that act as forces inside the structure while it moves."""
 LOADS = (LoadPlace, LoadGain, Washout, InertiaRelief)
 """Primitives that change what acts on the structure."""

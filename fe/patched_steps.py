@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from .motion import Laws, ModalSystem, laws_of, simulate, static_solution
 from .patch import LOADS, LoadGain, ModelPatch, PointMass
-from .patched_wing import LOAD_PLACE, PORTS, PatchedStructure, PatchedWing, motion_basis
+from .patched_wing import LOAD_PLACE, ON_MODES, PatchedStructure, PatchedWing, motion_basis
 from .reduced import ReducedModel
 from .transient import ModalIntegrator, TransientState
 
@@ -208,16 +208,16 @@ class PatchedSteps:
     def _system(self) -> ModalSystem:
         alpha, beta = self._rayleigh
         omega = self._modes.frequency
-        names = self._held_ports
-        rows = np.stack(list(names.values()))
+        ports = self._held_ports
+        rows = np.stack(list(ports.values()))
         modal = rows @ self._modes.shapes
         whole = np.einsum("pn,np->p", rows, self._patched.static(rows.T))
         left_out = whole - np.sum((modal / omega) ** 2, axis=1)
         return ModalSystem(
             omega,
             np.diag(alpha + beta * omega**2),
-            dict(zip(names, modal, strict=True)),
-            np.where((left_out > 1e-9 * whole) & [name in PORTS for name in names], left_out, 0.0),
+            dict(zip(ports, modal, strict=True)),
+            np.where((left_out > 1e-9 * whole) & [name not in ON_MODES for name in ports], left_out, 0.0),
             beta,
         )
 

@@ -33,10 +33,6 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Place = str | tuple[float, float]
 
-PATCH_RUNTIME_FILES = (
-    "patch.py", "patch_arrays.py", "local_loss.py", "planform_forces.py", "patched_wing.py",
-)  # fmt: skip
-"""Files of this package that evaluate a wing with changes, besides `fe.reduced.RUNTIME_FILES`."""
 LOAD_PLACE = "tip_load"
 """Name of the place of the static test."""
 OVERHANG = 0.15
@@ -45,6 +41,9 @@ PORTS = ("root", "tip", "span")
 """Ports where internal forces act on the motion of one place, or of the mean."""
 KNOWN_PORTS = (*PORTS, PLANFORM)
 """All places that an internal force may name."""
+ON_MODES = frozenset(STATION_PORTS)
+"""Ports whose position in motion is that of the modes alone. Beyond the modes, neighbouring stations move one
+another half as much as themselves, which a flexibility of each port by itself does not hold."""
 _STRAIN = re.compile(r"strain\[(\d+)\]")
 _NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
 _DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
@@ -457,7 +456,8 @@ class PatchedWing:
         if name in STATION_PORTS:
             distance = float(self.planform.distance[STATION_PORTS.index(name)])
             return np.asarray(self._along(distance) @ self.arrays.line_rows[2])
-        raise InvalidPatchError(f"The wing has no port {name!r}; it has {', '.join(KNOWN_PORTS)}.")
+        known = ", ".join((*PORTS, *STATION_PORTS))
+        raise InvalidPatchError(f"The wing has no port {name!r}; it has {known}.")
 
     def output_row(self, name: str, component: int = 0, patch: ModelPatch = EMPTY) -> FloatArray | None:
         """Return the row (n,) of an output, None if there is no such output.

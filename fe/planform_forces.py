@@ -43,6 +43,11 @@ _FORCES: dict[type[PortForce], tuple[str, ...]] = {
 """The numbers of a law that its force is in proportion to."""
 
 
+def place_of(port: str) -> str:
+    """Return the place that a patch names for a port: `PLANFORM` for those of its stations."""
+    return PLANFORM if port in STATION_PORTS else port
+
+
 class PlanformStations(NamedTuple):
     """Stations of the integral over the planform.
 
@@ -76,6 +81,10 @@ def at_stations(patch: ModelPatch, share: FloatArray) -> ModelPatch:
     share : (S,) ndarray
         Of the stations.
 
+    Returns
+    -------
+    ModelPatch
+        The patch itself where nothing acts at `PLANFORM`.
     """
     if not any(isinstance(item, PortForce) and item.port == PLANFORM for item in patch):
         return patch

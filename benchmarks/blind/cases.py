@@ -163,8 +163,8 @@ def _wing_bench(work: Workbench) -> Bench:
         length=rig.design.planform.semi_span,
         modal_mass=1.0 / motion["tip"] ** 2,
         region_places=places,
-        strip_shares=rig.area_shares(),
-        strip_motion=rig.line_motion(structure),
+        line_shares=rig.area_shares(),
+        line_motion=rig.line_motion(structure),
         port_motion=motion,
     )
 
@@ -228,7 +228,7 @@ def make_case(order: Order, folder: Path | None = None) -> Case:
 
 
 def finite_signals(work: Workbench, chance: Chance, changes: Changes) -> Signals | None:
-    """Return what channels without noise show, or None where the motion runs away."""
+    """Return what channels without noise show, or None where motion runs away or nothing holds a load."""
     try:
         with np.errstate(invalid="ignore", over="ignore"):
             signals = true_signals(work.rig, work.plan, chance, changes)

@@ -71,8 +71,8 @@ class Bench:
         Length of a ring-down and of the campaign [s].
     region_places : (R, 2)
         Start and end of each region [m].
-    strip_shares, strip_motion : (S,)
-        Shares of the area of the strips, and the first mode's motion there.
+    line_shares, line_motion : (S,)
+        Shares of the area by mesh line along the span, and the first mode's motion there.
     port_motion : mapping of str to float
         The first mode's motion at the ports.
     """
@@ -97,8 +97,8 @@ class Bench:
     length: float = 1.0
     modal_mass: float = 1.0
     region_places: tuple[tuple[float, float], ...] = ()
-    strip_shares: FloatArray | None = None
-    strip_motion: FloatArray | None = None
+    line_shares: FloatArray | None = None
+    line_motion: FloatArray | None = None
     port_motion: Mapping[str, float] | None = None
 
 
@@ -204,20 +204,20 @@ def quadratic_damping(generator: np.random.Generator, bench: Bench) -> Hidden:
     ratio = log_uniform(generator, 0.002, 0.05)
     at_free = ratio * 3.0 * np.pi * scale.stiffness / (4.0 * scale.displacement * scale.frequency**2)
     truth = "quadratic_damping.coefficient"
-    if bench.strip_shares is None or bench.strip_motion is None or bench.port_motion is None:
+    if bench.line_shares is None or bench.line_motion is None or bench.port_motion is None:
         law = Law(scale.port, DRAG, (at_free,))
         return Hidden("quadratic_damping", Changes(laws=(law,)), {truth: at_free}, scale.port)
     # Equal loss in the first mode.
-    cube = float(bench.strip_shares @ np.abs(bench.strip_motion) ** 3)
+    cube = float(bench.line_shares @ np.abs(bench.line_motion) ** 3)
     drag = at_free * bench.port_motion["tip"] ** 3 / cube
     values = {f"{truth}@{port}": drag * cube / motion**3 for port, motion in bench.port_motion.items()}
     values[f"{truth}@planform"] = drag
-    return Hidden("quadratic_damping", Changes(drag=drag), values, "span")
+    return Hidden("quadratic_damping", Changes(drag=drag), values, "planform")
 
 
 def cubic_stiffness(generator: np.random.Generator, bench: Bench) -> Hidden:
     """Hide a cubic spring where the structure moves most; sized at the largest motion of the campaign."""
-    # Softer than -4/27 nothing holds the largest load; where none does, the effect is drawn again.
+    # Softer than -4/27 no state holds the largest motion's load: such a draw is drawn again.
     hard = generator.random() < 0.6
     ratio = log_uniform(generator, 0.02, 0.3) if hard else -log_uniform(generator, 0.02, 0.15)
     force = ratio * bench.free.stiffness / bench.largest**2
@@ -229,15 +229,15 @@ def cubic_stiffness(generator: np.random.Generator, bench: Bench) -> Hidden:
 
 def spread_cubic_stiffness(generator: np.random.Generator, bench: Bench) -> Hidden:
     """Hide cubic springs spread over the wing's area."""
-    if bench.strip_shares is None or bench.strip_motion is None or bench.port_motion is None:
+    if bench.line_shares is None or bench.line_motion is None or bench.port_motion is None:
         raise ValueError("cubic springs can only be spread over the wing")
     at_tip = log_uniform(generator, 0.02, 0.2) * bench.free.stiffness / bench.largest**2
-    fourth = float(bench.strip_shares @ bench.strip_motion**4)
+    fourth = float(bench.line_shares @ bench.line_motion**4)
     spread = at_tip * bench.port_motion["tip"] ** 4 / fourth
     truth = "cubic_stiffness.coefficient"
     values = {f"{truth}@{port}": spread * fourth / m**4 for port, m in bench.port_motion.items()}
     values[f"{truth}@planform"] = spread
-    return Hidden("cubic_stiffness", Changes(spread_cubic=spread), values, "span")
+    return Hidden("cubic_stiffness", Changes(spread_cubic=spread), values, "planform")
 
 
 def breathing_crack(generator: np.random.Generator, bench: Bench) -> Hidden:

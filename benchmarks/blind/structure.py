@@ -31,23 +31,37 @@ LOAD_STEPS = 32
 
 
 @njit(cache=True)
+def _tangent(x, x0, flexibility, kinds, numbers, slip, stiffness, z, bouc, h):
+    """Return the derivative (P, P) of x + G F(x) by differences of length h."""
+    p = len(x)
+    matrix = np.eye(p)
+    for j in range(p):
+        at = _path_force(kinds[j], numbers[j], slip[j], stiffness[j], x[j], x0[j], z[j], bouc[j])
+        up = _path_force(kinds[j], numbers[j], slip[j], stiffness[j], x[j] + h, x0[j], z[j], bouc[j])
+        for i in range(p):
+            matrix[i, j] += flexibility[i, j] * (up - at) / h
+    return matrix
+
+
+@njit(cache=True)
 def _static_path(linear, flexibility, kinds, numbers, slip, stiffness, z, bouc, steps):
     """Return the forces (N, P) of elastic laws at each row of the motion `linear` (N, P) without them.
 
     x + G F(x) = x_linear, by Newton's method with differences, in `steps` increments from row to row and
     from rest to the first. `z` (P, E) and `bouc` (P,) are the state of the hysteresis; they are advanced.
-    From the row on that a softening structure cannot hold, forces are NaN: the stiffness along the path is
-    used up there, and what Newton's method may find is another branch.
+    Forces are NaN from the row on that has no state on this path: a softening structure has no stiffness left
+    there (the determinant of the tangent is not positive), and what Newton's method finds, if it ends at all,
+    is another branch.
     """
     rows, p = linear.shape
-    forces = np.zeros((rows, p))
+    forces = np.full((rows, p), np.nan)
     x, x0, before = np.zeros(p), np.zeros(p), np.zeros(p)
     force = np.zeros(p)
-    matrix = np.zeros((p, p))
-    forces[:] = np.nan
+    missed = 1e-6 * np.abs(linear).max() + 1e-12
     for row in range(rows):
         for step in range(1, steps + 1):
             target = before + (linear[row] - before) * (step / steps)
+            h = 1e-6 * (np.abs(target).max() + 1e-9)
             x0[:] = x
             for _ in range(60):
                 for j in range(p):
@@ -57,24 +71,10 @@ def _static_path(linear, flexibility, kinds, numbers, slip, stiffness, z, bouc, 
                 residual = x + flexibility @ force - target
                 if np.abs(residual).max() <= 1e-13 + 1e-11 * np.abs(target).max():
                     break
-                for j in range(p):
-                    h = 1e-6 * (np.abs(target).max() + 1e-9)
-                    up = _path_force(
-                        kinds[j], numbers[j], slip[j], stiffness[j], x[j] + h, x0[j], z[j], bouc[j]
-                    )
-                    slope = (up - force[j]) / h
-                    for i in range(p):
-                        matrix[i, j] = flexibility[i, j] * slope
-                    matrix[j, j] += 1.0
-                x = x - np.linalg.solve(matrix, residual)
-            for j in range(p):
-                h = 1e-6 * (np.abs(target).max() + 1e-9)
-                up = _path_force(kinds[j], numbers[j], slip[j], stiffness[j], x[j] + h, x0[j], z[j], bouc[j])
-                at = _path_force(kinds[j], numbers[j], slip[j], stiffness[j], x[j], x0[j], z[j], bouc[j])
-                for i in range(p):
-                    matrix[i, j] = flexibility[i, j] * (up - at) / h
-                matrix[j, j] += 1.0
-            if np.abs(residual).max() > 1e-6 * np.abs(target).max() + 1e-12 or np.linalg.det(matrix) <= 0.0:
+                tangent = _tangent(x, x0, flexibility, kinds, numbers, slip, stiffness, z, bouc, h)
+                x = x - np.linalg.solve(tangent, residual)
+            tangent = _tangent(x, x0, flexibility, kinds, numbers, slip, stiffness, z, bouc, h)
+            if np.abs(residual).max() > missed or np.linalg.det(tangent) <= 0.0:
                 return forces
             for j in range(p):
                 if kinds[j] == BOUC_WEN:

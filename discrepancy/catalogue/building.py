@@ -7,6 +7,7 @@ sent to another process.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from typing import get_args
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from discrepancy.campaign import Campaign, Channel, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import PortScale
-from fe.patch import EVERY_CHANNEL, INTERNAL_FORCES, Primitive, StiffnessDrift
+from fe.patch import EVERY_CHANNEL, PortForce, Primitive
 from fe.planform_forces import PLANFORM
 
 Check = Callable[[Setting], str | None]
@@ -31,7 +32,6 @@ KIND_NAMES = {
 NO_PORT = "has no port where an internal force can act"
 """Reason against effects that are forces within a structure or between it and the ground."""
 
-_AT_PORTS = tuple(item for item in INTERNAL_FORCES if item is not StiffnessDrift)
 
 EVERY_TRIAL = frozenset(TrialKind)
 DYNAMIC = frozenset({TrialKind.RINGDOWN, TrialKind.FORCED})
@@ -162,11 +162,18 @@ def _ports(preferred: tuple[str, ...], setting: Setting) -> tuple[str, ...]:
     return tuple(port for port in preferred if port in known) or known
 
 
-def over_the_planform(setting: Setting) -> tuple[str, ...]:
-    """Return the place of a force that is spread over the structure; where it has none, its ports."""
-    if PLANFORM in setting.scales.ports:
-        return (PLANFORM,)
-    return _ports(("span",), setting)
+def over_the_planform(*beside: str) -> Places:
+    """Return the places of a force that is spread over the structure, and of the like at ports `beside`.
+
+    A model without a planform has it at its mean displacement, "span", or else at all ports.
+    """
+    return partial(_over_the_planform, beside)
+
+
+def _over_the_planform(beside: tuple[str, ...], setting: Setting) -> tuple[str, ...]:
+    if PLANFORM not in setting.scales.ports:
+        return _ports((*beside, "span"), setting)
+    return (*(port for port in setting.model.ports() if port in beside), PLANFORM)
 
 
 def at_gauges(setting: Setting) -> tuple[str, ...]:
@@ -216,7 +223,7 @@ def carried(*primitives: type[Primitive]) -> Check:
 def _cannot_carry(primitives: tuple[type[Primitive], ...], setting: Setting) -> str | None:
     for primitive in primitives:
         if not setting.model.supports(primitive):
-            if primitive in _AT_PORTS and not setting.model.ports():
+            if primitive in get_args(PortForce) and not setting.model.ports():
                 return f"The model {setting.model.name!r} {NO_PORT}."
             return f"The model {setting.model.name!r} cannot carry the primitive {primitive.kind!r}."
     return None

@@ -144,7 +144,7 @@ QUADRATIC_DAMPING = Effect(
     identifier="quadratic_damping",
     name="quadratic aerodynamic damping",
     family=FAMILY,
-    equation="F = c |v| v, zeta_eq(A) = 4 c A w^2 / (3 pi k)",
+    equation="F = c |v| v, zeta_eq(A) = 4 c m A w^2 / (3 pi k), m = 1 at a port",
     signature="zeta ~ A: the envelope falls fast at first, then slowly.",
     reference="Worden and Tomlinson 2001, Nonlinearity in Structural Dynamics",
     acts_on=DYNAMIC,
@@ -160,7 +160,7 @@ QUADRATIC_DAMPING = Effect(
     ),
     build=_quadratic,
     shape=_exponents(2.0, 0.0),
-    places=over_the_planform,
+    places=over_the_planform(),
     unavailable=_AVAILABLE,
     confusable=("joint_micro_slip", "structural_damping", "bouc_wen_hysteresis"),
 )

@@ -13,6 +13,7 @@ from discrepancy.catalogue.building import (
     channels,
     has_port,
     needs,
+    over_the_planform,
     port_scale,
     removed_stiffness,
     somewhere,
@@ -110,7 +111,7 @@ CUBIC_STIFFNESS = Effect(
             Prior("uniform", -1.0, 1.0),
         ),
     ),
-    places=at_ports("tip", "span"),
+    places=over_the_planform("tip"),
     unavailable=needs(carried(PowerStiffness), has_port),
     confusable=("breathing_crack", "free_play", "stiffness_drift", "joint_micro_slip"),
 )

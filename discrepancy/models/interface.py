@@ -93,7 +93,7 @@ class Scales:
     campaign_time : float
         Time from the first to the last sample of the campaign [s]; 1 if unknown.
     ports : mapping of str to PortScale
-        By port name.
+        By port name; besides those of `Model.ports` the places of forces that are spread over the structure.
     """
 
     length: float
@@ -171,7 +171,7 @@ class Model(Protocol):
         """Whether the model can carry a primitive; sensors are not asked for: they need no model."""
 
     def ports(self) -> tuple[str, ...]:
-        """Names of the ports where internal forces can act."""
+        """Names of the ports where internal forces can act on one motion; user effects act at these."""
 
     def stations(self) -> tuple[float, float] | None:
         """Return the least and largest station [m] along the structure, None if it has no length."""

@@ -164,7 +164,7 @@ class WingModel:
         fitted = [motions[trial.name] for trial in campaign.fitted if trial.is_dynamic]
         largest = np.max(list(motions.values()), axis=0, initial=0.0) * np.ones(len(PORTS))
         usual = np.max(fitted, axis=0) if fitted else largest
-        port_rows = self._structure.port_rows
+        port_rows = self._structure.point_rows
         at_rest = 1.0 / np.einsum("pn,np->p", port_rows, static.solve(port_rows.T))
         dynamic = [trial for trial in campaign.trials if trial.is_dynamic]
         begins = [
@@ -362,16 +362,16 @@ class WingModel:
         empty = ModelPatch()
         if not trial.is_dynamic:
             place = None if trial.kind is TrialKind.FLIGHT else trial.load_place
-            port_rows = self._structure.port_rows
+            port_rows = self._structure.point_rows
             units = self._structure.static_units(static, place, empty, [port_rows], port_rows)[1]
             return np.asarray(_amounts(trial, empty) @ units)
         row = self.wing.force_row(trial.load_place)
         if trial.kind is TrialKind.FORCED:
             motion = moved.system.forced(row @ moved.basis, trial.force, trial.time, NO_LAWS)
-            return motion.values(self._structure.port_rows @ moved.basis)
+            return motion.values(self._structure.point_rows @ moved.basis)
         shape = static.solve(row)
         size = trial.release.displacement if trial.release is not None else 0.0
-        return np.asarray(size / float(row @ shape) * (self._structure.port_rows @ shape))[None]
+        return np.asarray(size / float(row @ shape) * (self._structure.point_rows @ shape))[None]
 
 
 def _amounts(trial: Trial, loads: ModelPatch) -> FloatArray:

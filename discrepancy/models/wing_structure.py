@@ -12,8 +12,7 @@ from discrepancy.errors import ModelError
 from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
 from fe.patch import LocalStiffnessLoss, ModelPatch, ModulusTemperature, PointMass, RootCompliance
-from fe.patched_wing import PORTS, PatchedWing, Place, motion_basis, strain_gauge
-from fe.planform_forces import STATION_PORTS
+from fe.patched_wing import ON_MODES, PORTS, PatchedWing, Place, motion_basis, strain_gauge
 
 FloatArray = NDArray[np.float64]
 Outputs = tuple[tuple[str, Quantity], ...]
@@ -57,13 +56,13 @@ class WingStructure:
 
     Attributes
     ----------
-    port_rows : (3, n) ndarray
+    point_rows : (3, n) ndarray
         Displacements of `PORTS` by the unknowns.
     """
 
     def __init__(self, wing: PatchedWing) -> None:
         self.wing = wing
-        self.port_rows = np.stack([wing.port_rows[port] for port in PORTS])
+        self.point_rows = np.stack([wing.port_rows[port] for port in PORTS])
         self._stiffnesses, self._systems = Memory(), Memory()
         self._rows = Memory()
 
@@ -148,13 +147,13 @@ class WingStructure:
         """Return the wing as it moves when released from, or pushed at, a place, with forces at `ports`."""
         key = self.stiffness_key(parameters, health, structure, temperature)
         masses = structure.of(PointMass)
+        held = self.wing.held_ports(ports)
 
         def make() -> MovingWing:
             e, servo, pitot, alpha, beta = (float(value) for value in parameters)
             stiffness = self.stiffness(parameters, health, structure, temperature)
             mass = self.wing.structure(e, health, servo, pitot, masses).mass
-            rows = self.wing.held_ports(ports)
-            still = stiffness.solve(np.vstack((self.wing.force_row(place), *rows.values())).T)
+            still = stiffness.solve(np.vstack((self.wing.force_row(place), *held.values())).T)
             basis = motion_basis(stiffness.solve, mass, self.wing.arrays.start_shapes, still)
             small_mass, small = basis.T @ mass @ basis, basis.T @ stiffness.matrix @ basis
             small_mass, small = 0.5 * (small_mass + small_mass.T), 0.5 * (small + small.T)
@@ -164,15 +163,14 @@ class WingStructure:
                     small_mass,
                     alpha * small_mass + beta * small,
                     small,
-                    {port: row @ basis for port, row in rows.items()},
+                    {port: row @ basis for port, row in held.items()},
                     MODE_COUNT,
                     beta,
-                    frozenset(STATION_PORTS),
+                    ON_MODES,
                 ),
             )
 
-        held = tuple(self.wing.held_ports(ports))
-        return self._systems.get((key, masses.primitives, parameters[1:].tobytes(), place, held), make)
+        return self._systems.get((key, masses.primitives, parameters[1:].tobytes(), place, tuple(held)), make)
 
     def static_units(
         self,

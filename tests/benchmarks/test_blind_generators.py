@@ -465,6 +465,13 @@ def test_motion_that_runs_away_is_no_campaign(share: float, runs_away: bool) -> 
     assert (finite_signals(work, chance, Changes(laws=(law,))) is None) is runs_away
 
 
+def test_a_release_that_nothing_holds_is_no_campaign() -> None:
+    work = workbench("lumped")
+    soft = Law("end", POWER, (-2.0 * work.bench.free.stiffness / work.bench.release**2, 3.0, 0.0))
+    chance = draw_chance(np.random.default_rng(1), work.plan)
+    assert finite_signals(work, chance, Changes(laws=(soft,))) is None
+
+
 @pytest.mark.parametrize("share", [0.5, 0.97, 1.03, 3.0])
 def test_a_softening_spring_holds_loads_up_to_its_limit(share: float) -> None:
     """k x - c x^3 = F has a state on the way from rest up to F = 2/3 k sqrt(k / (3 c))."""

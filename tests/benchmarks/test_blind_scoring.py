@@ -59,11 +59,16 @@ def test_every_effect_has_a_family() -> None:
 
 
 def test_interval_is_compared_at_the_port_where_the_effect_was_named() -> None:
-    truth = _truth("quadratic_damping", places={"quadratic_damping": "span"})
-    truth["truth"] = {"quadratic_damping.coefficient@span": 10.0, "quadratic_damping.coefficient@tip": 0.5}
+    truth = _truth("quadratic_damping", places={"quadratic_damping": "planform"})
+    truth["truth"] = {
+        "quadratic_damping.coefficient@planform": 3.0,
+        "quadratic_damping.coefficient@span": 10.0,
+        "quadratic_damping.coefficient@tip": 0.5,
+    }
     name = "quadratic_damping.coefficient"
     for port, low, high, wanted in (
         ("span", 9.0, 11.0, True), ("span", 0.4, 0.6, False), ("tip", 0.4, 0.6, True), ("", 9.0, 11.0, None),
+        ("planform", 2.0, 4.0, True), ("planform", 9.0, 11.0, False),
     ):  # fmt: skip
         verdict = _said("named", estimates={name: [low, 1.0, high]}, places={"quadratic_damping": port})
         assert coverage(truth, verdict) == {name: wanted}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -26,6 +28,13 @@ from fe.patched_wing import PatchedWing
 from fe.planform_forces import PLANFORM, STATION_COUNT, STATION_PORTS, at_stations, planform_stations
 
 SPAN, ROOT, TIP = 1.8, 0.4, 0.25
+LAWS: tuple[PortForce, ...] = (
+    PowerDamping(PLANFORM, 2.0, 2.0, 0.5, 0.3, 0.1),
+    PowerStiffness(PLANFORM, 40.0, 3.0, 0, 0.02),
+    FreePlay(PLANFORM, 90.0, 0.004),
+    MicroSlip(PLANFORM, 12.0, 1500.0, -0.3, 8),
+    BoucWen(PLANFORM, 800.0, 0.01, 1.5),
+)
 
 
 @given(st.floats(0.05, 5.0), st.floats(0.05, 5.0), st.integers(0, 2 * STATION_COUNT - 2))
@@ -37,17 +46,7 @@ def test_powers_of_the_distance_have_the_mean_over_the_area(root: float, tip: fl
     assert float(share @ distance**power) == pytest.approx(moment, rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    "item",
-    [
-        PowerDamping(PLANFORM, 2.0, 2.0, 0.5, 0.3, 0.1),
-        PowerStiffness(PLANFORM, 40.0, 3.0, 0, 0.02),
-        FreePlay(PLANFORM, 90.0, 0.004),
-        MicroSlip(PLANFORM, 12.0, 1500.0, -0.3, 8),
-        BoucWen(PLANFORM, 800.0, 0.01, 1.5),
-    ],
-    ids=lambda item: str(item.kind),
-)
+@pytest.mark.parametrize("item", LAWS, ids=lambda item: str(item.kind))
 def test_where_all_places_move_alike_the_forces_add_up_to_the_law(item: PortForce) -> None:
     _, share = planform_stations(SPAN, ROOT, TIP)
     before, after = PointMass(0.1, 1.0), FreePlay("root", 2.0, 1e-3)
@@ -59,6 +58,10 @@ def test_where_all_places_move_alike_the_forces_add_up_to_the_law(item: PortForc
     assert parts.values[:, 0].sum() == pytest.approx(one.values[0, 0])
     assert np.all(parts.values[:, 1:] == one.values[0, 1:])
     assert np.allclose(parts.slips, one.slips)  # each slips where the whole does
+
+
+def test_every_law_can_be_spread() -> None:
+    assert {type(item) for item in LAWS} == set(get_args(PortForce))
 
 
 def test_a_patch_without_such_a_force_stays_as_it_is() -> None:

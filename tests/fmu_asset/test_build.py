@@ -20,6 +20,7 @@ from fmu_asset.build import build_fmu, recorded_content_hash
 from fmu_asset.check import check_fmu
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing import relative_imports
+from fmu_asset.patched_runtime import SENSOR_FILES, STRUCTURE_FILES
 
 BIN = Path(sys.executable).parent
 ROOT = Path(__file__).parents[2]
@@ -153,6 +154,9 @@ def test_needs_numpy_alone(fmu: Path, tmp_path: Path) -> None:
 
 def test_packs_all_that_the_runtime_files_import() -> None:
     assert set(relative_imports(ROOT / "fe", RUNTIME_FILES)) == set(RUNTIME_FILES)
+    sensors = {*RUNTIME_FILES, *SENSOR_FILES}
+    assert set(relative_imports(ROOT / "fe", SENSOR_FILES)) <= sensors
+    assert set(relative_imports(ROOT / "fe", STRUCTURE_FILES)) <= {*sensors, *STRUCTURE_FILES}
 
 
 def test_a_changed_file_is_noticed(fmu: Path, tmp_path: Path) -> None:

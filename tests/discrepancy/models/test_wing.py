@@ -37,6 +37,7 @@ from fe.patch import (
 )
 from fe.patch_arrays import PatchArrays
 from fe.patch_cache import patch_cache_key
+from fe.planform_forces import STATION_PORTS
 
 NONE = ModelPatch()
 OUTPUTS = (
@@ -165,6 +166,38 @@ def test_a_cubic_spring_at_the_tip_solves_its_scalar_equation(
         x = brentq(residual, -1.0, 1.0, xtol=1e-14)
         acting = force - 5.0 * (x / 0.02) ** 3
         assert values[level] == pytest.approx(acting * (output_rows(model) @ u), rel=1e-7, abs=1e-12)
+
+
+def test_a_cubic_spring_over_the_planform_solves_the_equations_of_all_unknowns(
+    model: WingModel, conditions: Conditions
+) -> None:
+    patch = ModelPatch((PowerStiffness("planform", 60.0, 3.0, 0, 0.02),))
+    stiffness, *_ = matrices(model, conditions)
+    row, rows = (
+        model.wing.force_row("tip_load"),
+        np.stack([model.wing.port_row(port) for port in STATION_PORTS]),
+    )
+    share = model.wing.planform.share
+    values = model.respond(STATIC, OUTPUTS, patch, conditions).values
+    for level, force in enumerate(STATIC.force):
+        u = np.linalg.solve(stiffness, force * row)
+        for _ in range(60):  # Newton's method
+            moved = rows @ u / 0.02
+            residual = stiffness @ u - force * row + (60.0 * share * moved**3) @ rows
+            tangent = stiffness + (rows.T * (180.0 * share * moved**2 / 0.02)) @ rows
+            u = u - np.linalg.solve(tangent, residual)
+        assert values[level] == pytest.approx(output_rows(model) @ u, rel=1e-6, abs=1e-12)
+    plain = model.respond(STATIC, OUTPUTS, NONE, conditions).values
+    assert np.abs(values - plain).max() > 0.05 * np.abs(plain).max()
+
+
+def test_a_law_elsewhere_leaves_no_trace(model: WingModel, conditions: Conditions) -> None:
+    def drag(port: str) -> ModelPatch:
+        return ModelPatch((PowerDamping(port, 3.0, 2.0, 0.0, 1.0, 1.0),))
+
+    fresh = WingModel(model.wing.arrays).respond(RING, OUTPUTS, drag("span"), conditions).values
+    model.respond(RING, OUTPUTS, drag("planform"), conditions)
+    assert np.array_equal(model.respond(RING, OUTPUTS, drag("span"), conditions).values, fresh)
 
 
 def test_hysteresis_remembers_the_path_also_while_the_structure_warms(

@@ -1,0 +1,86 @@
+"""Effects that act over the wing's planform: their sizes mean what they say of the first mode."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import pi
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+
+from discrepancy.campaign import Campaign, Release, TrialKind
+from discrepancy.catalogue.damping import loss_integral
+from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.catalogue.library import library
+from discrepancy.models.wing import WingModel
+from fe.patch import PowerDamping, PowerStiffness
+from fe.patch_arrays import PatchArrays
+from tests.discrepancy.models.test_wing import RING
+
+RELEASE = 0.03
+
+
+@pytest.fixture(scope="module")
+def setting(coarse_patch_arrays: PatchArrays) -> Setting:
+    model = WingModel(coarse_patch_arrays)
+    ring = replace(RING, kind=TrialKind.RINGDOWN, release=Release(displacement=RELEASE))
+    campaign = Campaign("lab", {}, (ring,), None, {}, "")
+    return Setting(campaign, model, model.scales(campaign))
+
+
+def effect(identifier: str) -> Effect:
+    return next(item for item in library() if item.identifier == identifier)
+
+
+def first_mode(setting: Setting) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Shares of stations, their motion when the mean moves by one, stiffness at the mean, frequency."""
+    model = setting.model
+    assert isinstance(model, WingModel)
+    e, servo, pitot, *_ = (item.mean for item in model.parameters)
+    structure = model.wing.structure(e, (0.0, 0.0), servo, pitot)
+    square, shapes = eigh(structure.stiffness, structure.mass, subset_by_index=[0, 0])
+    arrays = model.wing.arrays
+    motion = arrays.line_rows[2] @ shapes[:, 0]
+    mean = float(arrays.station_weights @ motion)
+    return arrays.station_weights, motion / mean, float(square[0]) / mean**2, float(np.sqrt(square[0]))
+
+
+def test_they_act_there(setting: Setting) -> None:
+    assert effect("quadratic_damping").places(setting) == ("planform",)
+    assert effect("cubic_stiffness").places(setting) == ("tip", "planform")
+
+
+@pytest.mark.parametrize(("velocity", "displacement"), [(2.0, 0.0), (1.4, 0.0), (2.0, 0.6)])
+def test_damping_takes_the_stated_share_of_the_first_mode(
+    setting: Setting, velocity: float, displacement: float
+) -> None:
+    """2 pi zeta k A^2 in a cycle, with every station of the mesh instead of six."""
+    share, motion, stiffness, frequency = first_mode(setting)
+    values = {
+        "equivalent_damping_ratio": 0.01,
+        "velocity_exponent": velocity,
+        "displacement_exponent": displacement,
+    }
+    (force,) = effect("quadratic_damping").patch(setting, values, "planform")
+    assert isinstance(force, PowerDamping)
+    size = setting.scales.ports["planform"].displacement
+    moved = np.abs(motion) * size
+    at_place = (
+        share
+        * force.coefficient
+        * (moved * frequency / force.reference_velocity) ** velocity
+        * (moved / force.reference_displacement) ** displacement
+    )
+    loss = float(at_place @ moved) * 2.0 * loss_integral(velocity, displacement)
+    assert loss == pytest.approx(2.0 * pi * 0.01 * stiffness * size**2, rel=1e-2)
+
+
+def test_a_cubic_spring_has_the_stated_share_of_the_first_modes_force(setting: Setting) -> None:
+    share, motion, stiffness, _ = first_mode(setting)
+    (force,) = effect("cubic_stiffness").patch(setting, {"stiffening": 0.2}, "planform")
+    assert isinstance(force, PowerStiffness)
+    size = setting.scales.ports["planform"].largest_displacement
+    assert size is not None
+    at_place = share * force.coefficient * (motion * size / force.reference_displacement) ** 3
+    assert float(at_place @ motion) == pytest.approx(0.2 * stiffness * size, rel=1e-2)
