@@ -200,6 +200,9 @@ class Search(Hypotheses):
         self._deletions()
         self._settle_joints()
         self._settle_steps()
+        fewer = self.best()
+        if not fewer.candidate.is_family and 0 < len(fewer.candidate.terms) < len(current.candidate.terms):
+            self._extended(fewer)  # what stood in for it hid what is beside it
 
     def _relatives(self) -> None:
         """Fit effects that are easily taken for the best one, from where it stands."""
