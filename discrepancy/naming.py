@@ -9,6 +9,7 @@ from .catalogue.entry import NINETY, Effect
 from .consistency_gate import consistency_gate
 from .fitting import Fit
 from .gates import SHAPE_GAIN, absolute_gate, shape_gate
+from .hypotheses import LARGEST_SET
 from .neighbourhood import free_shape
 from .posterior import with_draws
 from .problem import Problem
@@ -119,6 +120,12 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         more = {"effects": named, "gates": (gate, shape, consistent)}
         return verdict(VerdictKind.NAMED, _named_sentence(named, p_top, gate), p_top, **more), found, best
     if family is not None and not shape.passed:
+        if len(best.candidate.terms) >= LARGEST_SET:  # a free shape counts as one more effect
+            return unexplained(
+                f"There is a gap that no effect of the catalogue fits; the nearest is {' with '.join(top)}, but "
+                "one of them would need a shape of its own, and with so much freedom nearly anything fits.",
+                (gate, shape, consistent),
+            )
         gate, consistent = absolute_gate(problem, family), consistency_gate(problem, family)
         if _pass(gate, consistent):
             return family_of(family, (gate, shape, consistent))

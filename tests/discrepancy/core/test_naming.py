@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from discrepancy.candidate import Candidate, Term
 from discrepancy.fitting import fit
 from discrepancy.gates import SHAPE_GAIN
-from discrepancy.hypotheses import key_of
+from discrepancy.hypotheses import LARGEST_SET, key_of
 from discrepancy.naming import _open, name
 from discrepancy.search import FINE_JOINT
 from discrepancy.verdict import Verdict, VerdictKind
@@ -268,3 +268,16 @@ def test_a_law_between_two_named_ones_is_their_family_once(small, effects) -> No
         named = Candidate(tuple(replace(term, free_shape=False) for term in item.candidate.terms))
         assert found.log_prior(item.candidate) == pytest.approx(found.log_prior(named) - SHAPE_GAIN)
     assert fit.candidate.is_family
+
+
+def test_a_law_of_free_shape_beside_two_effects_is_no_verdict(small, effects) -> None:  # type: ignore[no-untyped-def]
+    """With three effects and a shape to choose nearly anything fits."""
+    law = ModelPatch((PowerDamping("end", 0.15, 1.0, 0.0, 1.0, 1.0),))
+    others = small.patch("gauge_gain", {"gain_error": 0.08}, "g1")
+    run = next(item for item in effects if item.identifier == "seating_offset").places(small.setting)[0]
+    others = others + small.patch("seating_offset", {"offset_ratio": 0.05}, run)
+    verdict, found, _ = name(small.problem(small.measured(3, law + others)), effects)
+    assert len(found.best().candidate.terms) == LARGEST_SET
+    assert verdict.kind is VerdictKind.UNEXPLAINED, verdict.sentence
+    assert "shape of its own" in verdict.sentence
+    assert {"gauge_gain", "seating_offset"} < set(verdict.resembles)
