@@ -4,6 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from fe.patch import INTERNAL_FORCES
+
 from .candidate import FREE_SHAPE, Candidate
 from .catalogue.entry import NINETY, Effect
 from .consistency_gate import consistency_gate
@@ -120,10 +122,11 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         more = {"effects": named, "gates": (gate, shape, consistent)}
         return verdict(VerdictKind.NAMED, _named_sentence(named, p_top, gate), p_top, **more), found, best
     if family is not None and not shape.passed:
-        if len(best.candidate.terms) >= LARGEST_SET:  # a free shape counts as one more effect
+        if not _may_be_free(found, best):
             return unexplained(
-                f"There is a gap that no effect of the catalogue fits; the nearest is {' with '.join(top)}, but "
-                "one of them would need a shape of its own, and with so much freedom nearly anything fits.",
+                "There is a gap that no effect of the catalogue fits; the nearest is "
+                f"{' with '.join(top)}, but one of them would need a shape of its own, and with so much "
+                "freedom nearly anything fits.",
                 (gate, shape, consistent),
             )
         gate, consistent = absolute_gate(problem, family), consistency_gate(problem, family)
@@ -256,6 +259,18 @@ def _single_evidence(found: Search, best: Fit) -> float:
     for term in best.candidate.terms:
         places += np.log(len(term.effect.places(found.problem.setting)))
     return best.log_evidence - places
+
+
+def _may_be_free(found: Search, best: Fit) -> bool:
+    """Whether a set may be stated with one law of free shape.
+
+    A free shape counts as one more effect, and beside a second law it would imitate nearly anything.
+    """
+    laws = 0
+    for term, part in zip(best.candidate.terms, best.candidate.parts(best.point.effect), strict=True):
+        alone = Candidate((term,)).patch(found.problem.setting, part)
+        laws += len(alone.of(*INTERNAL_FORCES)) > 0
+    return laws < 2 and len(best.candidate.terms) < LARGEST_SET
 
 
 def _shape(found: Search, best: Fit) -> tuple[Gate, Fit | None]:
