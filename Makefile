@@ -34,7 +34,7 @@ BLIND ?= runs/blind
 
 .PHONY: blind
 blind: $(VENV)/.dev ## Hide effects in campaigns, name them, and score the names (two hours on two cores)
-	$(BIN)/python -m benchmarks.blind generate --out $(BLIND) --count-per-effect 8 --nulls 300 --pairs 40 --outside 2 --traps 3 --seed 2
+	$(BIN)/python -m benchmarks.blind generate --out $(BLIND) --count-per-effect 8 --nulls 300 --pairs 40 --outside 2 --traps 3 --seed 3
 	$(BIN)/python -m benchmarks.blind_naming $(BLIND)
 	$(BIN)/python -m benchmarks.blind score --out $(BLIND)
 
