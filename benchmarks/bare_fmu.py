@@ -15,7 +15,7 @@ import numpy as np
 from fmpy import simulate_fmu
 from fmpy.fmi2 import FMU2Slave
 
-from fmu_asset.archive import extract_fmu, read_fmu
+from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
 from fmu_asset.compiled.compiler import compile_library
 from fmu_asset.compiled.package import fmi_headers
 

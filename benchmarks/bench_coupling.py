@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measurement import Measurement, median_seconds
-from fe.cache import reduced_model
-from fmu_asset.binding import Binding, load_binding
-from fmu_asset.build import build_fmu
+from fe.reduction.model_cache import reduced_model
 from fmu_asset.companions.build import build_companion
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.layout import Layout
 from fmu_asset.coupling.roles import resolve_roles
 from fmu_asset.coupling.structure import Component, Connector, Setting, SystemStructure, expand_connection
 from fmu_asset.coupling.wiring import Wiring
-from fmu_asset.session import FmiAsset
+from fmu_asset.door.binding import Binding, load_binding
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.packing.wing_fmu import build_fmu
 from scenarios import binding_files
-from twin_master.scenario_file import load_scenario
+from twin_master.scenario.reading import load_scenario
 
 REPEATS, INNER = 300, 5
 

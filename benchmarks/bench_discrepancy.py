@@ -6,18 +6,18 @@ import resource
 import time
 
 from benchmarks.measurement import Measurement, median_seconds
-from discrepancy.campaign import TrialKind
-from discrepancy.candidate import Candidate
+from discrepancy.campaign.held_out import choose_held_out
+from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
-from discrepancy.examples import example_campaign, wing_plan
-from discrepancy.fitting import fit
-from discrepancy.held_out import choose_held_out
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.problem import Problem
+from discrepancy.models.sensing import observe
 from discrepancy.models.wing import WingModel
-from discrepancy.problem import Problem
-from discrepancy.search import Search, search
-from discrepancy.sensing import observe
-from fe.patch import ModelPatch, PowerDamping, RootCompliance
+from discrepancy.search.strategy import Search, search
+from discrepancy.sources.examples import example_campaign, wing_plan
+from fe.runtime.patch import ModelPatch, PowerDamping, RootCompliance
 
 SEED = 20210527
 ROUNDS = 3

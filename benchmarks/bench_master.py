@@ -13,12 +13,12 @@ import numpy as np
 
 from benchmarks.bare_fmu import LEVELS, bare_step, fmpy_simulation, minimal_fmu
 from benchmarks.measurement import Measurement, least_seconds
-from fe.cache import reduced_model
-from fmu_asset.binding import Binding, load_binding
-from fmu_asset.build import build_fmu
+from fe.reduction.model_cache import reduced_model
 from fmu_asset.compiled.compiler import find_compiler
+from fmu_asset.door.binding import Binding, load_binding
+from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError
-from fmu_asset.session import FmiAsset
+from fmu_asset.packing.wing_fmu import build_fmu
 
 BINDING = Path(__file__).parents[1] / "scenarios" / "bindings" / "uav_wing.toml"
 STEPS = 10_000

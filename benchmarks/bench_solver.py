@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.measurement import Measurement
-from fe.calculix_job import calculix_program
+from fe.verification.calculix_job import calculix_program
 
 REFINEMENT = 1.2
 REPEATS = 3
@@ -24,9 +24,9 @@ import json, resource, sys, time
 import numpy as np
 from scipy.sparse.linalg import splu
 from fe import cholesky
-from fe.design import load_design
-from fe.operators import assemble
-from fe.statics import Factorisation, solve_static
+from fe.wing.design import load_design
+from fe.full.operators import assemble
+from fe.full.statics import Factorisation, solve_static
 
 def least(function, repeats):
     times = []
@@ -71,9 +71,9 @@ print(json.dumps({
 _CALCULIX = """
 import sys
 from pathlib import Path
-from fe.calculix import CalculixModel
-from fe.design import load_design
-from fe.operators import assemble
+from fe.verification.calculix_input import CalculixModel
+from fe.wing.design import load_design
+from fe.full.operators import assemble
 operators = assemble(load_design().changed(mesh={"refinement": float(sys.argv[1])}))
 text = CalculixModel(operators).static_steps((operators.load_tip,))
 Path(sys.argv[2]).write_text(text, encoding="ascii")

@@ -13,8 +13,14 @@ import warnings
 import numpy as np
 
 from benchmarks.measurement import Measurement, median_seconds
-from twin_master.graphical_model import Factor, GraphicalModel, StateSpace, TransitionModel, worsening_table
-from twin_master.inference import (
+from twin_master.network.graphical_model import (
+    Factor,
+    GraphicalModel,
+    StateSpace,
+    TransitionModel,
+    worsening_table,
+)
+from twin_master.network.inference import (
     filter_sequence,
     filter_step,
     known_control,
@@ -22,9 +28,9 @@ from twin_master.inference import (
     smooth,
     smooth_many_twins,
 )
-from twin_master.planner import value_iteration
-from twin_master.rewards import RewardModel, RewardSettings
-from twin_master.sensor_model import GaussianSensorModel
+from twin_master.network.planner import value_iteration
+from twin_master.network.rewards import RewardModel, RewardSettings
+from twin_master.network.sensor_model import GaussianSensorModel
 
 STEPS = 50
 HORIZON = 10

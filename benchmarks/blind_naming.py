@@ -20,16 +20,16 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from discrepancy.campaign_file import read_campaign
+from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import library
 from discrepancy.errors import DiscrepancyError
+from discrepancy.files.patch import primitive_intervals
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.wing import WingModel
-from discrepancy.patch_file import primitive_intervals
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import Investigation, investigate, patch_draws
-from fe.patch import ModelPatch, PowerDamping, PowerStiffness
+from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
 
 NAMING = (VerdictKind.NAMED, VerdictKind.FAMILY)
 _models: dict[str, Model] = {}

@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign import (
+from discrepancy.campaign.records import (
     Campaign,
     Channel,
     NoiseRecord,
@@ -23,9 +23,9 @@ from discrepancy.campaign import (
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.sensing import observe
-from fe.motion import laws_of
-from fe.patch import (
+from discrepancy.models.sensing import observe
+from fe.runtime.motion import laws_of
+from fe.runtime.patch import (
     INTERNAL_FORCES,
     InertiaRelief,
     LoadGain,

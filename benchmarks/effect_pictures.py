@@ -11,11 +11,11 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from benchmarks.cantilever import Cantilever, campaign
-from discrepancy.campaign import Quantity, Trial
+from discrepancy.campaign.records import Quantity, Trial
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.models.interface import Conditions
-from discrepancy.sensing import observe
-from fe.patch import ModelPatch
+from discrepancy.models.sensing import observe
+from fe.runtime.patch import ModelPatch
 from reporting.figures import PREDICTION, REFERENCE, new_figure, publication_style, to_png
 
 FloatArray = NDArray[np.float64]

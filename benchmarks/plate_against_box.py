@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fe.design import load_design
-from fe.plate_comparison import DAMAGE, compare_with_plate
+from fe.verification.plate_comparison import DAMAGE, compare_with_plate
+from fe.wing.design import load_design
 from reporting.figures import (
     OBSERVED,
     PAST,

@@ -20,7 +20,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from calibration.dynamics import DynamicTargets, MassRange, fit_masses
+from calibration.dynamics.masses_and_damping import DynamicTargets, MassRange, fit_masses
+from calibration.dynamics.ringdown import Frequencies
+from calibration.dynamics.trials import fit_trials
 from calibration.errors import CalibrationError, RingDownError
 from calibration.joint import (
     NAMES,
@@ -34,14 +36,12 @@ from calibration.joint import (
     modal_measurement,
     tabulate_wing,
 )
-from calibration.posterior import GaussianPrior
-from calibration.ringdown import Frequencies
-from calibration.ringdown_trials import fit_trials
-from calibration.stiffness import LoadDisplacementData, exact_posterior
+from calibration.static.posterior import GaussianPrior
+from calibration.static.stiffness import LoadDisplacementData, exact_posterior
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down, weigh
-from fe.cache import reduced_model
-from fe.reduced import ReducedModel
-from fe.state import DigitalState, Geometry
+from fe.reduction.model_cache import reduced_model
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import DigitalState, Geometry
 from reporting.progress import RichProgress
 
 PROBABILITY = 0.90
@@ -83,7 +83,7 @@ def measure(model: ReducedModel, seed: int, model_error: ModelError, procedure: 
 
 
 def paper(model: ReducedModel, tables: WingTables, wing: Wing, seed: int) -> NDArray[np.float64]:
-    """Return (5, 2) intervals of the paper's procedure: samples of e, masses by eq. (19), damping by (25)."""
+    """Return (5, 2) intervals of the paper's procedure: samples of e, eqs. (19), (20) and (25)."""
     factors = exact_posterior(wing.static, curve=tables.stiffness).samples(
         seed, PAPER_SAMPLES, stratified=True
     )

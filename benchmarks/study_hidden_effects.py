@@ -26,10 +26,10 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.wing_in_air import depends_on_temperature, scenario_in_air
-from discrepancy.from_run import run_campaign, run_model
+from discrepancy.sources.from_run import run_campaign, run_model
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import investigate
-from fe.patch import (
+from fe.runtime.patch import (
     InertiaRelief,
     LocalStiffnessLoss,
     ModelPatch,
@@ -39,25 +39,25 @@ from fe.patch import (
     ThermalStrain,
     Washout,
 )
-from fmu_asset.patch_file import SCHEMA
+from fmu_asset.packing.patch_file import SCHEMA
 from reporting.files import atomic_write_text
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
-from twin_master.asset_source import AssetSource
-from twin_master.crew import prepare_knowledge
-from twin_master.mission import fly
-from twin_master.resolution import (
+from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.resolution import (
     Overrides,
     asset_source,
     located_scenario,
     portable_scenario,
     resolve_scenario,
 )
-from twin_master.results import MissionResult
+from twin_master.mission.loop import fly
+from twin_master.mission.preparation import prepare_knowledge
 from twin_master.run_folder import create_run_folder
-from twin_master.scenario import Scenario
-from twin_master.scenario_file import load_scenario
-from twin_master.store import store_mission
+from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.schema import Scenario
+from twin_master.store.results import MissionResult
+from twin_master.store.writing import store_mission
 from twin_master.study import in_credible_set
 
 TURNS = 50
@@ -164,17 +164,18 @@ def fly_mission(
     turns : int
         Length of the mission.
     """
-    lines = ""
-    for name, primitives in (("patch", hidden), ("model_patch", known)):
+    lines = {}
+    for name, primitives in (("asset", hidden), ("belief", known)):
         if primitives and not depends_on_temperature(hidden):
             file = atomic_write_text(folder.with_name(f"{folder.name}_{name}.json"), patch_text(primitives))
-            lines += f'{name} = "{file.name}"\n'
+            lines[name] = f'patch = "{file.name}"\n'
     text = scenario_files()[scenario].read_text(encoding="utf-8")
     text = text.replace("steps = 50", f"steps = {turns}", 1)
     if depends_on_temperature(hidden):
         text = scenario_in_air(text, folder.parent, f"{folder.name}_wing", patch_text(hidden))
     else:
-        text = text.replace('binding = "uav_wing"\n', f'binding = "uav_wing"\n{lines}', 1)
+        for name, line in lines.items():
+            text = text.replace(f"[{name}]\n", f"[{name}]\n{line}", 1)
     loaded = load_scenario(atomic_write_text(folder.with_name(f"{folder.name}.toml"), text))
     resolved = resolve_scenario(loaded, Overrides(seed=seed, in_process=True))
     source = asset_source(resolved)

@@ -1,7 +1,9 @@
 """How reliably the twin steers: the paper's mission under many seeds.
 
 `python -m benchmarks.study_level_turns --missions 300` flies the reduced model of the shipped wing;
-`--strain-library FOLDER` flies the authors' library instead, `--fmu` the FMU in a worker process.
+`--strain-library FOLDER` flies the authors' library instead, `--fmu` the FMU in a worker process. The true
+Young's modulus factor is the mean of the calibration; `--draw-factor` gives every mission a wing of its own,
+with one of the twin's draws.
 `--combinations --strain-library FOLDER` flies all four combinations of asset and twin's model, without and
 with a model error in the assumed noise, and says what the misfit of the models does; `--markdown` prints the
 tables for a page. Exit code 1 if a target is missed.
@@ -13,8 +15,8 @@ import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from itertools import product
 from pathlib import Path
 
@@ -23,15 +25,20 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from fe.runtime.reduced import ReducedModel
 from reporting.progress import RichProgress
-from twin_master.asset_source import AssetSource, ReducedModelSource
-from twin_master.crew import prepare_knowledge
-from twin_master.graphical_model import GraphicalModel
-from twin_master.mismatch import Misfit, MismatchedSource, find_misfit
-from twin_master.parameter import ParameterDraws
-from twin_master.resolution import Overrides, asset_source, resolve_scenario
-from twin_master.scenario import Scenario
-from twin_master.scenario_file import load_scenario
+from twin_master.assets.asset_source import AssetSource, PairedSource
+from twin_master.assets.mismatch import Misfit, find_misfit
+from twin_master.assets.parameter import ParameterDraws
+from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
+from twin_master.assets.strain_library import load_strain_library
+from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.mission.preparation import prepare_knowledge
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.schema import Scenario
 from twin_master.study import Estimated, Study, fly_many
 
 Float = NDArray[np.float64]
@@ -47,7 +54,7 @@ SHOWN = 6
 """Gauges that are shown one by one."""
 
 
-class ScaledSource(MismatchedSource):
+class ScaledSource(PairedSource):
     """A twin whose model was scaled, gauge by gauge, to what the undamaged asset shows without noise."""
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
@@ -57,6 +64,22 @@ class ScaledSource(MismatchedSource):
         undamaged = dict(zip(model.states.names, model.states.coordinates[0].tolist(), strict=True))
         shown = self.open().step(controls[-1].values, undamaged).values
         return np.asarray(table * (shown / table[:, 0, -1].mean(axis=0)))
+
+
+class KnownSource(PairedSource):
+    """A wing of many; what the twin knows of them is given, so that it is not made for each anew."""
+
+    def __init__(self, asset: AssetSource, model: AssetSource, draws: ParameterDraws, table: Float) -> None:
+        super().__init__(asset, model)
+        self._draws, self._table = draws, table
+
+    def draws(self, seed: int) -> ParameterDraws:
+        """Return the draws that are known."""
+        return self._draws
+
+    def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
+        """Return the predictions (E, S, U, G) that are known."""
+        return self._table
 
 
 @dataclass(frozen=True)
@@ -164,8 +187,8 @@ def show_misfit(scenario: Scenario, wing: AssetSource, library: AssetSource, see
 
 def combinations(given: argparse.Namespace, scenario: Scenario, seeds: Sequence[int]) -> list[Row]:
     """Fly the four combinations of asset and twin's model."""
-    from fe.cache import reduced_model
-    from fe.design import load_design
+    from fe.reduction.model_cache import reduced_model
+    from fe.wing.design import load_design
 
     wing_model = reduced_model(load_design(), progress=RichProgress())
     library_file = resolve_scenario(
@@ -173,8 +196,8 @@ def combinations(given: argparse.Namespace, scenario: Scenario, seeds: Sequence[
     )
 
     def sources(chosen: Scenario) -> dict[str, AssetSource]:
-        asset = library_file.asset
-        library = asset_source(chosen.model_copy(update={"asset": asset}))
+        flown = {"asset": library_file.asset, "belief": library_file.belief}
+        library = asset_source(chosen.model_copy(update=flown))
         return {"our wing": ReducedModelSource(chosen, wing_model), "library": library}
 
     own = sources(scenario)
@@ -189,7 +212,7 @@ def combinations(given: argparse.Namespace, scenario: Scenario, seeds: Sequence[
             for asset, twin in product(known, known):
                 if name == SCALED and asset == twin:
                     continue
-                kind = ScaledSource if name == SCALED else MismatchedSource
+                kind = ScaledSource if name == SCALED else PairedSource
                 source = known[asset] if asset == twin else kind(known[asset], known[twin])
                 study = fly_many(chosen, source, flown, calibration_seed=first)
                 rows.append(Row(asset, twin, LABELS.get(name) or f"{float(name):g} %", first, study))
@@ -203,25 +226,79 @@ def model_error(name: str, misfit: Misfit) -> float | tuple[float, ...]:
     return 0.0 if name == SCALED else float(name) / 100.0
 
 
+def fly_own_wings(
+    scenario: Scenario, source: AssetSource, wing: Callable[[ParameterDraws, int], AssetSource], seeds: range
+) -> Study:
+    """Fly every mission with a wing of its own: its factor is one of the twin's draws, as likely as any."""
+    model = build_graphical_model(scenario)
+    draws = source.draws(seeds[0])
+    table = source.observation_table(draws, model)
+    chosen = np.random.default_rng(seeds[0]).integers(len(draws.values), size=len(seeds))
+    flown = [
+        fly_many(scenario, KnownSource(wing(draws, index), source, draws, table), [seed])
+        for seed, index in zip(seeds, chosen.tolist(), strict=True)
+    ]
+    parts = {
+        item.name: np.concatenate([getattr(study, item.name) for study in flown])
+        for item in fields(Study)
+        if item.name != "seeds"
+    }
+    return Study(tuple(seeds), **parts)
+
+
+def library_wings(scenario: Scenario, folder: Path) -> Callable[[ParameterDraws, int], AssetSource]:
+    """Return what gives the authors' wing with one of their samples of the factor."""
+    library = load_strain_library(folder)
+    return lambda draws, index: StrainLibrarySource(
+        scenario, replace(library, strain=library.strain_per_draw[index]), "one sample"
+    )
+
+
+def model_wings(scenario: Scenario, wing: ReducedModel) -> Callable[[ParameterDraws, int], AssetSource]:
+    """Return what gives our wing with one of the twin's draws of the factor."""
+    return lambda draws, index: ReducedModelSource(
+        scenario.model_copy(
+            update={
+                "asset": scenario.asset.model_copy(
+                    update={"parameters": {draws.name: float(draws.values[index])}}
+                )
+            }
+        ),
+        wing,
+    )
+
+
 def single(given: argparse.Namespace, scenario: Scenario, seeds: Sequence[int]) -> list[Row]:
     """Fly one asset that the twin knows."""
     with tempfile.TemporaryDirectory() as folder:
+        wings: Callable[[ParameterDraws, int], AssetSource] | None = None
         if given.strain_library or given.fmu:
             source: AssetSource = asset_source(scenario)
+            if given.draw_factor:
+                wings = library_wings(scenario, given.strain_library)
         else:
-            from fe.cache import reduced_model
-            from fe.design import load_design
+            from fe.reduction.model_cache import reduced_model
+            from fe.wing.design import load_design
 
-            source = ReducedModelSource(scenario, reduced_model(load_design(), progress=RichProgress()))
+            wing = reduced_model(load_design(), progress=RichProgress())
+            source = ReducedModelSource(scenario, wing)
+            if given.draw_factor:
+                wings = model_wings(scenario, wing)
         source.prepare(Path(folder), RichProgress())
         name = "library" if given.strain_library else "our wing, FMU" if given.fmu else "our wing"
+        asset = f"{name}, e drawn" if given.draw_factor else name
         error = scenario.observation.model_error
         label = "none" if error == 0.0 else f"{100 * float(np.max(error)):g} %"
-        return [
-            Row(name, name, label, first,
-                fly_many(scenario, source, range(first, first + given.missions), calibration_seed=first))
-            for first in seeds
-        ]  # fmt: skip
+        rows = []
+        for first in seeds:
+            missions = range(first, first + given.missions)
+            study = (
+                fly_many(scenario, source, missions, calibration_seed=first)
+                if wings is None
+                else fly_own_wings(scenario, source, wings, missions)
+            )
+            rows.append(Row(asset, name, label, first, study))
+        return rows
 
 
 def main() -> int:
@@ -230,6 +307,10 @@ def main() -> int:
     parser.add_argument("--first-seed", type=int, nargs="+", help="by default the seed of the scenario")
     parser.add_argument("--strain-library", type=Path)
     parser.add_argument("--fmu", action="store_true", help="fly the FMU in a worker process")
+    parser.add_argument(
+        "--draw-factor", action="store_true",
+        help="each mission flies a wing with one of the twin's draws of Young's modulus factor, not the mean",
+    )  # fmt: skip
     parser.add_argument("--decide-on", choices=("filtered", "predicted"), help="instead of the scenario's")
     parser.add_argument(
         "--combinations", action="store_true", help="fly our wing and the library, each by both twins"
@@ -244,6 +325,8 @@ def main() -> int:
     given = parser.parse_args()
     if given.combinations and (given.strain_library is None or given.fmu):
         parser.error("--combinations needs --strain-library, and flies no FMU")
+    if given.draw_factor and (given.combinations or given.fmu):
+        parser.error("--draw-factor goes neither with --combinations nor with --fmu")
     given.model_error = given.model_error or (["0", "3", MISFIT, SCALED] if given.combinations else ["0"])
     for name in given.model_error:
         if not (name in (MISFIT, SCALED) and given.combinations) and not name.replace(".", "", 1).isdigit():

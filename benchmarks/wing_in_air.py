@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from fe.cache import reduced_model
-from fe.patch import Primitive
-from fmu_asset.build import build_fmu
-from fmu_asset.patch_file import parse_patch
-from fmu_asset.script import script_fmu
+from fe.reduction.model_cache import reduced_model
+from fe.runtime.patch import Primitive
+from fmu_asset.packing.patch_file import parse_patch
+from fmu_asset.packing.script import script_fmu
+from fmu_asset.packing.wing_fmu import build_fmu
 from reporting.files import atomic_write_bytes, atomic_write_text
 
 AIR = Path(__file__).with_name("swinging_air.py")
@@ -77,14 +77,14 @@ def scenario_in_air(text: str, folder: Path, name: str, patch: str) -> str:
         replace=True,
     )
     asset = [
-        "[asset]", 'kind = "coupled"', 'design = "uav_wing"', 'binding = "wing_in_air.toml"',
+        "[asset]", 'kind = "coupled"', 'binding = "wing_in_air.toml"',
         "parameters = { young_modulus_factor = 1.0073 }",
         "[[asset.component]]", 'name = "air"', 'fmu = "air.fmu"',
         "[[asset.component]]", 'name = "wing"', f'fmu = "{name}.fmu"',
     ]  # fmt: skip
     for source, target in _CONNECTIONS:
         asset += ["[[asset.connection]]", f'source = "{source}"', f'target = "{target}"']
-    begin, end = text.index("[asset]"), text.index("[calibration]")
+    begin, end = text.index("[asset]"), text.index("[belief]")
     return text[:begin] + "\n".join(asset) + "\n\n" + text[end:]
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from fe.state import Geometry
+from calibration.static.experiments import HALF_WIDTH_95
+from calibration.static.posterior import GaussianPrior
+from fe.runtime.state import Geometry
+from reporting.table_file import TextTable, read_table
 
 from .errors import ExperimentDataError, ExperimentFileError
-from .experiments import HALF_WIDTH_95
-from .posterior import GaussianPrior
+from .lab_folder import LAB_ERRORS, find_lab_file
 
 TOLERANCE = 2.54e-3
 """Design tolerance of a length, half-width of a 95 % interval [m] (Kapteyn et al. 2021, Table 1)."""
@@ -23,11 +24,12 @@ GEOMETRY_FILE = Path("step1") / "geometry_data.csv"
 """Where the authors' calibration folder keeps the lengths of step 1."""
 
 LENGTH_NAMES = ("semi_span", "root_chord", "tip_chord")
-"""The lengths, in the order of `fe.state.Geometry`."""
+"""The lengths, in the order of `fe.runtime.state.Geometry`."""
 
-# The names that the published file gives to the lengths.
-_PUBLISHED_NAMES = {"length": "semi_span", "chord_{root}": "root_chord", "chord_{tip}": "tip_chord"}
-_FOLDERS_OF_STEPS = (Path(), Path("datafiles"), Path("src") / "datafiles")
+PUBLISHED_NAMES = {"length": "semi_span", "chord_{root}": "root_chord", "chord_{tip}": "tip_chord"}
+"""The names that the published file gives to the lengths, beside those of `fe.runtime.state.Geometry`."""
+
+_USER = "the measured planform"
 _LARGEST_DEVIATION = 0.10  # of a length from its design; beyond this the units or the wing are others
 
 
@@ -153,63 +155,37 @@ def read_lengths(path: Path) -> GeometryCalibration:
     Raises
     ------
     ExperimentFileError
-        If the file is missing, empty, or lacks a column or a row.
+        If the file is missing, empty, lacks a column or a row, names a length twice, has a row with another
+        number of cells than its header or a cell that is no number.
     ExperimentDataError
-        If a value is not a positive finite number, or the lengths are in another unit.
+        If a value is not positive and finite, or the lengths are in another unit.
     """
-    file = _find(Path(path))
-    try:
-        with file.open(encoding="utf-8-sig", newline="") as stream:
-            rows = [
-                [cell.strip() for cell in row] for row in csv.reader(stream) if any(c.strip() for c in row)
-            ]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ExperimentFileError(f"{file} cannot be read as a CSV text file: {error}.") from error
-    if not rows:
-        raise ExperimentFileError(
-            f"{file} is empty; a header `parameter,designed,manufactured` and three rows are needed."
-        )
-    header = rows[0]
-    missing = [name for name in ("parameter", "designed", "manufactured") if name not in header]
-    if missing:
-        raise ExperimentFileError(
-            f"{file} lacks the column {' and '.join(missing)}; its columns are {', '.join(header)}."
-        )
-    found: dict[str, MeasuredLength] = {}
-    for row in rows[1:]:
-        cells = dict(zip(header, row, strict=False))
-        name = _PUBLISHED_NAMES.get(cells.get("parameter", ""))
-        if name is not None:
-            designed, measured = (_length(file, cells, column) for column in ("designed", "manufactured"))
-            found[name] = MeasuredLength(name, designed, measured)
-    lost = [published for published, name in _PUBLISHED_NAMES.items() if name not in found]
+    file = find_lab_file(Path(path), GEOMETRY_FILE)
+    table = read_table(file, LAB_ERRORS)
+    names = table.cells("parameter", _USER)
+    table.refuse_repeated(names, "parameter", "keep one of them")
+    lost = [published for published in PUBLISHED_NAMES if published not in names]
     if lost:
         raise ExperimentFileError(
-            f"{file} lacks the row {' and '.join(lost)}; the rows {', '.join(_PUBLISHED_NAMES)} are needed."
+            f"{file} lacks the row {' and '.join(lost)}; the rows {', '.join(PUBLISHED_NAMES)} are needed."
         )
+    for column in ("designed", "manufactured"):
+        table.cells(column, _USER)
+    found = {
+        name: MeasuredLength(
+            name,
+            *(_length(table, column, names.index(published)) for column in ("designed", "manufactured")),
+        )
+        for published, name in PUBLISHED_NAMES.items()
+    }
     return GeometryCalibration(source=file.name, **found)
 
 
-def _find(path: Path) -> Path:
-    if path.is_file():
-        return path
-    for folder in _FOLDERS_OF_STEPS:
-        if (path / folder / GEOMETRY_FILE).is_file():
-            return path / folder / GEOMETRY_FILE
-    if not path.exists():
-        raise ExperimentFileError(f"{path} does not exist; give the folder that holds {GEOMETRY_FILE}.")
-    raise ExperimentFileError(f"{path} does not hold {GEOMETRY_FILE}; give the authors' calibration folder.")
-
-
-def _length(file: Path, cells: dict[str, str], column: str) -> float:
-    text = cells.get(column, "")
-    try:
-        millimetres = float(text)
-    except ValueError:
-        millimetres = math.nan
-    where = f"{file}: {column} of {cells['parameter']}"
-    if not (math.isfinite(millimetres) and millimetres > 0.0):
-        raise ExperimentDataError(f"{where} is {text!r}, but a positive finite length in mm is needed.")
+def _length(table: TextTable, column: str, row: int) -> float:
+    millimetres = table.positive_number(column, row)
     if millimetres < 10.0:
-        raise ExperimentDataError(f"{where} is {text} mm, which looks like m: give it in mm.")
+        raise ExperimentDataError(
+            f"{table.name}, line {table.lines[row]}: {column} is {millimetres:g} mm, which looks like m: "
+            "give it in mm."
+        )
     return millimetres * 1e-3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from reporting.json_file import read_json
 
 from .errors import ExperimentDataError, ExperimentFileError
 
@@ -86,15 +87,7 @@ def read_published_strains(file: Path | str) -> PublishedStrains:
     ExperimentDataError
         If its values are not in the published format.
     """
-    try:
-        content = json.loads(Path(file).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ExperimentFileError(
-            f"cannot read the strain library {file}: {error.strerror}; give the file {FILE_NAME} of the "
-            "authors' repository UAV-Digital-Twin, or its folder"
-        ) from error
-    except ValueError as error:
-        raise ExperimentFileError(f"the strain library {file} is no JSON file: {error}") from error
+    content = read_json(file, ExperimentFileError, what="strain library")
     try:
         return _arranged(content)
     except KeyError as error:

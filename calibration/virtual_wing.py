@@ -1,7 +1,7 @@
 """A wing that never was on the test bench: experiments of which the truth is known.
 
 `TestBench` is what every experiment needs of a wing; `VirtualWing` is a reduced model with a digital state as
-its truth, `twin_master.virtual_experiments` has the FMU behind the same interface. The functions
+its truth, `twin_master.assets.virtual_experiments` has the FMU behind the same interface. The functions
 `measure_...` do the experiments of the paper on a bench, with reading errors and a seed.
 """
 
@@ -15,31 +15,31 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.damping import rayleigh_damping_ratio
-from fe.reduced import ReducedModel
-from fe.state import DigitalState, Geometry
-
-from .errors import ExperimentDataError
-from .experiments import (
+from calibration.dynamics.records import RingDownRecord
+from calibration.joint.prior import WeighedMass
+from calibration.static.experiments import (
     DISPLACEMENT_STANDARD_DEVIATION,
     HALF_WIDTH_95,
     LOAD_STANDARD_DEVIATION,
     LoadDisplacementData,
     published_measurements,
 )
+from calibration.static.posterior import MOST_SAMPLES, Seed, child_seed
+from fe.runtime.damping import rayleigh_damping_ratio
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import DigitalState, Geometry
+
+from .errors import ExperimentDataError
 from .geometry import READING_UNCERTAINTY, GeometryCalibration, MeasuredLength, published_lengths
-from .joint.prior import WeighedMass
-from .posterior import Seed, child_seed
-from .ringdown_records import RingDownRecord
 
 FloatArray = NDArray[np.float64]
 
 SENSITIVITY = 50.0
 """Volts per unit strain: a quarter bridge of gauge factor 2 at 5 V, amplified 20 times [V]."""
 
-RECORDED_GAUGE = 22
-"""The gauge whose strain is recorded: a released tip moves mode 2 by a quarter of mode 1 there, the higher
-modes hardly; nearer to the root mode 2 is lost behind mode 1."""
+RECORDED_GAUGE = 23
+"""The gauge whose strain is recorded, counted from 1: a released tip moves mode 2 by a quarter of mode
+1 there, the higher modes hardly; nearer to the root mode 2 is lost behind mode 1."""
 
 _PURPOSES = {"load": 31, "ring_down": 32, "geometry": 33, "weighing": 34}
 
@@ -93,7 +93,7 @@ class VirtualWing:
         Relative differences delta between this wing's two flapwise frequencies and its model's [1]: what
         the model leaves out. Mode shapes and damping ratios stay the model's.
     gauge : int
-        Whose strain is recorded, from 0.
+        Whose strain is recorded, counted from 1.
     sensitivity : float
         Of the strain signal [V].
 
@@ -101,7 +101,7 @@ class VirtualWing:
     ------
     ExperimentDataError
         If the gauge is not there or a frequency error is not above -1.
-    fe.errors.OutsideModelError
+    fe.runtime.errors.OutsideModelError
         If the truth lies outside the model.
     """
 
@@ -113,9 +113,9 @@ class VirtualWing:
     _modal: _FreeVibration = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.gauge < self.model.gauge_count:
+        if not 1 <= self.gauge <= self.model.gauge_count:
             raise ExperimentDataError(
-                f"the wing has the gauges 0 to {self.model.gauge_count - 1}, but {self.gauge} was asked for."
+                f"the wing has the gauges 1 to {self.model.gauge_count}, but {self.gauge} was asked for."
             )
         if not all(math.isfinite(error) and error > -1.0 for error in self.frequency_error):
             raise ExperimentDataError(
@@ -159,7 +159,7 @@ def _free_vibration(wing: VirtualWing) -> _FreeVibration:
     for mode, error in zip(modes.flapwise, wing.frequency_error, strict=True):
         frequency[mode] *= 1.0 + error
     zeta = rayleigh_damping_ratio(truth.damping_alpha, truth.damping_beta, modes.frequency)
-    return _FreeVibration(2.0 * math.pi * frequency, zeta, modes.strain[wing.gauge] * displacement)
+    return _FreeVibration(2.0 * math.pi * frequency, zeta, modes.strain[wing.gauge - 1] * displacement)
 
 
 def _free_decay(omega: float, zeta: float, time: FloatArray) -> FloatArray:
@@ -253,6 +253,11 @@ def measure_ring_down(
         raise ExperimentDataError(
             "ring-down tests need at least one trial and noise that is finite and not negative, but "
             f"{trials} trials with {noise:g} V were asked for."
+        )
+    if MOST_SAMPLES < trials * duration * sampling_rate < math.inf:
+        raise ExperimentDataError(
+            f"{trials} records of {duration:g} s at {sampling_rate:g} Hz are more than {MOST_SAMPLES:,} "
+            "samples: take fewer, shorter or slower ones."
         )
     if quantisation is not None and not (math.isfinite(quantisation) and quantisation > 0.0):
         raise ExperimentDataError(f"the recorder's step must be positive, but {quantisation:g} V was given.")

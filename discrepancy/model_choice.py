@@ -5,20 +5,20 @@ from enum import StrEnum
 from pathlib import Path
 
 from calibration.errors import CalibrationError
-from calibration.result import CalibrationResult
+from calibration.wing.result_file import load_calibration
 from discrepancy.errors import ModelError
-from discrepancy.from_run import CALIBRATION_FILE, DESIGN_FILE, MODEL_PATCH_FILE, run_model
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.fmu_runs import binding_file
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
-from discrepancy.models.model_file import read_toml
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
-from fe.design import SHIPPED_DESIGN, WingDesign, load_design
-from fe.errors import FiniteElementError
-from fe.reduction import Progress
+from discrepancy.sources.from_run import CALIBRATION_FILE, DESIGN_FILE, MODEL_PATCH_FILE, run_model
+from fe.reduction.reduced_basis import Progress
+from fe.runtime.errors import FiniteElementError
+from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
 from reporting.provenance import hash_file, hash_record
+from reporting.toml_file import read_toml
 
 
 class ModelKind(StrEnum):
@@ -95,7 +95,7 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
             f"shipped lumped model ({', '.join(shipped_lumped_models())}) is expected."
         )
     if path.suffix == ".toml":
-        content = read_toml(path, "model")
+        content = read_toml(path, ModelError, what="model")
         if content.get("kind") == "fmu":
             return _fmu(path)
         if "format" not in content:  # a wing design has none
@@ -104,6 +104,28 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
     shipped = not path.suffix and not path.exists()
     file = SHIPPED_MODELS / f"{path}.toml" if shipped else path
     return ModelChoice(model, ModelKind.LUMPED, path.name, hash_file(file), path=None if shipped else path)
+
+
+def load_model(name: str | Path | None = None, progress: Progress | None = None) -> Model:
+    """Return a model that a campaign can be compared with.
+
+    Parameters
+    ----------
+    name : str or Path, optional
+        A calibration (.nc), a wing design, a lumped model or the description of an FMU (.toml), the name of a
+        shipped lumped model, or the folder of a mission whose twin's model is meant; the shipped wing if left
+        out.
+    progress : Progress, optional
+        Where the modelling of a wing reports.
+
+    Raises
+    ------
+    ModelError, CampaignFileError
+        If there is no such model, or its file cannot be used.
+    """
+    if name is not None and Path(name).is_dir():
+        return run_model(name)
+    return choose_model(name, progress).model
 
 
 def choice_of_run(folder: Path) -> ModelChoice:
@@ -154,7 +176,7 @@ def _wing(path: Path | None, progress: Progress | None) -> ModelChoice:
 def _calibrated(path: Path, progress: Progress | None) -> ModelChoice:
     model = WingModel.of_calibration(path, progress)
     try:
-        design = CalibrationResult.load(path).design
+        design = load_calibration(path).design
     except (CalibrationError, OSError) as cause:
         raise ModelError(f"The calibration {path} cannot be used: {cause}") from cause
     return ModelChoice(model, ModelKind.CALIBRATION, path.name, hash_file(path), design, path)

@@ -2,8 +2,8 @@
 
 Campaigns are simulated with the model, the inputs, the channels and the noise of a real one. In a third of
 them nothing is hidden; in the others an effect drawn from its prior, where this campaign can detect it
-(d^2 >= 25, the limit of `discrepancy.separability`). Each is investigated as the real one is, and verdicts
-are compared with what was hidden. Motion is simulated with half the time step of the naming side.
+(d^2 >= 25, the limit of `discrepancy.judgement.separability`). Each is investigated as the real one is, and
+verdicts are compared with what was hidden. Motion is simulated with half the time step of the naming side.
 """
 
 import json
@@ -19,15 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
+from discrepancy.campaign.records import Campaign
+from discrepancy.catalogue.entry import Effect
+from discrepancy.files.document import Origin, plain
+from discrepancy.judgement.separability import usable
+from discrepancy.models.interface import Model
+from discrepancy.sources.simulated_campaigns import Hidden, Simulator
 from reporting.files import atomic_write_text
 
-from .campaign import Campaign
-from .catalogue.entry import Effect
-from .document_file import Origin, origin_rows, plain
 from .errors import FitError, ModelError
-from .models.interface import Model
-from .separability import usable
-from .simulated_campaigns import Hidden, Simulator
 from .verdict import VerdictKind
 from .workflow import checked, investigate
 
@@ -319,7 +319,7 @@ def write_self_calibration(path: Path, found: SelfCalibration, origin: Origin) -
     rows, columns, counts = found.confusion()
     content = {
         "schema": SCHEMA,
-        **origin_rows(origin),
+        **plain(origin),
         "seed": found.seed,
         "not_detectable": list(found.not_detectable),
         "outcomes": {

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from math import nan
 
-from fe.patch import ModelPatch
+from .document_types import Number, Patch
 
 
 class VerdictKind(StrEnum):
@@ -25,9 +25,9 @@ class Estimate:
     """A number with its 90 % interval: posterior median and quantiles 0.05, 0.95, in `unit`."""
 
     name: str
-    value: float
-    low: float
-    high: float
+    value: Number
+    low: Number
+    high: Number
     unit: str
     description: str = ""
 
@@ -42,7 +42,7 @@ class NamedEffect:
     family: str
     parameters: tuple[Estimate, ...]
     shape: tuple[Estimate, ...]
-    patch: ModelPatch
+    patch: Patch
 
 
 @dataclass(frozen=True)
@@ -62,10 +62,10 @@ class Hypothesis:
     """
 
     effects: tuple[NamedEffect, ...]
-    log_evidence: float
-    probability: float
-    chi_square: float
-    degrees_of_freedom: float
+    log_evidence: Number
+    probability: Number
+    chi_square: Number
+    degrees_of_freedom: Number
 
     @property
     def identifiers(self) -> tuple[str, ...]:
@@ -91,8 +91,8 @@ class Gate:
 
     name: str
     passed: bool | None
-    statistic: float
-    limit: float
+    statistic: Number
+    limit: Number
     reason: str
 
 
@@ -123,23 +123,23 @@ class Scores:
         Of their uniformity, with the effective number of samples; nan with fewer than ten.
     """
 
-    rms: Mapping[str, float]
-    chi_square_per_dof: float
-    log_score: float
-    coverage_50: float
-    coverage_90: float
-    whiteness: float
+    rms: Mapping[str, Number]
+    chi_square_per_dof: Number
+    log_score: Number
+    coverage_50: Number
+    coverage_90: Number
+    whiteness: Number
     sample_count: int = 0
-    chi_square_deviation: float = nan
-    pit: tuple[float, ...] = ()
-    pit_p_value: float = nan
+    chi_square_deviation: Number = nan
+    pit: tuple[Number, ...] = ()
+    pit_p_value: Number = nan
 
 
 @dataclass(frozen=True)
 class Proof:
     """What the effect does to data not used: before and after, on held-out and on fitted trials.
 
-    `gap_closed` = 1 - (chi2_after - 1) / (chi2_before - 1) per degree of freedom on held-out trials;
+    `gap_closed` = 1 - (χ²_after - 1) / (χ²_before - 1) per degree of freedom on held-out trials;
     nan with the reason in `gap_reason` where there is no held-out trial or no gap to close.
     `log_score_gain` per sample with its standard error, trials taken as units.
     """
@@ -148,9 +148,9 @@ class Proof:
     held_out_after: Scores | None
     fitted_before: Scores
     fitted_after: Scores
-    gap_closed: float
-    log_score_gain: float
-    log_score_gain_error: float
+    gap_closed: Number
+    log_score_gain: Number
+    log_score_gain_error: Number
     remaining: str = ""
     gap_reason: str = ""
 
@@ -160,8 +160,8 @@ class Experiment:
     """A proposed next experiment: what to do, its mutual information [nat], cost [1], and why."""
 
     description: str
-    information: float
-    cost: float
+    information: Number
+    cost: Number
     reason: str
 
 
@@ -203,14 +203,14 @@ class Verdict:
 
     kind: VerdictKind
     sentence: str
-    probability: float
-    log_bayes_factor: float
+    probability: Number
+    log_bayes_factor: Number
     effects: tuple[NamedEffect, ...] = ()
     group: tuple[str, ...] = ()
     family: str = ""
     gates: tuple[Gate, ...] = ()
     hypotheses: tuple[Hypothesis, ...] = ()
-    inclusion: Mapping[str, float] = field(default_factory=dict)
+    inclusion: Mapping[str, Number] = field(default_factory=dict)
     next_experiments: tuple[Experiment, ...] = ()
     remarks: tuple[str, ...] = ()
     resembles: tuple[str, ...] = ()

@@ -6,20 +6,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from discrepancy.document_file import Origin
-from discrepancy.naming import named_effects
-from discrepancy.patch_file import PATCH_NAME, fmu_outputs, primitive_intervals, write_patch
+from discrepancy.files.document import Origin
+from discrepancy.files.patch import PATCH_NAME, fmu_outputs, primitive_intervals, write_patch
+from discrepancy.files.residuals import RESIDUALS_NAME, write_residuals
+from discrepancy.files.verdict import VERDICT_NAME, write_verdict
+from discrepancy.judgement.naming import named_effects
+from discrepancy.judgement.separability import Separability
 from discrepancy.report.content import ReportInput
 from discrepancy.report.figures import draw, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.report.text import added_label
-from discrepancy.residual_file import RESIDUALS_NAME, write_residuals
 from discrepancy.self_calibration import SELF_CALIBRATION_NAME, SelfCalibration, write_self_calibration
-from discrepancy.separability import Separability
 from discrepancy.verdict import VerdictKind
-from discrepancy.verdict_file import VERDICT_NAME, write_verdict
 from discrepancy.workflow import Investigation, patch_draws
-from fe.design import WingDesign
+from fe.wing.design import WingDesign
 from reporting.errors import FileNotWrittenError
 from reporting.figures import to_png
 from reporting.files import atomic_write_bytes, atomic_write_text, write_error
@@ -84,7 +84,9 @@ def check_folder(folder: Path, *, replace_it: bool) -> None:
         )
 
 
-def write_verdict_folder(folder: Path, content: VerdictContent, *, replace_it: bool = False) -> Path:
+def write_verdict_folder(
+    folder: Path, content: VerdictContent, *, replace_it: bool = False, report: bool = True
+) -> Path:
     """Write everything beside the folder first, and move it into place when it is complete.
 
     Parameters
@@ -95,11 +97,13 @@ def write_verdict_folder(folder: Path, content: VerdictContent, *, replace_it: b
         What is written.
     replace_it : bool
         Put it in the place of an existing folder of a verdict. Anything else is never replaced.
+    report : bool
+        Draw the page and its figures.
 
     Returns
     -------
     Path
-        Of the report.
+        Of the report, or of the folder where there is none.
 
     Raises
     ------
@@ -115,7 +119,7 @@ def write_verdict_folder(folder: Path, content: VerdictContent, *, replace_it: b
     try:
         fresh = scratch / folder.name
         fresh.mkdir()
-        _write(fresh, content)
+        _write(fresh, content, report=report)
         if folder.is_dir():
             folder.rename(scratch / "old")
         try:
@@ -128,10 +132,10 @@ def write_verdict_folder(folder: Path, content: VerdictContent, *, replace_it: b
         raise write_error(error, folder) from error
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    return folder / REPORT_NAME
+    return folder / REPORT_NAME if report else folder
 
 
-def _write(folder: Path, content: VerdictContent) -> None:
+def _write(folder: Path, content: VerdictContent, *, report: bool) -> None:
     found = content.investigation
     verdict, origin = found.verdict, content.origin
     write_verdict(folder / VERDICT_NAME, verdict, found.proof, origin)
@@ -159,6 +163,8 @@ def _write(folder: Path, content: VerdictContent) -> None:
         )  # fmt: skip
     if content.self_calibration is not None:
         write_self_calibration(folder / SELF_CALIBRATION_NAME, content.self_calibration, origin)
+    if not report:
+        return
     figures = report_figures(page)
     drawings = draw(figures)
     for name, item in figures.items():

@@ -4,36 +4,42 @@ import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from fe.patch import ModelPatch
+from discrepancy.campaign.held_out import choose_held_out
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.records import Campaign
+from discrepancy.catalogue.building import NO_PORT
+from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.catalogue.library import load_catalogue
+from discrepancy.checks.fault import DataFault
+from discrepancy.checks.outliers import wrong_ends
+from discrepancy.checks.quality import check_against_model, check_data, mark_outliers
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.fitting import fit as fit_to
+from discrepancy.fits.linearisation import Point
+from discrepancy.fits.predictive import residual_set
+from discrepancy.fits.problem import Problem
+from discrepancy.judgement.look_alikes import look_alike_remark
+from discrepancy.judgement.naming import name
+from discrepancy.judgement.next_experiment import next_experiments
+from discrepancy.judgement.proof import prove
+from discrepancy.location.locate import Location, locate
+from discrepancy.location.residuals import ResidualSet
+from discrepancy.models.interface import Model
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.search.strategy import Search, solver_share
+from discrepancy.sources.from_run import RUN_FILE, run_campaign
+from fe.runtime.patch import ModelPatch
 from reporting.words import be
 
-from .campaign import Campaign
-from .candidate import Candidate
-from .catalogue.building import NO_PORT
-from .catalogue.entry import Effect, Setting
-from .catalogue.library import load_catalogue
-from .data_fault import DataFault
-from .data_quality import check_against_model, check_data, mark_outliers
 from .errors import CampaignDataError
-from .fitting import Fit
-from .fitting import fit as fit_to
-from .held_out import choose_held_out
-from .locate import Location, locate
-from .look_alikes import look_alike_remark
-from .models.interface import Model
-from .models.lumped import LumpedModel
-from .naming import name
-from .next_experiment import next_experiments
-from .outliers import wrong_ends
-from .predictive import residual_set
-from .problem import Point, Problem
-from .proof import prove
-from .residuals import ResidualSet
-from .search import SOLVER_SHARE, Search, solver_share
+from .model_choice import load_model
+from .search_settings import SEARCH
 from .verdict import Experiment, Proof, Verdict, VerdictKind
 
 DRAWS = 400
@@ -71,7 +77,7 @@ class Investigation:
         Where an effect was named, or is the most probable one.
     before, after : ResidualSet or None
         Residuals without and with it; None where faults of the data stopped the work.
-    problem, search, fit : Problem, Search, Fit or None
+    problem, search, fit : Problem, Search, CandidateFit or None
         What the naming side worked with; `fit` stands for the verdict.
     seconds : dict of str to float
         Wall time by stage.
@@ -87,13 +93,13 @@ class Investigation:
     after: ResidualSet | None = None
     problem: Problem | None = None
     search: Search | None = None
-    fit: Fit | None = None
+    fit: CandidateFit | None = None
     seconds: dict[str, float] | None = None
 
 
 def investigate(
-    campaign: Campaign,
-    model: Model,
+    campaign: Campaign | str | Path,
+    model: Model | str | Path | None = None,
     effects: Sequence[Effect] | None = None,
     *,
     seed: int = 0,
@@ -104,10 +110,11 @@ def investigate(
 
     Parameters
     ----------
-    campaign : Campaign
-        Measured data.
-    model : Model
-        The model that is to explain them.
+    campaign : Campaign or path
+        Measured data: a campaign, its folder, or the folder of a mission whose flight is meant.
+    model : Model or path, optional
+        The model that is to explain them, as `load_model` takes it: that of the mission's twin if left out
+        beside a mission, else the shipped wing.
     effects : sequence of Effect, optional
         The catalogue; the shipped one with the user's installed entries if left out.
     seed : int
@@ -127,6 +134,7 @@ def investigate(
     DiscrepancyError
         If the campaign cannot be compared with the model at all.
     """
+    campaign, model = _given(campaign, model)
     seconds: dict[str, float] = {}
 
     def stage(description: str, key: str) -> "_Timed":
@@ -153,26 +161,14 @@ def investigate(
             problem = Problem(campaign, model, setting)
         catalogue = load_catalogue() if effects is None else effects
         verdict, search, fit = name(problem, catalogue)
-    remarks = [fault.sentence for fault in faults] + list(campaign.remarks)
-    remarks += strained(problem, fit)
-    remarks += without_port(setting, catalogue)
-    alike = look_alike_remark(verdict, search.effects)
-    remarks += [] if alike is None else [alike]
-    if not model.parameters:
-        remarks.append(
-            f"The model {model.name!r} has no uncertain parameter, so a stiffness or damping a little "
-            "off can be taken for an effect: give it some with their deviations."
-        )
-    if fit.candidate.terms and not fit.converged:
-        remarks.append(
-            "The fit of the verdict had not settled when it ended: its intervals may be too narrow."
-        )
+    remarks = [fault.sentence for fault in faults]
+    remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stage("Checking the time steps", "steps"):
         share = solver_share(problem, fit)
-        if share > SOLVER_SHARE:
+        if share > SEARCH.solver_share:
             remarks.append(
-                f"The time steps cost up to {share:.2g} of the noise (rms), more than the {SOLVER_SHARE:g} "
-                "that is wanted: probabilities may be too sharp."
+                f"The time steps cost up to {share:.2g} of the noise (rms), more than the "
+                f"{SEARCH.solver_share:g} that is wanted: probabilities may be too sharp."
             )
     with stage("Residuals", "residuals"):
         before = residual_set(problem, search.none, sensitivities=thorough)
@@ -194,6 +190,38 @@ def investigate(
     return Investigation(
         campaign, model, faults, verdict, location, proof, before, after, problem, search, fit, seconds
     )
+
+
+def _remarks(
+    problem: Problem, catalogue: Sequence[Effect], verdict: Verdict, search: Search, fit: CandidateFit
+) -> list[str]:
+    """Return what has to be said beside a verdict."""
+    remarks = list(problem.campaign.remarks)
+    remarks += strained(problem, fit)
+    remarks += without_port(problem.setting, catalogue)
+    alike = look_alike_remark(verdict, search.effects)
+    remarks += [] if alike is None else [alike]
+    if not problem.model.parameters:
+        remarks.append(
+            f"The model {problem.model.name!r} has no uncertain parameter, so a stiffness or damping a "
+            "little off can be taken for an effect: give it some with their deviations."
+        )
+    if fit.candidate.terms and not fit.converged:
+        remarks.append(
+            "The fit of the verdict had not settled when it ended: its intervals may be too narrow."
+        )
+    return remarks
+
+
+def _given(campaign: Campaign | str | Path, model: Model | str | Path | None) -> tuple[Campaign, Model]:
+    """Return campaign and model, read where a path was given."""
+    if not isinstance(campaign, Campaign):
+        flown = (Path(campaign) / RUN_FILE).is_file()
+        model = Path(campaign) if model is None and flown else model
+        campaign = run_campaign(campaign) if flown else read_campaign(Path(campaign))
+    if model is None or isinstance(model, str | Path):
+        model = load_model(model)
+    return campaign, model
 
 
 def checked(campaign: Campaign, model: Model) -> tuple[Campaign, tuple[DataFault, ...]]:
@@ -249,7 +277,7 @@ def without_wrong_ends(problem: Problem) -> Campaign:
     return replace(problem.campaign, trials=tuple(trials.values()), remarks=tuple(remarks))
 
 
-def strained(problem: Problem, fit: Fit) -> list[str]:
+def strained(problem: Problem, fit: CandidateFit) -> list[str]:
     """Return a sentence for each calibrated parameter and gain that a fit takes far from its prior.
 
     What an implausible nuisance has taken up leaves no residual; the absolute gate judges all gains together,
@@ -280,7 +308,7 @@ def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
     return [f"Not tested for lack of a port: {listed}; declare {what} where such a force may act."]
 
 
-def open_hypotheses(search: Search, count: int = 5) -> list[tuple[Fit, float]]:
+def open_hypotheses(search: Search, count: int = 5) -> list[tuple[CandidateFit, float]]:
     """Return the most probable hypotheses with their probabilities, different sets of effects."""
     found = []
     for identifiers, probability in list(search.set_probabilities().items())[:count]:
@@ -289,7 +317,7 @@ def open_hypotheses(search: Search, count: int = 5) -> list[tuple[Fit, float]]:
     return found
 
 
-def patch_draws(problem: Problem, fit: Fit, seed: int, count: int = DRAWS) -> list[list[ModelPatch]]:
+def patch_draws(problem: Problem, fit: CandidateFit, seed: int, count: int = DRAWS) -> list[list[ModelPatch]]:
     """Return for each effect of a fit its patch at draws of the posterior: of the fit, else Gaussian."""
     generator = np.random.default_rng(seed)
     if fit.draws is not None:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from .variables import ENUMERATIONS, UNITS, EnumerationType, FmuVariable, Unit
+from fmu_asset.slaves.variables import ENUMERATIONS, UNITS, EnumerationType, FmuVariable, Unit
 
 LOG_CATEGORIES = {
     "logStatusWarning": "Log messages with fmi2Warning status.",
@@ -89,6 +89,20 @@ def model_description(
         listed = SubElement(interface, "SourceFiles")
         for name in source_files:
             SubElement(listed, "File", name=name)
+    _add_definitions(root, units, enumerations)
+    categories = SubElement(root, "LogCategories")
+    for name, text in LOG_CATEGORIES.items():
+        SubElement(categories, "Category", name=name, description=text)
+    SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="50.0", stepSize="1.0")
+    variables = SubElement(root, "ModelVariables")
+    for row in table:
+        variables.append(_scalar_variable(row))
+    _add_structure(root, table, dependencies)
+    indent(root)
+    return bytes(tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
+
+
+def _add_definitions(root: Element, units: Sequence[Unit], enumerations: Sequence[EnumerationType]) -> None:
     defined = SubElement(root, "UnitDefinitions")
     for unit in units:
         element = SubElement(defined, "Unit", name=unit.name)
@@ -101,13 +115,11 @@ def model_description(
         items = SubElement(simple, "Enumeration")
         for name, value, text in enumeration.items:
             SubElement(items, "Item", name=name, value=str(value), description=text)
-    categories = SubElement(root, "LogCategories")
-    for name, text in LOG_CATEGORIES.items():
-        SubElement(categories, "Category", name=name, description=text)
-    SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="50.0", stepSize="1.0")
-    variables = SubElement(root, "ModelVariables")
-    for row in table:
-        variables.append(_scalar_variable(row))
+
+
+def _add_structure(
+    root: Element, table: Sequence[FmuVariable], dependencies: Mapping[str, Sequence[str]] | None
+) -> None:
     structure = SubElement(root, "ModelStructure")
     index = {row.name: row.reference + 1 for row in table}
     for name in ("Outputs", "InitialUnknowns"):
@@ -118,8 +130,6 @@ def model_description(
                 if name == "Outputs" and dependencies is not None and row.name in dependencies:
                     inputs = sorted(index[source] for source in dependencies[row.name])
                     unknown.set("dependencies", " ".join(map(str, inputs)))
-    indent(root)
-    return bytes(tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
 
 
 _WRITERS: Mapping[str, Callable[[float], str]] = {

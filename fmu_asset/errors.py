@@ -4,6 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+_CONTROLS = {code: f"\\x{code:02x}" for code in (*range(9), *range(11, 32), *range(127, 160))}
+
+
+def visible(text: str) -> str:
+    r"""Return a text with its control characters, which a terminal would obey, written as `\x1b`."""
+    return text.translate(_CONTROLS)
+
 
 class FmuError(Exception):
     """Any error that this package raises on purpose.
@@ -15,8 +22,8 @@ class FmuError(Exception):
     """
 
     def __init__(self, sentence: str, messages: Sequence[str] = ()) -> None:
-        self.messages = tuple(messages)
-        self.sentence = sentence
+        self.messages = tuple(visible(message) for message in messages)
+        self.sentence = sentence = visible(sentence)
         log = "".join(f"\n  the FMU says: {message}" for message in self.messages)
         super().__init__(sentence + log)
 

@@ -1,5 +1,8 @@
 """One publication style for every figure of the project, and reproducible bytes from a figure.
 
+Text is drawn as it is written, whatever signs a user's title holds; a text with mathematics between dollar
+signs is given ``parse_math=True``.
+
 Figures are made with `new_figure` inside ``with publication_style():`` and never through pyplot, so that
 nothing global is left behind. Equal data give equal bytes: ids are salted, dates and program names left out.
 """
@@ -16,6 +19,7 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 
 from reporting.errors import InvalidFigureError
 
@@ -82,7 +86,7 @@ _STYLE: Final[dict[Any, Any]] = {
     "svg.image_inline": True,
     "path.simplify": True,
     "text.usetex": False,
-    "text.parse_math": True,
+    "text.parse_math": False,  # a title may hold any sign; a text that is mathematics says so itself
 }
 
 
@@ -133,6 +137,7 @@ def to_svg(figure: Figure) -> bytes:
     """Return the figure as SVG: text as outlines, deterministic ids, no date, no program name, no DTD."""
     buffer = io.BytesIO()
     with publication_style():
+        _read_powers(figure)
         # All four must be left out for the block of metadata, with its addresses, to vanish.
         figure.savefig(
             buffer,
@@ -149,8 +154,22 @@ def to_png(figure: Figure, resolution: float = PNG_RESOLUTION) -> bytes:
     """Return the figure as PNG at `resolution` dots per inch, without program name."""
     buffer = io.BytesIO()
     with publication_style():
+        _read_powers(figure)
         figure.savefig(buffer, format="png", dpi=resolution, metadata={"Software": None})
     return buffer.getvalue()
+
+
+def _read_powers(figure: Figure) -> None:
+    """Let logarithmic axes show the powers of ten that matplotlib writes as mathematics."""
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+        for formatter, ticks, places in (
+            (axis.get_major_formatter(), axis.get_major_ticks, axis.get_majorticklocs()),
+            (axis.get_minor_formatter(), axis.get_minor_ticks, axis.get_minorticklocs()),
+        ):
+            if isinstance(formatter, LogFormatter):
+                for tick in ticks(len(places)):
+                    tick.label1.set_parse_math(True)
+                    tick.label2.set_parse_math(True)
 
 
 _IDENTIFIER = re.compile(r'\bid="([^"]+)"')

@@ -11,20 +11,17 @@ Library code takes a `Progress` and never asks what it is::
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    SpinnerColumn,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-)
-from rich.progress import Progress as RichBars
+if TYPE_CHECKING:  # rich takes a while to import, and most code only names what it reports to
+    from rich.console import Console
+    from rich.progress import Progress as RichBars
+    from rich.progress import TaskID
+
+SECONDS_BETWEEN_LINES = 10.0
+"""On a pipe, how long a stage is silent at most while its parts advance."""
 
 
 @runtime_checkable
@@ -78,27 +75,57 @@ class _BarStage:
             self._bars.update(self._task, advance=amount, detail=detail)
 
 
+class _LineStage:
+    """A stage on a pipe: a line now and then, so that nobody takes long work for a standstill."""
+
+    def __init__(self, note: Callable[[str], None], description: str, total: int | None, unit: str) -> None:
+        self._note, self._description, self._total, self._unit = note, description, total, unit
+        self._begin = self._last = time.perf_counter()
+        self._done = 0
+        amount = f", {total} {unit}".rstrip() if total is not None else ""
+        note(f"{description}{amount} ...")
+
+    def advance(self, amount: int = 1, detail: str | None = None) -> None:
+        """Tell how far the work is, if the last line is old."""
+        self._done += amount
+        now = time.perf_counter()
+        if now - self._last >= SECONDS_BETWEEN_LINES:
+            self._last = now
+            total = "" if self._total is None else f" of {self._total} {self._unit}".rstrip()
+            told = f"{self._done}{total}" if detail is None else f"{self._done}{total}, {detail}"
+            self._note(f"{self._description}: {told}, {now - self._begin:.0f} s ...")
+
+    def end(self) -> None:
+        """Tell that the stage is done, and how long it took."""
+        self._note(f"{self._description}: done, {time.perf_counter() - self._begin:.1f} s")
+
+
 class RichProgress:
-    """Progress on a terminal: a bar for each stage; on a pipe or in a log, one line as each stage ends.
+    """Progress on a terminal: a bar for each stage; on a pipe or in a log, lines as a stage begins and ends.
 
     Parameters
     ----------
     console
         Where to show it; the standard error stream by default, so that results can be piped.
+    lines
+        Show lines on a terminal too.
     """
 
-    def __init__(self, console: Console | None = None) -> None:
+    def __init__(self, console: Console | None = None, *, lines: bool = False) -> None:
+        from rich.console import Console
+
         self.console = console if console is not None else Console(stderr=True, highlight=False)
+        self._lines = lines or not self.console.is_terminal
         self._bars: RichBars | None = None
         self._open_stages = 0
 
     @contextmanager
     def stage(self, description: str, total: int | None = None, unit: str = "") -> Iterator[Stage]:
         """Show a stage; stages may be nested."""
-        start = time.perf_counter()
-        if not self.console.is_terminal:
-            yield _SilentStage()
-            self._line(description, total, unit, time.perf_counter() - start)
+        if self._lines:
+            stage = _LineStage(self.note, description, total, unit)
+            yield stage
+            stage.end()
             return
         bars = self._start()
         task = bars.add_task(description, total=total, unit=unit, detail="")
@@ -121,14 +148,16 @@ class RichProgress:
 
     def _start(self) -> RichBars:
         if self._bars is None:
-            self._bars = RichBars(
-                SpinnerColumn(finished_text="✓"),
-                TextColumn("{task.description}", markup=False),
-                BarColumn(bar_width=28),
-                MofNCompleteColumn(),
-                TextColumn("{task.fields[unit]}", markup=False),
-                TimeElapsedColumn(),
-                TextColumn("{task.fields[detail]}", style="dim", markup=False),
+            from rich import progress as rich
+
+            self._bars = rich.Progress(
+                rich.SpinnerColumn(finished_text="✓"),
+                rich.TextColumn("{task.description}", markup=False),
+                rich.BarColumn(bar_width=28),
+                rich.MofNCompleteColumn(),
+                rich.TextColumn("{task.fields[unit]}", markup=False),
+                rich.TimeElapsedColumn(),
+                rich.TextColumn("{task.fields[detail]}", style="dim", markup=False),
                 console=self.console,
             )
             self._bars.start()
@@ -140,7 +169,3 @@ class RichProgress:
         if self._open_stages == 0 and self._bars is not None:
             self._bars.stop()
             self._bars = None
-
-    def _line(self, description: str, total: int | None, unit: str, seconds: float) -> None:
-        amount = f", {total} {unit}".rstrip() if total is not None else ""
-        self.note(f"{description}{amount}: {seconds:.1f} s")

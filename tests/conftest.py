@@ -14,15 +14,16 @@ import pytest
 from hypothesis import settings
 
 if TYPE_CHECKING:
-    from calibration.result import CalibrationResult
-    from fe.patch_arrays import PatchArrays
+    from calibration.wing.result import CalibrationResult
+    from fe.runtime.patch_arrays import PatchArrays
 
 LEVELS = (0, 20, 40, 60, 80)
 
-# The same examples in every run of continuous integration; new ones at each run of a developer.
-settings.register_profile("ci", derandomize=True)
-if os.environ.get("CI"):
-    settings.load_profile("ci")
+# The same examples in every run of continuous integration; new ones at each run of a developer. No test is an
+# assertion on seconds.
+settings.register_profile("ci", derandomize=True, deadline=None)
+settings.register_profile("developer", deadline=None)
+settings.load_profile("ci" if os.environ.get("CI") else "developer")
 
 
 def synthetic_library() -> dict[str, object]:
@@ -53,6 +54,24 @@ def synthetic_library() -> dict[str, object]:
     }
 
 
+@pytest.fixture
+def die_after_turn() -> Callable[..., None]:
+    """Let runs die when a turn was put on the disk: `die_after_turn(monkeypatch, number of turns, error)`."""
+    from twin_master.mission.checkpoint import CheckpointFile, FlownTurn
+
+    def install(patch: pytest.MonkeyPatch, turns: int, error: BaseException | None = None) -> None:
+        keep = CheckpointFile.keep
+
+        def dying(self: CheckpointFile, turn: FlownTurn) -> None:
+            keep(self, turn)
+            if self.turns == turns:
+                raise error or KeyboardInterrupt
+
+        patch.setattr(CheckpointFile, "keep", dying)
+
+    return install
+
+
 @pytest.fixture(scope="session")
 def library_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Path of a synthetic strain library."""
@@ -65,12 +84,12 @@ def synthetic_calibration(
     count: int = 40, seed: int = 1, asset: str = "Wing 7 (é)", young_modulus_factor: float = 1.01
 ) -> CalibrationResult:
     """A calibration drawn from Gaussians, for a design 2 mm longer than the shipped one."""
-    from calibration.experiments import published_measurements
     from calibration.geometry import published_lengths
     from calibration.joint import WeighedMass, published_modal_measurement
-    from calibration.result import CalibrationResult
-    from calibration.steps import CalibrationStep, StepReward, Update
-    from fe.design import load_design
+    from calibration.static.experiments import published_measurements
+    from calibration.wing.result import CalibrationResult
+    from calibration.wing.steps import CalibrationStep, StepReward, Update
+    from fe.wing.design import load_design
 
     generator = np.random.default_rng(seed)
     mean = np.array([young_modulus_factor, 0.17, 0.132, 1.05, 7.6e-4])
@@ -105,8 +124,8 @@ def make_calibration() -> Callable[..., CalibrationResult]:
 @pytest.fixture(scope="session")
 def coarse_patch_arrays() -> PatchArrays:
     """The shipped wing for patches, on a coarse mesh."""
-    from fe.design import load_design
-    from fe.patch_cache import build_patch_arrays
+    from fe.reduction.patch_cache import build_patch_arrays
+    from fe.wing.design import load_design
 
     return build_patch_arrays(load_design().changed(mesh={"refinement": 0.25}))
 

@@ -2,70 +2,78 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-if TYPE_CHECKING:
-    from twin_master.workflow import RunOutcome
+from reporting import terminal
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+if TYPE_CHECKING:
+    from twin_master.store.outcome import RunOutcome
+
+
+Scenario = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="SCENARIO",
+        help="A shipped scenario (see `uav-twin scenarios`), the path of a TOML file, or of an SSP file "
+        "(with --scenario).",
+    ),
+]
+Out = Annotated[Path | None, typer.Option(help="The run folder to make.", show_default="runs/SCENARIO")]
+Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the run; by default that of the scenario.")]
+Fmu = Annotated[
+    Path | None, typer.Option(help="Fly this FMU; the design of the scenario stays the twin's model.")
+]
+Binding = Annotated[
+    Path | None,
+    typer.Option(help="Which variable of the FMU plays which role; by default as in the scenario."),
+]
+StrainLibrary = Annotated[
+    Path | None,
+    typer.Option(
+        help="Fly the authors' strain library (UAVconfig.json or its folder) as model and asset; in a "
+        "scenario that flies a library, its file."
+    ),
+]
+Calibration = Annotated[
+    Path | None,
+    typer.Option(help="Fly with this calibration of the wing, a calibration.nc of `uav-twin calibrate`."),
+]
+Library = Annotated[
+    Path | None,
+    typer.Option(help="Believe this observation library, made by `uav-twin library sample`."),
+]
+InProcess = Annotated[
+    bool, typer.Option("--in-process", help="Run the FMU in this process instead of a worker.")
+]
+WithScenario = Annotated[
+    str | None, typer.Option("--scenario", help="What is flown with the SSP file that SCENARIO names.")
+]
 
 
 def run(
-    scenario: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="SCENARIO",
-            help="A shipped scenario (see `uav-twin scenarios`), the path of a TOML file, or of an SSP file "
-            "(with --scenario).",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="The run folder to make.", show_default="runs/SCENARIO")
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the run; by default that of the scenario.")
-    ] = None,
+    scenario: Scenario = None,
+    out: Out = None,
+    seed: Seed = None,
     resume: Annotated[Path | None, typer.Option(help="Continue the interrupted run in this folder.")] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the run folder if it exists.")] = False,
-    fmu: Annotated[
-        Path | None, typer.Option(help="Fly this FMU; the design of the scenario stays the twin's model.")
-    ] = None,
-    binding: Annotated[
-        Path | None,
-        typer.Option(help="Which variable of the FMU plays which role; by default as in the scenario."),
-    ] = None,
-    strain_library: Annotated[
-        Path | None,
-        typer.Option(
-            help="Fly the authors' strain library (UAVconfig.json or its folder) as model and asset; in a "
-            "scenario that flies a library, its file."
-        ),
-    ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="Fly with this calibration of the wing, a calibration.nc of `uav-twin calibrate`."),
-    ] = None,
-    library: Annotated[
-        Path | None,
-        typer.Option(help="Believe this observation library, made by `uav-twin library sample`."),
-    ] = None,
-    in_process: Annotated[
-        bool, typer.Option("--in-process", help="Run the FMU in this process instead of a worker.")
-    ] = False,
-    with_scenario: Annotated[
-        str | None, typer.Option("--scenario", help="What is flown with the SSP file that SCENARIO names.")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress and no summary.")] = False,
+    fmu: Fmu = None,
+    binding: Binding = None,
+    strain_library: StrainLibrary = None,
+    calibration: Calibration = None,
+    library: Library = None,
+    in_process: InProcess = False,
+    with_scenario: WithScenario = None,
+    no_report: terminal.NoReport = False,
+    json: terminal.Json = False,
 ) -> None:
     """Fly a scenario: model, reduce, pack, calibrate, fly, report."""
-    from reporting.progress import RichProgress, SilentProgress
-    from twin_master.resolution import Overrides
-    from twin_master.scenario_file import load_scenario
+    from twin_master.assets.resolution import Overrides
+    from twin_master.scenario.reading import load_scenario
     from twin_master.workflow import new_run, resume_run
 
     ssp = None
@@ -78,26 +86,39 @@ def run(
     elif with_scenario is not None:
         raise typer.BadParameter("belongs to an SSP file as SCENARIO.", param_hint="--scenario")
     overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration, ssp, library)
-    progress = SilentProgress() if quiet else RichProgress()
+    progress, report = terminal.progress(), not no_report
     if resume is not None:
         if out is not None or replace or overrides != Overrides():
             raise typer.BadParameter(
-                "a run is continued with what its folder holds: give nothing but SCENARIO and --quiet "
-                "beside it.",
+                "a run is continued with what its folder holds: give nothing beside it that would change it.",
                 param_hint="--resume",
             )
         loaded = None if scenario is None else load_scenario(scenario)
-        outcome = _interruptible(lambda: resume_run(resume, loaded, progress=progress), resume)
+        outcome = _interruptible(lambda: resume_run(resume, loaded, report=report, progress=progress), resume)
     else:
         if scenario is None:
             raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
         loaded = load_scenario(scenario)
         folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
         outcome = _interruptible(
-            lambda: new_run(loaded, folder, overrides, replace=replace, progress=progress), folder
+            lambda: new_run(loaded, folder, overrides, replace=replace, report=report, progress=progress),
+            folder,
         )
-    if not quiet:
+    if json:
+        terminal.print_json(_record(outcome))
+    else:
         show_outcome(outcome)
+
+
+def _record(outcome: RunOutcome) -> dict[str, Any]:
+    """Return the content of `summary.json` with the places of run and report."""
+    import json
+
+    from twin_master.store.writing import SUMMARY_NAME
+
+    record: dict[str, Any] = json.loads((outcome.folder / SUMMARY_NAME).read_text(encoding="utf-8"))
+    report = None if outcome.report is None else str(outcome.report)
+    return {"folder": str(outcome.folder), "report": report} | record
 
 
 def _interruptible(fly: Callable[[], RunOutcome], folder: Path) -> RunOutcome:
@@ -107,16 +128,15 @@ def _interruptible(fly: Callable[[], RunOutcome], folder: Path) -> RunOutcome:
         begun = (folder / "config.json").is_file()
         hint = f"continue with `uav-twin run --resume {folder}`" if begun else "no run was begun"
         typer.secho(f"Interrupted; nothing is lost: {hint}.", fg="red", err=True)
-        raise typer.Exit(INTERRUPTED) from None
+        raise typer.Exit(terminal.INTERRUPTED) from None
 
 
 def show_outcome(outcome: RunOutcome) -> None:
     """Print the figures of a run beside their references, and where the report is."""
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False, markup=False)
+    console = terminal.console()
     referred = any(figure.reference is not None for figure in outcome.figures)
     headings = ("figure", "this run", "reference") if referred else ("figure", "this run")
     table = Table(*headings, box=box.SIMPLE_HEAD)
@@ -141,7 +161,10 @@ def show_outcome(outcome: RunOutcome) -> None:
         )
     for source, number in sources.items():
         console.print(f"  ({number}) {source}", soft_wrap=True)
-    console.print(f"Report: {outcome.report}", soft_wrap=True)
+    if outcome.report is None:
+        console.print(f"Run: {outcome.folder}", soft_wrap=True)
+    else:
+        console.print(f"Report: {outcome.report}", soft_wrap=True)
 
 
 def _shown(value: float | int | str | None, unit: str, missing: str = "") -> str:
@@ -160,6 +183,8 @@ def guarded(application: Callable[[], None], *others: type[Exception]) -> None:
     try:
         application()
     except Exception as error:
+        if terminal.loudness.verbose:
+            traceback.print_exc()
         if not (_is_ours(error) or isinstance(error, others)):
             raise
         sentence = str(error)
@@ -172,7 +197,7 @@ def guarded(application: Callable[[], None], *others: type[Exception]) -> None:
 
 def _is_ours(error: Exception) -> bool:
     from calibration.errors import CalibrationError
-    from fe.errors import FiniteElementError
+    from fe.runtime.errors import FiniteElementError
     from fmu_asset.errors import FmuError
     from reporting.errors import ReportingError
     from twin_master.errors import TwinMasterError
@@ -186,4 +211,4 @@ def main() -> None:
     """Run `python -m twin_master`."""
     application = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     application.command()(run)
-    guarded(lambda: application(prog_name="python -m twin_master"))
+    guarded(lambda: terminal.with_common_options(application)(prog_name="python -m twin_master"))

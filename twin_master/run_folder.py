@@ -14,12 +14,16 @@ from pathlib import Path
 from typing import Any
 
 from reporting.files import atomic_write_bytes, atomic_write_text, remove_leftovers, write_error
+from reporting.folders import lock_folder, replace_folder
+from reporting.provenance import collect_provenance
 from twin_master.errors import NotResumableError, RunFolderError, RunFolderExistsError
 
 CONFIG_NAME = "config.json"
 FIELD_NAME = "wing.vtu"
 KIND = "uav-twin run"
 """Value of `kind` in `config.json`, by which a run folder is known."""
+HARMLESS_PACKAGES = frozenset({"discrepancy", "reporting", "scenarios", "uav_twin", "matplotlib"})
+"""A run may be resumed after a change of these: no stored figure depends on them."""
 
 
 def to_json(record: Mapping[str, Any]) -> str:
@@ -42,7 +46,7 @@ def create_run_folder(
     files: Mapping[str, bytes] | None = None,
     *,
     replace: bool = False,
-) -> None:
+) -> int:
     """Make a run folder that holds its configuration and copies of what is flown, in one step.
 
     Parameters
@@ -56,10 +60,17 @@ def create_run_folder(
     replace
         Put the new folder in the place of an existing run folder. Anything else is never replaced.
 
+    Returns
+    -------
+    int
+        A file descriptor that holds the folder for this process, to close at the end.
+
     Raises
     ------
     RunFolderExistsError
         The folder exists and is not to be replaced, or is no run folder.
+    RunFolderError
+        Another process is flying in the folder that is to be replaced.
     FileNotWrittenError
         The disk is full or the place is not writable.
     """
@@ -75,29 +86,35 @@ def create_run_folder(
             f"{folder} holds a run already: choose another --out, continue it with --resume {folder}, "
             "or give --replace."
         )
+    held = lock_run_folder(folder) if occupied else None
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
-        fresh.chmod(0o777 & ~_umask())
+        fresh, lock = _fresh_folder(folder)
+        try:
+            for name, content in (files or {}).items():
+                atomic_write_bytes(fresh / name, content)
+            atomic_write_text(fresh / CONFIG_NAME, to_json(config))
+            if occupied:
+                replace_folder(fresh, folder)
+            else:
+                fresh.rename(folder)
+        except BaseException:
+            os.close(lock)
+            shutil.rmtree(fresh, ignore_errors=True)
+            raise
     except OSError as error:
-        raise write_error(error, folder) from error
-    old: Path | None = None
-    try:
-        for name, content in (files or {}).items():
-            atomic_write_bytes(fresh / name, content)
-        atomic_write_text(fresh / CONFIG_NAME, to_json(config))
-        if occupied:
-            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.old-", dir=folder.parent))
-            folder.rename(old / folder.name)
-        fresh.rename(folder)
-    except OSError as error:
-        if old is not None and not folder.exists():
-            (old / folder.name).rename(folder)
         raise write_error(error, folder) from error
     finally:
-        shutil.rmtree(fresh, ignore_errors=True)
-        if old is not None and folder.exists():
-            shutil.rmtree(old, ignore_errors=True)
+        if held is not None:
+            os.close(held)
+    return lock
+
+
+def _fresh_folder(folder: Path) -> tuple[Path, int]:
+    """Return an empty folder beside the one to be, held by this process."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
+    fresh.chmod(0o777 & ~_umask())
+    return fresh, lock_run_folder(fresh)
 
 
 def _umask() -> int:
@@ -147,14 +164,12 @@ def lock_run_folder(folder: Path) -> int:
     RunFolderError
         Another process is flying in the folder.
     """
-    import fcntl
-
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    descriptor = lock_folder(folder)
+    if descriptor is None:
+        raise RunFolderError(f"another process is flying in {folder}: wait for it to end.")
+    if not folder.is_dir() or not os.path.samestat(os.fstat(descriptor), folder.stat()):
         os.close(descriptor)
-        raise RunFolderError(f"another process is flying in {folder}: wait for it to end.") from None
+        raise RunFolderError(f"another process has just put another run into {folder}: look at that one.")
     return descriptor
 
 
@@ -167,3 +182,52 @@ def tidy(folder: Path) -> None:
             path.unlink(missing_ok=True)
     for place in [folder, *(path for path in folder.rglob("*") if path.is_dir())]:
         remove_leftovers(place)
+
+
+def check_versions(folder: Path, config: Mapping[str, Any], seed: int) -> None:
+    """Refuse to go on with other code than the run was begun with.
+
+    Raises
+    ------
+    NotResumableError
+        With the packages that changed.
+    """
+    recorded = config["provenance"]
+    now = collect_provenance(seed).as_dict()
+    for what in ("versions", "source_hashes"):
+        changed = sorted(
+            name
+            for name, value in now[what].items()
+            if name not in HARMLESS_PACKAGES and _entry(recorded, what, name) != value
+        )
+        if changed:
+            raise NotResumableError(
+                f"{folder} was begun with another version of {', '.join(changed)}, so its results could not "
+                "be the same: fly the mission again with --replace."
+            )
+
+
+def _entry(record: Mapping[str, Any], table: str, name: str) -> object:
+    entries = record.get(table)
+    return entries.get(name) if isinstance(entries, dict) else None
+
+
+def with_inputs(folder: Path, config: dict[str, Any], hashes: Mapping[str, str]) -> dict[str, Any]:
+    """Note the hashes of what is flown; refuse to go on with something else.
+
+    Raises
+    ------
+    NotResumableError
+        With the inputs that changed.
+    """
+    recorded = config.get("inputs")
+    if recorded is not None and recorded != dict(hashes):
+        changed = sorted(name for name in {*recorded, *hashes} if recorded.get(name) != hashes.get(name))
+        raise NotResumableError(
+            f"the {', '.join(changed).replace('_', ' ')} changed since the run in {folder} was begun: "
+            "fly the mission again with --replace."
+        )
+    if recorded is None:
+        config = {**config, "inputs": dict(hashes)}
+        write_config(folder, config)
+    return config

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.asset_source import AssetSource
-from twin_master.crew import Knowledge, prepare_knowledge
+from twin_master.assets.asset_source import AssetSource
 from twin_master.errors import MissionInputError
-from twin_master.graphical_model import GraphicalModel
-from twin_master.mission import Flight, fly
-from twin_master.scenario import Scenario
-from twin_master.summary import find_fallback
+from twin_master.mission.loop import Flight, fly
+from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.scenario.schema import Scenario
+from twin_master.store.summary import find_fallback
 
 Float = NDArray[np.float64]
 

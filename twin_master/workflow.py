@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import time
@@ -12,70 +13,53 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from reporting.files import atomic_write_text
+from reporting.folders import restore_folder
 from reporting.progress import Progress, SilentProgress
-from reporting.provenance import collect_provenance, hash_record
-from twin_master.asset_source import AssetSource, Origin
-from twin_master.checkpoint import CHECKPOINT_NAME, read_checkpoint, write_checkpoint
-from twin_master.crew import Knowledge, prepare_knowledge
-from twin_master.errors import NotResumableError
-from twin_master.mismatch import Misfit, find_misfit
-from twin_master.mission import Flight, fly
-from twin_master.resolution import (
+from reporting.provenance import collect_provenance, hash_file, hash_record
+from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.mismatch import Misfit, find_misfit
+from twin_master.assets.resolution import (
     Overrides,
     asset_source,
+    given_overrides,
     located_scenario,
     portable_scenario,
     resolve_scenario,
 )
-from twin_master.results import MissionResult
+from twin_master.errors import NotResumableError
+from twin_master.mission.checkpoint import CHECKPOINT_NAME, open_checkpoint
+from twin_master.mission.loop import Flight, fly
+from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import (
     CONFIG_NAME,
     KIND,
+    check_versions,
     create_run_folder,
     lock_run_folder,
     read_config,
     tidy,
-    write_config,
+    with_inputs,
 )
-from twin_master.scenario import Scenario
-from twin_master.scenario_file import LoadedScenario, parse_scenario
-from twin_master.store import store_mission, values_of, write_summary, write_timing
-from twin_master.summary import Figure, summarise
+from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.scenario.schema import Scenario
+from twin_master.seeds import check_seed
+from twin_master.store.outcome import RunOutcome, finished_run
+from twin_master.store.results import MissionResult
+from twin_master.store.summary import Figure, control_changes, summarise
+from twin_master.store.writing import (
+    store_mission,
+    values_of,
+    write_summary,
+    write_timing,
+)
 
-REPORT_NAME = "report.html"
+POLICY_NAME = "policy.npy"
+"""In the run folder: the policy (S, U) that was given in the place of a plan."""
 CALIBRATION_NAME = "calibration.json"
-HARMLESS_PACKAGES = frozenset({"discrepancy", "reporting", "scenarios", "uav_twin", "matplotlib"})
-"""A run may be resumed after a change of these: no stored figure depends on them."""
-
-
-@dataclass(frozen=True)
-class RunOutcome:
-    """A finished run.
-
-    Attributes
-    ----------
-    folder : Path
-        The run folder.
-    report : Path
-        The report in it.
-    figures : tuple of Figure
-        The summary.
-    timing : dict
-        Content of `timing.json`.
-    origin : Origin
-        What was flown and what the twin believed, in words.
-    step_name : str
-        What a step is called.
-    """
-
-    folder: Path
-    report: Path
-    figures: tuple[Figure, ...]
-    timing: Mapping[str, Any]
-    origin: Origin
-    step_name: str = "turn"
 
 
 @dataclass
@@ -93,25 +77,32 @@ class _Clock:
 
 
 def new_run(
-    loaded: LoadedScenario,
-    folder: Path,
-    overrides: Overrides | None = None,
+    scenario: LoadedScenario | str | Path,
+    folder: Path | str | None = None,
+    overrides: Overrides | Mapping[str, Any] | None = None,
     *,
+    policy: ArrayLike | None = None,
     replace: bool = False,
+    report: bool = True,
     progress: Progress | None = None,
 ) -> RunOutcome:
     """Fly a scenario into a new run folder.
 
     Parameters
     ----------
-    loaded
-        The scenario.
+    scenario
+        The scenario, its shipped name, or its file.
     folder
-        The run folder to make.
+        The run folder to make; ``runs/NAME`` by default.
     overrides
-        What differs from the file.
+        What differs from the file: the fields of `Overrides`, such as ``{"seed": 3, "fmu": "wing.fmu"}``.
+    policy : (S, U)
+        p(U | D) to fly instead of planning, row-stochastic: states in the order of `Knowledge.model.states`,
+        controls in that of the scenario. It is kept in the run folder.
     replace
         Take the place of an existing run folder.
+    report
+        Draw the report.
     progress
         Shows the stages.
 
@@ -122,24 +113,40 @@ def new_run(
     TwinMasterError, FmuError, FiniteElementError, CalibrationError, ReportingError
         With one clear sentence; the run folder stays resumable.
     """
-    scenario = resolve_scenario(loaded, overrides or Overrides())
+    loaded = scenario if isinstance(scenario, LoadedScenario) else load_scenario(scenario)
+    resolved = resolve_scenario(loaded, given_overrides(overrides))
+    check_seed(resolved.mission.seed)
+    folder = Path("runs") / resolved.mission.name if folder is None else Path(folder)
     config = {
         "kind": KIND,
         "format": 1,
-        "scenario": portable_scenario(scenario).to_dict(),
+        "scenario": portable_scenario(resolved).to_dict(),
         "scenario_file": {"name": loaded.path.name, "sha256": loaded.content_hash},
-        "provenance": collect_provenance(scenario.mission.seed).as_dict(),
+        "provenance": collect_provenance(resolved.mission.seed).as_dict(),
     }
-    source = asset_source(scenario)
+    source = asset_source(resolved)
     source.check()  # what is not there should not cost the user a folder
-    create_run_folder(folder, config, source.files(), replace=replace)
-    return _run(
-        folder, config, located_scenario(portable_scenario(scenario), folder), progress or SilentProgress()
-    )
+    files = dict(source.files())
+    if policy is not None:
+        kept = io.BytesIO()
+        np.save(kept, build_graphical_model(resolved).policy(policy))
+        files[POLICY_NAME] = kept.getvalue()
+    progress = progress or SilentProgress()
+    _restore(folder, progress)
+    lock = create_run_folder(folder, config, files, replace=replace)
+    try:
+        located = located_scenario(portable_scenario(resolved), folder)
+        return _run(folder, config, located, progress, report=report)
+    finally:
+        os.close(lock)
 
 
 def resume_run(
-    folder: Path, loaded: LoadedScenario | None = None, *, progress: Progress | None = None
+    folder: Path | str,
+    loaded: LoadedScenario | None = None,
+    *,
+    report: bool = True,
+    progress: Progress | None = None,
 ) -> RunOutcome:
     """Continue an interrupted run; the results are those of an uninterrupted one, bit for bit.
 
@@ -149,6 +156,8 @@ def resume_run(
         The run folder.
     loaded
         The scenario that the user believes to be flown; checked against the folder.
+    report
+        Draw the report.
     progress
         Shows the stages.
 
@@ -157,73 +166,103 @@ def resume_run(
     NotResumableError
         The folder holds no run, or one of another scenario or another version.
     """
+    folder, progress = Path(folder), progress or SilentProgress()
+    _restore(folder, progress)
     config = read_config(folder)
     scenario = parse_scenario(config["scenario"], str(folder / CONFIG_NAME))
-    recorded = config["provenance"]
     file = config["scenario_file"]
     if loaded is not None and file.get("sha256") != loaded.content_hash:
         raise NotResumableError(
             f"{folder} flies another scenario ({scenario.mission.name}, {file.get('name')}) "
             f"than {loaded.path}: resume it without naming a scenario."
         )
-    now = collect_provenance(scenario.mission.seed).as_dict()
-    for what in ("versions", "source_hashes"):
-        changed = sorted(
-            name
-            for name, value in now[what].items()
-            if name not in HARMLESS_PACKAGES and _entry(recorded, what, name) != value
-        )
-        if changed:
-            raise NotResumableError(
-                f"{folder} was begun with another version of {', '.join(changed)}, so its results could not "
-                "be the same: fly the mission again with --replace."
-            )
-    return _run(folder, config, located_scenario(scenario, folder), progress or SilentProgress())
-
-
-def _entry(record: Mapping[str, Any], table: str, name: str) -> object:
-    entries = record.get(table)
-    return entries.get(name) if isinstance(entries, dict) else None
-
-
-def _run(folder: Path, config: dict[str, Any], scenario: Scenario, progress: Progress) -> RunOutcome:
     lock = lock_run_folder(folder)
     try:
-        tidy(folder)
-        clock = _Clock()
-        source = asset_source(scenario)
-        with _unflown(folder), clock.stage("asset"):
-            hashes = source.prepare(folder, progress)
-        config = _with_inputs(folder, config, hashes)
-        with (
-            _unflown(folder),
-            clock.stage("calibration"),
-            progress.stage("Calibrating and planning"),
-        ):
-            knowledge = prepare_knowledge(scenario, source, scenario.mission.seed)
-            _tell_of_another_truth(knowledge, progress)
-            if knowledge.draws.record is not None:
-                text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
-                atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
-            # A turn without observations on a twin of its own compiles the inner loops before the flight.
-            knowledge.twin().turn(np.full(scenario.observation.count, np.nan), 0)
-        with clock.stage("mission"), _kept(folder):
-            result = _fly(folder, config, knowledge, source, progress)
-        with clock.stage("store"), progress.stage("Storing"), _kept(folder):
-            figures = _store(folder, config, knowledge, source, result)
-        with clock.stage("report"), progress.stage("Writing the report"), _kept(folder):
-            report = _report(folder)
-        timing = _timing(result.flight, clock)
-        write_timing(folder, timing)
-        return RunOutcome(folder, report, figures, timing, source.origin, scenario.mission.step_name)
+        finished = finished_run(folder)
+        if finished is not None and (finished.report or not report):
+            progress.note(f"The run in {folder} is finished: nothing is flown again.")
+            return finished
+        check_versions(folder, config, scenario.mission.seed)
+        return _run(folder, config, located_scenario(scenario, folder), progress, report=report)
     finally:
         os.close(lock)
+
+
+def _restore(folder: Path, progress: Progress) -> None:
+    """Put back a run that a killed --replace had moved aside."""
+    if restore_folder(folder):
+        progress.note(f"A replacement of {folder} was interrupted: the run that was there is back.")
+
+
+def _run(
+    folder: Path, config: dict[str, Any], scenario: Scenario, progress: Progress, *, report: bool
+) -> RunOutcome:
+    tidy(folder)
+    clock = _Clock()
+    source = asset_source(scenario)
+    with _unflown(folder), clock.stage("asset"):
+        hashes = dict(source.prepare(folder, progress))
+        policy = _given_policy(folder, hashes)
+    config = with_inputs(folder, config, hashes)
+    figures, timing = _fly_and_store(folder, config, scenario, source, policy, clock, progress)
+    page: Path | None = None
+    if report:
+        with clock.stage("report"), progress.stage("Writing the report"), _kept(folder):
+            page = _report(folder)
+    timing |= {"stages_seconds": dict(clock.stages), "total_seconds": time.perf_counter() - clock.begin}
+    write_timing(folder, timing)
+    return RunOutcome(folder, page, figures, timing, source.origin, scenario.mission.step_name)
+
+
+def _fly_and_store(
+    folder: Path,
+    config: Mapping[str, Any],
+    scenario: Scenario,
+    source: AssetSource,
+    policy: NDArray[np.float64] | None,
+    clock: _Clock,
+    progress: Progress,
+) -> tuple[tuple[Figure, ...], dict[str, Any]]:
+    """Return summary and timing of the turns; twin and mission are let go of before the report is drawn."""
+    with (
+        _unflown(folder),
+        clock.stage("calibration"),
+        progress.stage("Calibrating and planning"),
+    ):
+        knowledge = prepare_knowledge(scenario, source, scenario.mission.seed, policy)
+        _tell_of_another_truth(knowledge, progress)
+        if knowledge.draws.record is not None:
+            text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
+            atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
+        # A turn without observations on a twin of its own compiles the inner loops before the flight.
+        compiling = knowledge.twin()
+        compiling.turn(np.full(scenario.observation.count, np.nan), 0)
+        compiling.smoothed()
+    with clock.stage("mission"), _kept(folder):
+        result = _fly(folder, config, knowledge, source, progress)
+    with clock.stage("store"), progress.stage("Storing"), _kept(folder):
+        figures = _store(folder, config, knowledge, source, result)
+    return figures, _timing(result.flight)
+
+
+def _given_policy(folder: Path, hashes: dict[str, str]) -> NDArray[np.float64] | None:
+    """Return the policy (S, U) that a run folder keeps, its hash noted, or None where it was planned."""
+    path = folder / POLICY_NAME
+    if not path.is_file():
+        return None
+    hashes["policy"] = hash_file(path)
+    try:
+        return np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+    except (OSError, ValueError) as error:
+        raise NotResumableError(
+            f"{path} is damaged ({error}): fly the mission again with --replace."
+        ) from None
 
 
 def _tell_of_another_truth(knowledge: Knowledge, progress: Progress) -> None:
     """Say so where the true wing of the scenario is not the one that the calibration file describes."""
     draws, scenario = knowledge.draws, knowledge.scenario
-    truth = scenario.asset.parameters.get(draws.name)
+    truth = scenario.asset.true_parameters.get(draws.name)
     if scenario.calibration.source != "file" or truth is None:
         return
     off = abs(truth - draws.mean)
@@ -261,38 +300,22 @@ def _unflown(folder: Path) -> Iterator[None]:
         raise
 
 
-def _with_inputs(folder: Path, config: dict[str, Any], hashes: Mapping[str, str]) -> dict[str, Any]:
-    """Note the hashes of what is flown; refuse to go on with something else."""
-    recorded = config.get("inputs")
-    if recorded is not None and recorded != dict(hashes):
-        changed = sorted(name for name in {*recorded, *hashes} if recorded.get(name) != hashes.get(name))
-        raise NotResumableError(
-            f"the {', '.join(changed).replace('_', ' ')} changed since the run in {folder} was begun: "
-            "fly the mission again with --replace."
-        )
-    if recorded is None:
-        config = {**config, "inputs": dict(hashes)}
-        write_config(folder, config)
-    return config
-
-
 def _fly(
     folder: Path, config: Mapping[str, Any], knowledge: Knowledge, source: AssetSource, progress: Progress
 ) -> MissionResult:
-    config_hash = hash_record(config)
     scenario = knowledge.scenario
     truth = knowledge.truth(scenario.mission.seed)
     asset = source.open()
     try:
-        flight = fly(
-            scenario,
-            knowledge.twin(),
-            knowledge.plant(truth, asset),
-            config_hash=config_hash,
-            checkpoint=read_checkpoint(folder, config_hash),
-            keep=lambda checkpoint: write_checkpoint(folder, checkpoint),
-            progress=progress,
-        )
+        with open_checkpoint(folder, hash_record(config)) as kept:
+            flight = fly(
+                scenario,
+                knowledge.twin(),
+                knowledge.plant(truth, asset),
+                checkpoint=kept.checkpoint,
+                keep=kept.keep,
+                progress=progress,
+            )
         units = asset.units
     finally:
         asset.close()
@@ -332,8 +355,10 @@ def _store(
         result, knowledge.draws, values_of(tree, "filtered", "reward_mean"), _misfit(knowledge, source)
     )
     heading = {"scenario": mission.name, "title": mission.title, "seed": mission.seed, "steps": mission.steps}
+    controls = knowledge.scenario.control_names
+    said = {"control": control_changes(controls, result.flight.control_index, mission.step_name)}
     origin = {"asset": source.origin.asset, "twin_model": source.origin.model}
-    write_summary(folder, figures, heading | origin | {"asset_and_model_differ": source.origin.differ})
+    write_summary(folder, figures, heading | said | origin | {"asset_and_model_differ": source.origin.differ})
     return figures
 
 
@@ -364,14 +389,9 @@ def _field_writer(
     return lambda path: source.write_field(path, state, control)
 
 
-def _timing(flight: Flight, clock: _Clock) -> dict[str, Any]:
-    """Return the content of `timing.json`: seconds of the stages, and of the turns flown by this process."""
-    record: dict[str, Any] = {
-        "stages_seconds": dict(clock.stages),
-        "total_seconds": time.perf_counter() - clock.begin,
-        "resumed_at": flight.resumed_at,
-        "turns": len(flight.timing),
-    }
+def _timing(flight: Flight) -> dict[str, Any]:
+    """Return the seconds of the turns flown by this process."""
+    record: dict[str, Any] = {"resumed_at": flight.resumed_at, "turns": len(flight.timing)}
     for name in ("asset", "twin", "checkpoint"):
         values = np.array([getattr(turn, name) for turn in flight.timing])
         if len(values):

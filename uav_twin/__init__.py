@@ -1,1 +1,109 @@
-"""The command line."""
+"""A predictive structural digital twin of a UAV wing: the one name to import.
+
+Each name below comes from the package that holds it, and is imported when it is first used. `docs/python.md`
+shows all of them at work; the command line is `uav-twin`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same when it runs
+    from calibration.wing.result_file import load_calibration
+    from calibration.wing.three_steps import calibrate_wing as calibrate
+    from discrepancy.campaign.reading import read_campaign
+    from discrepancy.files.verdict import read_verdict_folder as read_verdict
+    from discrepancy.model_choice import load_model
+    from discrepancy.workflow import investigate
+    from fe.full.modes import eigenmodes
+    from fe.full.operators import assemble
+    from fe.full.statics import solve_static
+    from fe.reduction.model_cache import reduced_model
+    from fe.wing.design import load_design
+    from fmu_asset.door.session import FmiAsset
+    from fmu_asset.packing.wing_fmu import build_fmu
+    from twin_master.mission.preparation import prepare_twin
+    from twin_master.network.graphical_model import GraphicalModel
+    from twin_master.network.inference import filter_sequence
+    from twin_master.network.planner import value_iteration
+    from twin_master.network.sensor_model import GaussianSensorModel
+    from twin_master.network.twin import Twin
+    from twin_master.report.page import report_figures, write_report
+    from twin_master.report.reading import open_run
+    from twin_master.scenario.reading import load_scenario
+    from twin_master.workflow import new_run as fly
+    from twin_master.workflow import resume_run as resume
+
+__all__ = [
+    "FmiAsset",
+    "GaussianSensorModel",
+    "GraphicalModel",
+    "Twin",
+    "assemble",
+    "build_fmu",
+    "calibrate",
+    "eigenmodes",
+    "filter_sequence",
+    "fly",
+    "investigate",
+    "load_calibration",
+    "load_design",
+    "load_model",
+    "load_scenario",
+    "open_run",
+    "prepare_twin",
+    "read_campaign",
+    "read_verdict",
+    "reduced_model",
+    "report_figures",
+    "resume",
+    "solve_static",
+    "value_iteration",
+    "write_report",
+]
+
+_HOMES = {
+    "FmiAsset": "fmu_asset.door.session",
+    "GaussianSensorModel": "twin_master.network.sensor_model",
+    "GraphicalModel": "twin_master.network.graphical_model",
+    "Twin": "twin_master.network.twin",
+    "assemble": "fe.full.operators",
+    "build_fmu": "fmu_asset.packing.wing_fmu",
+    "calibrate": "calibration.wing.three_steps:calibrate_wing",
+    "eigenmodes": "fe.full.modes",
+    "filter_sequence": "twin_master.network.inference",
+    "fly": "twin_master.workflow:new_run",
+    "investigate": "discrepancy.workflow",
+    "load_calibration": "calibration.wing.result_file",
+    "load_design": "fe.wing.design",
+    "load_model": "discrepancy.model_choice",
+    "load_scenario": "twin_master.scenario.reading",
+    "open_run": "twin_master.report.reading",
+    "prepare_twin": "twin_master.mission.preparation",
+    "read_campaign": "discrepancy.campaign.reading",
+    "read_verdict": "discrepancy.files.verdict:read_verdict_folder",
+    "reduced_model": "fe.reduction.model_cache",
+    "report_figures": "twin_master.report.page",
+    "resume": "twin_master.workflow:resume_run",
+    "solve_static": "fe.full.statics",
+    "value_iteration": "twin_master.network.planner",
+    "write_report": "twin_master.report.page",
+}
+"""Module of each name; behind a colon what it is called there, where that differs."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name of `__all__` when it is first used."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+    from uav_twin.shadowing import refuse_shadowing
+
+    refuse_shadowing()
+    module, _, own_name = _HOMES[name].partition(":")
+    found = globals()[name] = getattr(import_module(module), own_name or name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,6 +1,20 @@
-"""`python -m uav_twin`: the same as `uav-twin`."""
+"""The command `uav-twin`, also as `python -m uav_twin`."""
 
-from uav_twin.cli import main
+import sys
+
+from uav_twin.shadowing import ShadowedPackageError, refuse_shadowing
+
+
+def main() -> None:
+    """Run the command line, once it is sure that it is made of this project's own packages."""
+    try:
+        refuse_shadowing()
+    except ShadowedPackageError as error:
+        sys.exit(str(error))  # the sentence on the error stream, and exit code 1
+    from uav_twin.cli import main as run_commands
+
+    run_commands()
+
 
 if __name__ == "__main__":
     main()

@@ -2,16 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from reporting import terminal
+
 if TYPE_CHECKING:
     from calibration.virtual_wing import TestBench
-    from fe.state import DigitalState
+    from fe.runtime.state import DigitalState, Geometry
 
 TRUTH_FILE = "truth.json"
+
+
+Fmu = Annotated[
+    Path | None,
+    typer.Option(
+        help="Do the experiments on this wing FMU, not on the reduced model; of the shipped planform."
+    ),
+]
+SamplingRate = Annotated[
+    float, typer.Option(help="Samples per second of a ring-down record; the published have 100000.")
+]
+Quantisation = Annotated[float | None, typer.Option(help="Step of the recorder [V]; none by default.")]
+FrequencyError = Annotated[
+    tuple[float, float],
+    typer.Option(help="Relative differences of the wing's f1 and f2 from its model's; not with --fmu."),
+]
 
 
 def calibrate_simulate(
@@ -21,41 +41,21 @@ def calibrate_simulate(
     pitot_mass: Annotated[float, typer.Option(help="True mass of the pitot tube [kg].")] = 0.134,
     alpha: Annotated[float, typer.Option(help="True mass-proportional damping [1/s].")] = 1.03,
     beta: Annotated[float, typer.Option(help="True stiffness-proportional damping [s].")] = 7.66e-4,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all errors.")] = 0,
-    fmu: Annotated[
-        Path | None,
-        typer.Option(
-            help="Do the experiments on this wing FMU, not on the reduced model; of the shipped planform."
-        ),
-    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all errors.")] = 0,
+    fmu: Fmu = None,
     design: Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")] = None,
-    sampling_rate: Annotated[
-        float, typer.Option(help="Samples per second of a ring-down record; the published have 100000.")
-    ] = 2000.0,
+    sampling_rate: SamplingRate = 2000.0,
     noise: Annotated[float, typer.Option(min=0.0, help="Noise of a record [V], standard deviation.")] = 1e-4,
-    quantisation: Annotated[
-        float | None, typer.Option(help="Step of the recorder [V]; none by default.")
-    ] = None,
-    frequency_error: Annotated[
-        tuple[float, float],
-        typer.Option(help="Relative differences of the wing's f1 and f2 from its model's; not with --fmu."),
-    ] = (0.0, 0.0),
+    quantisation: Quantisation = None,
+    frequency_error: FrequencyError = (0.0, 0.0),
 ) -> None:
     """Measure a virtual wing: a folder as `calibrate` reads it, and truth.json beside it."""
-    import json
+    from contextlib import nullcontext
 
     from calibration.errors import ExperimentFileError
-    from calibration.laboratory import write_lab_folder
-    from calibration.virtual_wing import (
-        VirtualWing,
-        measure_lengths,
-        measure_load_test,
-        measure_ring_down,
-        weigh,
-    )
-    from fe.design import load_design
-    from fe.state import DigitalState
-    from reporting.files import atomic_write_text
+    from calibration.virtual_wing import VirtualWing
+    from fe.runtime.state import DigitalState
+    from fe.wing.design import load_design
 
     if fmu is not None and frequency_error != (0.0, 0.0):
         raise typer.BadParameter("--frequency-error needs the reduced model; an FMU has its own frequencies.")
@@ -72,40 +72,56 @@ def calibrate_simulate(
         damping_alpha=alpha,
         damping_beta=beta,
     )
-
-    def write(bench: TestBench) -> None:
-        load_test = measure_load_test(bench, seed)
-        records = measure_ring_down(
-            bench, seed, sampling_rate=sampling_rate, noise=noise, quantisation=quantisation
-        )
-        write_lab_folder(
-            out,
-            lengths=measure_lengths(
-                truth.geometry, seed, designed=None if design is None else drawn.geometry
-            ),
-            load_test=load_test,
-            records=records,
-            total_mass=weigh(truth, seed),
-        )
-        record = _truth(truth) | {
-            "frequency_error": list(frequency_error),
-            "seed": seed,
-            "bench": "reduced model" if fmu is None else fmu.name,
-        }
-        atomic_write_text(out / TRUTH_FILE, json.dumps(record, indent=2) + "\n")
-
+    designed = None if design is None else drawn.geometry
+    recorder = {"sampling_rate": sampling_rate, "noise": noise, "quantisation": quantisation}
+    told = {
+        "frequency_error": list(frequency_error),
+        "seed": seed,
+        "bench": "reduced model" if fmu is None else fmu.name,
+    }
+    opened: AbstractContextManager[TestBench]
     if fmu is not None:
-        from twin_master.virtual_experiments import FmuTestBench
+        from twin_master.assets.virtual_experiments import FmuTestBench
 
-        with FmuTestBench(fmu, truth) as bench:
-            write(bench)
+        opened = FmuTestBench(fmu, truth)
     else:
-        from fe.cache import reduced_model
-        from reporting.progress import RichProgress
+        from fe.reduction.model_cache import reduced_model
 
-        model = reduced_model(drawn, progress=RichProgress())
-        write(VirtualWing(model, truth, frequency_error))
-    typer.echo(f"Laboratory folder: {out}; its truth: {out / TRUTH_FILE}")
+        model = reduced_model(drawn, progress=terminal.progress())
+        opened = nullcontext(VirtualWing(model, truth, frequency_error))
+    with opened as bench:
+        _measure(bench, truth, designed, out, seed, recorder)
+    _write_truth(out / TRUTH_FILE, _truth(truth) | told)
+    terminal.say(f"Laboratory folder: {out}; its truth: {out / TRUTH_FILE}")
+
+
+def _measure(
+    bench: TestBench,
+    truth: DigitalState,
+    designed: Geometry | None,
+    out: Path,
+    seed: int,
+    recorder: Mapping[str, Any],
+) -> None:
+    """Do all experiments on a bench and write the laboratory folder."""
+    from calibration.virtual_wing import measure_lengths, measure_load_test, measure_ring_down, weigh
+    from calibration.wing.laboratory import write_lab_folder
+
+    write_lab_folder(
+        out,
+        load_test=measure_load_test(bench, seed),
+        records=measure_ring_down(bench, seed, **recorder),
+        lengths=measure_lengths(truth.geometry, seed, designed=designed),
+        total_mass=weigh(truth, seed),
+    )
+
+
+def _write_truth(path: Path, record: Mapping[str, Any]) -> None:
+    import json
+
+    from reporting.files import atomic_write_text
+
+    atomic_write_text(path, json.dumps(record, indent=2) + "\n")
 
 
 def _truth(truth: DigitalState) -> dict[str, object]:

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from reporting import terminal
+
 if TYPE_CHECKING:
-    from calibration.summary import SummaryRow
+    from calibration.static.summary import SummaryRow
 
 Out = Annotated[Path | None, typer.Option(help="Folder for tables and figures.")]
 
@@ -21,7 +23,7 @@ def calibrate_geometry(
     out: Out = None,
 ) -> None:
     """Posterior of semi-span and chords from design tolerance and measurement."""
-    from calibration.dynamics_summary import geometry_rows, write_rows
+    from calibration.dynamics.summary import geometry_rows, write_rows
     from calibration.geometry import published_lengths, read_lengths
 
     rows = geometry_rows(published_lengths() if data is None else read_lengths(data))
@@ -46,21 +48,21 @@ def calibrate_ringdown(
     ] = None,
 ) -> None:
     """Natural frequencies and damping ratios of two modes from ring-down records."""
-    from calibration.dynamics_summary import ring_down_rows, write_figure, write_rows
-    from calibration.ringdown import FIRST_PEAK, Frequencies
-    from calibration.ringdown_records import read_records
-    from calibration.ringdown_trials import fit_trials
+    from calibration.dynamics.records import read_records
+    from calibration.dynamics.ringdown import FIRST_PEAK, Frequencies
+    from calibration.dynamics.summary import ring_down_rows, write_figure, write_rows
+    from calibration.dynamics.trials import fit_trials
 
     procedure = Frequencies.FITTED if fitted else Frequencies.PEAKS
     trials = fit_trials(read_records(data), procedure, start=FIRST_PEAK if start is None else start)
     if extremes:
-        from calibration.ringdown_extremes import refine_by_extremes
+        from calibration.dynamics.extremes import refine_by_extremes
 
         trials = refine_by_extremes(trials)
     rows = ring_down_rows(trials)
     _show(rows)
     if out is not None:
-        from calibration.dynamics_figures import ring_down_figure
+        from calibration.dynamics.figures import ring_down_figure
 
         write_rows(rows, out / "ringdown.csv")
         write_figure(ring_down_figure(trials), out / "figures" / "ringdown")
@@ -76,18 +78,17 @@ def calibrate_dynamics(
         bool,
         typer.Option("--measured", help="Aim at the ring-down records in --data, not the published figures."),
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the samples of e.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of the samples of e.")] = 0,
     design: Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")] = None,
 ) -> None:
     """Posterior of servo and pitot masses and of the Rayleigh damping, for 100 samples of e."""
-    from calibration import dynamics_summary as summary
-    from calibration.dynamics import DynamicTargets, calibrate_dynamics
-    from calibration.dynamics_data import read_factor_samples, read_published_results
+    from calibration.dynamics import summary as summary
+    from calibration.dynamics.masses_and_damping import DynamicTargets, calibrate_dynamics
+    from calibration.dynamics.published import read_factor_samples, read_published_results
     from calibration.errors import ExperimentFileError
-    from calibration.stiffness import exact_posterior, published_measurements
-    from fe.cache import reduced_model
-    from fe.design import load_design
-    from reporting.progress import RichProgress
+    from calibration.static.stiffness import exact_posterior, published_measurements
+    from fe.reduction.model_cache import reduced_model
+    from fe.wing.design import load_design
 
     if measured and data is None:
         raise typer.BadParameter("--measured needs --data with ring-down records.")
@@ -97,21 +98,21 @@ def calibrate_dynamics(
         factors = read_factor_samples(data)
     targets = DynamicTargets()
     if measured and data is not None:
-        from calibration.ringdown_extremes import refine_by_extremes
-        from calibration.ringdown_records import read_records
-        from calibration.ringdown_trials import fit_trials
+        from calibration.dynamics.extremes import refine_by_extremes
+        from calibration.dynamics.records import read_records
+        from calibration.dynamics.trials import fit_trials
 
         records = read_records(data)
         trials = fit_trials(records)
         if all(record.lowest is not None for record in records):
             trials = refine_by_extremes(trials)
         targets = DynamicTargets(trials.target_frequencies, trials.target_damping_ratios)
-    model = reduced_model(None if design is None else load_design(design), progress=RichProgress())
+    model = reduced_model(None if design is None else load_design(design), progress=terminal.progress())
     result = calibrate_dynamics(model, factors, targets)
     rows = summary.dynamics_rows(result)
     _show(rows)
     if out is not None:
-        from calibration.dynamics_figures import masses_figure
+        from calibration.dynamics.figures import masses_figure
 
         authors = None
         if data is not None:
@@ -125,11 +126,10 @@ def calibrate_dynamics(
 
 
 def _show(rows: list[SummaryRow]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table("figure", "found", "paper", "unit")
     for row in rows:
         paper = "" if row.paper is None else f"{row.paper:.5g}"
         table.add_row(row.name, f"{row.ours:.5g}", paper, "" if row.unit == "1" else row.unit)
-    Console(highlight=False).print(table)
+    terminal.console().print(table)

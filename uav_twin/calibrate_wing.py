@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from reporting import terminal
+
 if TYPE_CHECKING:
-    from calibration.wing_calibration import WingCalibration
+    from calibration.wing.three_steps import WingCalibration
 
 
 class ProcedureName(StrEnum):
@@ -19,40 +21,42 @@ class ProcedureName(StrEnum):
     paper = "paper"
 
 
+Data = Annotated[
+    Path | None,
+    typer.Option(help="Lab folder with step1, step2, step3, or some of them; published figures otherwise."),
+]
+Out = Annotated[Path | None, typer.Option(help="Folder for calibration.nc, report, table and figures.")]
+Asset = Annotated[str | None, typer.Option(help="Name of this wing.", show_default="that of the design")]
+Procedure = Annotated[
+    ProcedureName,
+    typer.Option(help="Keep samples of the joint posterior, or of the paper's steps one after another."),
+]
+Design = Annotated[Path | None, typer.Option(help="The wing as drawn; the shipped design by default.")]
+Measured = Annotated[
+    bool | None,
+    typer.Option(
+        "--measured/--published",
+        help="Aim step 3 at the ring-down records of --data or at the published figures.",
+        show_default="measured where there are records",
+    ),
+]
+Fitted = Annotated[
+    bool,
+    typer.Option("--fitted", help="Fit the frequencies of the records too; spectral peaks by default."),
+]
+
+
 def calibrate_wing(
     context: typer.Context,
-    data: Annotated[
-        Path | None,
-        typer.Option(
-            help="Lab folder with step1, step2, step3, or some of them; published figures otherwise."
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for calibration.nc, report, table and figures.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all samples.")] = 0,
-    asset: Annotated[
-        str | None, typer.Option(help="Name of this wing.", show_default="that of the design")
-    ] = None,
-    procedure: Annotated[
-        ProcedureName,
-        typer.Option(help="Keep samples of the joint posterior, or of the paper's steps one after another."),
-    ] = ProcedureName.joint,
-    design: Annotated[
-        Path | None, typer.Option(help="The wing as drawn; the shipped design by default.")
-    ] = None,
-    measured: Annotated[
-        bool | None,
-        typer.Option(
-            "--measured/--published",
-            help="Aim step 3 at the ring-down records of --data or at the published figures.",
-            show_default="measured where there are records",
-        ),
-    ] = None,
-    fitted: Annotated[
-        bool,
-        typer.Option("--fitted", help="Fit the frequencies of the records too; spectral peaks by default."),
-    ] = False,
+    data: Data = None,
+    out: Out = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all samples.")] = 0,
+    asset: Asset = None,
+    procedure: Procedure = ProcedureName.joint,
+    design: Design = None,
+    measured: Measured = None,
+    fitted: Fitted = False,
+    no_report: terminal.NoReport = False,
 ) -> None:
     """Tailor the model to one wing: planform, stiffness, masses and damping, in this order.
 
@@ -64,6 +68,7 @@ def calibrate_wing(
             any(value is not None for value in given)
             or seed
             or fitted
+            or no_report
             or procedure is not ProcedureName.joint
         ):
             raise typer.BadParameter(
@@ -74,12 +79,11 @@ def calibrate_wing(
         raise typer.BadParameter("--measured needs --data with ring-down records.")
     if fitted and (data is None or measured is False):
         raise typer.BadParameter("--fitted needs --data with ring-down records, and no --published.")
-    from calibration.lab_data import Targets, published_data, read_lab_folder
-    from calibration.ringdown import Frequencies
-    from calibration.wing_calibration import calibrate_wing as calibrate
-    from calibration.wing_files import check_folder, write_calibration_folder
-    from fe.design import load_design
-    from reporting.progress import RichProgress
+    from calibration.dynamics.ringdown import Frequencies
+    from calibration.wing.folder import check_folder, write_calibration_folder
+    from calibration.wing.lab_data import Targets, published_data, read_lab_folder
+    from calibration.wing.three_steps import calibrate_wing as calibrate
+    from fe.wing.design import load_design
 
     drawn = load_design(design)
     name = drawn.name if asset is None else asset
@@ -89,28 +93,28 @@ def calibrate_wing(
     frequencies = Frequencies.FITTED if fitted else Frequencies.PEAKS
     lab = published_data() if data is None else read_lab_folder(data, targets, frequencies)
     for origin in lab.origins:
-        typer.echo(f"Step {origin.step}: {origin.text}.")
-    progress = RichProgress()
+        terminal.say(f"Step {origin.step}: {origin.text}.")
+    progress = terminal.progress()
     calibration = calibrate(lab, drawn, asset=name, procedure=procedure.value, seed=seed, progress=progress)
     _show(calibration)
     if out is None:
-        typer.echo("Nothing was written: give --out DIR for calibration.nc and the report.")
+        terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
         return
-    paths = write_calibration_folder(calibration, out, progress)
-    typer.echo(f"Calibration: {paths.calibration}")
-    typer.echo(f"Report: {paths.report}")
+    paths = write_calibration_folder(calibration, out, progress, report=not no_report)
+    terminal.say(f"Calibration: {paths.calibration}")
+    if not no_report:
+        terminal.say(f"Report: {paths.report}")
 
 
 def _show(calibration: WingCalibration) -> None:
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
-    from calibration.disagreements import disagreements, misses
-    from calibration.table_1 import SHOWN, printed, signed, signed_number, table_1
+    from calibration.wing.disagreements import disagreements, misses
+    from calibration.wing.table_1 import SHOWN, printed, signed, signed_number, table_1
 
     result = calibration.result
-    console = Console(highlight=False, markup=False)
+    console = terminal.console()
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("figure", "this wing", "in the paper", "difference"):
         table.add_column(heading, no_wrap=True)

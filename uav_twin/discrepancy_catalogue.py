@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from reporting import terminal
 from reporting.words import counted
 from uav_twin.console_table import console_table
 
 if TYPE_CHECKING:
-    from discrepancy.campaign import Campaign
+    from discrepancy.campaign.records import Campaign
     from discrepancy.catalogue.entry import Effect
-    from discrepancy.examples import ExamplePlan
     from discrepancy.model_choice import ModelChoice
     from discrepancy.models.interface import Model
-    from fe.patch import ModelPatch
+    from discrepancy.sources.examples import ExamplePlan
+    from fe.runtime.patch import ModelPatch
 
 
 def effects(
@@ -28,13 +29,11 @@ def effects(
     ] = None,
 ) -> None:
     """List the effects that can be named."""
-    from rich.console import Console
-
     from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
     from discrepancy.report.text import formula
 
     catalogue = load_catalogue(add or ())
-    console = Console(highlight=False, markup=False)
+    console = terminal.console()
     if show is not None:
         _show(effect_by_identifier(show, catalogue), console)
         return
@@ -85,7 +84,9 @@ def example(
         str | None,
         typer.Option(help="As of `discrepancy run`.", show_default="the shipped wing"),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of noise, zeros, gains and releases.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**63 - 1, help="Seed of noise, zeros, gains and releases.")
+    ] = 0,
     effect: Annotated[
         list[str] | None,
         typer.Option(
@@ -97,15 +98,14 @@ def example(
     ] = None,
 ) -> None:
     """Write a simulated campaign, with an effect hidden in it if asked for."""
-    from discrepancy.examples import write_example
     from discrepancy.model_choice import choose_model
-    from fe.patch import ModelPatch
+    from discrepancy.sources.examples import write_example
+    from fe.runtime.patch import ModelPatch
     from reporting.errors import FileNotWrittenError
-    from reporting.progress import RichProgress
 
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileNotWrittenError(f"{out} exists and is not empty: choose another folder.")
-    choice = choose_model(model, RichProgress())
+    choice = choose_model(model, terminal.progress())
     plan = _plan(choice)
     patch = ModelPatch()
     if effect:
@@ -115,18 +115,18 @@ def example(
     campaign = write_example(choice.model, out, kind, seed, plan, patch)  # type: ignore[arg-type]
     hidden = ", ".join(effect) if effect else "nothing"
     named = "" if model is None else f" --model {shlex.quote(model)}"
-    typer.echo(
+    terminal.say(
         f"Wrote {out}: {counted(len(campaign.trials), 'trial')}, "
         f"{counted(len(campaign.channels), 'channel')}; hidden: {hidden}."
     )
-    typer.echo(f"Next: uav-twin discrepancy check {shlex.quote(str(out))}{named}")
-    typer.echo(f"Then: uav-twin discrepancy run {shlex.quote(str(out))}{named}")
+    terminal.say(f"Next: uav-twin discrepancy check {shlex.quote(str(out))}{named}")
+    terminal.say(f"Then: uav-twin discrepancy run {shlex.quote(str(out))}{named}")
 
 
 def _plan(choice: ModelChoice) -> ExamplePlan:
     """Return what an example measures: gauges and tip of a wing, every output of a lumped model."""
-    from discrepancy.examples import plan_for, wing_plan
     from discrepancy.models.lumped import LumpedModel
+    from discrepancy.sources.examples import plan_for, wing_plan
 
     if not isinstance(choice.model, LumpedModel):
         return wing_plan()
@@ -136,7 +136,7 @@ def _plan(choice: ModelChoice) -> ExamplePlan:
 
 
 def _bare(model: Model, kind: str, seed: int, plan: ExamplePlan) -> Campaign:
-    from discrepancy.examples import example_campaign
+    from discrepancy.sources.examples import example_campaign
 
     return example_campaign(model, kind, seed, plan)  # type: ignore[arg-type]
 
@@ -199,7 +199,7 @@ def convert(
     ],
 ) -> None:
     """Write the real wing's published ring-downs and load test as a campaign."""
-    from discrepancy.real_wing import write_wing_campaign
+    from discrepancy.sources.real_wing import write_wing_campaign
 
     campaign = write_wing_campaign(data, out)
-    typer.echo(f"{campaign.name}: {counted(len(campaign.trials), 'trial')} in {out}")
+    terminal.say(f"{campaign.name}: {counted(len(campaign.trials), 'trial')} in {out}")

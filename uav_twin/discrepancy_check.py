@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from reporting import terminal
+
+if TYPE_CHECKING:
+    from discrepancy.campaign.records import Campaign
+    from discrepancy.catalogue.entry import Effect
+    from discrepancy.checks.fault import DataFault
+    from discrepancy.judgement.separability import Separability
 
 
 def check(
@@ -17,14 +26,68 @@ def check(
     effects: Annotated[
         list[Path] | None, typer.Option(help="A TOML file of further effects; may be given several times.")
     ] = None,
+    json: terminal.Json = False,
 ) -> None:
     """Say what is wrong with the data, which effects they can show, and which they cannot tell apart."""
-    from rich.console import Console
-
-    from discrepancy.campaign_file import read_campaign
+    from discrepancy.campaign.reading import read_campaign
     from discrepancy.catalogue.entry import Setting
     from discrepancy.catalogue.library import load_catalogue
+    from discrepancy.judgement.separability import separability
     from discrepancy.model_choice import choose_model
+    from discrepancy.workflow import checked
+
+    data = read_campaign(campaign)
+    catalogue = load_catalogue(effects or ())
+    progress = terminal.progress()
+    choice = choose_model(model, progress)
+    data, faults = checked(data, choice.model)
+    able = None
+    if not any(fault.fatal for fault in faults):
+        with progress.stage("What this campaign can decide"):
+            able = separability(
+                data, choice.model, Setting(data, choice.model, choice.model.scales(data)), catalogue
+            )
+    if json:
+        terminal.print_json(_record(data, choice.model.name, faults, able))
+    else:
+        _show(data, choice.model.name, faults, able, catalogue)
+    if able is None:
+        typer.secho("Mend the faults first: conclusions from these data would be wrong.", fg="red", err=True)
+        raise typer.Exit(1)
+
+
+def _record(
+    data: Campaign, model: str, faults: Sequence[DataFault], able: Separability | None
+) -> dict[str, Any]:
+    """Return faults and what the campaign can decide as plain data; a size that is never seen is null."""
+    return {
+        "campaign": data.name,
+        "model": model,
+        "trials": [{"name": trial.name, "held_out": trial.held_out} for trial in data.trials],
+        "channels": list(data.channels),
+        "passed": able is not None,
+        "faults": [
+            {"kind": fault.kind.value, "fatal": fault.fatal, "sentence": fault.sentence,
+             "channel": fault.channel, "trial": fault.trial}
+            for fault in faults
+        ],
+        "effects": [] if able is None else [
+            {"effect": item.effect.identifier, "testable": not item.reason, "reason": item.reason,
+             "place": item.place, "parameter": item.parameter, "detectable_from": item.detectable,
+             "prior_median": item.typical, "unit": item.unit}
+            for item in able.detectability
+        ],
+        "confusion_groups": [] if able is None else [list(group) for group in able.groups],
+    }  # fmt: skip
+
+
+def _show(
+    data: Campaign,
+    model: str,
+    faults: Sequence[DataFault],
+    able: Separability | None,
+    catalogue: Sequence[Effect],
+) -> None:
     from discrepancy.report.check_tables import (
         HEADINGS,
         confused_lines,
@@ -33,33 +96,20 @@ def check(
         rows_of,
         untested_lines,
     )
-    from discrepancy.separability import separability
-    from discrepancy.workflow import checked
-    from reporting.progress import RichProgress
     from reporting.words import counted
     from uav_twin.console_table import console_table
 
-    data = read_campaign(campaign)
-    catalogue = load_catalogue(effects or ())
-    progress = RichProgress()
-    choice = choose_model(model, progress)
-    data, faults = checked(data, choice.model)
-    console = Console(highlight=False, markup=False)
+    console = terminal.console()
     held = [trial.name for trial in data.trials if trial.held_out]
     console.print(
         f"{data.name}: {counted(len(data.trials), 'trial')}, {counted(len(data.channels), 'channel')}, "
-        f"beside {choice.model.name}; held out: {', '.join(held) or 'none'}.",
+        f"beside {model}; held out: {', '.join(held) or 'none'}.",
         soft_wrap=True,
     )
     for fault in faults:
         console.print(f"{'Fault' if fault.fatal else 'Limit'}: {fault.sentence}", soft_wrap=True)
-    if any(fault.fatal for fault in faults):
-        typer.secho("Mend the faults first: conclusions from these data would be wrong.", fg="red", err=True)
-        raise typer.Exit(1)
-    with progress.stage("What this campaign can decide"):
-        able = separability(
-            data, choice.model, Setting(data, choice.model, choice.model.scales(data)), catalogue
-        )
+    if able is None:
+        return
     shown = [at for at, title in enumerate(HEADINGS) if title not in ("testable", "confused with")]
     rows = [
         [row[at] for at in shown]

@@ -5,15 +5,20 @@ from __future__ import annotations
 import shlex
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from reporting import terminal
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from discrepancy.campaign.records import Campaign
+    from discrepancy.files.document import Origin
     from discrepancy.model_choice import ModelChoice
     from discrepancy.self_calibration import SelfCalibration
+    from discrepancy.verdict import Proof
     from discrepancy.verdict_folder import Pack
     from discrepancy.workflow import Investigation
     from reporting.progress import Progress
@@ -21,59 +26,57 @@ if TYPE_CHECKING:
 SHOWN_EXPERIMENTS = 3
 
 
+CampaignOption = Annotated[Path | None, typer.Argument(help="Folder with campaign.toml.", show_default=False)]
+FromRun = Annotated[
+    Path | None,
+    typer.Option(help="Folder of a mission (uav-twin run): its flight and its twin's model are compared."),
+]
+Model = Annotated[
+    str | None,
+    typer.Option(
+        help="A calibration.nc, a wing design, a lumped model or a description of an FMU (.toml), or "
+        "the name of a shipped "
+        "lumped model.",
+        show_default="the shipped wing",
+    ),
+]
+Out = Annotated[Path | None, typer.Option(help="Folder of the verdict.", show_default="verdicts/CAMPAIGN")]
+Replace = Annotated[bool, typer.Option("--replace", help="Replace the folder of an earlier verdict.")]
+Effects = Annotated[
+    list[Path] | None, typer.Option(help="A TOML file of further effects; may be given several times.")
+]
+Calibrate = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=10_000,
+        metavar="N",
+        help="Try the workflow on N simulated campaigns of this geometry; takes minutes.",
+    ),
+]
+
+
 def run(
-    campaign: Annotated[
-        Path | None, typer.Argument(help="Folder with campaign.toml.", show_default=False)
-    ] = None,
-    from_run: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of a mission (uav-twin run): its flight and its twin's model are compared."
-        ),
-    ] = None,
-    model: Annotated[
-        str | None,
-        typer.Option(
-            help="A calibration.nc, a wing design, a lumped model or a description of an FMU (.toml), or "
-            "the name of a shipped "
-            "lumped model.",
-            show_default="the shipped wing",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of the verdict.", show_default="verdicts/CAMPAIGN")
-    ] = None,
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Replace the folder of an earlier verdict.")
-    ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all draws.")] = 0,
-    effects: Annotated[
-        list[Path] | None, typer.Option(help="A TOML file of further effects; may be given several times.")
-    ] = None,
-    calibrate: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            help="Try the workflow on N simulated campaigns of this geometry; takes minutes.",
-        ),
-    ] = None,
+    campaign: CampaignOption = None,
+    from_run: FromRun = None,
+    model: Model = None,
+    out: Out = None,
+    replace: Replace = False,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all draws.")] = 0,
+    effects: Effects = None,
+    calibrate: Calibrate = None,
+    no_report: terminal.NoReport = False,
+    json: terminal.Json = False,
 ) -> None:
     """Find out what the model lacks: verdict, report, patch, residuals."""
-    from rich.console import Console
-
-    from discrepancy.campaign_file import read_campaign
+    from discrepancy.campaign.reading import read_campaign
     from discrepancy.catalogue.library import load_catalogue
-    from discrepancy.document_file import Origin
     from discrepancy.errors import CampaignFileError
-    from discrepancy.from_run import run_campaign
+    from discrepancy.judgement.separability import separability
     from discrepancy.model_choice import choice_of_run, choose_model
-    from discrepancy.separability import separability
-    from discrepancy.verdict import VerdictKind
+    from discrepancy.sources.from_run import run_campaign
     from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
     from discrepancy.workflow import investigate
-    from reporting.progress import RichProgress
-    from reporting.provenance import collect_provenance
 
     if (campaign is None) == (from_run is None):
         raise CampaignFileError("Give either the folder of a campaign or --from-run with that of a mission.")
@@ -85,7 +88,7 @@ def run(
     check_folder(folder, replace_it=replace)
     data = read_campaign(source) if from_run is None else run_campaign(source)
     catalogue = load_catalogue(effects or ())
-    progress = RichProgress()
+    progress = terminal.progress()
     choice = choose_model(model, progress) if from_run is None else choice_of_run(from_run)
     found = investigate(data, choice.model, catalogue, seed=seed, progress=progress)
     able, tried = None, None
@@ -94,25 +97,58 @@ def run(
             able = separability(found.campaign, choice.model, found.problem.setting, catalogue)
         if calibrate is not None:
             tried = _calibrated(found, choice, catalogue, calibrate, seed, progress)
-    origin = Origin(
+    command = _command(source, model, seed, effects or [], calibrate, from_run=from_run is not None)
+    pack = None if choice.design is None else _packing(choice, progress)
+    origin = _origin(data, choice, command, seed, effects or [])
+    content = VerdictContent(found, origin, able, tried, choice.design, pack)
+    with progress.stage("Writing the verdict"):
+        place = write_verdict_folder(folder, content, replace_it=replace, report=not no_report)
+    if json:
+        terminal.print_json(_record(folder, report=None if no_report else place))
+    _conclude(found, tried, folder, f"{'Verdict' if no_report else 'Report'}: {place}", silent=json)
+
+
+def _origin(data: Campaign, choice: ModelChoice, command: str, seed: int, effects: list[Path]) -> Origin:
+    from discrepancy.files.document import Origin
+    from reporting.provenance import collect_provenance
+
+    return Origin(
         data.name,
         choice.model.name,
         data.data_hash,
         choice.source_hash,
-        _command(source, model, seed, effects or [], calibrate, from_run=from_run is not None),
-        collect_provenance(seed, input_hashes=_inputs(data.data_hash, choice, effects or [])),
+        command,
+        collect_provenance(seed, input_hashes=_inputs(data.data_hash, choice, effects)),
     )
-    pack = None if choice.design is None else _packing(choice, progress)
-    content = VerdictContent(found, origin, able, tried, choice.design, pack)
-    with progress.stage("Writing the report"):
-        report = write_verdict_folder(folder, content, replace_it=replace)
+
+
+def _record(folder: Path, report: Path | None) -> dict[str, Any]:
+    """Return the content of `verdict.json` with the places of folder and report."""
+    import json
+
+    from discrepancy.files.verdict import VERDICT_NAME
+
+    record: dict[str, Any] = json.loads((folder / VERDICT_NAME).read_text(encoding="utf-8"))
+    return {"folder": str(folder), "report": None if report is None else str(report)} | record
+
+
+def _conclude(
+    found: Investigation, tried: SelfCalibration | None, folder: Path, place: str, *, silent: bool
+) -> None:
+    """Print the conclusion; data at fault end the command with 1."""
+    from discrepancy.verdict import VerdictKind
+
+    console = terminal.console(silent=silent)
     if found.verdict.kind is VerdictKind.DATA_ERROR:
         typer.secho(found.verdict.sentence, fg="red", err=True)
         for fault in found.faults[1:]:
             typer.secho(fault.sentence, fg="red", err=True)
-        typer.echo(f"Report: {report}")
+        console.print(place, soft_wrap=True)
         raise typer.Exit(1)
-    _show(found, tried, report, Console(highlight=False, markup=False))
+    _show(found, folder, console)
+    if tried is not None:
+        _show_trials(tried, console)
+    console.print(place, soft_wrap=True)
 
 
 def _calibrated(
@@ -159,25 +195,21 @@ def _packing(choice: ModelChoice, progress: Progress) -> Pack:
     """Return what makes the FMU of a wing that carries a patch, its effects off."""
 
     def pack(patch_file: Path, target: Path) -> str:
-        from calibration.result import CalibrationResult
+        from calibration.wing.result_file import load_calibration
+        from calibration.wing.wing_record import tailoring
         from discrepancy.model_choice import ModelKind
-        from fe.cache import reduced_model
-        from fe.patch_cache import patch_arrays
-        from fmu_asset.build import build_fmu
         from fmu_asset.errors import PatchFileError
-        from fmu_asset.patch_file import load_patch
-        from twin_master.calibrated_asset import pack_calibrated_wing
+        from fmu_asset.packing.patch_file import load_patch
+        from fmu_asset.packing.wing_packing import pack_wing
 
         try:
             patch = load_patch(patch_file)
-            model = reduced_model(choice.design, progress=progress)
-            arrays = patch_arrays(choice.design, progress) if patch.needs_arrays else None
+            tailored = None
             if choice.kind is ModelKind.CALIBRATION:
                 assert choice.path is not None
-                wing = CalibrationResult.load(choice.path)
-                pack_calibrated_wing(model, wing, target, patch=patch, arrays=arrays)
-            else:
-                build_fmu(model, target, patch=patch, arrays=arrays)
+                tailored = tailoring(load_calibration(choice.path))
+            assert choice.design is not None  # a patch of the wing's FMU comes from a wing
+            pack_wing(choice.design, target, tailoring=tailored, patch=patch, progress=progress)
         except PatchFileError as cause:
             return f"There is no patched FMU: {str(cause).replace(str(patch_file), patch_file.name)}"
         names = ", ".join(f"effect.{effect.id}.active" for effect in patch.effects)
@@ -189,25 +221,22 @@ def _packing(choice: ModelChoice, progress: Progress) -> Pack:
 # ---------------------------------------------------------------- summary
 
 
-def _show(found: Investigation, tried: SelfCalibration | None, report: Path, console: Console) -> None:
-    from discrepancy.patch_file import PATCH_NAME, read_patch
+def _show(found: Investigation, folder: Path, console: Console) -> None:
+    from discrepancy.files.patch import PATCH_NAME, read_patch
     from discrepancy.report.sizes import size_sentence
     from discrepancy.report.text import (
         estimate_text,
         headline,
-        number,
-        percent,
         probability_text,
         unit_text,
     )
     from discrepancy.verdict import VerdictKind
-    from reporting.words import counted
     from uav_twin.console_table import console_table
 
     verdict, proof = found.verdict, found.proof
     console.print(f"Verdict: {verdict.kind.value}", style="bold")
     console.print(headline(verdict), soft_wrap=True)
-    if (patch_file := report.parent / PATCH_NAME).is_file():
+    if (patch_file := folder / PATCH_NAME).is_file():
         stored = read_patch(patch_file)
         if sizes := size_sentence(found, stored.effects, stored.intervals):
             console.print(sizes, soft_wrap=True)
@@ -227,17 +256,7 @@ def _show(found: Investigation, tried: SelfCalibration | None, report: Path, con
         ]  # fmt: skip
         console.print(console_table(headings, rows, console.width))
     if proof is not None:
-        first, second, where = proof.fitted_before, proof.fitted_after, "fitted trials (none is held out)"
-        if proof.held_out_before is not None and proof.held_out_after is not None:
-            first, second = proof.held_out_before, proof.held_out_after
-            where = f"held-out trials ({', '.join(trial.name for trial in found.campaign.held_out)})"
-        closed = f", {percent(proof.gap_closed)} % of the gap closed" if isfinite(proof.gap_closed) else ""
-        why = f" {proof.gap_reason}" if proof.held_out_before is not None and proof.gap_reason else ""
-        scores = (
-            f"χ²/dof on {where}: {number(first.chi_square_per_dof)} before, "
-            f"{number(second.chi_square_per_dof)} with the effect{closed}.{why}"
-        )
-        console.print(scores if isfinite(first.chi_square_per_dof) else proof.remaining, soft_wrap=True)
+        _show_proof(proof, found.campaign, console)
     for experiment in verdict.next_experiments[:SHOWN_EXPERIMENTS]:
         console.print(f"Next: {experiment.description} ({experiment.information:.2f} nat)", soft_wrap=True)
     for fault in found.faults:
@@ -246,11 +265,30 @@ def _show(found: Investigation, tried: SelfCalibration | None, report: Path, con
     for remark in verdict.remarks:
         if remark not in said:
             console.print(f"Note: {remark}", soft_wrap=True)
-    if tried is not None:
-        right, wrong = tried.share("right"), tried.share("wrong")
-        false = tried.share("wrong", null=True)
-        console.print(
-            f"Simulated campaigns: {right.count} of {right.total} hidden effects named, {wrong.count} "
-            f"wrongly; {counted(false.count, 'false name')} where nothing was hidden ({false.total})."
-        )
-    console.print(f"Report: {report}", soft_wrap=True)
+
+
+def _show_proof(proof: Proof, campaign: Campaign, console: Console) -> None:
+    from discrepancy.report.text import number, percent
+
+    first, second, where = proof.fitted_before, proof.fitted_after, "fitted trials (none is held out)"
+    if proof.held_out_before is not None and proof.held_out_after is not None:
+        first, second = proof.held_out_before, proof.held_out_after
+        where = f"held-out trials ({', '.join(trial.name for trial in campaign.held_out)})"
+    closed = f", {percent(proof.gap_closed)} % of the gap closed" if isfinite(proof.gap_closed) else ""
+    why = f" {proof.gap_reason}" if proof.held_out_before is not None and proof.gap_reason else ""
+    scores = (
+        f"χ²/dof on {where}: {number(first.chi_square_per_dof)} before, "
+        f"{number(second.chi_square_per_dof)} with the effect{closed}.{why}"
+    )
+    console.print(scores if isfinite(first.chi_square_per_dof) else proof.remaining, soft_wrap=True)
+
+
+def _show_trials(tried: SelfCalibration, console: Console) -> None:
+    from reporting.words import counted
+
+    right, wrong = tried.share("right"), tried.share("wrong")
+    false = tried.share("wrong", null=True)
+    console.print(
+        f"Simulated campaigns: {right.count} of {right.total} hidden effects named, {wrong.count} "
+        f"wrongly; {counted(false.count, 'false name')} where nothing was hidden ({false.total})."
+    )

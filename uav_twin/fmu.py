@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from reporting import terminal
 from uav_twin.fmu_bind import bind
 from uav_twin.fmu_check import check
 from uav_twin.fmu_simulate import simulate
@@ -44,21 +45,13 @@ def build(
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Pack the wing (or a model script) as an FMI 2.0 co-simulation FMU; equal input gives equal bytes."""
-    from fe.cache import reduced_model
-    from fe.design import load_design
-    from fe.patch_cache import patch_arrays
-    from fmu_asset.build import build_fmu, check_kind
+    from fe.wing.design import load_design
     from fmu_asset.compiled.compiler import find_compiler
-    from fmu_asset.errors import FmuBuildError
-    from fmu_asset.patch_file import load_patch
-    from reporting.progress import RichProgress
+    from fmu_asset.packing.patch_file import load_patch
+    from fmu_asset.packing.wing_fmu import check_kind
+    from fmu_asset.packing.wing_packing import pack_wing
 
-    if calibration is not None and design is not None:
-        raise typer.BadParameter("the calibration holds its design: give either it or --design.")
-    if out.exists() and not replace:
-        raise FmuBuildError(f"{out} exists: choose another --out or give --replace.")
-    if activate and patch is None:
-        raise typer.BadParameter("there is no --patch whose effects could be switched on.")
+    _refuse_contradictions(out, design, calibration, patch, activate=activate, replace=replace)
     if script is not None:
         for_the_wing = design is not None or calibration is not None or kind != "python" or patch is not None
         _build_script(script, out, replace=replace, other=for_the_wing)
@@ -68,80 +61,100 @@ def build(
         check_kind(kind)
     if kind == "compiled":
         find_compiler()  # before the wing is modelled, which can take a minute
+    tailored = None
     if calibration is None:
         shape = load_design(design)
-        model = reduced_model(shape, progress=RichProgress())
-        arrays = patch_arrays(shape, RichProgress()) if effects is not None and effects.needs_arrays else None
-        info = build_fmu(
-            model, out, kind=kind, patch=effects, activate=activate, arrays=arrays, replace=replace
-        )
     else:
-        from calibration.result import CalibrationResult
-        from twin_master.calibrated_asset import pack_calibrated_wing
+        from calibration.wing.result_file import load_calibration
+        from calibration.wing.wing_record import tailoring
 
-        wing = CalibrationResult.load(calibration)
-        model = reduced_model(wing.design, progress=RichProgress())
-        arrays = (
-            patch_arrays(wing.design, RichProgress())
-            if effects is not None and effects.needs_arrays
-            else None
-        )
-        info = pack_calibrated_wing(
-            model, wing, out, kind=kind, patch=effects, activate=activate, arrays=arrays, replace=replace
-        )
-        typer.echo(f"Calibrated for {wing.asset}.")
-    typer.echo(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
+        wing = load_calibration(calibration)
+        shape, tailored = wing.design, tailoring(wing)
+    info = pack_wing(
+        shape,
+        out,
+        tailoring=tailored,
+        kind=kind,
+        patch=effects,
+        activate=activate,
+        replace=replace,
+        progress=terminal.progress(),
+    )
+    if calibration is not None:
+        terminal.say(f"Calibrated for {wing.asset}.")
+    terminal.say(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
+
+
+def _refuse_contradictions(
+    out: Path,
+    design: Path | None,
+    calibration: Path | None,
+    patch: Path | None,
+    *,
+    activate: bool,
+    replace: bool,
+) -> None:
+    """Refuse options that cannot be kept together, before anything is built."""
+    from fmu_asset.errors import FmuBuildError
+
+    if calibration is not None and design is not None:
+        raise typer.BadParameter("the calibration holds its design: give either it or --design.")
+    if out.exists() and not replace:
+        raise FmuBuildError(f"{out} exists: choose another --out or give --replace.")
+    if activate and patch is None:
+        raise typer.BadParameter("there is no --patch whose effects could be switched on.")
 
 
 def _build_script(script: str, out: Path, *, replace: bool, other: bool) -> None:
     """Pack a model script, shipped or a file."""
-    from fmu_asset.script import build_script_fmu
+    from fmu_asset.packing.script import build_script_fmu
     from scenarios import asset_scripts
 
     if other:
         raise typer.BadParameter(
             "--design, --calibration, --patch and --kind are for the wing.", param_hint="--script"
         )
-    info = build_script_fmu(asset_scripts().get(script, Path(script)), out, replace=replace)
-    typer.echo(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}")
+    built = build_script_fmu(asset_scripts().get(script, Path(script)), out, replace=replace)
+    terminal.say(f"{built.path}: {built.size / 1024:.0f} KiB, GUID {built.guid}")
 
 
 @fmu_app.command("info")
 def info(
     file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)],
     variables: Annotated[bool, typer.Option("--variables/--no-variables", help="List the variables.")] = True,
+    json: terminal.Json = False,
 ) -> None:
     """Say what an FMU is: version, capabilities, variables with units and ranges."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from fmu_asset.archive import describe_fmu, read_fmu
+    from fmu_asset.archive.fmu_file import describe_fmu, read_fmu
+    from uav_twin.console_table import console_table
 
     record = describe_fmu(read_fmu(file))
-    console = Console(highlight=False)
-    facts = Table(show_header=False, title=str(file))
-    for name, value in record.items():
-        if isinstance(value, str | int | float | bool) and value != "":
-            facts.add_row(name.replace("_", " "), str(value))
-        elif name == "platforms":
-            facts.add_row("platforms", ", ".join(value))
+    if json:
+        terminal.print_json({"file": str(file)} | record)
+        return
+    console = terminal.console()
+    console.print(str(file), soft_wrap=True)
+    facts = [
+        (name.replace("_", " "), str(value))
+        for name, value in record.items()
+        if isinstance(value, str | int | float | bool) and value != ""
+    ]
+    facts.append(("platforms", ", ".join(record.get("platforms", ()))))
     switches = [row for row in record["variables"] if _SWITCH.fullmatch(row["name"])]
     if switches:
         effects = (
             f"{row['name'].split('.')[1]} ({'on' if float(row['start']) else 'off'})" for row in switches
         )
-        facts.add_row("effects", ", ".join(effects))
-    console.print(facts)
+        facts.append(("effects", ", ".join(effects)))
+    console.print(console_table(("fact", "value"), facts, console.width))
     if variables:
-        table = Table("variable", "causality", "unit", "least", "largest", "start", "description")
-        for variable in record["variables"]:
-            table.add_row(
-                *(
-                    "" if variable.get(key) is None else str(variable[key])
-                    for key in ("name", "causality", "unit", "minimum", "maximum", "start", "description")
-                )
-            )
-        console.print(table)
+        keys = ("name", "causality", "unit", "minimum", "maximum", "start", "description")
+        rows = [
+            tuple("" if row.get(key) is None else str(row[key]) for key in keys)
+            for row in record["variables"]
+        ]
+        headings = ("variable", "causality", "unit", "least", "largest", "start", "description")
+        console.print(console_table(headings, rows, console.width))
 
 
 fmu_app.command("bind")(bind)

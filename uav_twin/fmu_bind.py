@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from reporting import terminal
+
 
 def bind(
     file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)],
@@ -20,8 +22,8 @@ def bind(
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Draft a binding for an FMU: which variable is which role, in which unit."""
-    from fmu_asset.archive import read_fmu
-    from fmu_asset.draft import draft_binding
+    from fmu_asset.archive.fmu_file import read_fmu
+    from fmu_asset.door.draft import draft_binding
     from fmu_asset.errors import BindingError
     from reporting.files import atomic_write_text
 
@@ -32,4 +34,4 @@ def bind(
         typer.echo(text, nl=False)
         return
     atomic_write_text(out, text)
-    typer.echo(f"{out}: drafted; correct the roles, then run `uav-twin fmu check {file} --binding {out}`.")
+    terminal.say(f"{out}: drafted; correct the roles, then run `uav-twin fmu check {file} --binding {out}`.")

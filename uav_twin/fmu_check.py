@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from reporting import terminal
+
 _COLOURS = {"ok": "green", "warning": "yellow", "problem": "red", "skipped": "dim"}
 
 
@@ -27,14 +29,13 @@ def check(
     memory_limit: Annotated[
         float | None, typer.Option(help="Limit of a worker's memory in MiB.", min=0.0)
     ] = None,
+    json: terminal.Json = False,
 ) -> None:
     """Check an FMU in every way we know; exit code 1 if anything is wrong with it."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
+    from dataclasses import asdict
 
     from fmu_asset.check import check_fmu
-    from reporting.progress import RichProgress
+    from uav_twin.console_table import console_table
 
     result = check_fmu(
         file,
@@ -43,15 +44,22 @@ def check(
         step_size=step_size,
         step_timeout=step_timeout,
         memory_limit=memory_limit,
-        progress=RichProgress(),
+        progress=terminal.progress(),
     )
-    table = Table("check", "", "found", title=escape(str(file)))
-    for finding in result.findings:
-        colour = _COLOURS[finding.verdict]
-        table.add_row(finding.check, f"[{colour}]{finding.verdict}[/]", escape(finding.text))
-    Console(highlight=False).print(table)
+    if json:
+        findings = [asdict(finding) for finding in result.findings]
+        terminal.print_json({"file": str(file), "passed": result.passed, "findings": findings})
+    else:
+        console = terminal.console()
+        console.print(str(file), soft_wrap=True)
+        rows = [(found.check, found.verdict, found.text) for found in result.findings]
+        table = console_table(("check", "verdict", "found"), rows, console.width)
+        for row, finding in zip(table.rows, result.findings, strict=True):
+            row.style = _COLOURS[finding.verdict]
+        console.print(table)
     if not result.passed:
         count = len(result.problems)
         typer.secho(f"{file}: {count} problem{'' if count == 1 else 's'}.", fg="red", err=True)
         raise typer.Exit(1)
-    typer.echo(f"{file}: no problem found.")
+    if not json:
+        terminal.say(f"{file}: no problem found.")

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from reporting import terminal
+
 
 def simulate(
     file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)],
@@ -30,10 +32,9 @@ def simulate(
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Simulate an FMU under input histories; inputs without a column keep their start values."""
+    from fmu_asset.door.history_file import read_histories, write_history
+    from fmu_asset.door.session import FmiAsset
     from fmu_asset.errors import FmuInputError
-    from fmu_asset.history_file import read_histories, write_history
-    from fmu_asset.session import FmiAsset
-    from reporting.progress import RichProgress
 
     if out.suffix not in (".csv", ".nc"):
         raise FmuInputError(f"{out} must end in .csv or .nc: choose another --out.")
@@ -42,6 +43,6 @@ def simulate(
     asset = FmiAsset(file, binding, isolated=not in_process, step_timeout=step_timeout)
     given = read_histories(inputs, asset.binding)
     with asset:
-        history = asset.simulate(**given.roles, steps=given.steps, progress=RichProgress())
+        history = asset.simulate(**given.roles, steps=given.steps, progress=terminal.progress())
         write_history(out, asset, history)
-    typer.echo(f"{out}: {len(history.time)} steps to t = {history.time[-1]:g} s.")
+    terminal.say(f"{out}: {len(history.time)} steps to t = {history.time[-1]:g} s.")

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from reporting import terminal
+
 if TYPE_CHECKING:
-    from calibration.identification.workflow import Identification
+    from calibration.identification.identified import Identification
 
 
 def identify(
@@ -23,19 +25,16 @@ def identify(
     from_prior: Annotated[
         bool, typer.Option("--from-prior", help="Begin with every free number at its prior mean.")
     ] = False,
-    steps: Annotated[int, typer.Option(min=1, help="Largest number of full models.")] = 15,
+    steps: Annotated[int, typer.Option(min=1, max=1000, help="Largest number of full models.")] = 15,
     remesh: Annotated[
         list[float] | None,
         typer.Option(help="Evaluate the result again on a mesh this much finer; may be given several times."),
     ] = None,
 ) -> None:
     """Fit the free numbers of the wing design to outputs of the published model; takes minutes."""
-    from rich.console import Console
-
     from calibration.identification.workflow import run_identification, write_identification
-    from fe.design import load_design
+    from fe.wing.design import load_design
     from reporting.errors import FileNotWrittenError
-    from reporting.progress import RichProgress
 
     if out is not None and out.exists() and not out.is_dir():
         raise FileNotWrittenError(f"{out} exists and is no folder: choose another --out.")
@@ -45,9 +44,9 @@ def identify(
         from_prior=from_prior,
         largest_count=steps,
         refinements=remesh or (),
-        progress=RichProgress(),
+        progress=terminal.progress(),
     )
-    console = Console(highlight=False)
+    console = terminal.console()
     _show(result, console)
     if out is not None:
         for path in write_identification(result, out):

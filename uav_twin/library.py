@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from reporting import terminal
+
 library_app = typer.Typer(no_args_is_help=True, help="Sample FMUs into observation libraries.")
 
 
@@ -16,48 +18,49 @@ def library() -> None:
     """Sample FMUs into observation libraries."""
 
 
+Scenario = Annotated[
+    str | None,
+    typer.Argument(help="A scenario, whose FMU is sampled at its states, controls and draws."),
+]
+Grid = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="NAME=VALUES with a name of the binding, such as wear=0,0.2,0.4 or wear=0:0.4:3; repeated.",
+        show_default=False,
+    ),
+]
+Role = Annotated[
+    str | None, typer.Option(help="Observation of the binding, where it has several.", show_default=False)
+]
+Settle = Annotated[
+    int,
+    typer.Option(min=0, help="Steps from a fresh start at every point, for an FMU with memory."),
+]
+Workers = Annotated[int | None, typer.Option(min=1, help="Processes.", show_default="one for each processor")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with the blocks of an interrupted sampling.")]
+
+
 @library_app.command("sample")
 def sample(
     out: Annotated[Path, typer.Option(help="The NetCDF file to write.", show_default=False)],
-    scenario: Annotated[
-        str | None,
-        typer.Argument(help="A scenario, whose FMU is sampled at its states, controls and draws."),
-    ] = None,
+    scenario: Scenario = None,
     fmu: Annotated[Path | None, typer.Option(help="The FMU to sample.", show_default=False)] = None,
     binding: Annotated[Path | None, typer.Option(help="Its binding.", show_default=False)] = None,
-    grid: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="NAME=VALUES with a name of the binding, such as wear=0,0.2,0.4 or wear=0:0.4:3; repeated.",
-            show_default=False,
-        ),
-    ] = None,
-    role: Annotated[
-        str | None, typer.Option(help="Observation of the binding, where it has several.", show_default=False)
-    ] = None,
+    grid: Grid = None,
+    role: Role = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the draws of a scenario.")] = None,
-    settle: Annotated[
-        int,
-        typer.Option(min=0, help="Steps from a fresh start at every point, for an FMU with memory."),
-    ] = 0,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes.", show_default="one for each processor")
-    ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the blocks of an interrupted sampling.")
-    ] = False,
+    settle: Settle = 0,
+    workers: Workers = None,
+    resume: Resume = False,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress and no summary.")] = False,
 ) -> None:
     """Ask an FMU for its observation at every draw, state and control; write an observation library."""
-    from reporting.progress import RichProgress, SilentProgress
-    from twin_master.command import INTERRUPTED
-    from twin_master.library_request import grid_of_fmu, grid_of_scenario
-    from twin_master.library_sampling import blocks_folder, sample_library
-    from twin_master.resolution import Overrides
-    from twin_master.scenario_file import load_scenario
+    from twin_master.assets.resolution import Overrides
+    from twin_master.library.request import grid_of_fmu, grid_of_scenario
+    from twin_master.library.sampling import blocks_folder, sample_library
+    from twin_master.scenario.reading import load_scenario
 
-    progress = SilentProgress() if quiet else RichProgress()
+    progress = terminal.progress()
     if resume and replace:
         raise typer.BadParameter("give either --resume or --replace.", param_hint="--resume")
     if scenario is None and (fmu is None or binding is None):
@@ -86,11 +89,10 @@ def sample(
         kept = blocks_folder(out).is_dir()
         hint = "go on with the same command and --resume" if kept else "nothing was sampled yet"
         typer.secho(f"Interrupted; finished blocks are kept: {hint}.", fg="red", err=True)
-        raise typer.Exit(INTERRUPTED) from None
-    if not quiet:
-        values = outcome.library.values
-        note = f", {outcome.kept_blocks} of {outcome.block_count} blocks kept" if outcome.kept_blocks else ""
-        typer.echo(
-            f"{outcome.path}: {' x '.join(str(n) for n in values.shape)} (draws, states, controls, sensors), "
-            f"{outcome.workers} processes, {outcome.seconds:.1f} s{note}, FMU {outcome.library.fmu_hash[:12]}"
-        )
+        raise typer.Exit(terminal.INTERRUPTED) from None
+    values = outcome.library.values
+    note = f", {outcome.kept_blocks} of {outcome.block_count} blocks kept" if outcome.kept_blocks else ""
+    terminal.say(
+        f"{outcome.path}: {' x '.join(str(n) for n in values.shape)} (draws, states, controls, sensors), "
+        f"{outcome.workers} processes, {outcome.seconds:.1f} s{note}, FMU {outcome.library.fmu_hash[:12]}"
+    )

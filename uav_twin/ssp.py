@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from reporting import terminal
+
 ssp_app = typer.Typer(no_args_is_help=True, help="Write and check systems of FMUs as SSP files.")
 
 
@@ -28,21 +30,20 @@ def export(
 ) -> None:
     """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs."""
     from fmu_asset.errors import SspError
-    from reporting.progress import RichProgress
-    from twin_master.scenario_file import load_scenario
-    from twin_master.system_export import export_design, export_scenario
+    from twin_master.assets.system_export import export_design, export_scenario
+    from twin_master.scenario.reading import load_scenario
 
     if out.suffix != ".ssp":
         raise SspError(f"An SSP file must have the suffix .ssp, but {out} was given.")
     if out.exists() and not replace:
         raise SspError(f"{out} exists: choose another --out or give --replace.")
-    progress = RichProgress()
+    progress = terminal.progress()
     if _is_design(what):
         design = None if what == "uav_wing" else Path(what)
         path = export_design(design, out, replace_file=replace, progress=progress)
     else:
         path = export_scenario(load_scenario(what), out, seed=seed, replace_file=replace, progress=progress)
-    typer.echo(f"{path}: {path.stat().st_size / 1024:.0f} KiB")
+    terminal.say(f"{path}: {path.stat().st_size / 1024:.0f} KiB")
 
 
 def _is_design(what: str) -> bool:
@@ -58,20 +59,27 @@ def _is_design(what: str) -> bool:
 
 
 @ssp_app.command("check")
-def check(file: Annotated[Path, typer.Argument(help="An SSP file.", show_default=False)]) -> None:
+def check(
+    file: Annotated[Path, typer.Argument(help="An SSP file.", show_default=False)],
+    json: terminal.Json = False,
+) -> None:
     """Check an SSP file: archive, schemas, FMUs, connections, one step; exit code 1 if anything is wrong."""
+    from dataclasses import asdict
+
     from fmu_asset.ssp.check import check_ssp
 
     result = check_ssp(file)
+    if json:
+        terminal.print_json({"passed": result.passed} | asdict(result))
     for problem in result.problems:
         typer.secho(f"problem: {problem}", fg="red", err=True)
-    for loop in result.loops:
-        typer.echo(f"warning: {loop}")
+    for loop in () if json else result.loops:
+        terminal.say(f"warning: {loop}")
     if not result.passed:
         raise typer.Exit(1)
     order = ", ".join(f"{name} ({model})" for name, model in result.components)
-    typer.echo(
-        f"{file}: no problem found; {result.connections} connections, {result.parameters} parameters, "
-        "evaluated "
-        f"in the order {order}."
-    )
+    if not json:
+        terminal.say(
+            f"{file}: no problem found; {result.connections} connections, {result.parameters} parameters, "
+            f"evaluated in the order {order}."
+        )

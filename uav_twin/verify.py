@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from reporting import terminal
+from uav_twin.console_table import console_table
+
 if TYPE_CHECKING:
-    from fe.design import WingDesign
-    from fe.operators import AffineOperators
+    from fe.full.operators import AffineOperators
+    from fe.wing.design import WingDesign
+    from reporting.progress import Progress
 
 DAMAGED = (0.4, 0.6)
 REFINEMENTS = (0.5, 1.0, 2.0)
@@ -66,44 +70,28 @@ def verify(
     ] = False,
 ) -> None:
     """Check the finite element model: known answers, balances, convergence, and CalculiX where installed."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from fe.calculix_job import calculix_program
-    from fe.design import load_design
+    from fe.verification.calculix_job import calculix_program
+    from fe.wing.design import load_design
     from reporting.errors import FileNotWrittenError
-    from reporting.files import atomic_write_text
-    from reporting.progress import RichProgress
 
     wing_design = load_design(design)
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileNotWrittenError(f"{out} exists and is not an empty folder: choose another --out.")
-    checks: list[Check] = []
     with tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch:
         jobs = (out or Path(scratch)) / "calculix"
-        with RichProgress().stage("Verifying") as stage:
-            for check in all_checks(wing_design, jobs, quick=quick):
-                checks.append(check)
-                stage.advance(detail=check.name)
-    console = Console(highlight=False)
-    table = Table("check", "figure", "found", "limit", "")
+        checks = all_checks(wing_design, jobs, terminal.progress(), quick=quick)
+    console = terminal.console()
+    rows = []
     for check in checks:
         limit = "" if check.limit is None else f"{check.limit:.3g}"
         verdict = "" if check.limit is None else "kept" if check.passed else "BROKEN"
         found = f"{check.value:.3g}" + (f" {check.note}" if check.note else "")
-        table.add_row(check.group, check.name, found, limit, verdict)
-    console.print(table)
+        rows.append((check.group, check.name, found, limit, verdict))
+    console.print(console_table(("check", "figure", "found", "limit", "verdict"), rows, console.width))
     if calculix_program() is None:
         console.print("CalculiX is not installed (apt-get install calculix-ccx): its checks are left out.")
     if out is not None:
-        rows = [
-            {**asdict(check), "value": check.value if math.isfinite(check.value) else None}
-            | {"passed": check.passed}
-            for check in checks
-        ]
-        record = {"design": wing_design.name, "design_hash": wing_design.hash, "checks": rows}
-        path = atomic_write_text(out / "verification.json", json.dumps(record, indent=2) + "\n")
-        console.print(f"Wrote {path}", soft_wrap=True)
+        console.print(f"Wrote {write_record(out, wing_design, checks)}", soft_wrap=True)
     broken = [check for check in checks if not check.passed]
     if broken:
         names = "; ".join(f"{check.group}, {check.name}" for check in broken)
@@ -111,8 +99,21 @@ def verify(
         raise typer.Exit(1)
 
 
-def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> Iterator[Check]:
-    """Yield every check of a design; those against CalculiX where it is installed.
+def write_record(folder: Path, design: WingDesign, checks: Sequence[Check]) -> Path:
+    """Write `verification.json`: each check with its value and limit."""
+    from reporting.files import atomic_write_text
+
+    rows = [
+        {**asdict(check), "value": check.value if math.isfinite(check.value) else None}
+        | {"passed": check.passed}
+        for check in checks
+    ]
+    record = {"design": design.name, "design_hash": design.hash, "checks": rows}
+    return atomic_write_text(folder / "verification.json", json.dumps(record, indent=2) + "\n")
+
+
+def all_checks(design: WingDesign, jobs: Path, progress: Progress, *, quick: bool = False) -> list[Check]:
+    """Return every check of a design; those against CalculiX where it is installed.
 
     Parameters
     ----------
@@ -120,26 +121,45 @@ def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> Iterat
         The wing.
     jobs : Path
         Where CalculiX works.
+    progress : Progress
+        Where each group of checks is announced.
     quick : bool
         Coarser meshes and a short ring-down.
     """
-    from fe.calculix_job import calculix_program
-    from fe.operators import assemble
+    from fe.full.operators import assemble
+    from fe.verification.calculix_job import calculix_program
 
-    yield from element_checks()
-    mesh = assemble(design.changed(mesh={"refinement": QUICK_REFINEMENTS[0]}) if quick else design)
-    yield from balance_checks(mesh)
-    yield from plate_checks(mesh, limited=not quick)
-    yield from convergence_checks(design, QUICK_REFINEMENTS if quick else REFINEMENTS, limited=not quick)
+    checks: list[Check] = []
+
+    def run(title: str, found: Iterable[Check]) -> None:
+        with progress.stage(title) as stage:
+            for check in found:
+                checks.append(check)
+                stage.advance(detail=check.name)
+
+    run("Elements against known answers", element_checks())
+    with progress.stage("Meshing the wing"):
+        mesh = assemble(design.changed(mesh={"refinement": QUICK_REFINEMENTS[0]}) if quick else design)
+    run("Balances of the wing", balance_checks(mesh))
+    run("The sandwich plate beside the box", plate_checks(mesh, limited=not quick))
+    refinements = QUICK_REFINEMENTS if quick else REFINEMENTS
+    run("Convergence of the mesh", convergence_checks(design, refinements, limited=not quick))
     if calculix_program() is not None:
-        yield from calculix_checks(mesh, jobs)
+        run("CalculiX on the same mesh", calculix_checks(mesh, jobs))
         coarse = assemble(design.changed(mesh={"refinement": RING_DOWN_REFINEMENT}))
-        yield from ring_down_checks(coarse, jobs, periods=0.25 if quick else 5.0)
+        periods = 0.25 if quick else 5.0
+        run("A ring-down by CalculiX", ring_down_checks(coarse, jobs, periods=periods))
+    return checks
 
 
 def element_checks() -> Iterator[Check]:
     """Yield the checks of the element and the assembly on bodies of their own."""
-    from fe.verification import cantilever_check, macneal_harder_beam, patch_test, rigid_body_check
+    from fe.verification.known_answers import (
+        cantilever_check,
+        macneal_harder_beam,
+        patch_test,
+        rigid_body_check,
+    )
 
     patch = patch_test()
     yield Check("patch test", "displacement", patch.displacement_error, 1e-12)
@@ -157,7 +177,7 @@ def element_checks() -> Iterator[Check]:
 
 def balance_checks(operators: AffineOperators) -> Iterator[Check]:
     """Yield the sums that must agree for the wing at the load factor of its lift."""
-    from fe.verification import rigid_body_residual, wing_balance
+    from fe.verification.known_answers import rigid_body_residual, wing_balance
 
     yield Check("wing", "force of a rigid motion", rigid_body_residual(operators), 1e-12)
     balance = wing_balance(operators, operators.wing_mesh.design.lift.load_factor)
@@ -186,7 +206,7 @@ def convergence_checks(
     """
     import numpy as np
 
-    from fe.verification import mesh_convergence, observed_order
+    from fe.verification.known_answers import mesh_convergence, observed_order
 
     rows = mesh_convergence(design, refinements)
     group = f"mesh x{refinements[-2]:g} to x{refinements[-1]:g}"
@@ -203,8 +223,9 @@ def convergence_checks(
     strain = np.array([row.strain for row in rows])
     change = np.abs(strain[-1] / strain[-2] - 1.0)
     yield Check(group, "gauges, rms", float(np.sqrt(np.mean(change**2))), limit)
-    for gauge, value in enumerate(change):
-        note = f"({1e6 * strain[-1, gauge]:.0f} microstrain, {order(strain[:, gauge].tolist())})"
+    for gauge, value in enumerate(change, start=1):
+        own = strain[:, gauge - 1].tolist()
+        note = f"({1e6 * own[-1]:.0f} microstrain, {order(own)})"
         yield Check(group, f"gauge {gauge}", float(value), None, note)
     yield Check(group, "unknowns of the finest mesh", rows[-1].unknowns)
 
@@ -224,8 +245,12 @@ def plate_checks(operators: AffineOperators, *, limited: bool = True) -> Iterato
     """
     import numpy as np
 
-    from fe.plate_comparison import DAMAGE, compare_with_plate
-    from fe.plate_verification import cantilever_strip, square_plate_deflection, square_plate_frequency
+    from fe.verification.plate_comparison import DAMAGE, compare_with_plate
+    from fe.verification.plate_known_answers import (
+        cantilever_strip,
+        square_plate_deflection,
+        square_plate_frequency,
+    )
 
     for name, closed_form in (
         ("square plate, deflection", square_plate_deflection),
@@ -255,11 +280,12 @@ def plate_checks(operators: AffineOperators, *, limited: bool = True) -> Iterato
                 if len(gauges):
                     rms = float(np.sqrt(np.mean(difference[gauges] ** 2)))
                     worst = gauges[np.abs(difference[gauges]).argmax()]
-                    note = f"({len(gauges)} gauges, largest {abs(difference[worst]):.2g}, gauge {worst})"
+                    note = f"({len(gauges)} gauges, largest {abs(difference[worst]):.2g}, gauge {worst + 1})"
                     yield Check(group, f"{name}, {kind}", rms, limit if limited else None, note)
             at_edges = np.flatnonzero(found.at_edges)
             if len(at_edges):
-                note = f"({', '.join(f'{gauge}: {100 * difference[gauge]:+.1f} %' for gauge in at_edges)})"
+                each = (f"{gauge + 1}: {100 * difference[gauge]:+.1f} %" for gauge in at_edges)
+                note = f"({', '.join(each)})"
                 largest = float(np.abs(difference[at_edges]).max())
                 yield Check(group, f"{name}, largest at the edges", largest, None, note)
         ratio = found.plate.frequency[3:] / found.box.frequency[3:] - 1.0
@@ -270,8 +296,8 @@ def plate_checks(operators: AffineOperators, *, limited: bool = True) -> Iterato
 
 def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:
     """Yield the differences to CalculiX on the identical mesh: statics and six modes."""
-    from fe.cross_check import modal_agreement, static_agreement
-    from fe.state import DigitalState
+    from fe.runtime.state import DigitalState
+    from fe.verification.calculix_comparison import modal_agreement, static_agreement
 
     for health, loss in (("healthy", (0.0, 0.0)), ("damaged", DAMAGED)):
         group = f"CalculiX, {health}"
@@ -285,8 +311,8 @@ def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:
 
 def ring_down_checks(operators: AffineOperators, jobs: Path, periods: float) -> Iterator[Check]:
     """Yield the difference of a ring-down to direct integration by CalculiX."""
-    from fe.cross_check import ring_down_agreement
-    from fe.state import DigitalState
+    from fe.runtime.state import DigitalState
+    from fe.verification.calculix_comparison import ring_down_agreement
 
     agreement = ring_down_agreement(operators, jobs / "ring_down", DigitalState(), periods)
     note = f"({len(agreement.time)} increments, {operators.unknowns} unknowns)"

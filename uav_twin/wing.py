@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from reporting import terminal
+from uav_twin.console_table import console_table
 from uav_twin.identify import identify
 from uav_twin.verify import verify
 
 if TYPE_CHECKING:
-    from fe.design import WingDesign
-    from fe.reduced import Modes
+    from fe.runtime.reduced import Modes, ReducedModel
+    from fe.wing.design import WingDesign
 
 PUBLISHED = {
     "tip stiffness": "0.6770 (eq. 14)",
@@ -34,41 +36,56 @@ def wing(
         Path | None,
         typer.Option(help="Write the undamaged wing at 3g for ParaView, and its modes beside it."),
     ] = None,
+    json: terminal.Json = False,
 ) -> None:
     """Say what the wing weighs, how it vibrates and how stiff its tip is."""
     if context.invoked_subcommand is not None:
-        if design is not None or vtu is not None:
+        if design is not None or vtu is not None or json:
             raise typer.BadParameter(f"options go behind the command: wing {context.invoked_subcommand} ...")
         return
-    from rich.console import Console
-    from rich.table import Table
-
-    from fe.cache import reduced_model
-    from fe.design import load_design
-    from fe.state import DigitalState
-    from reporting.progress import RichProgress
+    from fe.reduction.model_cache import reduced_model
+    from fe.wing.design import load_design
 
     wing_design = load_design(design)
-    model = reduced_model(wing_design, progress=RichProgress())
+    record = wing_record(wing_design, reduced_model(wing_design, progress=terminal.progress()))
+    written = [] if vtu is None else [str(path) for path in write_fields(wing_design, vtu)]
+    if json:
+        terminal.print_json(record | {"written": written})
+        return
+    rows = [
+        ("mass of the structure", f"{record['structural_mass']:.4f}", "", "kg"),
+        ("mass with two servos and pitot", f"{record['mass']:.4f}", "", "kg"),
+        ("tip stiffness", f"{1e-3 * record['tip_stiffness']:.4f}", PUBLISHED["tip stiffness"], "N/mm"),
+    ]
+    for mode in record["modes"]:
+        title = f"frequency {mode['number']}" + (f", {mode['shape']}" if mode["shape"] else "")
+        rows.append((title, f"{mode['frequency']:.3f}", PUBLISHED.get(mode["shape"], ""), "Hz"))
+    console = terminal.console()
+    console.print(console_table(("figure", "this wing", "published model", "unit"), rows, console.width))
+    console.print("The published figures are of Kapteyn et al. 2021 and belong to the shipped wing.")
+    for path in written:
+        console.print(f"Wrote {path}", soft_wrap=True)
+
+
+def wing_record(design: WingDesign, model: ReducedModel) -> dict[str, Any]:
+    """Return mass [kg], stiffness [N/m] and frequencies [Hz] of the undamaged wing by name."""
+    from fe.runtime.state import DigitalState
+
     state = DigitalState()
     masses = (state.servo_mass, state.pitot_mass)
     modes = model.modes(state.young_modulus_factor, state.stiffness_loss, *masses)
-    structure = structural_mass(wing_design)
-    table = Table("figure", "this wing", "published model", "unit")
-    table.add_row("mass of the structure", f"{structure:.4f}", "", "kg")
-    table.add_row("mass with two servos and pitot", f"{structure + 2 * masses[0] + masses[1]:.4f}", "", "kg")
-    stiffness = 1e-3 * model.tip_stiffness(state.young_modulus_factor)
-    table.add_row("tip stiffness", f"{stiffness:.4f}", PUBLISHED["tip stiffness"], "N/mm")
-    for index, frequency in enumerate(modes.frequency):
-        name = mode_name(modes, index)
-        title = f"frequency {index + 1}" + (f", {name}" if name else "")
-        table.add_row(title, f"{frequency:.3f}", PUBLISHED.get(name, ""), "Hz")
-    console = Console(highlight=False)
-    console.print(table)
-    console.print("The published figures are of Kapteyn et al. 2021 and belong to the shipped wing.")
-    if vtu is not None:
-        for path in write_fields(wing_design, vtu):
-            console.print(f"Wrote {path}", soft_wrap=True)
+    structure = structural_mass(design)
+    return {
+        "design": design.name,
+        "design_hash": design.hash,
+        "structural_mass": structure,
+        "mass": structure + 2 * masses[0] + masses[1],
+        "tip_stiffness": float(model.tip_stiffness(state.young_modulus_factor)),
+        "modes": [
+            {"number": index + 1, "frequency": float(frequency), "shape": mode_name(modes, index)}
+            for index, frequency in enumerate(modes.frequency)
+        ],
+    }
 
 
 def mode_name(modes: Modes, index: int) -> str:
@@ -81,9 +98,9 @@ def structural_mass(design: WingDesign) -> float:
     """Return the mass of the structure without its point masses, from the volumes of the cells [kg]."""
     import numpy as np
 
-    from fe.assembly import global_gradients
-    from fe.mesh import build_mesh
-    from fe.operators import cell_density
+    from fe.full.assembly import global_gradients
+    from fe.full.operators import cell_density
+    from fe.wing.mesh import build_mesh
 
     mesh = build_mesh(design)
     half = 0.5 / np.sqrt(3.0)  # two Gauss points each way integrate a trilinear Jacobian exactly
@@ -94,13 +111,12 @@ def structural_mass(design: WingDesign) -> float:
 
 def write_fields(design: WingDesign, path: Path) -> tuple[Path, Path]:
     """Write the undamaged wing in a 3g turn, and its modes in a file beside it; return both paths."""
-    from fe.cache import wing_fields
-    from fe.fields import write_modes_vtu, write_wing_vtu
-    from fe.state import DigitalState
-    from reporting.progress import RichProgress
+    from fe.reduction.fields import write_modes_vtu, write_wing_vtu
+    from fe.reduction.model_cache import wing_fields
+    from fe.runtime.state import DigitalState
 
     state = DigitalState()
-    fields = wing_fields(design, progress=RichProgress())
+    fields = wing_fields(design, progress=terminal.progress())
     path.parent.mkdir(parents=True, exist_ok=True)
     write_wing_vtu(
         path,

@@ -137,5 +137,5 @@ def _proof(cases: Sequence[Scored]) -> list[str]:
                 ]
             )
     lines = ["## Proof on held-out trials where the name is right: median (5 to 95 %)", ""]
-    header = ["cases", "named right", "chi^2/dof after", "gap closed", "seconds a case"]
+    header = ["cases", "named right", "χ²/dof after", "gap closed", "seconds a case"]
     return lines + _table(header, rows)

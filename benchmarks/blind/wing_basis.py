@@ -18,12 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
-from fe.assembly import Discretisation, point_jacobians
-from fe.design import SHIPPED_DESIGN, WingDesign, load_design
-from fe.gauges import gauge_output
-from fe.mesh import DEFECT_1, DEFECT_2, SKIN
-from fe.modes import lowest_eigenpairs
-from fe.operators import (
+from fe.full.assembly import Discretisation, point_jacobians
+from fe.full.gauges import gauge_output
+from fe.full.modes import lowest_eigenpairs
+from fe.full.operators import (
     ROOT_UNKNOWNS,
     AffineOperators,
     assemble,
@@ -33,8 +31,10 @@ from fe.operators import (
     point_mass_weights,
     section_displacement,
 )
-from fe.statics import Factorisation
-from fe.turn_load import STANDARD_GRAVITY
+from fe.full.statics import Factorisation
+from fe.full.turn_load import STANDARD_GRAVITY
+from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
+from fe.wing.mesh import DEFECT_1, DEFECT_2, SKIN
 
 FloatArray = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.blind.plan import CampaignPlan, ChannelPlan, TrialPlan
 from benchmarks.blind.wing_basis import MIDDLE
-from fe.design import WingDesign
+from fe.wing.design import WingDesign
 
 MICROSTRAIN, MILLIMETRE = 1e-6, 1e-3
 STRAIN_NOISE = 5.0  # microstrain

@@ -41,7 +41,7 @@ class Comparison:
     fitted : bool
         Whether the numbers of the design were fitted to it.
     where : str
-        Where the largest difference is.
+        Where the largest difference is; gauges are counted from 1.
     """
 
     name: str
@@ -150,7 +150,7 @@ def _row(
 ) -> Comparison:
     values = np.atleast_1d(difference)
     worst = int(np.nanargmax(np.abs(values)))
-    where = f"gauge {worst % 24}" if by_gauge and values.size > 2 else ""
+    where = f"gauge {worst % 24 + 1}" if by_gauge and values.size > 2 else ""
     return Comparison(
         name,
         unit,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fe.design import WingDesign
+from fe.wing.design import WingDesign
 
 DIGITS = 6
 """Significant digits of identified numbers; coarser than a step that `least_squares.CONVERGED` allows."""
@@ -27,7 +27,7 @@ _NOTES = {
     "planform": "as built",
     "root": "rigid root rib on springs",
     "masses": "nominal; calibrated later",
-    "gauges": "(distance from the root, chord fraction); row A is gauges 0-15, row B gauges 16-23",
+    "gauges": "(distance from the root, chord fraction); row A is gauges 1-16, row B gauges 17-24",
     "lift": "net load on the half-wing at the load factor",
     "defects": "upper skin; the first loses z1, the second z2",
 }

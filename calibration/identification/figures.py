@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from reporting.figures import (
     OBSERVED,
@@ -21,7 +22,7 @@ from reporting.figures import (
 
 from .comparison import PERCENT, Outputs
 from .identifiability import Identifiability, Profile
-from .least_squares import Fit
+from .least_squares import DesignFit
 from .targets import LEVELS, Targets
 
 _COLOURS = (OBSERVED, PAST, PRESENT, PREDICTION)
@@ -41,16 +42,18 @@ def gauge_figure(found: Outputs, before: Outputs, targets: Targets) -> Figure:
         figure.subplots_adjust(left=0.075, right=0.985, bottom=0.09, top=0.94, hspace=0.5, wspace=0.25)
         for place, (label, title, after, start) in zip(axes[0], panels, strict=True):
             _zero(place, label, title)
-            place.plot(start, "o", color=REFERENCE, markerfacecolor="none", label="start")
-            place.plot(after, "o", color=PAST, label="identified")
+            place.plot(_numbers(start), start, "o", color=REFERENCE, markerfacecolor="none", label="start")
+            place.plot(_numbers(after), after, "o", color=PAST, label="identified")
             place.legend(loc="upper right", ncols=2)
         for place, label, region, index in ((axes[1, 0], "c", "z1", 0), (axes[1, 1], "d", "z2", 1)):
             _zero(place, label, f"ratio under {region}, points")
             for number, level in enumerate(LEVELS[1:], start=1):
                 state = (number, 0) if index == 0 else (0, number)
                 held = number % 2 == 1
+                points = PERCENT * (found.ratio - targets.ratio)[state]
                 place.plot(
-                    PERCENT * (found.ratio - targets.ratio)[state],
+                    _numbers(points),
+                    points,
                     "o",
                     color=_COLOURS[number - 1],
                     markerfacecolor="none" if held else None,
@@ -60,6 +63,11 @@ def gauge_figure(found: Outputs, before: Outputs, targets: Targets) -> Figure:
     return figure
 
 
+def _numbers(values: NDArray[np.float64]) -> range:
+    """Return the numbers of the gauges, from 1."""
+    return range(1, len(values) + 1)
+
+
 def _zero(axes: Axes, label: str, title: str) -> None:
     panel_label(axes, label, title)
     axes.axhline(0.0, color=REFERENCE, linewidth=0.7)
@@ -67,7 +75,7 @@ def _zero(axes: Axes, label: str, title: str) -> None:
     axes.margins(y=0.3)
 
 
-def identifiability_figure(fit: Fit, analysis: Identifiability) -> Figure:
+def identifiability_figure(fit: DesignFit, analysis: Identifiability) -> Figure:
     """Draw the singular values, and what is left of each parameter's prior width."""
     with publication_style():
         figure = new_figure(height=5.2)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import IdentificationError
 
-from .least_squares import Fit, minimise_local, objective
+from .least_squares import DesignFit, minimise_local, objective
 from .local_model import build_local_model
 from .parameters import FreeParameter, deviations, scaled
 from .residuals import fitted_residuals
@@ -86,7 +86,7 @@ class Identifiability:
 
 
 def analyse(
-    fit: Fit, targets: Targets, weights: Weights, fixed: Sequence[FreeParameter] = ()
+    fit: DesignFit, targets: Targets, weights: Weights, fixed: Sequence[FreeParameter] = ()
 ) -> Identifiability:
     """Analyse a fit; `fixed` are numbers of the design that were not free but might have been."""
     own = fitted_residuals(fit.model.wing, targets, weights).gradient * deviations(fit.parameters)
@@ -104,7 +104,7 @@ def analyse(
 
 
 def _imitated(
-    fit: Fit, targets: Targets, weights: Weights, own: FloatArray, fixed: Sequence[FreeParameter]
+    fit: DesignFit, targets: Targets, weights: Weights, own: FloatArray, fixed: Sequence[FreeParameter]
 ) -> list[tuple[str, float]]:
     if not fixed:
         return []
@@ -143,7 +143,9 @@ class Profile:
     linear: FloatArray
 
 
-def profile(fit: Fit, targets: Targets, weights: Weights, analysis: Identifiability, name: str) -> Profile:
+def profile(
+    fit: DesignFit, targets: Targets, weights: Weights, analysis: Identifiability, name: str
+) -> Profile:
     """Profile the objective along a named parameter, on the local model of the fit.
 
     Raises
@@ -177,11 +179,11 @@ def profile(fit: Fit, targets: Targets, weights: Weights, analysis: Identifiabil
     )
 
 
-def _objective(fit: Fit, values: FloatArray, targets: Targets, weights: Weights) -> float:
+def _objective(fit: DesignFit, values: FloatArray, targets: Targets, weights: Weights) -> float:
     residual, _ = objective(fit.model, values, fit.parameters, targets, weights)
     return 0.5 * float(residual @ residual)
 
 
-def prior_shift(fit: Fit) -> FloatArray:
+def prior_shift(fit: DesignFit) -> FloatArray:
     """Distance (P,) of the fit from the prior mean in prior standard deviations."""
     return scaled(fit.parameters, fit.values)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from calibration.errors import IdentificationError
-from fe.design import WingDesign
-from fe.errors import FiniteElementError
+from fe.runtime.errors import FiniteElementError
+from fe.wing.design import WingDesign
 from reporting.progress import Progress, SilentProgress
 
 from .local_model import LocalModel, build_local_model
@@ -54,7 +54,7 @@ class Iteration:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class DesignFit:
     """Result of the identification.
 
     Attributes
@@ -164,7 +164,7 @@ def identify(
     largest_count: int = 15,
     tolerance: float = CONVERGED,
     progress: Progress | None = None,
-) -> Fit:
+) -> DesignFit:
     """Fit the free parameters of a wing design.
 
     Parameters
@@ -232,7 +232,7 @@ def identify(
             radius = 0.25 * min(radius, step)
             if radius < tolerance:  # no step that is worth one lowers the objective of the full model
                 break
-    return Fit(model.design, parameters, values, first, model, tuple(iterations), converged)
+    return DesignFit(model.design, parameters, values, first, model, tuple(iterations), converged)
 
 
 def _is_limited(

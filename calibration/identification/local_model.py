@@ -16,11 +16,11 @@ from scipy import sparse
 
 from calibration.errors import IdentificationError
 from calibration.published_strains import LIBRARY_FACTOR
-from fe.design import WingDesign
-from fe.errors import FiniteElementError
-from fe.modes import flapwise_bending_modes, lowest_eigenpairs
-from fe.operators import AffineOperators, assemble
-from fe.statics import Factorisation
+from fe.full.modes import flapwise_bending_modes, lowest_eigenpairs
+from fe.full.operators import AffineOperators, assemble
+from fe.full.statics import Factorisation
+from fe.runtime.errors import FiniteElementError
+from fe.wing.design import WingDesign
 from reporting.progress import Progress, SilentProgress
 
 from .parameters import FreeParameter, deviations, values_of, with_values

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import IdentificationError
-from fe.design import WingDesign, parse_design
+from fe.wing.design import WingDesign, parse_design
 
 FloatArray = NDArray[np.float64]
 Content = dict[str, Any]

@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from calibration.errors import IdentificationError
-from fe.assembly import Discretisation
-from fe.design import WingDesign
-from fe.gauges import gauge_output
-from fe.mesh import DEFECT_1, DEFECT_2, SKIN, WingMesh, build_mesh
-from fe.operators import (
+from fe.full.assembly import Discretisation
+from fe.full.gauges import gauge_output
+from fe.full.operators import (
     ROOT_UNKNOWNS,
     STIFFNESS_TERM_NAMES,
     cell_density,
@@ -28,7 +26,9 @@ from fe.operators import (
     root_expansion,
     section_displacement,
 )
-from fe.turn_load import inertia_relief, lift_load
+from fe.full.turn_load import inertia_relief, lift_load
+from fe.wing.design import WingDesign
+from fe.wing.mesh import DEFECT_1, DEFECT_2, SKIN, WingMesh, build_mesh
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

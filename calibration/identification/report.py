@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from reporting.figures import to_svg
 from reporting.page import Column, Page, Table
 
 from .comparison import Comparison
 from .figures import gauge_figure, identifiability_figure, profile_figure
+from .identified import Identification
 from .parameters import deviations, scaled
-
-if TYPE_CHECKING:
-    from .workflow import Identification
 
 SOURCE = (
     "M. G. Kapteyn, J. V. R. Pretorius, K. E. Willcox: A probabilistic graphical model foundation for "
@@ -32,6 +29,28 @@ def report_page(result: Identification) -> str:
         footer=(SOURCE, f"Design {fit.design.hash[:16]}."),
     )
     page.add_section("Result")
+    _add_result(page, result)
+    page.add_section("Free numbers")
+    page.add_table(
+        _parameter_table(result),
+        "Before: normal distribution. After: the fit, and its width by the linear analysis; widths follow "
+        "from the weights and are to be compared with each other.",
+        title="Free numbers before and after",
+    )
+    page.add_section("What the data tell")
+    _add_identifiability(page, result)
+    page.add_section("Way of the fit")
+    page.add_table(
+        _iteration_table(result),
+        "Each model is the full one, factorised and differentiated at that point.",
+        title="Iterations",
+    )
+    return page.render()
+
+
+def _add_result(page: Page, result: Identification) -> None:
+    """Add the outputs beside the published ones, in figures, by gauge and on other meshes."""
+    fit = result.fit
     if not fit.converged:
         page.add_notice("The fit has not converged: its next step is larger than the stated tolerance.")
     reached = [row for row in result.comparison if row.reached is not None]
@@ -64,16 +83,12 @@ def report_page(result: Identification) -> str:
             "Nothing is fitted again. Each cell: rms / largest.",
             title="The same wing on other meshes",
         )
-    page.add_section("Free numbers")
-    page.add_table(
-        _parameter_table(result),
-        "Before: normal distribution. After: the fit, and its width by the linear analysis; widths follow "
-        "from the weights and are to be compared with each other.",
-        title="Free numbers before and after",
-    )
-    page.add_section("What the data tell")
+
+
+def _add_identifiability(page: Page, result: Identification) -> None:
+    """Add what the data determine, what the prior does, and the objective about the fit."""
     page.add_figure(
-        to_svg(identifiability_figure(fit, result.analysis)),
+        to_svg(identifiability_figure(result.fit, result.analysis)),
         "(a) Below one, the prior decides along a direction. (b) One: the data tell nothing of the number.",
         title="Identifiability",
     )
@@ -93,24 +108,6 @@ def report_page(result: Identification) -> str:
             "Objective along one number with all others fitted again, on the reduced model of the last step.",
             title="Profiles",
         )
-    page.add_section("Way of the fit")
-    page.add_table(
-        Table(
-            (
-                Column("model"),
-                Column("objective", numeric=True),
-                Column("of it misfit", numeric=True),
-                Column("next step", "prior deviations", numeric=True),
-            ),
-            [
-                (str(number), f"{row.objective:.2f}", f"{row.misfit:.2f}", f"{row.largest_step:.4f}")
-                for number, row in enumerate(fit.iterations, start=1)
-            ],
-        ),
-        "Each model is the full one, factorised and differentiated at that point.",
-        title="Iterations",
-    )
-    return page.render()
 
 
 def comparison_table(rows: Sequence[Comparison], before: Sequence[Comparison]) -> Table:
@@ -202,3 +199,17 @@ def _direction_table(result: Identification) -> Table:
         (Column("singular value", numeric=True), Column("direction, in prior deviations")),
         [(f"{analysis.singular_values[n]:.3g}", analysis.describe(n)) for n in weak],
     )
+
+
+def _iteration_table(result: Identification) -> Table:
+    columns = (
+        Column("model"),
+        Column("objective", numeric=True),
+        Column("of it misfit", numeric=True),
+        Column("next step", "prior deviations", numeric=True),
+    )
+    rows = [
+        (str(number), f"{row.objective:.2f}", f"{row.misfit:.2f}", f"{row.largest_step:.4f}")
+        for number, row in enumerate(result.fit.iterations, start=1)
+    ]
+    return Table(columns, rows)

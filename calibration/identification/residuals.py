@@ -59,7 +59,7 @@ def _part(found: Value, target: FloatArray, deviation: FloatArray | float, label
 
 def _strains(wing: ReducedWing, targets: Targets, weights: Weights) -> Iterator[_Part]:
     gauges = targets.strain.shape[2]
-    numbers = range(gauges)
+    numbers = range(1, gauges + 1)
     limiting = np.arange(gauges) == LIMITING_GAUGE
     healthy = wing.strain(LIBRARY_FACTOR, (0.0, 0.0))
     yield _part(

@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve, eigh
 
 from calibration.errors import IdentificationError
 from calibration.published_strains import LIBRARY_FACTOR
-from fe.operators import AffineOperators
+from fe.full.operators import AffineOperators
 
 from .pieces import ReducedTerms
 from .targets import LEVELS, LOAD_FACTOR, MASS_TOTAL, REFERENCE_PITOT

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.dynamics_data import RESULTS_FILE, read_published_results
+from calibration.dynamics.published import RESULTS_FILE, read_published_results
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.published_strains import LIBRARY_FACTOR, find_strain_file, read_published_strains
 
@@ -35,7 +35,7 @@ TIP_STIFFNESS = 677.0
 TIP_STIFFNESS_SLOPE = 0.5752 / 0.6770
 """d ln k / d ln e at e = 1 of eq. (14)."""
 MASS_TOTAL = 0.472
-"""Two servos and the pitot [kg]: Kapteyn et al. 2021, eq. (20)."""
+"""Two servos and the pitot [kg]: Kapteyn et al. 2021, eqs. (19) and (20)."""
 REFERENCE_PITOT = 0.1345
 """Pitot mass [kg] at which frequencies and slopes are stated."""
 

@@ -4,27 +4,28 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from calibration.errors import IdentificationError
-from fe.design import WingDesign, load_design
+from fe.wing.design import WingDesign, load_design
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_text
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance
 
-from .comparison import Comparison, Outputs, compare, outputs
+from .comparison import compare, outputs
 from .design_file import design_toml
-from .identifiability import Identifiability, Profile, analyse, profile
-from .least_squares import CONVERGED, Fit, identify
+from .identifiability import analyse, profile
+from .identified import Identification
+from .least_squares import CONVERGED, identify
 from .local_model import build_local_model
-from .parameters import deviations, fixed_parameters, scaled, wing_parameters, with_values
+from .parameters import deviations, fixed_parameters, wing_parameters, with_values
 from .report import report_page
-from .targets import Targets, Weights, read_targets
+from .targets import Weights, read_targets
 
 RECORD_NAME = "identification.json"
 DESIGN_NAME = "uav_wing.toml"
@@ -44,42 +45,6 @@ class IdentificationFiles(NamedTuple):
 def result_files(out: Path) -> IdentificationFiles:
     """Return the paths that `write_identification` writes in the folder `out`."""
     return IdentificationFiles(out / RECORD_NAME, out / DESIGN_NAME, out / REPORT_NAME)
-
-
-@dataclass(frozen=True, eq=False)
-class Identification:
-    """An identification with everything that is reported of it.
-
-    Attributes
-    ----------
-    fit : Fit
-    targets : Targets
-    weights : Weights
-    comparison, before : tuple of Comparison
-        Of the identified wing, and of the start.
-    outputs, outputs_before : Outputs
-    analysis : Identifiability
-    profiles : tuple of Profile
-    remeshed : tuple of (refinement, unknowns, rows)
-        The identified wing on other meshes, with its own first; empty unless asked for.
-    """
-
-    fit: Fit
-    targets: Targets
-    weights: Weights
-    comparison: tuple[Comparison, ...]
-    before: tuple[Comparison, ...]
-    outputs: Outputs
-    outputs_before: Outputs
-    analysis: Identifiability
-    profiles: tuple[Profile, ...]
-    remeshed: tuple[tuple[float, int, tuple[Comparison, ...]], ...]
-
-    @property
-    def largest_change(self) -> float:
-        """Largest change of a number from the start, in prior standard deviations."""
-        fit = self.fit
-        return float(np.abs(scaled(fit.parameters, fit.values) - scaled(fit.parameters, fit.start)).max())
 
 
 def run_identification(
@@ -115,7 +80,7 @@ def run_identification(
     ------
     CalibrationError
         If the published files cannot be read, or the start cannot be identified.
-    fe.errors.FiniteElementError
+    fe.runtime.errors.FiniteElementError
         If a mesh cannot be built or solved.
     """
     progress, weights = progress or SilentProgress(), weights or Weights()

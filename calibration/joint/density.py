@@ -28,10 +28,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors_in_variables import log_likelihood
-from ..experiments import LoadDisplacementData
-from ..posterior import GaussianPrior
-from ..stiffness_curve import StiffnessCurve
+from calibration.static.errors_in_variables import log_likelihood
+from calibration.static.experiments import LoadDisplacementData
+from calibration.static.posterior import GaussianPrior
+from calibration.static.stiffness_curve import StiffnessCurve
+
 from .frequency_table import FrequencyTable
 from .measurement import ModalMeasurement
 from .prior import JointPrior, ModelError, WeighedMass

@@ -9,10 +9,9 @@ from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import qmc
 
-from fe.reduced import ReducedModel
-
-from ..errors import OutsideValidityError, PosteriorError
-from ..stiffness_curve import StiffnessCurve, stiffness_curve_of
+from calibration.errors import OutsideValidityError, PosteriorError
+from calibration.static.stiffness_curve import StiffnessCurve, stiffness_curve_of
+from fe.runtime.reduced import ReducedModel
 
 TOLERANCE = 1e-5
 """Largest relative error of a tabulated frequency that is accepted; 0.1 % of f1 is 1 g of servo mass."""

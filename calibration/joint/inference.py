@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.reduced import ReducedModel
+from calibration.errors import ExperimentDataError, MassConstraintError, OutsideValidityError, PosteriorError
+from calibration.static.errors_in_variables import exact_posterior
+from calibration.static.experiments import LoadDisplacementData
+from calibration.static.posterior import check_count, child_seed
+from fe.runtime.reduced import ReducedModel
 
-from ..errors import ExperimentDataError, MassConstraintError, OutsideValidityError, PosteriorError
-from ..errors_in_variables import exact_posterior
-from ..experiments import LoadDisplacementData
-from ..posterior import child_seed
 from .density import JointDensity, masses_of
 from .frequency_table import WingTables, tabulate_wing
 from .measurement import ModalMeasurement
@@ -35,6 +36,7 @@ _LARGEST_SHARE_AT_LIMIT = 0.05
 _ADAPTATION_ROUNDS = 3
 _ADAPTATION_COUNT = 1000
 _PROPOSALS_PER_SAMPLE = 20
+_MOST_SAMPLES = 100_000  # the proposals of more do not fit into memory
 _FEWEST_PROPOSALS = 4_000
 _PURPOSE_PRIOR, _PURPOSE_POSTERIOR = 21, 22
 
@@ -85,14 +87,13 @@ def joint_posterior(
         If the load test alone puts e outside the model, or all measurements together press it against the
         end of the model's range.
     PosteriorError
-        If `count` is not positive, or the measurements contradict each other so much that the sampler
+        If `count` is not 1 to 100,000, or the measurements contradict each other so much that the sampler
         finds no posterior.
     """
     prior = prior or JointPrior()
     total_mass = WeighedMass() if total_mass is None else total_mass
     model_error = ModelError() if model_error is None else model_error
-    if count < 1:
-        raise PosteriorError(f"the number of samples must be positive, but {count} were asked for.")
+    check_count(count, PosteriorError, most=_MOST_SAMPLES)
     _check(total_mass, model_error)
     tables = model if isinstance(model, WingTables) else tabulate_wing(model)
     table, curve = tables.frequency, tables.stiffness
@@ -104,10 +105,73 @@ def joint_posterior(
         )
     }
     limits = prior.limits(validity)
-    log_inside = prior.log_mass_inside(limits)
     alone = exact_posterior(static, curve=curve, prior=prior.young_modulus_factor)
     approximation = _laplace(density, alone.mean, alone.standard_deviation)
     generator = np.random.default_rng(child_seed(seed, _PURPOSE_POSTERIOR))
+    draws = _weighted_draws(
+        density, approximation, generator, max(_FEWEST_PROPOSALS, _PROPOSALS_PER_SAMPLE * count)
+    )
+    _refuse_limit(draws.quantities[:, 0], draws.weight, limits[0])
+    mean = draws.weight @ draws.quantities
+    spread = np.sqrt(draws.weight @ (draws.quantities - mean) ** 2)
+    chosen = systematic_resampling(draws.weight, generator, count)
+    mode, covariance = _five(density, approximation)
+    return JointPosterior(
+        samples=draws.quantities[chosen],
+        prior_samples=prior.samples(validity, np.random.default_rng(child_seed(seed, _PURPOSE_PRIOR)), count),
+        frequency=draws.frequency[chosen],
+        prior=prior,
+        total_mass=total_mass,
+        model_error=model_error,
+        modal=modal,
+        static_source=static.source,
+        static_sha256=static.sha256,
+        diagnostics=JointDiagnostics(
+            proposal_count=draws.proposals,
+            effective_sample_size=draws.effective,
+            distinct_samples=int(np.unique(chosen).size),
+            laplace_mode=mode,
+            laplace_covariance=covariance,
+            weighted_mean=mean,
+            weighted_standard_deviation=spread,
+            log_evidence=draws.log_mean - prior.log_mass_inside(limits),
+            frequency_table_error=table.error,
+        ),
+        seed=seed,
+    )
+
+
+class _Draws(NamedTuple):
+    """Weighted draws of the five quantities.
+
+    Attributes
+    ----------
+    quantities : (N, 5) array
+        Young's modulus factor, masses [kg] and Rayleigh coefficients [1/s, s].
+    frequency : (N, 2) array
+        Of the model [Hz].
+    weight : (N,) array
+        Sums to one.
+    proposals : int
+        How many were drawn, also those outside the model, whose weight is zero and which are not kept.
+    effective : float
+        Effective number of draws.
+    log_mean : float
+        Log of the mean of the unnormalised weights of all proposals.
+    """
+
+    quantities: NDArray[np.float64]
+    frequency: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    proposals: int
+    effective: float
+    log_mean: float
+
+
+def _weighted_draws(
+    density: JointDensity, approximation: Laplace, generator: np.random.Generator, proposals: int
+) -> _Draws:
+    """Draw from a proposal adapted to the posterior, and weigh; refuse draws that do not describe it."""
 
     def log_density(points: NDArray[np.float64]) -> NDArray[np.float64]:
         return _log_density(density, points)
@@ -115,7 +179,6 @@ def joint_posterior(
     proposal = adapted_proposal(
         log_density, approximation, generator, rounds=_ADAPTATION_ROUNDS, count=_ADAPTATION_COUNT
     )
-    proposals = max(_FEWEST_PROPOSALS, _PROPOSALS_PER_SAMPLE * count)
     points, log_proposal = proposal.draw(generator, proposals)
     standard = generator.standard_normal((proposals, 2))
     inside = density.inside(points)
@@ -125,8 +188,9 @@ def joint_posterior(
     coefficients = damping.mean + (factor @ standard[..., None])[..., 0]
     positive = (coefficients >= 0.0).all(axis=1)
     if np.mean(positive) < 0.01:
+        first, second = density.modal.damping_ratio
         raise ExperimentDataError(
-            f"damping ratios {modal.damping_ratio[0]:g} and {modal.damping_ratio[1]:g} need a negative "
+            f"damping ratios {first:g} and {second:g} need a negative "
             "Rayleigh coefficient, but neither may be negative; check the ring-down records."
         )
     weight, log_mean = normalised(np.where(positive, logarithm - log_proposal, -np.inf))
@@ -138,34 +202,8 @@ def joint_posterior(
             "the model a larger error of its frequencies."
         )
     quantities = np.column_stack([masses_of(points), coefficients])
-    _refuse_limit(quantities[:, 0], weight, limits[0])
-    mean = weight @ quantities
-    spread = np.sqrt(weight @ (quantities - mean) ** 2)
-    chosen = systematic_resampling(weight, generator, count)
-    mode, covariance = _five(density, approximation)
-    return JointPosterior(
-        samples=quantities[chosen],
-        prior_samples=prior.samples(validity, np.random.default_rng(child_seed(seed, _PURPOSE_PRIOR)), count),
-        frequency=frequency[chosen],
-        prior=prior,
-        total_mass=total_mass,
-        model_error=model_error,
-        modal=modal,
-        static_source=static.source,
-        static_sha256=static.sha256,
-        diagnostics=JointDiagnostics(
-            proposal_count=proposals,
-            effective_sample_size=effective,
-            distinct_samples=int(np.unique(chosen).size),
-            laplace_mode=mode,
-            laplace_covariance=covariance,
-            weighted_mean=mean,
-            weighted_standard_deviation=spread,
-            # The mean runs over all proposals, also those outside the model, whose weight is zero.
-            log_evidence=log_mean + math.log(points.shape[0] / proposals) - log_inside,
-            frequency_table_error=table.error,
-        ),
-        seed=seed,
+    return _Draws(
+        quantities, frequency, weight, proposals, effective, log_mean + math.log(points.shape[0] / proposals)
     )
 
 

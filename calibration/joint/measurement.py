@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from ..damped_cosine import DampedCosines
-from ..errors import ExperimentDataError
-from ..ringdown import Frequencies, RingDownFit
-from ..ringdown_trials import (
+from calibration.dynamics.damped_cosine import DampedCosines, NaturalMode, natural_mode
+from calibration.dynamics.ringdown import Frequencies, RingDownFit
+from calibration.dynamics.trials import (
     PUBLISHED_DAMPING_RATIOS,
     PUBLISHED_FREQUENCIES,
     RingDownTrials,
     amplitude_dependence,
 )
+from calibration.errors import ExperimentDataError
 
 PUBLISHED_STANDARD_DEVIATIONS = (0.062, 0.63, 0.0039, 0.0162)
 """Of f1, f2 [Hz], zeta1 and zeta2 [1]; see `published_modal_measurement`."""
@@ -52,8 +52,8 @@ class ModalMeasurement:
     Raises
     ------
     ExperimentDataError
-        If a frequency, a damping ratio or a standard deviation is not positive and finite, or the first
-        frequency is not the lower one.
+        If a frequency, a damping ratio or a standard deviation is not positive and finite, a damping ratio is
+        1 or more, or the first frequency is not the lower one.
     """
 
     frequency: tuple[float, float]
@@ -76,6 +76,11 @@ class ModalMeasurement:
                     f"mode, but {', '.join(f'{value:g}{unit}' for value in values)} came."
                 )
             object.__setattr__(self, name, tuple(float(value) for value in values))
+        if not max(self.damping_ratio) < 1.0:
+            raise ExperimentDataError(
+                f"{self.source}: a damping ratio of {max(self.damping_ratio):.4g} lets nothing swing; give "
+                "fractions of critical damping, 0.05 for 5 %."
+            )
         if not self.frequency[0] < self.frequency[1]:
             raise ExperimentDataError(
                 f"{self.source}: the first flapwise frequency, {self.frequency[0]:.4g} Hz, must lie below "
@@ -102,7 +107,7 @@ def modal_measurement(trials: RingDownTrials) -> ModalMeasurement:
     Parameters
     ----------
     trials : RingDownTrials
-        Fitted records, by `calibration.ringdown_trials.fit_trials`.
+        Fitted records, by `calibration.dynamics.trials.fit_trials`.
 
     Raises
     ------
@@ -176,8 +181,9 @@ def _choice_terms(trials: RingDownTrials, frequency: float, ratio: float) -> tup
         found = [refitted for fit in trials.fits if (refitted := _refit(fit, delay)) is not None]
         if len(found) < len(trials.fits):
             continue  # the mode has died away by then
-        other, error = _mean([row[0] for row in found], [row[1] for row in found])
-        other_ratio, ratio_error = _mean([row[2] for row in found], [row[3] for row in found])
+        frequencies, errors, ratios, ratio_errors = zip(*found, strict=True)
+        other, error = _mean(frequencies, errors)
+        other_ratio, ratio_error = _mean(ratios, ratio_errors)
         terms.append(
             (_beyond_chance(other - frequency, error), _beyond_chance(other_ratio - ratio, ratio_error))
         )
@@ -193,8 +199,8 @@ def _beyond_chance(difference: float, error: float) -> float:
     return math.sqrt(difference**2 - error**2)
 
 
-def _refit(fit: RingDownFit, delay: float) -> tuple[float, float, float, float] | None:
-    """Return f2, its standard error, zeta2 and its standard error of a record begun later, or None."""
+def _refit(fit: RingDownFit, delay: float) -> NaturalMode | None:
+    """Return the second mode of a record begun later, or None where it is gone by then."""
     record = fit.record
     after = record.time >= record.time[0] + delay
     model = DampedCosines(record.time[after], record.signal[after], record.averaging_width)
@@ -212,16 +218,7 @@ def _refit(fit: RingDownFit, delay: float) -> tuple[float, float, float, float] 
     solution = model.solve((found.x * scale)[:2], (found.x * scale)[2:], frequencies_fitted=True)
     if abs(solution.amplitude[1]) < _VISIBLE * solution.residual_deviation:
         return None
-    covariance = solution.covariance[np.ix_([1, 3], [1, 3])]
-    natural = math.hypot(decay, damped)
-    of_frequency = np.array([decay, damped]) / natural / (2.0 * math.pi)
-    of_ratio = np.array([damped**2, -decay * damped]) / natural**3
-    return (
-        natural / (2.0 * math.pi),
-        math.sqrt(float(of_frequency @ covariance @ of_frequency)),
-        decay / natural,
-        math.sqrt(float(of_ratio @ covariance @ of_ratio)),
-    )
+    return natural_mode(decay, damped, solution.covariance[np.ix_([1, 3], [1, 3])])
 
 
 def published_modal_measurement() -> ModalMeasurement:

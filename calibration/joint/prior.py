@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from ..dynamics import TOTAL_MASS
-from ..errors import PosteriorError
-from ..posterior import GaussianPrior
+from calibration.dynamics.masses_and_damping import TOTAL_MASS
+from calibration.errors import PosteriorError
+from calibration.static.posterior import GaussianPrior
 
 NAMES = ("young_modulus_factor", "servo_mass", "pitot_mass", "damping_alpha", "damping_beta")
 """The quantities of the joint posterior: e [1], each servo [kg], the pitot tube [kg], [1/s], [s]."""
@@ -25,8 +25,8 @@ DEFAULT_MODEL_ERROR = (0.01, 0.05)
 class WeighedMass(NamedTuple):
     """Weighed mass of two servos and the pitot tube, and the standard deviation of the weighing [kg].
 
-    The mass is that of Kapteyn et al. 2021, eq. (20). The paper gives no uncertainty: 1 g is our choice, a
-    scale that shows grams and leads that may or may not have been weighed.
+    The mass is that of Kapteyn et al. 2021, eqs. (19) and (20). The paper gives no uncertainty: 1 g is our
+    choice, a scale that shows grams and leads that may or may not have been weighed.
     """
 
     mass: float = TOTAL_MASS

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.state import DigitalState, Geometry
+from calibration.errors import PosteriorError
+from fe.runtime.state import DigitalState, Geometry
 
-from ..errors import PosteriorError
 from .measurement import ModalMeasurement
 from .prior import NAMES, JointPrior, ModelError, WeighedMass
 

@@ -7,16 +7,15 @@ sent to another process.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import get_args
 
 import numpy as np
 
-from discrepancy.campaign import Campaign, Channel, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Channel, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import PortScale
-from fe.patch import EVERY_CHANNEL, PortForce, Primitive
-from fe.planform_forces import PLANFORM
+from fe.runtime.patch import EVERY_CHANNEL, PortForce, Primitive
+from fe.runtime.planform_forces import PLANFORM
 
 Check = Callable[[Setting], str | None]
 Places = Callable[[Setting], tuple[str, ...]]
@@ -223,7 +222,7 @@ def carried(*primitives: type[Primitive]) -> Check:
 def _cannot_carry(primitives: tuple[type[Primitive], ...], setting: Setting) -> str | None:
     for primitive in primitives:
         if not setting.model.supports(primitive):
-            if primitive in get_args(PortForce) and not setting.model.ports():
+            if issubclass(primitive, PortForce) and not setting.model.ports():
                 return f"The model {setting.model.name!r} {NO_PORT}."
             return f"The model {setting.model.name!r} cannot carry the primitive {primitive.kind!r}."
     return None

@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from math import pi
 
-from discrepancy.campaign import TrialKind
+from discrepancy.campaign.noise import MAINS, aliased
+from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.building import (
     DYNAMIC,
     channels,
@@ -14,8 +15,7 @@ from discrepancy.catalogue.building import (
     trials,
 )
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting
-from discrepancy.noise import MAINS, aliased
-from fe.patch import EVERY_CHANNEL, Clock, DecayingLine, Line, ModelPatch
+from fe.runtime.patch import EVERY_CHANNEL, Clock, DecayingLine, Line, ModelPatch
 
 RINGDOWN = frozenset({TrialKind.RINGDOWN})
 ALL = "all "

@@ -35,7 +35,7 @@ from discrepancy.catalogue.building import (
     trial_of,
 )
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting, ShapeParameter
-from fe.patch import ModelPatch, PowerDamping
+from fe.runtime.patch import ModelPatch, PowerDamping
 
 FAMILY = "damping |v|^p |x|^a"
 

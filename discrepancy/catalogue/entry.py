@@ -7,9 +7,9 @@ from typing import Literal
 
 from scipy.special import ndtr, ndtri
 
-from discrepancy.campaign import Campaign, TrialKind
+from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.models.interface import Model, Scales
-from fe.patch import ModelPatch
+from fe.runtime.patch import ModelPatch
 
 NINETY = 1.6448536269514722
 """Standard normal quantile of 0.95."""

@@ -12,12 +12,12 @@ from discrepancy.catalogue.building import (
     removed_stiffness,
 )
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting, ShapeParameter
-from fe.patch import BoucWen, MicroSlip, ModelPatch
+from fe.runtime.patch import BoucWen, MicroSlip, ModelPatch
 
 FAMILY = "rate-independent hysteresis"
 # With 24 Jenkins elements and chi = -0.5 the loss of a cycle is that of a continuous distribution within 2 %
 # from a twentieth of the largest slip displacement on and within 13 % at a hundredth; at chi = -0.2 within
-# 6 % and 73 %. What is named has more of them (`search.FINE_JOINT`).
+# 6 % and 73 %. What is named has more of them (`SearchSettings.fine_joint`).
 
 
 def _micro_slip(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 
-from discrepancy.campaign import TrialKind
+from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.building import LOADED, applied_force, carried, needs, trial_of
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting, ShapeParameter
-from fe.patch import InertiaRelief, LoadGain, LoadPlace, ModelPatch, Washout
+from fe.runtime.patch import InertiaRelief, LoadGain, LoadPlace, ModelPatch, Washout
 
 FLIGHT = frozenset({TrialKind.FLIGHT})
 

@@ -24,7 +24,7 @@ from discrepancy.catalogue.building import (
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting, ShapeParameter
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, Response
-from fe.patch import HighPass, ModelPatch, SensorDrift, SensorGain, SensorRotation, ThermalStrain
+from fe.runtime.patch import HighPass, ModelPatch, SensorDrift, SensorGain, SensorRotation, ThermalStrain
 
 _NO_STRAIN = "The campaign has no strain channel."
 

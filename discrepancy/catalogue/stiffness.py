@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from math import isinf
 
-from discrepancy.campaign import Quantity, TrialKind
+from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.catalogue.building import (
     DYNAMIC,
     EVERY_TRIAL,
@@ -21,7 +21,7 @@ from discrepancy.catalogue.building import (
     trials,
 )
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting, ShapeParameter
-from fe.patch import FreePlay, ModelPatch, PowerStiffness, RunOffset, StiffnessDrift
+from fe.runtime.patch import FreePlay, ModelPatch, PowerStiffness, RunOffset, StiffnessDrift
 
 FAMILY = "stiffness |x|^n, one- or two-sided"
 SKINS = {"lower skin": 1, "upper skin": -1}

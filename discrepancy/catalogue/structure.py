@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from discrepancy.campaign import TrialKind
+from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.building import (
     DYNAMIC,
     EVERY_TRIAL,
@@ -14,7 +14,7 @@ from discrepancy.catalogue.building import (
     trial_of,
 )
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting
-from fe.patch import LocalStiffnessLoss, ModelPatch, ModulusTemperature, PointMass, RootCompliance
+from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, ModulusTemperature, PointMass, RootCompliance
 
 LARGEST_LOSS = 0.9
 """Stiffness losses beyond this are built as this: a section without stiffness is no wing."""

@@ -28,7 +28,6 @@ Keys that may be left out: `confusable` (identifiers), `places` (names, or one o
 Text values of a primitive (port, channel, run) are taken as they are; "place" stands for the place.
 """
 
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import partial
@@ -37,13 +36,14 @@ from math import isfinite, pi
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
-from discrepancy.campaign import Quantity, TrialKind
+from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.catalogue.building import carried, channels, needs, somewhere, trial_of, trials
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting, ShapeParameter, nowhere_else
 from discrepancy.catalogue.expression import Expression
 from discrepancy.errors import CatalogueError
-from fe.errors import InvalidPatchError
-from fe.patch import PRIMITIVES, SENSORS, ModelPatch, Primitive
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.patch import PRIMITIVES, SENSORS, ModelPatch, Primitive
+from reporting.toml_file import read_toml
 
 GROUP = "uav_twin.effects"
 """Group of the entry points: each a function without arguments that returns an Effect or several."""
@@ -89,14 +89,7 @@ def effects_of_file(path: Path) -> tuple[Effect, ...]:
     CatalogueError
         If the file cannot be read, or an effect in it is not sound; the sentence says where.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as cause:
-        raise CatalogueError(f"The file of effects {path} cannot be read: {cause}.") from cause
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as cause:
-        raise CatalogueError(f"The file of effects {path} is not TOML: {cause}.") from cause
+    data = read_toml(path, CatalogueError, what="file of effects")
     rows = data.get("effect", [data])
     if "effect" in data and len(data) > 1:
         other = next(key for key in data if key != "effect")

@@ -1,13 +1,12 @@
 """Any FMU with a binding as a model: its inputs loaded, its outputs read, internal forces at its ports."""
 
-from collections.abc import Mapping, Sequence
-from math import inf
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign import Campaign, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_excitation import State
 from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
@@ -18,7 +17,7 @@ from discrepancy.models.fmu_runs import FmuRuns
 from discrepancy.models.fmu_samples import sampled
 from discrepancy.models.fmu_trials import DEFAULT_PLACE, FmuTrials
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
-from fe.patch import (
+from fe.runtime.patch import (
     ModelPatch,
     Primitive,
 )
@@ -108,8 +107,7 @@ class FmuModel:
 
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is, or None if the model has no such output."""
-        found = self.runs.quantities.get(output)
-        return None if found is None else Quantity(found)
+        return self.runs.quantities.get(output)
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive."""
@@ -218,8 +216,7 @@ class FmuModel:
         columns = self._columns(outputs)
         parts = sorted_patch(patch, self.description)
         if not trial.is_dynamic:
-            moving = (Quantity.VELOCITY, Quantity.ACCELERATION)
-            if any(quantity in moving for _, quantity in outputs):
+            if any(quantity.is_rate for _, quantity in outputs):
                 raise ModelError(
                     f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
                 )
@@ -227,7 +224,8 @@ class FmuModel:
         state = self._trials.state(trial, conditions, parts.settings, 0)
         values, step = self._moving(trial, conditions, state, parts, refinement)
         rate, zero = conditions.clock
-        derivatives = [self._derivatives(output, quantity) for output, quantity in outputs]
+        quantities = self.runs.quantities
+        derivatives = [quantity.derivatives_of(quantities[output]) for output, quantity in outputs]
         return sampled(values[:, columns], step, (1.0 + rate) * trial.time + zero, derivatives)
 
     def _moving(
@@ -262,12 +260,6 @@ class FmuModel:
 
     # ------------------------------------------------------------ parts
 
-    def _derivatives(self, output: str, quantity: Quantity) -> int:
-        """Return how often an output is derived for a channel of a quantity."""
-        if quantity is Quantity.SIGNAL:
-            return 0
-        return max(_ORDER.get(quantity, 0) - _ORDER.get(Quantity(self.runs.quantities[output]), 0), 0)
-
     def _columns(self, outputs: Sequence[tuple[str, Quantity]]) -> list[int]:
         columns = []
         for output, quantity in outputs:
@@ -277,8 +269,7 @@ class FmuModel:
                     f"The FMU model {self.name!r} has no output {output!r}; it has "
                     f"{', '.join(self.runs.quantities)}."
                 )
-            derived = _ORDER.get(quantity, -1) > _ORDER.get(own, inf)
-            if quantity not in (own, Quantity.SIGNAL) and not derived:
+            if not quantity.shows(own):
                 raise ModelError(
                     f"The output {output!r} of {self.name!r} is a {own.value}, but a channel measures "
                     f"{quantity.value}."
@@ -296,8 +287,3 @@ def _any_trial(kind: TrialKind, interval: float) -> Trial:
         "", kind, (), empty, empty.astype(bool), time, zeros, zeros, DEFAULT_PLACE, zeros,
         0.0, "", np.zeros((1, 2)), np.zeros((1, 2)),
     )  # fmt: skip
-
-
-_ORDER: Mapping[Quantity, int] = {
-    Quantity.DISPLACEMENT: 0, Quantity.VELOCITY: 1, Quantity.ACCELERATION: 2,
-}  # fmt: skip

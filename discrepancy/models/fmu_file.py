@@ -1,22 +1,24 @@
 """An FMU as a model, described by a TOML file: which variables are parameters, inputs, outputs and ports."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from discrepancy.campaign.records import Quantity
+from discrepancy.errors import ModelError
 from discrepancy.models.model_file import (
-    NotNegative,
+    ModelDescription,
+    Name,
     Number,
+    ParameterSection,
     Positive,
     Section,
     check_unique,
-    checked,
-    read_toml,
 )
-from fe.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
-
-Name = Annotated[str, Field(min_length=1, max_length=200)]
+from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
+from reporting.section import checked
+from reporting.toml_file import read_toml
 
 CARRIED = tuple(item.kind for item in (*STRUCTURE, *LOADS, StiffnessDrift))
 """Kinds of primitives that an FMU can carry as its own parameters."""
@@ -118,12 +120,12 @@ class ReleaseOf(Section):
         return self
 
 
-class Output(Section):
+class OutputOf(Section):
     """`[[output]]`: what a channel's `output` names; `{a..b}` stands for all numbers from a to b."""
 
     name: Name
     variable: Name | None = None
-    quantity: Literal["strain", "displacement", "velocity", "acceleration", "signal"] = "displacement"
+    quantity: Quantity = Quantity.DISPLACEMENT
 
 
 class PortOf(Section):
@@ -136,22 +138,10 @@ class PortOf(Section):
     rotation: bool = False
 
 
-class ParameterOf(Section):
-    """`[[parameter]]`: a calibrated parameter with its posterior as prior."""
+class VariableParameter(ParameterSection):
+    """`[[parameter]]`: a calibrated parameter that is a variable of the FMU."""
 
-    name: Name
     variable: Name | None = None
-    mean: Number
-    deviation: NotNegative
-    low: Number
-    high: Number
-    unit: str = "1"
-
-    @model_validator(mode="after")
-    def _in_range(self) -> Self:
-        if not self.low <= self.mean <= self.high:
-            raise ValueError(f"the mean {self.mean:g} is not between low {self.low:g} and high {self.high:g}")
-        return self
 
 
 class ScalesOf(Section):
@@ -163,7 +153,7 @@ class ScalesOf(Section):
     angular_frequency: Positive | None = None
 
 
-class FmuModelDescription(Section):
+class FmuModelDescription(ModelDescription):
     """Content of the file.
 
     Attributes
@@ -187,18 +177,16 @@ class FmuModelDescription(Section):
         Whether the FMU runs in a process of its own.
     """
 
-    format: Literal[1]
     kind: Literal["fmu"]
-    name: Name
     fmu: Name
     binding: Name | None = None
     inputs: Inputs = Field(default_factory=Inputs)
     static: Rest = Field(default_factory=Rest)
     motion: Moving = Field(default_factory=Moving)
     release: ReleaseOf | None = None
-    output: tuple[Output, ...] = Field(min_length=1)
+    output: tuple[OutputOf, ...] = Field(min_length=1)
     port: tuple[PortOf, ...] = ()
-    parameter: tuple[ParameterOf, ...] = ()
+    parameter: tuple[VariableParameter, ...] = ()
     effects: dict[Name, Name] = Field(default_factory=dict)
     scales: ScalesOf = Field(default_factory=ScalesOf)
     superposition: bool = True
@@ -228,7 +216,7 @@ def parse_fmu_model(content: dict[str, Any], source: str = "the FMU model") -> F
     ModelError
         One sentence that names `source`, the place, what came and what was expected.
     """
-    return checked(FmuModelDescription, content, source, "an FMU model")
+    return checked(FmuModelDescription, content, source, ModelError, what="an FMU model")
 
 
 def load_fmu_model(path: Path | str) -> FmuModelDescription:
@@ -239,4 +227,4 @@ def load_fmu_model(path: Path | str) -> FmuModelDescription:
     ModelError
         If there is no such file, it is not TOML, or its content is no FMU model.
     """
-    return parse_fmu_model(read_toml(Path(path), "FMU model"), str(path))
+    return parse_fmu_model(read_toml(path, ModelError, what="FMU model"), str(path))

@@ -7,15 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from discrepancy.campaign import Trial, TrialKind
+from discrepancy.campaign.records import Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_excitation import Excitation, Loads, State
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_ports import LINEAR, FmuPorts
 from discrepancy.models.fmu_runs import FmuRuns, is_affine
 from discrepancy.models.port_coupling import LawStepper, PortMotion, coupled_motion
-from fe.motion import Laws
-from fmu_asset.session import FmiAsset
+from fe.runtime.motion import Laws
+from fmu_asset.door.session import FmiAsset
 
 FloatArray = NDArray[np.float64]
 
@@ -283,7 +283,7 @@ class FmuMotion:
             return self._coupled(laws, state, step, steps, loads), step
         strength = float(np.max(np.abs(laws.values[:, 0])))
         exponents = np.round(np.clip(laws.values[:, 1:3], -9.0, 9.0), 1)  # what is rough needs shorter steps
-        key = (trial.kind, trial.interval, laws.ports, laws.codes.tobytes(), exponents.tobytes())
+        key = (trial.kind, trial.interval, laws.ports, laws.numbers.tobytes(), exponents.tobytes())
         known, tried = self._refinements.get(key, (1, 0.0))
         if strength > 2.0 * tried:
             known = self._converged(laws, excite, state, known)

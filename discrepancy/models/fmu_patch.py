@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_file import FmuModelDescription
-from fe.errors import InvalidPatchError
-from fe.motion import NO_LAWS, Laws, laws_of
-from fe.patch import (
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.motion import NO_LAWS, Laws, laws_of
+from fe.runtime.patch import (
     INTERNAL_FORCES,
     SENSORS,
     LoadGain,

@@ -3,14 +3,14 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.compiled_motion import compiled_kernel
 from discrepancy.errors import ModelError
+from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.fmu_excitation import State
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_runs import FmuRuns
-from fe.errors import SolutionError
-from fe.motion import Laws, static_solution
+from fe.runtime.errors import SolutionError
+from fe.runtime.motion import Laws, static_solution
 
 FloatArray = NDArray[np.float64]
 

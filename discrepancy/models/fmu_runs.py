@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from discrepancy.campaign.records import Quantity
+from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_file import FmuModelDescription
-from fmu_asset.binding import Binding, Input, Parameter, Vector, expand, load_binding
+from fmu_asset.door.binding import Binding, Input, Parameter, Vector, expand, load_binding
+from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuError
-from fmu_asset.session import FmiAsset
 from reporting.words import counted
 from scenarios import binding_files
 
@@ -24,8 +26,6 @@ KEPT_BYTES = 256 * 2**20
 """Results that are remembered."""
 SETTLE_CHUNK = 200
 """Steps after which it is asked whether the motion has come to rest."""
-
-_UNITS = {"strain": "1", "displacement": "m", "velocity": "m/s", "acceleration": "m/s2"}
 
 
 class FmuRuns:
@@ -135,7 +135,7 @@ class FmuRuns:
                     f"{counted(len(names), 'name')}, but its variable for {len(variables)}; give as many."
                 )
             for name, variable in zip(names, variables, strict=True):
-                unit = _UNITS.get(item.quantity, "")
+                unit = "" if item.quantity is Quantity.SIGNAL else UNITS[item.quantity].si
                 at = columns.setdefault((self.variable(variable), unit), len(columns))
                 self.columns[name], self.quantities[name] = at, item.quantity
         for port in given.port:
@@ -162,7 +162,7 @@ class FmuRuns:
         return Binding.model_validate(content)
 
     def _own_unit(self, variable: str) -> str:
-        from fmu_asset.archive import read_fmu
+        from fmu_asset.archive.fmu_file import read_fmu
 
         found = read_fmu(self._path).variable(variable)
         return (found.unit if found is not None else None) or "1"

@@ -5,7 +5,7 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign import Trial, TrialKind
+from discrepancy.campaign.records import Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_excitation import Excitation, State
 from discrepancy.models.fmu_file import FmuModelDescription

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.motion import ModalSystem
+from fe.runtime.modal_system import ModalSystem
 
 FloatArray = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign import Campaign, Quantity, Trial
-from fe.patch import ModelPatch, Primitive
+from discrepancy.campaign.records import Campaign, Quantity, Trial
+from fe.runtime.patch import ModelPatch, Primitive
 
 FloatArray = NDArray[np.float64]
 

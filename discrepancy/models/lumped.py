@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign import Campaign, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
 from discrepancy.models.lumped_file import LumpedDescription, load_lumped, matrix_of
 from discrepancy.models.second_order import SecondOrderSystem
-from fe.errors import InvalidPatchError
-from fe.motion import NO_LAWS, laws_of
-from fe.patch import (
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.motion import NO_LAWS, laws_of
+from fe.runtime.patch import (
     INTERNAL_FORCES,
     SENSORS,
     LoadGain,
@@ -187,7 +187,7 @@ class LumpedModel:
         acting = trial.force * (1.0 + gain) + tare * (trial.force != 0.0) if gain or tare else trial.force
         row = self._input_row(trial.load_place)
         if trial.kind is TrialKind.STATIC:
-            if any(quantity in (Quantity.VELOCITY, Quantity.ACCELERATION) for quantity in quantities):
+            if any(quantity.is_rate for quantity in quantities):
                 raise ModelError(
                     f"The trial {trial.name!r} is static, but a channel measures velocity or acceleration."
                 )
@@ -228,8 +228,7 @@ class LumpedModel:
                     f"The lumped model {self.name!r} has no output {output!r}; it has "
                     f"{', '.join(self._outputs)}."
                 )
-            derived = own is Quantity.DISPLACEMENT and quantity in (Quantity.VELOCITY, Quantity.ACCELERATION)
-            if quantity not in (own, Quantity.SIGNAL) and not derived:
+            if not quantity.shows(own):
                 raise ModelError(
                     f"The output {output!r} of {self.name!r} is a {own.value}, but a channel measures "
                     f"{quantity.value}."

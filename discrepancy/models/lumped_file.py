@@ -1,5 +1,6 @@
 """A lumped model as a TOML file: matrices, named vectors and calibrated parameters, checked strictly."""
 
+from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -10,23 +11,23 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from discrepancy.errors import ModelError
 from discrepancy.models.model_file import (
+    ModelDescription,
+    Name,
     NotNegative,
     Number,
+    ParameterSection,
     Positive,
     Section,
     check_unique,
-    checked,
-    read_toml,
-    shown,
 )
+from reporting.section import checked, shown
+from reporting.toml_file import read_toml
 from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
 SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"
 """Models that come with the package, by file name without the ending."""
-
-Name = Annotated[str, Field(min_length=1, max_length=100)]
 
 
 def _is_number(value: object) -> bool:
@@ -62,10 +63,14 @@ Vector = Annotated[tuple[Number, ...], BeforeValidator(_numbers)]
 Matrix = Annotated[tuple[tuple[Number, ...], ...] | tuple[Number, ...], BeforeValidator(_matrix)]
 
 
+Ratio = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=3.0)]
+"""Share of critical damping; overdamped modes are carried, but far above one a percentage was meant."""
+
+
 class Damping(Section):
     """`[damping]`: exactly one of modal ratios, a matrix, or Rayleigh coefficients alpha M + beta K."""
 
-    ratios: Annotated[tuple[NotNegative, ...], BeforeValidator(_numbers)] | None = None
+    ratios: Annotated[tuple[Ratio, ...], BeforeValidator(_numbers)] | None = None
     matrix: Matrix | None = None
     alpha: NotNegative | None = None
     beta: NotNegative | None = None
@@ -78,61 +83,54 @@ class Damping(Section):
         return self
 
 
-class Part(Section):
+class PartSection(Section):
     """`[[mass_part]]`, `[[stiffness_part]]`: a part that a parameter can scale, added to the base matrix."""
 
     name: Name
     matrix: Matrix
 
 
-class Input(Section):
-    """`[[input]]`: where a force acts, and how the vector changes when its place moves [1/m]."""
+class NamedVector(Section):
+    """A row of the unknowns with a name."""
 
     name: Name
     vector: Vector
+
+
+class InputSection(NamedVector):
+    """`[[input]]`: where a force acts, and how the vector changes when its place moves [1/m]."""
+
     station_derivative: Vector | None = None
     chord_derivative: Vector | None = None
 
 
-class Output(Section):
+class OutputSection(NamedVector):
     """`[[output]]`: what can be measured; velocity and acceleration come from a displacement."""
 
-    name: Name
-    vector: Vector
     quantity: Literal["displacement", "strain", "signal"] = "displacement"
 
 
-class Port(Section):
+class PortSection(NamedVector):
     """`[[port]]`: where an internal force can act, between the structure and the ground or within it."""
 
-    name: Name
-    vector: Vector
 
-
-class Place(Section):
+class PlaceSection(NamedVector):
     """`[[place]]`: where a mass can sit; places with a station [m] make a line along the structure."""
 
-    name: Name
-    vector: Vector
     station: Number
 
 
-class Root(Section):
+class RootSection(Section):
     """`[root]`: motion of the unknowns when the root turns by one radian as a rigid body [m/rad]."""
 
     lever: Vector
 
 
-class Parameter(Section):
+class ScaledParameter(ParameterSection):
     """`[[parameter]]`: a factor of the terms named."""
 
-    name: Name
     terms: Name | tuple[Name, ...]
     mean: Number = 1.0
-    deviation: NotNegative
-    low: Number
-    high: Number
-    unit: str = "1"
 
     @property
     def scaled(self) -> tuple[str, ...]:
@@ -146,7 +144,7 @@ class Parameter(Section):
         return self
 
 
-class LumpedDescription(Section):
+class LumpedDescription(ModelDescription):
     """Content of a lumped model's file; vectors have as many entries as the mass matrix has rows, n.
 
     Attributes
@@ -163,20 +161,18 @@ class LumpedDescription(Section):
         L [m]; by default the largest station, or 1.
     """
 
-    format: Literal[1]
-    name: Name
     mass: Matrix
     stiffness: Matrix
     damping: Damping
     characteristic_length: Positive | None = None
-    mass_part: tuple[Part, ...] = ()
-    stiffness_part: tuple[Part, ...] = ()
-    input: tuple[Input, ...] = Field(min_length=1)
-    output: tuple[Output, ...] = Field(min_length=1)
-    port: tuple[Port, ...] = ()
-    place: tuple[Place, ...] = ()
-    root: Root | None = None
-    parameter: tuple[Parameter, ...] = ()
+    mass_part: tuple[PartSection, ...] = ()
+    stiffness_part: tuple[PartSection, ...] = ()
+    input: tuple[InputSection, ...] = Field(min_length=1)
+    output: tuple[OutputSection, ...] = Field(min_length=1)
+    port: tuple[PortSection, ...] = ()
+    place: tuple[PlaceSection, ...] = ()
+    root: RootSection | None = None
+    parameter: tuple[ScaledParameter, ...] = ()
 
     @property
     def size(self) -> int:
@@ -185,6 +181,20 @@ class LumpedDescription(Section):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
+        self._check_matrices()
+        for kind, items in (
+            ("input", self.input),
+            ("output", self.output),
+            ("port", self.port),
+            ("place", self.place),
+        ):
+            self._check_vectors(kind, items)
+        self._check_root_and_ratios()
+        self._check_parameters()
+        return self
+
+    def _check_matrices(self) -> None:
+        """Refuse matrices of another size, that are not symmetric, feed energy or leave something loose."""
         n = self.size
         matrices = [("mass", self.mass), ("stiffness", self.stiffness)]
         matrices += [(f"mass_part {part.name!r}", part.matrix) for part in self.mass_part]
@@ -192,43 +202,55 @@ class LumpedDescription(Section):
         if self.damping.matrix is not None:
             matrices.append(("damping.matrix", self.damping.matrix))
         for where, content in matrices:
-            rows = [row if isinstance(row, tuple) else None for row in content]
-            lengths = {len(row) for row in rows if row is not None}
+            lengths = {len(row) for row in content if isinstance(row, tuple)}
             if len(content) != n or (lengths and lengths != {n}):
                 raise ValueError(
                     f"{where} must be a {n} x {n} matrix (or {counted(n, 'diagonal value')}), as mass has "
                     f"{counted(n, 'row')}"
                 )
             full = matrix_of(content)
-            if np.max(np.abs(full - full.T)) > 1e-9 * max(float(np.max(np.abs(full))), 1e-300):
+            size = float(np.max(np.abs(full)))
+            if np.max(np.abs(full - full.T)) > 1e-9 * max(size, 1e-300):
                 raise ValueError(f"{where} must be symmetric")
-            if where.startswith("damping") and np.min(np.linalg.eigvalsh(full)) < -1e-9 * np.max(
-                np.abs(full)
-            ):
+            if where == "damping.matrix" and np.min(np.linalg.eigvalsh(full)) < -1e-9 * size:
                 raise ValueError(f"{where} must not feed energy: it has a negative eigenvalue")
-        for kind, items in (
-            ("input", self.input),
-            ("output", self.output),
-            ("port", self.port),
-            ("place", self.place),
+        for where, base, added, why in (
+            ("mass", self.mass, self.mass_part, ""),
+            (
+                "stiffness",
+                self.stiffness,
+                self.stiffness_part,
+                "; a structure that can float away has no static response",
+            ),
         ):
-            for item in items:
-                for key in ("vector", "station_derivative", "chord_derivative"):
-                    vector = getattr(item, key, None)
-                    if vector is not None and len(vector) != n:
-                        came = counted(len(vector), "entry", "entries")
-                        raise ValueError(
-                            f"{key} of {kind} {item.name!r} has {came}, but the model has "
-                            f"{counted(n, 'unknown')}"
-                        )
-                if not any(item.vector):
-                    raise ValueError(f"vector of {kind} {item.name!r} is zero")
-            check_unique(kind, [item.name for item in items])
+            whole = matrix_of(base) + sum((matrix_of(part.matrix) for part in added), np.zeros((n, n)))
+            if np.min(np.linalg.eigvalsh(whole)) <= 0.0:
+                raise ValueError(f"{where} (with its parts) must be positive definite{why}")
+
+    def _check_vectors(self, kind: str, items: Sequence[NamedVector]) -> None:
+        """Refuse vectors of another length, zero ones and names that are there twice."""
+        n = self.size
+        for item in items:
+            for key in ("vector", "station_derivative", "chord_derivative"):
+                vector = getattr(item, key, None)
+                if vector is not None and len(vector) != n:
+                    came = counted(len(vector), "entry", "entries")
+                    raise ValueError(
+                        f"{key} of {kind} {item.name!r} has {came}, but the model has {counted(n, 'unknown')}"
+                    )
+            if not any(item.vector):
+                raise ValueError(f"vector of {kind} {item.name!r} is zero")
+        check_unique(kind, [item.name for item in items])
+
+    def _check_root_and_ratios(self) -> None:
+        n = self.size
         if self.root is not None and (len(self.root.lever) != n or not any(self.root.lever)):
             raise ValueError(f"lever of root needs {counted(n, 'entry', 'entries')}, not all zero")
         if self.damping.ratios is not None and len(self.damping.ratios) != n:
             came = counted(len(self.damping.ratios), "value")
             raise ValueError(f"damping.ratios needs one value for each mode, {n} in all, but {came} came")
+
+    def _check_parameters(self) -> None:
         check_unique("place station", [f"{place.station:g}" for place in self.place])
         parts = [part.name for part in (*self.mass_part, *self.stiffness_part)]
         check_unique("part", [*parts, "mass", "stiffness", "damping"])
@@ -240,20 +262,6 @@ class LumpedDescription(Section):
                         f"parameter {parameter.name!r} scales {term!r}, but there are mass, stiffness, "
                         f"damping" + "".join(f", {part}" for part in parts)
                     )
-        for where, base, added in (
-            ("mass", self.mass, self.mass_part),
-            ("stiffness", self.stiffness, self.stiffness_part),
-        ):
-            whole = matrix_of(base) + sum((matrix_of(part.matrix) for part in added), np.zeros((n, n)))
-            if np.min(np.linalg.eigvalsh(whole)) <= 0.0:
-                raise ValueError(
-                    f"{where} (with its parts) must be positive definite; a structure that can float "
-                    f"away has no "
-                    "static response"
-                    if where == "stiffness"
-                    else f"{where} (with its parts) must be positive definite"
-                )
-        return self
 
 
 def matrix_of(content: Matrix) -> FloatArray:
@@ -270,7 +278,7 @@ def parse_lumped(content: dict[str, Any], source: str = "the lumped model") -> L
     ModelError
         One sentence that names `source`, the place, what came and what was expected.
     """
-    return checked(LumpedDescription, content, source, "a lumped model")
+    return checked(LumpedDescription, content, source, ModelError, what="a lumped model")
 
 
 def load_lumped(path: Path | str) -> LumpedDescription:
@@ -287,4 +295,4 @@ def load_lumped(path: Path | str) -> LumpedDescription:
         if not file.exists():
             known = ", ".join(sorted(item.stem for item in SHIPPED_MODELS.glob("*.toml")))
             raise ModelError(f"There is no lumped model {str(path)!r}; shipped are {known}, or give a file.")
-    return parse_lumped(read_toml(file, "lumped model"), str(file))
+    return parse_lumped(read_toml(file, ModelError, what="lumped model"), str(file))

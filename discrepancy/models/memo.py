@@ -2,8 +2,8 @@
 
 from collections import OrderedDict
 
-from discrepancy.campaign import Quantity, Trial
-from fe.patch import ModelPatch
+from discrepancy.campaign.records import Quantity, Trial
+from fe.runtime.patch import ModelPatch
 
 from .interface import Conditions, Model, Response
 from .wrapped import WrappedModel

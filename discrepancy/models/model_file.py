@@ -1,32 +1,12 @@
-"""What the TOML files of models share: strict tables, kinds of numbers, one sentence for what is wrong."""
+"""What the TOML files of models share: their tables and kinds of numbers."""
 
-import re
-import tomllib
-from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from discrepancy.errors import ModelError
-
-Number = Annotated[float, Field(allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0)]
-Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0)]
-
-_SHOWN_LENGTH = 60
-_EXPECTED = {
-    "tuple_type": "a list",
-    "dict_type": "a table",
-    "model_type": "a table",
-    "string_type": "a text in quotes",
-    "string_too_short": "a text that is not empty",
-    "float_type": "a number",
-    "float_parsing": "a number",
-    "bool_type": "true or false",
-    "bool_parsing": "true or false",
-    "finite_number": "a finite number",
-}
-"""What is expected, by pydantic's type of error, where its own words are those of Python."""
+Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0, strict=True)]
+Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0, strict=True)]
 
 
 class Section(BaseModel):
@@ -35,61 +15,31 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-_Description = TypeVar("_Description", bound=Section)
+Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 
-def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """Return the content of a TOML file.
+class ParameterSection(Section):
+    """`[[parameter]]`: a calibrated parameter with its posterior as prior."""
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    what : str
-        What it is to be, for the error: "lumped model".
+    name: Name
+    mean: Number
+    deviation: NotNegative
+    low: Number
+    high: Number
+    unit: str = "1"
 
-    Raises
-    ------
-    ModelError
-        If there is no such file, it cannot be read or is not TOML.
-    """
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ModelError(f"The {what} {path} cannot be read: {error.strerror}.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ModelError(f"The {what} {path} is not valid TOML: {error}.") from None
+    @model_validator(mode="after")
+    def _in_range(self) -> Self:
+        if not self.low <= self.mean <= self.high:
+            raise ValueError(f"the mean {self.mean:g} is not between low {self.low:g} and high {self.high:g}")
+        return self
 
 
-def checked(description: type[_Description], content: dict[str, Any], source: str, what: str) -> _Description:
-    """Return the content of a file as its description.
+class ModelDescription(Section):
+    """What every description of a model begins with: version of the format, and a name for people."""
 
-    Parameters
-    ----------
-    description : type of Section
-        What the file may hold.
-    content : dict
-        What it holds.
-    source : str
-        Where it comes from, for the error.
-    what : str
-        What it is, with its article, for the error: "a lumped model".
-
-    Raises
-    ------
-    ModelError
-        One sentence that names `source`, the place, what came and what was expected.
-    """
-    try:
-        return description.model_validate(content)
-    except ValidationError as error:
-        raise ModelError(f"{source}: {_sentence(error, what)}.") from None
-
-
-def shown(value: object) -> str:
-    """Return a value as it can stand in a sentence, shortened if it is long."""
-    text = repr(value)
-    return text if len(text) <= _SHOWN_LENGTH else f"{text[: _SHOWN_LENGTH - 3]}..."
+    format: Literal[1]
+    name: Name
 
 
 def check_unique(kind: str, names: list[str]) -> None:
@@ -97,32 +47,3 @@ def check_unique(kind: str, names: list[str]) -> None:
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"there are two of {kind} {name!r}")
-
-
-def _sentence(error: ValidationError, what: str) -> str:
-    first = error.errors()[0]
-    place = _written(first["loc"])
-    if first["type"] == "extra_forbidden":
-        return f"{place!r} is not a key of {what}; remove it or correct its spelling"
-    if first["type"] == "missing":
-        return f"{place!r} is missing"
-    if first["type"] == "value_error":
-        return f"{place + ': ' if place else ''}{first['ctx']['error']}"
-    if first["type"] == "tuple_type" and isinstance(first["input"], dict):
-        return f"there can be several of {place!r}, so write [[{place}]] for each, not [{place}]"
-    if first["type"] in _EXPECTED:
-        message = f"{_EXPECTED[first['type']]} is expected"
-    else:
-        message = first["msg"][0].lower() + first["msg"][1:]
-    return f"{place + ': ' if place else ''}{message}, but {shown(first['input'])} came"
-
-
-def _written(location: tuple[int | str, ...]) -> str:
-    """Return a place as people count, from one, without pydantic's names of types."""
-    text = ""
-    for part in location:
-        if isinstance(part, int):
-            text += f"[{part + 1}]"
-        elif not re.search(r"[^\w]|^constrained", part):
-            text += f".{part}" if text else part
-    return text

@@ -1,7 +1,7 @@
 """A model with a patch built in: a known addition, or an effect that was found."""
 
-from discrepancy.campaign import Quantity, Trial
-from fe.patch import SENSORS, ModelPatch
+from discrepancy.campaign.records import Quantity, Trial
+from fe.runtime.patch import SENSORS, ModelPatch
 
 from .interface import Conditions, Model, Response
 from .wrapped import WrappedModel
@@ -11,7 +11,7 @@ class PatchedModel(WrappedModel):
     """A `Model` that adds a patch to every question.
 
     What the patch makes of the structure, its forces and loads is in the responses; sensors in it are applied
-    where those of a question are, in `discrepancy.sensing.observe`, and come first.
+    where those of a question are, in `discrepancy.models.sensing.observe`, and come first.
 
     Parameters
     ----------

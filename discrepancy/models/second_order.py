@@ -14,20 +14,14 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, eigh
 from scipy.linalg.lapack import dpotrs
 
-from discrepancy.campaign import Release
-from discrepancy.compiled_motion import compiled_kernel
+from discrepancy.campaign.records import Release
 from discrepancy.errors import ModelError
+from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.free_motion import free_motion
 from discrepancy.models.second_order_motion import Motion
-from fe.errors import SolutionError
-from fe.motion import (
-    Laws,
-    ModalSystem,
-    StaticSolution,
-    linear_step,
-    simulate,
-    static_solution,
-)
+from fe.runtime.errors import SolutionError
+from fe.runtime.modal_system import ModalSystem, linear_step
+from fe.runtime.motion import Laws, StaticSolution, simulate, static_solution
 
 FloatArray = NDArray[np.float64]
 

@@ -3,19 +3,47 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign import Quantity
+from discrepancy.campaign.records import Quantity
 from discrepancy.models.interface import Response
-from fe.motion import Laws
-
-if TYPE_CHECKING:
-    from discrepancy.models.second_order import SecondOrderSystem
+from fe.runtime.modal_system import ModalSystem
+from fe.runtime.motion import Laws
 
 FloatArray = NDArray[np.float64]
+
+
+class Structure(Protocol):
+    """What a motion asks of the structure that moved; see `second_order.SecondOrderSystem`."""
+
+    @property
+    def relaxation(self) -> float:
+        """Delay of the modes without inertia [s]."""
+
+    @property
+    def angular_frequency(self) -> FloatArray:
+        """Angular frequencies (M,) [rad/s]."""
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Mass-normalised mode shapes (n, M)."""
+
+    @property
+    def truncated(self) -> bool:
+        """Whether modes are left out."""
+
+    @property
+    def modal(self) -> ModalSystem:
+        """The modes with damping and ports."""
+
+    def residual(self, loads: FloatArray) -> FloatArray:
+        """Return the displacements by loads (n,) or (n, k) that the modes leave out."""
+
+    def port_rows(self, laws: Laws) -> FloatArray:
+        """Return the rows (J, n) of the laws' ports."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +52,7 @@ class Motion:
 
     Attributes
     ----------
-    system : SecondOrderSystem
+    system : Structure
         What moved.
     time : (N,) ndarray
         Times of the motion since the release or the begin of the force [s].
@@ -46,7 +74,7 @@ class Motion:
         Force that held the input point until the release [N].
     """
 
-    system: "SecondOrderSystem"
+    system: Structure
     time: FloatArray
     q: FloatArray
     velocity: FloatArray

@@ -7,17 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
-from calibration.result import STATE, CalibrationResult
-from discrepancy.campaign import Campaign, Quantity, Trial, TrialKind
-from discrepancy.compiled_motion import compiled_kernel
+from calibration.wing.result import STATE
+from calibration.wing.result_file import load_calibration
+from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
+from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
 from discrepancy.models.memory import Memory
 from discrepancy.models.wing_structure import MovingWing, Outputs, Stiffness, WingStructure
-from fe.design import load_design
-from fe.errors import FiniteElementError, InvalidPatchError, SolutionError
-from fe.motion import NO_LAWS, Laws, laws_of, static_solution
-from fe.patch import (
+from fe.reduction.patch_cache import patch_arrays
+from fe.reduction.reduced_basis import Progress
+from fe.runtime.errors import FiniteElementError, InvalidPatchError, SolutionError
+from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
+from fe.runtime.patch import (
     INTERNAL_FORCES,
     LOADS,
     PRIMITIVES,
@@ -29,12 +31,11 @@ from fe.patch import (
     PointMass,
     Primitive,
 )
-from fe.patch_arrays import PatchArrays
-from fe.patch_cache import patch_arrays
-from fe.patched_wing import LOAD_PLACE, PORTS, PatchedWing
-from fe.planform_forces import PLANFORM, STATION_PORTS
-from fe.reduced_arrays import PARAMETER_NAMES
-from fe.reduction import Progress
+from fe.runtime.patch_arrays import PatchArrays
+from fe.runtime.patched_wing import LOAD_PLACE, PORTS, PatchedWing
+from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
+from fe.runtime.reduced_arrays import PARAMETER_NAMES
+from fe.wing.design import load_design
 
 FloatArray = NDArray[np.float64]
 
@@ -60,7 +61,8 @@ class WingModel:
     name : str
         For people.
     prior : mapping of str to (float, float)
-        Mean and standard deviation of the calibrated parameters, by the names of `calibration.result.STATE`.
+        Mean and standard deviation of the calibrated parameters, by the names of
+        `calibration.wing.result.STATE`.
 
     Notes
     -----
@@ -112,7 +114,7 @@ class WingModel:
             If the calibration cannot be read, or its wing not be modelled.
         """
         try:
-            result = CalibrationResult.load(Path(path))
+            result = load_calibration(Path(path))
             prior = {
                 item.name: (float(np.mean(column)), float(np.std(column)))
                 for item, column in zip(STATE, result.samples.T, strict=True)
@@ -254,7 +256,7 @@ class WingModel:
         laws: Laws,
         components: bool,
     ) -> Response:
-        if any(quantity in (Quantity.VELOCITY, Quantity.ACCELERATION) for _, quantity in outputs):
+        if any(quantity.is_rate for _, quantity in outputs):
             raise ModelError(
                 f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
             )

@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from discrepancy.campaign import Quantity
+from discrepancy.campaign.records import Quantity
 from discrepancy.errors import ModelError
 from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
-from fe.patch import LocalStiffnessLoss, ModelPatch, ModulusTemperature, PointMass, RootCompliance
-from fe.patched_wing import ON_MODES, PORTS, PatchedWing, Place, motion_basis, strain_gauge
+from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, ModulusTemperature, PointMass, RootCompliance
+from fe.runtime.patched_structure import motion_basis
+from fe.runtime.patched_wing import ON_MODES, PORTS, PatchedWing, Place, strain_gauge
 
 FloatArray = NDArray[np.float64]
 Outputs = tuple[tuple[str, Quantity], ...]
@@ -100,8 +101,7 @@ class WingStructure:
                     f"strain[{self.wing.gauge_count}], tip_displacement, load_point_displacement and "
                     f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction."
                 )
-            moving = own is Quantity.DISPLACEMENT and quantity in (Quantity.VELOCITY, Quantity.ACCELERATION)
-            if quantity not in (own, Quantity.SIGNAL) and not moving:
+            if not quantity.shows(own):
                 raise ModelError(
                     f"The output {output!r} of the wing is a {own.value}, but a channel measures "
                     f"{quantity.value}."

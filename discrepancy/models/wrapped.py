@@ -1,7 +1,7 @@
 """What models around another model have in common: everything but the response is that of the inner one."""
 
-from discrepancy.campaign import Campaign, Quantity
-from fe.patch import ModelPatch, Primitive
+from discrepancy.campaign.records import Campaign, Quantity
+from fe.runtime.patch import ModelPatch, Primitive
 
 from .interface import Model, ModelParameter, Scales
 
@@ -57,7 +57,7 @@ class WrappedModel:
 def built_in_sensors(model: Model) -> ModelPatch:
     """Return the sensor primitives that a model has built in, their channels named by its outputs.
 
-    They are no part of its responses: `discrepancy.sensing.observe` applies them, since what sensors show
-    of a response depends on all of them together.
+    They are no part of its responses: `discrepancy.models.sensing.observe` applies them, since what sensors
+    show of a response depends on all of them together.
     """
     return model.sensors if isinstance(model, WrappedModel) else ModelPatch()

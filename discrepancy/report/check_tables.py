@@ -5,10 +5,10 @@ from math import isfinite
 
 import numpy as np
 
-from discrepancy.campaign import Campaign, TrialKind
+from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.catalogue.entry import Effect
+from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
 from discrepancy.report.text import listing, number, unit_text
-from discrepancy.separability import CONFUSED, DETECTED, Detectability, Separability
 from reporting.page import Column, Table
 
 HEADINGS = (
@@ -135,14 +135,15 @@ def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) ->
         if not item.reason and item.parameter and isfinite(item.detectable) and item.distance < DETECTED
     ]
     if hidden:
-        worst = max(hidden, key=lambda item: item.distance)
-        factor = (DETECTED / worst.distance) ** 0.5 if worst.distance > 0.0 else float("inf")
-        lines.append(
-            f"At their prior medians {listing(i.effect.identifier.replace('_', ' ') for i in hidden)} "
-            "would not be "
-            f"seen; the nearest to it, {worst.effect.identifier.replace('_', ' ')}, would be with noise "
-            f"{factor:.2g} times smaller or {factor**2:.2g} times as many trials."
-        )
+        first = max(hidden, key=lambda item: item.distance)
+        factor = (DETECTED / first.distance) ** 0.5 if first.distance > 0.0 else float("inf")
+        unseen = [item.effect.identifier.replace("_", " ") for item in hidden]
+        if len(unseen) == 1:
+            told = f"At its prior median {unseen[0]} would not be seen; it would be"
+        else:
+            name = first.effect.identifier.replace("_", " ")
+            told = f"At their prior medians {listing(unseen)} would not be seen; {name} would be the first,"
+        lines.append(f"{told} with noise {factor:.2g} times smaller or {factor**2:.2g} times as many trials.")
     unknown = [name for name, channel in campaign.channels.items() if channel.noise is None]
     if unknown:
         lines.append(

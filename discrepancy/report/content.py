@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from discrepancy.document_file import Origin
-from discrepancy.patch_file import PrimitiveInterval
+from discrepancy.files.document import Origin
+from discrepancy.files.patch import PrimitiveInterval
+from discrepancy.judgement.separability import Separability
 from discrepancy.self_calibration import SelfCalibration
-from discrepancy.separability import Separability
 from discrepancy.workflow import Investigation
-from fe.design import WingDesign
+from fe.wing.design import WingDesign
 
 
 @dataclass(frozen=True)

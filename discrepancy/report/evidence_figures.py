@@ -7,9 +7,9 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
 from discrepancy.report.text import hypothesis_name, probability_text
 from discrepancy.self_calibration import SelfCalibration
-from discrepancy.separability import CONFUSED, DETECTED, Separability
 from discrepancy.verdict import Hypothesis, Scores
 from reporting.figures import LEVELS, OBSERVED, PAST, PREDICTION, REFERENCE, new_figure, publication_style
 

@@ -4,6 +4,8 @@ from collections.abc import Callable, Sequence
 
 from matplotlib.figure import Figure
 
+from discrepancy.judgement.separability import CONFUSED
+from discrepancy.location.residuals import ResidualSet
 from discrepancy.report.content import ReportFigure, ReportInput
 from discrepancy.report.evidence_figures import (
     confusion_figure,
@@ -19,8 +21,6 @@ from discrepancy.report.motion_figures import (
 )
 from discrepancy.report.residual_figures import heat_figure, load_figure, planform_figure
 from discrepancy.report.text import listing
-from discrepancy.residuals import ResidualSet
-from discrepancy.separability import CONFUSED
 from discrepancy.workflow import Investigation
 from reporting.figures import to_svg
 
@@ -65,44 +65,56 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
             "trials. A "
             "slope is a stiffness or a gain, an offset a zero, a bend a nonlinearity.",
         )  # fmt: skip
-        worst = worst_record(before)
-        if worst is not None:
-            trial = before.trials[worst.trial].trial
-            role = "held out" if trial.held_out else "fitted"
-            add(
-                "history", history_figure(before, after, worst), "The record with the largest gap",
-                f"Channel {worst.channel} in the trial {trial.name} ({role}). The grey band is two "
-                "standard deviations of the noise record.",
-            )  # fmt: skip
-            add(
-                "spectrum", spectrum_figure(before, after, worst), "Spectra of the residuals",
-                "Power relative to white noise of the stated size; peaks at the modes are missing "
-                "dynamics, single "
-                "lines elsewhere come from outside.",
-            )  # fmt: skip
-        backbone = backbone_figure(before, after)
-        if backbone is not None:
-            add(
-                "backbone", backbone[0], "Frequency and damping over the amplitude",
-                f"All ring-downs, channel {backbone[1]}, windows of four periods. Viscous damping and a "
-                "linear "
-                "spring are flat; Coulomb friction gives a damping ratio that falls as 1/A, quadratic "
-                "damping one "
-                "that rises with A, a cubic spring a frequency that goes with A squared; under micro-slip "
-                "the "
-                "frequency falls and the damping rises with A.",
-            )  # fmt: skip
-        force = force_figure(before, after)
-        if force is not None:
-            add(
-                "restoring_force", force[0], "Restoring force of the first mode",
-                f"What is left of the force per modal mass after the best straight line in displacement and "
-                f"velocity, in percent of the largest elastic force; {force[1]}. Measured and predicted "
-                "signals are "
-                "filtered and evaluated alike; means in bins with standard errors.",
-            )  # fmt: skip
+        _add_worst_record(before, after, add)
+        _add_motion(before, after, add)
     _add_evidence(content, add)
     return found
+
+
+def _add_worst_record(
+    before: ResidualSet, after: ResidualSet | None, add: Callable[[str, Figure | None, str, str], None]
+) -> None:
+    worst = worst_record(before)
+    if worst is not None:
+        trial = before.trials[worst.trial].trial
+        role = "held out" if trial.held_out else "fitted"
+        add(
+            "history", history_figure(before, after, worst), "The record with the largest gap",
+            f"Channel {worst.channel} in the trial {trial.name} ({role}). The grey band is two "
+            "standard deviations of the noise record.",
+        )  # fmt: skip
+        add(
+            "spectrum", spectrum_figure(before, after, worst), "Spectra of the residuals",
+            "Power relative to white noise of the stated size; peaks at the modes are missing "
+            "dynamics, single "
+            "lines elsewhere come from outside.",
+        )  # fmt: skip
+
+
+def _add_motion(
+    before: ResidualSet, after: ResidualSet | None, add: Callable[[str, Figure | None, str, str], None]
+) -> None:
+    backbone = backbone_figure(before, after)
+    if backbone is not None:
+        add(
+            "backbone", backbone[0], "Frequency and damping over the amplitude",
+            f"All ring-downs, channel {backbone[1]}, windows of four periods. Viscous damping and a "
+            "linear "
+            "spring are flat; Coulomb friction gives a damping ratio that falls as 1/A, quadratic "
+            "damping one "
+            "that rises with A, a cubic spring a frequency that goes with A squared; under micro-slip "
+            "the "
+            "frequency falls and the damping rises with A.",
+        )  # fmt: skip
+    force = force_figure(before, after)
+    if force is not None:
+        add(
+            "restoring_force", force[0], "Restoring force of the first mode",
+            f"What is left of the force per modal mass after the best straight line in displacement and "
+            f"velocity, in percent of the largest elastic force; {force[1]}. Measured and predicted "
+            "signals are "
+            "filtered and evaluated alike; means in bins with standard errors.",
+        )  # fmt: skip
 
 
 def _add_evidence(content: ReportInput, add: Callable[[str, Figure | None, str, str], None]) -> None:
@@ -137,10 +149,9 @@ def _add_evidence(content: ReportInput, add: Callable[[str, Figure | None, str, 
         add(
             "separability", separability_figure(content.separability), "What this campaign can tell apart",
             "Squared distance, in noise deviations and with all nuisances adapted, of the effect of the "
-            "row at its "
-            "prior median from the nearest that the effect of the column can do. Crosses: closer than "
-            f"{CONFUSED:g}, so that the column's effect can pass for the row's. Made before the data were "
-            "looked at.",
+            "row at its prior median (or where it is not seen there, as large as it must be to be seen) from "
+            f"the nearest that the effect of the column can do. Crosses: closer than {CONFUSED:g}, so that "
+            "the column's effect can pass for the row's. Made before the data were looked at.",
         )  # fmt: skip
     if content.self_calibration is not None:
         add(

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from math import isfinite, isnan
 
-from discrepancy.naming import named_effects
+from discrepancy.judgement.naming import named_effects
 from discrepancy.report.content import ReportInput
 from discrepancy.report.sizes import definite_unit, size_sentence
 from discrepancy.report.text import (

@@ -3,10 +3,10 @@
 from collections.abc import Callable, Sequence
 from math import isfinite, isnan
 
-from discrepancy.document_file import Origin
+from discrepancy.campaign.units import UNITS
+from discrepancy.files.document import Origin
 from discrepancy.report.check_tables import can_decide_table, group_lines
 from discrepancy.report.content import ReportInput
-from discrepancy.report.residual_figures import UNIT_OF
 from discrepancy.report.text import (
     added_label,
     listing,
@@ -103,7 +103,7 @@ def add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
     add("samples", lambda s: str(s.sample_count))
     channels = investigation.before.channels if investigation.before is not None else {}
     for name in dict.fromkeys(name for pair in pairs for name in pair[0].rms):
-        factor, unit = UNIT_OF[channels[name].quantity] if name in channels else (1.0, "")
+        factor, unit = UNITS[channels[name].quantity].drawn if name in channels else (1.0, "")
         add(
             f"rms of {name}, {unit}",
             lambda s, name=name, factor=factor: (

@@ -9,12 +9,12 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from discrepancy.backbone import Backbone, backbones, restoring_force_surface
-from discrepancy.campaign import TrialKind
+from discrepancy.campaign.records import TrialKind
+from discrepancy.campaign.units import UNITS
 from discrepancy.errors import FitError
+from discrepancy.location.backbone import Backbone, backbones, restoring_force_surface
+from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.report.motion_figures import AFTER, before_label, mode_frequencies
-from discrepancy.report.residual_figures import UNIT_OF
-from discrepancy.residuals import FittedTrial, ResidualSet
 from reporting.figures import (
     OBSERVED,
     PAST,
@@ -108,7 +108,7 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
     ]
     if not modes:
         return None
-    factor, unit = UNIT_OF[before.channels[channel].quantity]
+    factor, unit = UNITS[before.channels[channel].quantity].drawn
     with publication_style():
         figure = new_figure(2.3 * len(modes) + 0.3)
         grid = figure.add_gridspec(

@@ -7,9 +7,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import welch
 
-from discrepancy.report.residual_figures import UNIT_OF, size
-from discrepancy.residual_dependence import predicted_frequencies
-from discrepancy.residuals import ResidualSet
+from discrepancy.campaign.units import UNITS
+from discrepancy.location.dependence import predicted_frequencies
+from discrepancy.location.residuals import ResidualSet
+from discrepancy.report.residual_figures import size
 from reporting.figures import (
     OBSERVED,
     PAST,
@@ -60,7 +61,7 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
     """Draw the worst record: measured and predicted values, and the residuals against the noise."""
     item = before.trials[worst.trial]
     column = item.column(worst.channel)
-    factor, unit = UNIT_OF[before.channels[worst.channel].quantity]
+    factor, unit = UNITS[before.channels[worst.channel].quantity].drawn
     time, used = item.trial.time, item.used[:, column]
     with publication_style():
         rows = 3 if after is not None else 2

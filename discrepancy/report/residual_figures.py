@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
-from discrepancy.campaign import Channel, Quantity, Trial, TrialKind
-from discrepancy.residuals import FittedTrial, ResidualSet
-from fe.design import WingDesign
+from discrepancy.campaign.records import Channel, Quantity, Trial, TrialKind
+from discrepancy.campaign.units import UNITS
+from discrepancy.location.residuals import FittedTrial, ResidualSet
+from fe.wing.design import WingDesign
 from reporting.figures import (
     LEVELS,
     OBSERVED,
@@ -29,14 +30,6 @@ FloatArray = NDArray[np.float64]
 MOST_CELLS = 12
 """Rows or columns up to which a heat map has its numbers written in."""
 _STRAIN = re.compile(r"strain\[(\d+)\]")
-UNIT_OF = {
-    Quantity.STRAIN: (1e6, "µε"),
-    Quantity.DISPLACEMENT: (1e3, "mm"),
-    Quantity.VELOCITY: (1.0, "m/s"),
-    Quantity.ACCELERATION: (1.0, "m/s²"),
-    Quantity.SIGNAL: (1.0, "signal"),
-}
-"""Factor from SI, and unit, in which a quantity is drawn."""
 
 
 def size(item: FittedTrial, column: int) -> float:
@@ -268,7 +261,7 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
         )  # fmt: skip
         for number, (kind, label, quantity, names) in enumerate(panels):
             axes = figure.add_subplot(grid[number // columns, number % columns])
-            factor, unit = UNIT_OF[quantity]
+            factor, unit = UNITS[quantity].drawn
             noise = _draw_loads(
                 axes,
                 before,

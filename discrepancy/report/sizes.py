@@ -5,28 +5,22 @@ from math import isfinite
 
 import numpy as np
 
-from discrepancy.campaign import Campaign, Quantity
-from discrepancy.file_models import CHANNEL_UNIT, PRIMITIVE_UNITS
+from discrepancy.campaign.records import Campaign, Quantity
+from discrepancy.campaign.units import UNITS
+from discrepancy.document_types import CHANNEL_UNIT, PRIMITIVE_UNITS
+from discrepancy.files.patch import PrimitiveInterval
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.wing import WingModel
-from discrepancy.patch_file import PrimitiveInterval
 from discrepancy.report.text import rounded, unit_text
 from discrepancy.verdict import NamedEffect, VerdictKind
 from discrepancy.workflow import Investigation
-from fe.patch import ModelPatch, Primitive
+from fe.runtime.patch import ModelPatch, Primitive
 
 BESIDE = ("reference_velocity", "reference_displacement", "time", "start", "length", "station")
 """Where or at what a size holds; no sizes themselves."""
 ROTATING_PORT = "root"
 """Port of the wing that turns; its others move up and down."""
-SI_UNITS = {
-    Quantity.STRAIN: "",
-    Quantity.DISPLACEMENT: "m",
-    Quantity.VELOCITY: "m/s",
-    Quantity.ACCELERATION: "m/s2",
-    Quantity.SIGNAL: "",
-}
 
 
 def si_sizes(
@@ -114,7 +108,8 @@ def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campa
     """Return the unit of a number, made definite as far as port and channel say it."""
     if unit.startswith(CHANNEL_UNIT):
         names = campaign.channels if (name := getattr(primitive, "channel", "*")) == "*" else (name,)
-        units = {SI_UNITS[campaign.channels[name].quantity] for name in names if name in campaign.channels}
+        measured = {campaign.channels[name].quantity for name in names if name in campaign.channels}
+        units = {"1" if item is Quantity.SIGNAL else UNITS[item].si for item in measured}
         return unit_text(units.pop()) if len(units) == 1 and unit == CHANNEL_UNIT else ""
     if " or " in unit:
         moving, turning = unit.split(" or ")

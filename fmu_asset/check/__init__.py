@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 
+from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.door.binding import Binding, load_binding
+from fmu_asset.door.draft import trial_binding
+from fmu_asset.errors import BindingError, FmuError
 from reporting.progress import Progress, SilentProgress
 
-from ..archive import read_fmu
-from ..binding import Binding, load_binding
-from ..draft import trial_binding
-from ..errors import BindingError, FmuError
 from .file import check_file
 from .flight import Flights
 from .result import Finding, FmuCheck

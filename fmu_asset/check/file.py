@@ -5,10 +5,11 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Iterator
 
-from ..build import recorded_content_hash
-from ..declared import FLOAT_KINDS, FmuDescription
-from ..unit_symbols import meaning_of
-from ..units import contradictions
+from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription
+from fmu_asset.door.unit_symbols import meaning_of
+from fmu_asset.door.units import contradictions
+from fmu_asset.packing.wing_fmu import recorded_content_hash
+
 from .result import Finding
 
 

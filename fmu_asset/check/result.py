@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from fmu_asset.errors import visible
+
 Verdict = Literal["ok", "warning", "problem", "skipped"]
 
 
@@ -26,6 +28,10 @@ class Finding:
     check: str
     verdict: Verdict
     text: str
+
+    def __post_init__(self) -> None:
+        """Make control characters, which names of an FMU may hold, visible."""
+        object.__setattr__(self, "text", visible(self.text))
 
 
 @dataclass(frozen=True)

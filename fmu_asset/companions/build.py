@@ -11,11 +11,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from reporting.files import atomic_write_bytes
-
-from ..description import documentation_page, model_description
-from ..errors import FmuBuildError
-from ..packing import (
+from fmu_asset.description import documentation_page, model_description
+from fmu_asset.errors import FmuBuildError
+from fmu_asset.packing.contents import (
     PLACEHOLDER,
     archive_bytes,
     check_start,
@@ -25,11 +23,13 @@ from ..packing import (
     guid_of,
     pythonfmu_members,
     pythonfmu_version,
+    room_members,
 )
-from ..variables import ENUMERATIONS, FmuVariable, Unit
+from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable, Unit
+from reporting.files import atomic_write_bytes
+
 from . import damage_growth, strain_gauges
 
-_SHARED_FILES = ("base_slave.py", "variables.py")
 _OWN_FILES = ("slave.py", "table.py")
 _STATUS = tuple(enumeration for enumeration in ENUMERATIONS if enumeration.name == "Status")
 _UNITS = (
@@ -54,10 +54,10 @@ class Companion{tag}(CompanionSlave, Fmi2Slave):
 _ENTRY = '''"""Joins the slave, the behaviour and pythonfmu's base class."""
 import json
 
-from .base_slave import Contents
 from .companions import {name} as companion
 from .companions.slave import CompanionSlave as _CompanionSlave
 from .pythonfmu.fmi2slave import Fmi2Slave
+from .slaves.base import Contents
 
 __all__ = ["CompanionSlave", "Fmi2Slave", "keep_alive"]
 
@@ -180,7 +180,7 @@ def _members(
 ) -> dict[str, bytes]:
     """Return the files of the archive, with the placeholder wherever the content hash will stand."""
     installed = pythonfmu_version()
-    own = files("fmu_asset")
+    own = files("fmu_asset.companions")
     module = f"{companion.name}_{PLACEHOLDER}"
     runtime = f"resources/{module}_runtime"
     host = "It runs in any Python host; the standard library is enough."
@@ -204,12 +204,12 @@ def _members(
         f"resources/{module}.py": _SCRIPT.format(module=module, tag=PLACEHOLDER).encode(),
         f"{runtime}/__init__.py": b'"""An FMU of uav-twin."""\n',
         f"{runtime}/entry.py": _ENTRY.format(name=companion.name).encode(),
-        **{f"{runtime}/{name}": (own / name).read_bytes() for name in _SHARED_FILES},
+        **room_members("fmu_asset.slaves", f"{runtime}/slaves"),
         f"{runtime}/companions/__init__.py": b'"""What the FMU does."""\n',
         f"{runtime}/pythonfmu/__init__.py": b'"""The base class of pythonfmu."""\n',
     }
     members |= {
-        f"{runtime}/companions/{name}": (own / "companions" / name).read_bytes()
+        f"{runtime}/companions/{name}": (own / name).read_bytes()
         for name in (*_OWN_FILES, f"{companion.name}.py")
     }
     return members | pythonfmu_members(module, f"{runtime}/pythonfmu", ["fmi2slave.py"])

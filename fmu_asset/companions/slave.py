@@ -1,7 +1,7 @@
 """A small FMI slave that is told what it is by a table and a behaviour.
 
 This file is copied into the FMU: standard library and relative imports only. What all slaves do alike is in
-`base_slave`.
+`base`.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Protocol
 
-from ..base_slave import INITIALISING, READY, TERMINATED, BaseSlave
-from ..variables import STATUS_BAD_CALL, STATUS_BAD_STATE, STATUS_INTERNAL, STATUS_OK
+from ..slaves.base import INITIALISING, READY, TERMINATED, BaseSlave
+from ..slaves.variables import STATUS_BAD_CALL, STATUS_BAD_STATE, STATUS_INTERNAL, STATUS_OK
 
 
 class Behaviour(Protocol):

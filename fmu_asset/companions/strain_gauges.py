@@ -16,7 +16,7 @@ import random
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..variables import FmuVariable
+from ..slaves.variables import FmuVariable
 from .slave import Behaviour
 from .table import Table
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ..variables import Causality, FmuVariable, Kind, Variability
+from ..slaves.variables import Causality, FmuVariable, Kind, Variability
 
 
 class Table:

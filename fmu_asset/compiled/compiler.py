@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fmpy import platform as fmi_platform
 
-from ..errors import FmuBuildError
+from fmu_asset.errors import FmuBuildError
 
 COMPILERS = ("cc", "gcc", "clang")
 """Tried in this order where the environment variable CC names none."""

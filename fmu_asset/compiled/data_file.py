@@ -10,7 +10,7 @@ from dataclasses import fields
 import numpy as np
 import numpy.typing as npt
 
-from fe.reduced_arrays import ReducedArrays
+from fe.runtime.reduced_arrays import ReducedArrays
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -8,11 +8,11 @@ from importlib.metadata import distribution, version
 from importlib.resources import files
 from pathlib import Path
 
-from fe.reduced_arrays import ReducedArrays
+from fe.runtime.reduced_arrays import ReducedArrays
+from fmu_asset.description import documentation_page, model_description
+from fmu_asset.errors import FmuBuildError
+from fmu_asset.slaves.variables import FmuVariable
 
-from ..description import documentation_page, model_description
-from ..errors import FmuBuildError
-from ..variables import FmuVariable
 from .compiler import PLATFORM, compile_library
 from .data_file import data_file_bytes
 from .variable_header import variable_sources

@@ -6,8 +6,8 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 
-from ..description import LOG_CATEGORIES
-from ..variables import ENUMERATIONS, INPUTS, FmuVariable
+from fmu_asset.description import LOG_CATEGORIES
+from fmu_asset.slaves.variables import ENUMERATIONS, INPUTS, FmuVariable
 
 _NOTE = "/* Made by the build of the FMU from its table of variables; a change here is lost. */\n"
 
@@ -29,6 +29,14 @@ def variable_sources(table: Sequence[FmuVariable], *, guid: str, content_tag: st
     dict of str to str
         File name to content: `wing_variables.h` and `wing_variables.c`.
     """
+    return {
+        "wing_variables.h": _header(table, guid, content_tag),
+        "wing_variables.c": _source(table),
+    }
+
+
+def _header(table: Sequence[FmuVariable], guid: str, content_tag: str) -> str:
+    """Return `wing_variables.h`: every constant, and the type of a row of the table."""
     outputs = [row for row in table if row.causality == "output"]
     counts = {
         "VARIABLE_COUNT": len(table),
@@ -48,7 +56,7 @@ def variable_sources(table: Sequence[FmuVariable], *, guid: str, content_tag: st
         (f"LOG_{name.removeprefix('log').removeprefix('Status').upper()}", index)
         for index, name in enumerate(LOG_CATEGORIES)
     )
-    header = f"""{_NOTE}#ifndef WING_VARIABLES_H
+    return f"""{_NOTE}#ifndef WING_VARIABLES_H
 #define WING_VARIABLES_H
 
 #include <stdbool.h>
@@ -85,9 +93,13 @@ extern const char *const wing_log_categories[WING_LOG_CATEGORIES];
 
 #endif
 """
+
+
+def _source(table: Sequence[FmuVariable]) -> str:
+    """Return `wing_variables.c`: the table."""
     rows = "".join(f"    {{{_row(row)}}},\n" for row in table)
     names = "".join(f'    "{name}",\n' for name in LOG_CATEGORIES)
-    source = f"""{_NOTE}#include "wing_variables.h"
+    return f"""{_NOTE}#include "wing_variables.h"
 
 #include <math.h>
 
@@ -97,7 +109,6 @@ const wing_variable wing_variables[WING_VARIABLE_COUNT] = {{
 const char *const wing_log_categories[WING_LOG_CATEGORIES] = {{
 {names}}};
 """
-    return {"wing_variables.h": header, "wing_variables.c": source}
 
 
 def _row(row: FmuVariable) -> str:

@@ -9,8 +9,10 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from ..binding import INPUT_ROLES, Binding
-from ..errors import (
+from fmu_asset.door.binding import INPUT_ROLES, Binding
+from fmu_asset.door.observation import Observation
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.errors import (
     AlgebraicLoopError,
     BindingError,
     CouplingError,
@@ -19,8 +21,7 @@ from ..errors import (
     FmuStateError,
     IterationError,
 )
-from ..observation import Observation
-from ..session import FmiAsset
+
 from .layout import Layout
 from .roles import Roles, resolve_roles
 from .saved import CoupledState, wiring_hash

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from fmpy import read_model_description
 
-from ..archive import FmuDescription, VariableInfo, read_fmu
-from ..errors import FmuFileError
+from fmu_asset.archive.fmu_file import FmuDescription, VariableInfo, read_fmu
+from fmu_asset.errors import FmuFileError
 
 READABLE = ("output", "local", "calculatedParameter")
 """Causalities of what can be the source of a connection."""

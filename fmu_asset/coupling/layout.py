@@ -6,12 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from operator import itemgetter
 from typing import NamedTuple
 
-from ..binding import Binding, Header, Input, Parameter, Vector
-from ..errors import BindingError, CouplingError
-from ..units import IDENTITY, Conversion
+from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector
+from fmu_asset.door.units import IDENTITY, Conversion
+from fmu_asset.errors import BindingError, CouplingError
+
 from .roles import Roles
 from .structure import Endpoint, listed
-from .wiring import Port, Wiring
+from .wiring import ConnectedVariable, Wiring
 
 
 class Tap(NamedTuple):
@@ -109,7 +110,7 @@ class Layout:
             (tuple(self._number[name] for name in group), circular)
             for group, circular in zip(wiring.schedule.groups, wiring.schedule.circular, strict=True)
         ]
-        ports = [Port(feed.source, feed.conversion, feed.delayed) for feed in wiring.feeds]
+        ports = [ConnectedVariable(feed.source, feed.conversion, feed.delayed) for feed in wiring.feeds]
         self._outputs = self._read([*ports, *roles.observations, *roles.monitors.values()])
         self.spans: list[slice] = []
         self._place: dict[Endpoint, int] = {}
@@ -142,14 +143,14 @@ class Layout:
             self.settings.append({key: value for key, value in given.items() if key not in inputs})
             self.constants.append({key: value for key, value in given.items() if key in inputs})
 
-    def _read(self, ports: Iterable[Port]) -> list[list[str]]:
+    def _read(self, ports: Iterable[ConnectedVariable]) -> list[list[str]]:
         """Return the outputs that are read of each component; at least one, to see that it is alive."""
         read: list[dict[str, None]] = [{} for _ in self.names]
         for port in ports:
             read[self._number[port.end.component]][port.end.variable] = None
         return [list(own) or [self._any_output(name)] for name, own in zip(self.names, read, strict=True)]
 
-    def _pick(self, ports: Iterable[Port]) -> Pick:
+    def _pick(self, ports: Iterable[ConnectedVariable]) -> Pick:
         return Pick([Tap(self._place[port.end], port.conversion, port.delayed) for port in ports])
 
     @property

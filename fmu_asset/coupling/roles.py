@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from ..archive import UnitInfo
-from ..binding import INPUT_ROLES, Binding
-from ..errors import BindingError
-from ..units import Conversion, between
+from fmu_asset.archive.fmu_file import UnitInfo
+from fmu_asset.door.binding import INPUT_ROLES, Binding
+from fmu_asset.door.units import Conversion, between
+from fmu_asset.errors import BindingError
+
 from .declared import READABLE
 from .structure import Endpoint, listed
-from .wiring import Port, Wiring, composed
+from .wiring import ConnectedVariable, Wiring, composed
 
 
 class Roles(NamedTuple):
@@ -18,20 +19,20 @@ class Roles(NamedTuple):
 
     Attributes
     ----------
-    inputs : dict of str to dict of str to tuple of Port
+    inputs : dict of str to dict of str to tuple of ConnectedVariable
         For each role, for each name, where a value goes; each conversion is from the binding's unit.
-    parameters : dict of str to tuple of Port
+    parameters : dict of str to tuple of ConnectedVariable
         The same for parameters.
-    observations : tuple of Port
+    observations : tuple of ConnectedVariable
         Where observed values come from, in order; each conversion is to the binding's unit.
-    monitors : dict of str to Port
+    monitors : dict of str to ConnectedVariable
         The same for monitors.
     """
 
-    inputs: dict[str, dict[str, tuple[Port, ...]]]
-    parameters: dict[str, tuple[Port, ...]]
-    observations: tuple[Port, ...]
-    monitors: dict[str, Port]
+    inputs: dict[str, dict[str, tuple[ConnectedVariable, ...]]]
+    parameters: dict[str, tuple[ConnectedVariable, ...]]
+    observations: tuple[ConnectedVariable, ...]
+    monitors: dict[str, ConnectedVariable]
 
 
 def resolve_roles(wiring: Wiring, binding: Binding) -> Roles:
@@ -80,7 +81,7 @@ def resolve_roles(wiring: Wiring, binding: Binding) -> Roles:
     )
 
 
-def _targets(wiring: Wiring, name: str, unit: str, where: str, kind: str) -> tuple[Port, ...]:
+def _targets(wiring: Wiring, name: str, unit: str, where: str, kind: str) -> tuple[ConnectedVariable, ...]:
     end = wiring.structure.locate(name)
     if not end.component:
         if name not in wiring.inward:
@@ -105,10 +106,10 @@ def _targets(wiring: Wiring, name: str, unit: str, where: str, kind: str) -> tup
         )
     if any(feed.target == end for feed in wiring.feeds):
         raise BindingError(f"{where} names {name!r}, which is fed by a connection already.")
-    return (Port(end, _unit(unit, variable.unit, wiring, end, where, outward=False), False),)
+    return (ConnectedVariable(end, _unit(unit, variable.unit, wiring, end, where, outward=False), False),)
 
 
-def _source(wiring: Wiring, name: str, unit: str, where: str) -> Port:
+def _source(wiring: Wiring, name: str, unit: str, where: str) -> ConnectedVariable:
     end = wiring.structure.locate(name)
     if not end.component:
         port = wiring.outward.get(name)
@@ -126,7 +127,7 @@ def _source(wiring: Wiring, name: str, unit: str, where: str) -> Port:
             f"{where} names {name!r}, which is declared as {variable.causality} of the type {variable.kind}; "
             "a numeric output is needed."
         )
-    return Port(end, _unit(unit, variable.unit, wiring, end, where, outward=True), False)
+    return ConnectedVariable(end, _unit(unit, variable.unit, wiring, end, where, outward=True), False)
 
 
 def _unit(

@@ -9,8 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
-from ..binding import Binding
-from ..errors import FmuStateError
+from fmu_asset.door.binding import Binding
+from fmu_asset.errors import FmuStateError
+
 from .wiring import Wiring
 
 _MAGIC = b"UAVSYSTM"

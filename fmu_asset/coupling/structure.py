@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from ..archive import UnitInfo
-from ..binding import expand
-from ..errors import CouplingError
+from fmu_asset.archive.fmu_file import UnitInfo
+from fmu_asset.door.binding import expand
+from fmu_asset.errors import CouplingError
 
 ConnectorKind = Literal["input", "output", "parameter"]
 SettingValue = float | bool | str

@@ -7,9 +7,10 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from ..archive import UnitInfo, VariableInfo
-from ..errors import CouplingError
-from ..units import IDENTITY, Conversion, between
+from fmu_asset.archive.fmu_file import UnitInfo, VariableInfo
+from fmu_asset.door.units import IDENTITY, Conversion, between
+from fmu_asset.errors import CouplingError
+
 from .declared import READABLE, DeclaredFmu, read_declared
 from .schedule import Link, Schedule, schedule
 from .structure import Component, Connection, Connector, Endpoint, Setting, SystemStructure, listed
@@ -32,7 +33,7 @@ class Feed(NamedTuple):
     delayed: bool
 
 
-class Port(NamedTuple):
+class ConnectedVariable(NamedTuple):
     """A variable behind a connector of the system.
 
     variable = factor * connector + offset for inputs and parameters, and the other way round for outputs.
@@ -59,9 +60,9 @@ class Wiring:
         The FMUs by component.
     feeds : tuple of Feed
         Connections between components.
-    inward : dict of str to tuple of Port
+    inward : dict of str to tuple of ConnectedVariable
         For each input and parameter of the system, where it goes.
-    outward : dict of str to Port
+    outward : dict of str to ConnectedVariable
         For each output of the system, where it comes from.
     units : dict of str to (str or None)
         Unit of each connector: its own, or that of what it is connected to.
@@ -94,10 +95,10 @@ class Wiring:
         self._connectors = {connector.name: connector for connector in structure.connectors}
         self.units: dict[str, str | None] = {c.name: c.unit for c in structure.connectors}
         self._joined: list[Feed] = []
-        self.inward: dict[str, tuple[Port, ...]] = {
+        self.inward: dict[str, tuple[ConnectedVariable, ...]] = {
             c.name: () for c in structure.connectors if c.kind != "output"
         }
-        self.outward: dict[str, Port] = {}
+        self.outward: dict[str, ConnectedVariable] = {}
         taken: dict[Endpoint, Endpoint] = {}
         for connection in structure.connections:
             self._connect(connection, taken)
@@ -191,7 +192,7 @@ class Wiring:
         if self.units[connector.name] is None:
             self.units[connector.name] = target.unit
         conversion = self._converted(connection, self.units[connector.name], target.unit)
-        self.inward[connector.name] += (Port(connection.target, conversion, False),)
+        self.inward[connector.name] += (ConnectedVariable(connection.target, conversion, False),)
 
     def _leave(self, connection: Connection) -> None:
         connector = self._connector(connection.target, ("output",), "the target")
@@ -199,7 +200,7 @@ class Wiring:
         if self.units[connector.name] is None:
             self.units[connector.name] = source.unit
         conversion = self._converted(connection, source.unit, self.units[connector.name])
-        self.outward[connector.name] = Port(connection.source, conversion, connection.delayed)
+        self.outward[connector.name] = ConnectedVariable(connection.source, conversion, connection.delayed)
 
     def _readable(self, end: Endpoint) -> VariableInfo:
         variable = self.variable(end)

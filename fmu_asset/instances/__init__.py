@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from .base import FmuInstance
+from typing import TYPE_CHECKING
+
 from .plan import Plan
+
+if TYPE_CHECKING:
+    from .base import FmuInstance
 
 
 def open_instance(plan: Plan) -> FmuInstance:

@@ -18,7 +18,8 @@ from typing import Any
 
 from fmpy.fmi1 import FMICallException
 
-from ..errors import FmuCallError, FmuError, FmuStateError, FmuWorkerError
+from fmu_asset.errors import FmuCallError, FmuError, FmuStateError, FmuWorkerError
+
 from .block import Block
 from .messages import Mailbox
 from .plan import Group, Plan, Settings
@@ -26,7 +27,8 @@ from .prepared import prepared
 from .series import Series, run
 
 STATUS_NAMES = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
-WARNING, DISCARD, ERROR, FATAL, PENDING = 1, 2, 3, 4, 5
+OK, WARNING, DISCARD, ERROR, FATAL, PENDING = range(6)
+ACCEPTED = frozenset({OK, WARNING})
 _MESSAGES_IN_ERROR = 10
 
 _Calls = list[tuple[str, Callable[[], int], Callable[[], None] | None]]
@@ -70,6 +72,10 @@ class FmuInstance(ABC):
                 messages = self._texts()
                 self._mailbox.close()
                 raise FmuCallError(_why_not_instantiated(error), messages) from error
+        for function in vars(self._fmu.dll).values():
+            # fmpy lets negative statuses pass.
+            if getattr(function, "restype", None) is ctypes.c_int:
+                function.errcheck = _refuse_negative
         self._component = self._fmu.component
         self._set = self._blocks("Set", plan.inputs, self.request, 2)
         self._get = self._blocks("Get", plan.outputs, self.reply, 0)
@@ -100,7 +106,7 @@ class FmuInstance(ABC):
         """Read the outputs into the reply block."""
         for name, call, convert in self._get:
             status = call()
-            if status > WARNING:
+            if status not in ACCEPTED:
                 raise self._call_error(f"fmi{self._plan.fmi_version}{name}", status, "reading outputs")
             if convert is not None:
                 convert()
@@ -271,7 +277,7 @@ class FmuInstance(ABC):
             if convert is not None:
                 convert()
             status = call()
-            if status > WARNING:
+            if status not in ACCEPTED:
                 raise self._call_error(f"fmi{self._plan.fmi_version}{name}", status, "setting inputs")
 
     def _where(self) -> str:
@@ -306,6 +312,13 @@ class FmuInstance(ABC):
 
     def _texts(self) -> list[str]:
         return [text for _, text in self.take_log()][-_MESSAGES_IN_ERROR:]
+
+
+def _refuse_negative(status: int, function: Any, arguments: tuple[Any, ...]) -> int:
+    """Check what a C function that fmpy calls has returned."""
+    if status < 0:
+        raise FMICallException(function=function.__name__, status=status)
+    return status
 
 
 def _why_not_instantiated(error: Exception) -> str:

@@ -10,8 +10,9 @@ from fmpy.fmi1 import FMU1Slave
 from fmpy.fmi2 import FMU2Slave
 from fmpy.fmi3 import FMU3Slave
 
-from ..errors import FmuCallError
-from .base import WARNING, FmuInstance
+from fmu_asset.errors import FmuCallError
+
+from .base import ACCEPTED, FmuInstance
 from .messages import Mailbox, callbacks
 from .plan import Plan, Settings
 from .prepared import prepared
@@ -59,7 +60,7 @@ class CoSimulation1(FmuInstance):
 
     def _advance(self) -> None:
         status = self._do_step()
-        if status > WARNING:
+        if status not in ACCEPTED:
             raise self._call_error("fmiDoStep", status, self._where())
 
 
@@ -94,7 +95,7 @@ class CoSimulation2(FmuInstance):
 
     def _advance(self) -> None:
         status = self._do_step()
-        if status > WARNING:
+        if status not in ACCEPTED:
             raise self._call_error("fmi2DoStep", status, self._where())
 
 
@@ -131,7 +132,7 @@ class CoSimulation3(FmuInstance):
         # Outputs of a call that an FMU need not set.
         self._terminate.value = self._early.value = False
         status = self._do_step()
-        if status > WARNING:
+        if status not in ACCEPTED:
             raise self._call_error("fmi3DoStep", status, self._where())
         if self._terminate.value:
             raise FmuCallError(f"The FMU asked to end the simulation in {self._where()}.", self._texts())

@@ -23,6 +23,8 @@ from fmpy.fmi2 import (
 )
 from fmpy.logging import addLoggerProxy
 
+from fmu_asset.errors import visible
+
 _LONGEST_LOG = 1000
 
 # fmpy's native proxy, which formats the messages of C FMUs, knows one logger in a process.
@@ -65,7 +67,8 @@ class Mailbox:
     def log(self, _: object, status: int, category: bytes, message: bytes) -> None:
         """Take a message."""
         self.errors += status in (_ERROR, _FATAL)
-        self._messages.append((int(status), (message or b"").decode("utf-8", "replace").rstrip()))
+        text = (message or b"").decode("utf-8", "replace").rstrip()
+        self._messages.append((int(status), visible(text)))
 
     @property
     def filled(self) -> bool:

@@ -12,14 +12,14 @@ from fmpy.fmi1 import FMICallException, FMU1Model
 from fmpy.fmi2 import FMU2Model
 from fmpy.fmi3 import FMU3Model
 
-from ..errors import FmuCallError
+from fmu_asset.errors import FmuCallError
+
 from .base import FmuInstance
 from .co_simulation import slave_arguments
 from .messages import Mailbox, callbacks
 from .plan import Plan, Settings
 from .solver import Solver
 
-_DEFAULT_TOLERANCE = 1e-6
 _MOST_EVENT_ITERATIONS = 100
 _MOST_EVENTS_IN_A_STEP = 10_000
 
@@ -99,7 +99,7 @@ class ModelExchange(FmuInstance):
                 self._solver = Solver(
                     start_time=begin,
                     largest_step=size,
-                    tolerance=self._plan.tolerance or _DEFAULT_TOLERANCE,
+                    tolerance=self._plan.solver_tolerance,
                     states=self._plan.states,
                     event_indicators=self._plan.event_indicators,
                     functions=self._functions(),
@@ -204,7 +204,10 @@ class ModelExchange1(ModelExchange):
         self._apply(parameters)
         if with_inputs:
             FmuInstance._send(self)
-        converged, _, _, finished, due, time = self._fmu.initialize()
+        tolerance = self._plan.tolerance
+        converged, _, _, finished, due, time = self._fmu.initialize(
+            toleranceControlled=b"\x00" if tolerance is None else b"\x01", relativeTolerance=tolerance or 0.0
+        )
         self._refuse_end(finished, start_time)
         self._first: tuple[bool, float | None] | None = (not converged, time if due else None)
 

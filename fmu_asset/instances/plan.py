@@ -8,6 +8,9 @@ from typing import Literal, Self
 
 Interface = Literal["co-simulation", "model-exchange"]
 
+SOLVER_TOLERANCE = 1e-6
+"""Relative, of our solver, unless the binding gives another or the FMU declares a smaller one."""
+
 Settings = list[tuple[str, int, list[float]]]
 """FMI base type, value reference, values: one for a scalar, all elements for an array."""
 
@@ -50,7 +53,9 @@ class Plan:
     substeps : int
         Communication steps of the FMU between two observations.
     tolerance : float or None
-        Relative tolerance, for the FMU's solver or, in model exchange, for ours.
+        Relative tolerance that the FMU is told.
+    solver_tolerance : float
+        Relative tolerance of our solver (model exchange).
     states, event_indicators : int
         Numbers of continuous states and event indicators (model exchange).
     completed_step : bool
@@ -67,6 +72,7 @@ class Plan:
     outputs: tuple[Group, ...]
     substeps: int = 1
     tolerance: float | None = None
+    solver_tolerance: float = SOLVER_TOLERANCE
     states: int = 0
     event_indicators: int = 0
     completed_step: bool = False

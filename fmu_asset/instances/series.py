@@ -5,16 +5,23 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from .base import FmuInstance
-
 REPORT_PERIOD = 0.02
 """Seconds after which a running series reports what is done, at the end of the step that is being made."""
+
+
+class Stepped(Protocol):
+    """What makes a step from a request block to a reply block, as an instance does."""
+
+    request: Any
+    reply: Any
+
+    def step(self) -> None:
+        """Make the step that the request block describes."""
 
 
 class Series:
@@ -40,12 +47,12 @@ class Series:
         self.reply_size = replies.itemsize * replies.shape[1]
 
 
-def run(instance: FmuInstance, series: Series, report: Callable[[], object]) -> None:
+def run(instance: Stepped, series: Series, report: Callable[[], object]) -> None:
     """Make the steps of a series; end after one whose outputs are not all finite.
 
     Parameters
     ----------
-    instance : FmuInstance
+    instance : Stepped
         An instance in this process.
     series : Series
         The steps; `done` counts them also when one fails.

@@ -7,14 +7,15 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..archive import plain_folder
-from ..binding import Binding, Header, Vector
-from ..coupling.asset import CoupledAsset
-from ..coupling.schedule import loop_sentence
-from ..coupling.structure import Endpoint
-from ..coupling.wiring import Wiring
-from ..errors import FmuError, SspError
-from ..units import between
+from fmu_asset.archive.fmu_file import plain_folder
+from fmu_asset.coupling.asset import CoupledAsset
+from fmu_asset.coupling.schedule import loop_sentence
+from fmu_asset.coupling.structure import Endpoint
+from fmu_asset.coupling.wiring import Wiring
+from fmu_asset.door.binding import Binding, Header, Vector
+from fmu_asset.door.units import between
+from fmu_asset.errors import FmuError, SspError
+
 from .reader import SspSystem, read_ssp
 
 _CAUSALITIES = {

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from ..coupling.structure import Connection, Endpoint, Setting
+from fmu_asset.coupling.structure import Connection, Endpoint, Setting
+
 from .tree import INWARD, ElementPath, Node, Tree
 
 

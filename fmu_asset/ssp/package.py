@@ -14,8 +14,8 @@ from urllib.parse import unquote, urlsplit
 
 from lxml import etree
 
-from ..archive import LARGEST_EXTRACTED_BYTES, _check_entry
-from ..errors import FmuFileError, SspError
+from fmu_asset.archive.fmu_file import LARGEST_EXTRACTED_BYTES, _check_entry
+from fmu_asset.errors import FmuFileError, SspError
 
 SSD_NAME = "SystemStructure.ssd"
 NAMESPACES = {

@@ -5,16 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from ..archive import UnitInfo
-from ..coupling.structure import Setting, SettingValue
-from ..errors import SspError
+from fmu_asset.archive.fmu_file import UnitInfo
+from fmu_asset.coupling.structure import Setting, SettingValue
+from fmu_asset.errors import SspError
+
 from .package import NAMESPACES, SspPackage, tag, validate
 
 _SET_TYPE = "application/x-ssp-parameter-set"
 _MAPPING_TYPE = "application/x-ssp-parameter-mapping"
 
 
-class Binding(NamedTuple):
+class ParameterBinding(NamedTuple):
     """A parameter binding of an element: values by target name, and the units that the set defines."""
 
     values: dict[str, Setting]
@@ -52,7 +53,7 @@ def read_units(element: Any) -> tuple[UnitInfo, ...]:
     return tuple(found)
 
 
-def read_bindings(element: Any, package: SspPackage, where: str) -> list[Binding]:
+def read_bindings(element: Any, package: SspPackage, where: str) -> list[ParameterBinding]:
     """Return the parameter bindings of a component or system.
 
     Raises
@@ -66,7 +67,7 @@ def read_bindings(element: Any, package: SspPackage, where: str) -> list[Binding
     ]
 
 
-def _read_binding(element: Any, package: SspPackage, where: str) -> Binding:
+def _read_binding(element: Any, package: SspPackage, where: str) -> ParameterBinding:
     what = f"a parameter binding of {where}"
     if element.get("type", _SET_TYPE) != _SET_TYPE:
         raise SspError(
@@ -87,7 +88,7 @@ def _read_binding(element: Any, package: SspPackage, where: str) -> Binding:
             raise SspError(f"{what} in {package.path} has a mapping of the type {mapping.get('type')!r}.")
         entries = _content(mapping, None, "ssm", "ParameterMapping", package, f"the mapping of {what}")
         values = _mapped(values, _entries(entries, f"{what} in {package.path}"), f"{what} in {package.path}")
-    return Binding(values, () if units is None else read_units(units))
+    return ParameterBinding(values, () if units is None else read_units(units))
 
 
 def _content(element: Any, inline: str | None, kind: str, name: str, package: SspPackage, what: str) -> Any:

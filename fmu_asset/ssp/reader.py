@@ -12,9 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reporting.files import atomic_write_bytes
-
-from ..coupling.structure import (
+from fmu_asset.coupling.structure import (
     Component,
     Connector,
     ConnectorKind,
@@ -22,6 +20,8 @@ from ..coupling.structure import (
     Setting,
     SystemStructure,
 )
+from reporting.files import atomic_write_bytes
+
 from .flatten import flat_connections, flat_settings
 from .package import NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage, tag
 from .parameters import flag, read_bindings, read_transformation, read_units

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from ..archive import UnitInfo
-from ..coupling.structure import Setting
-from ..errors import SspError
+from fmu_asset.archive.fmu_file import UnitInfo
+from fmu_asset.coupling.structure import Setting
+from fmu_asset.errors import SspError
+
 from .package import SSD_NAME, SspPackage
 
 INWARD = ("input", "parameter")

@@ -8,13 +8,13 @@ from importlib.metadata import version
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, register_namespace, tostring
 
+from fmu_asset.archive.fmu_file import UnitInfo, VariableInfo
+from fmu_asset.coupling.structure import Component, Connection, Endpoint, Setting
+from fmu_asset.coupling.wiring import Wiring
+from fmu_asset.description import number
+from fmu_asset.errors import SspError
 from reporting.files import atomic_write_bytes
 
-from ..archive import UnitInfo, VariableInfo
-from ..coupling.structure import Component, Connection, Endpoint, Setting
-from ..coupling.wiring import Wiring
-from ..description import number
-from ..errors import SspError
 from .package import NAMESPACES, OWN_ANNOTATION, OWN_NAMESPACE, SSD_NAME, pack, parse_xml, tag, validate
 
 SSV_NAME = "resources/parameters.ssv"

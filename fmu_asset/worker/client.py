@@ -6,21 +6,35 @@ import contextlib
 import ctypes
 import json
 import select
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from .. import errors
-from ..errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
-from ..instances.plan import Plan, Settings
-from ..instances.series import REPORT_PERIOD, Series
+from fmu_asset import errors
+from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
+from fmu_asset.folders import remove_folder
+from fmu_asset.instances.plan import Plan, Settings
+from fmu_asset.instances.series import REPORT_PERIOD, Series
+
 from .guard import resident_memory
 from .process import CLOSE_LIMIT, WorkerProcess
-from .protocol import FAILURE, HEADER, LARGEST_MESSAGE, PART, QUICK, RESULT, Operation, look, receive, send
+from .protocol import (
+    FAILURE,
+    HEADER,
+    LARGEST_MESSAGE,
+    PART,
+    QUICK,
+    RESULT,
+    Operation,
+    look,
+    receive,
+    send,
+    separated,
+)
 
 _MEBIBYTE = 1024**2
+_STEP = int(Operation.STEP)
 _GLANCE = 0.05
 """Seconds between two looks at the memory of a worker that is at work."""
 _OPENING, _INITIALISING, _RESETTING = "loading and instantiation", "initialisation", "reset"
@@ -84,14 +98,14 @@ class WorkerInstance:
         self._reply = memoryview(self.reply).cast("B")
         self._header = bytearray(HEADER.size)
         self._header_view = memoryview(self._header)
-        self._step_header = HEADER.pack(Operation.STEP, 0, len(self._request))
+        self._number = 0
         self._limits = limits
         self._folder = scratch
         self._logged = False
         self._lost = False
         # An exception between question and answer, such as an interruption, leaves the two out of step.
         self._busy = False
-        self._process = WorkerProcess(scratch)
+        self._process = WorkerProcess(scratch, plan.folder)
         self._out, self._in = self._process.outgoing, self._process.incoming
         self._next_glance = 0.0
         self._first_wait = 1000.0 * min(limits.step_time, _GLANCE)
@@ -119,7 +133,7 @@ class WorkerInstance:
         what = "the step"
         self._begin()
         try:
-            send(self._out, self._step_header, self._request)
+            send(self._out, HEADER.pack(_STEP, 0, self._number, len(self._request)), self._request)
         except BrokenPipeError:
             raise self._died(what) from None
         look(self._poll)
@@ -139,7 +153,9 @@ class WorkerInstance:
         what = "a step"
         self._begin()
         try:
-            send(self._out, HEADER.pack(Operation.RUN, 0, len(series.requests)), series.requests)
+            send(
+                self._out, HEADER.pack(Operation.RUN, 0, self._number, len(series.requests)), series.requests
+            )
         except BrokenPipeError:
             raise self._died(what) from None
         kind = PART
@@ -181,8 +197,13 @@ class WorkerInstance:
         if not self._logged or self.lost:
             return []
         self._logged = False
-        content = json.loads(self._call(Operation.LOG, b"", "reading the log", self._limits.step_time))
-        return [(int(status), str(text)) for status, text in content]
+        what = "reading the log"
+        content = self._call(Operation.LOG, b"", what, self._limits.step_time)
+        texts = separated(content) if content else []
+        try:
+            return [(int(status), text) for status, _, text in (entry.partition(" ") for entry in texts)]
+        except ValueError:
+            raise self._died(what) from None
 
     def renew(self) -> None:
         """Free the instance and make a new one in the same process."""
@@ -215,17 +236,17 @@ class WorkerInstance:
         kindly = not (self._lost or self._busy)
         if kindly:
             with contextlib.suppress(BrokenPipeError):
-                send(self._out, HEADER.pack(Operation.CLOSE, 0, 0))
+                send(self._out, HEADER.pack(Operation.CLOSE, 0, 0, 0))
         self._lost = True
         self._process.close_pipes()
         self._out = self._in = -1
         self._process.end(CLOSE_LIMIT if kindly else 0.0)
-        shutil.rmtree(self._folder, ignore_errors=True)
+        remove_folder(self._folder)
 
     def _call(self, operation: Operation, content: bytes, what: str, limit: float) -> bytes:
         self._begin()
         try:
-            send(self._out, HEADER.pack(operation, 0, len(content)), content)
+            send(self._out, HEADER.pack(operation, 0, self._number, len(content)), content)
         except BrokenPipeError:
             raise self._died(what) from None
         if operation in QUICK:
@@ -243,14 +264,16 @@ class WorkerInstance:
         if self._lost or self._busy:
             raise FmuWorkerError("The FMU's worker is gone or was interrupted; reset the asset to go on.")
         self._busy = True
+        self._number = (self._number + 1) % 2**32
 
     def _await(self, what: str, limit: float, *, part: bool = False) -> tuple[int, int]:
         # The first wait covers the usual step; a longer one is a chance to look at the worker's memory.
         if not self._poll.poll(self._first_wait):
             self._await_long(what, limit, REPORT_PERIOD if part else 0.0)
         self._fill(self._header_view, what)
-        kind, logged, length = HEADER.unpack(self._header)
-        if kind not in (RESULT, FAILURE, PART if part else RESULT) or length > LARGEST_MESSAGE:
+        kind, logged, number, length = HEADER.unpack(self._header)
+        known = kind in (RESULT, FAILURE, PART if part else RESULT) and number == self._number
+        if not known or length > LARGEST_MESSAGE:
             raise self._died(what)
         self._logged = self._logged or logged != 0
         return kind, length
@@ -292,7 +315,10 @@ class WorkerInstance:
         content = bytearray(length)
         self._fill(memoryview(content), what)
         self._busy = False
-        name, sentence, messages, lost = json.loads(content)
+        try:
+            name, lost, sentence, *messages = separated(content)
+        except ValueError:
+            raise self._died(what) from None
         self._lost = self._lost or bool(lost)
         self._logged = False
         raise _ERRORS.get(name, FmuWorkerError)(sentence, messages)

@@ -10,11 +10,13 @@ import sys
 import time
 from pathlib import Path
 
-from ..errors import FmuWorkerError
-from .protocol import OWN_FAILURE, PIPES_GONE
+from fmu_asset.errors import FmuWorkerError
+
+from .protocol import OWN_FAILURE, PIPES_GONE, WORKER_NUMBER, receive
 
 CLOSE_LIMIT = 2.0
 """Seconds that a worker has to end by itself."""
+_KILL_LIMIT = 10.0
 
 _MEANINGS = {
     "SIGSEGV": "the FMU's code touched memory that is not its own",
@@ -29,15 +31,19 @@ _REMEDY = "Reset the asset, or resume the run, to go on; if it happens again, th
 
 
 class WorkerProcess:
-    """The process and its two pipes.
+    """The process, its keeper and its two pipes.
 
     Parameters
     ----------
     folder : Path
         Scratch folder: the working directory, and where its output goes.
+    shared : str
+        Folder of the extracted FMU.
 
     Attributes
     ----------
+    number : int
+        Process number of the worker.
     outgoing, incoming : int
         The twin's ends of the pipes; -1 once closed.
 
@@ -47,19 +53,19 @@ class WorkerProcess:
         If it cannot be started.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, shared: str) -> None:
         self._folder = folder
         their_in, self.outgoing = os.pipe()
         self.incoming, their_out = os.pipe()
         root = str(Path(__file__).parents[2])
         program = (
-            "import sys; sys.path.append(sys.argv[1]); from fmu_asset.worker.server import serve; "
-            "serve(int(sys.argv[2]), int(sys.argv[3]), sys.argv[4])"
+            "import sys; sys.path.append(sys.argv[1]); from fmu_asset.worker.keeper import keep; "
+            "keep(int(sys.argv[2]), int(sys.argv[3]), *sys.argv[4:])"
         )
         # One thread: the matrices are small, and results do not depend on the number of cores.
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         environment["PYTHONDONTWRITEBYTECODE"] = "1"
-        arguments = [root, str(their_in), str(their_out), str(folder)]
+        arguments = [root, str(their_in), str(their_out), str(folder), shared]
         try:
             with (folder / "worker.log").open("wb") as log:
                 self._process = subprocess.Popen(
@@ -70,8 +76,8 @@ class WorkerProcess:
                     cwd=folder,
                     env=environment,
                     pass_fds=(their_in, their_out),
-                    # A group of its own, so that what the FMU starts ends with it.
-                    process_group=0,
+                    # What the terminal sends is for the twin alone.
+                    start_new_session=True,
                 )
         except OSError as error:
             os.close(self.outgoing)
@@ -80,20 +86,22 @@ class WorkerProcess:
         finally:
             os.close(their_in)
             os.close(their_out)
-
-    @property
-    def number(self) -> int:
-        """Process number."""
-        return self._process.pid
+        first = bytearray(WORKER_NUMBER.size)
+        if not receive(self.incoming, memoryview(first)):
+            self.close_pipes()
+            self.end(CLOSE_LIMIT)
+            raise FmuWorkerError("The worker process ended before it began.", self._last_words())
+        self.number: int = WORKER_NUMBER.unpack(first)[0]
 
     def kill(self) -> None:
         """End it, and whatever the FMU has started, at once."""
         if self._process.returncode is None:
-            # Before it is reaped: its number, which is that of its group, cannot belong to anybody else yet.
-            with contextlib.suppress(OSError):
-                os.killpg(self._process.pid, signal.SIGKILL)
-            self._process.kill()
-            self._process.wait()
+            self._process.terminate()
+            try:
+                self._process.wait(_KILL_LIMIT)
+            except subprocess.TimeoutExpired:  # the worker dies with its keeper
+                self._process.kill()
+                self._process.wait()
 
     def end(self, limit: float) -> None:
         """Wait for its end, and kill what is left then."""

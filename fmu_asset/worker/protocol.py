@@ -1,9 +1,12 @@
 """What twin and worker say to each other.
 
-Two pipes carry binary messages: a header (operation or kind, whether there are log messages, length), then
-the payload. A step is the request block of an instance one way and the reply block the other, without copies.
-A run is many request blocks in one message; their reply blocks come back in parts while it goes on, so that
-the twin sees how far it is and can stop a step that takes too long.
+Two pipes carry binary messages: a header (operation or kind, whether there are log messages, number of the
+request, length), then the payload. A reply bears the number of its request: an FMU that has made a copy of
+the worker's process, which answers too, cannot shift the replies. Texts of the worker are separated by zeros
+and are not JSON, of which an FMU in Python may have changed the module. A step is the request block of an
+instance one way and the reply block the other, without copies. A run is many request blocks in one message;
+their reply blocks come back in parts while it goes on, so that the twin sees how far it is and can stop a
+step that takes too long.
 """
 
 from __future__ import annotations
@@ -14,7 +17,9 @@ import struct
 import time
 from enum import IntEnum
 
-HEADER = struct.Struct("<HHQ")
+HEADER = struct.Struct("<HHIQ")
+WORKER_NUMBER = struct.Struct("<q")
+"""First of all, the process number of the worker."""
 LARGEST_MESSAGE = 2**34
 """Bytes; a header that announces more does not come from the other side's program."""
 
@@ -39,13 +44,23 @@ QUICK = frozenset({Operation.STEP, Operation.RUN, Operation.READ, Operation.SAVE
 """What is asked often and answered at once: both sides look again for a moment before they sleep."""
 
 RESULT, FAILURE, PART = 1, 2, 3
-OWN_FAILURE, PIPES_GONE = 70, 71
-"""Exit statuses of a worker whose own program failed, or whose pipes were closed by the FMU."""
+OWN_FAILURE, PIPES_GONE, DESERTED = 70, 71, 72
+"""Exit statuses of a worker: its own program failed, the FMU closed its pipes, the twin is gone."""
 
 # Waking a process that sleeps on a pipe costs as much as a whole step. Whoever awaits the other side of a
 # step therefore looks again for a moment before it sleeps, if there is a processor for each of the two.
 _LOOK_AGAIN = 2.5e-4
 _PROCESSORS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def joined(*texts: str) -> bytes:
+    """Return texts as one message."""
+    return "\0".join(text.replace("\0", "") for text in texts).encode("utf-8", "replace")
+
+
+def separated(message: bytes | bytearray) -> list[str]:
+    """Return the texts of a message."""
+    return message.decode("utf-8", "replace").split("\0")
 
 
 def receive(descriptor: int, target: memoryview) -> bool:

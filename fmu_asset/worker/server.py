@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import errno
 import faulthandler
-import json
 import os
 import select
 import signal
 import sys
 import traceback
+from json import loads
+from typing import NoReturn
 
 import numpy as np
 
-from ..errors import FmuError, FmuWorkerError
-from ..instances import open_instance
-from ..instances.base import FmuInstance
-from ..instances.plan import Plan
-from ..instances.series import Series
-from .guard import Household, restrict
+from fmu_asset.errors import FmuError, FmuWorkerError
+from fmu_asset.instances import open_instance
+from fmu_asset.instances.base import FmuInstance
+from fmu_asset.instances.plan import Plan
+from fmu_asset.instances.series import Series
+
+from .guard import restrict
 from .protocol import (
+    DESERTED,
     FAILURE,
     HEADER,
     OWN_FAILURE,
@@ -28,6 +31,7 @@ from .protocol import (
     QUICK,
     RESULT,
     Operation,
+    joined,
     look,
     receive,
     send,
@@ -46,22 +50,38 @@ _STEP, _RUN, _OPEN, _RENEW, _CLOSE, _LOG = (
 )
 
 
-def serve(incoming: int, outgoing: int, folder: str) -> None:
-    """Answer requests until the pipe closes; then remove the folders that nobody else removes.
+def serve(incoming: int, outgoing: int) -> NoReturn:
+    """Answer requests until the pipe closes, and end.
 
     Parameters
     ----------
     incoming, outgoing : int
         File descriptors of the pipes.
-    folder : str
-        The scratch folder of this worker.
     """
     # The twin decides what an interruption means; the worker ends when its pipe closes.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable()
     restrict()
-    household = Household(incoming, folder)
     asked = False
+    try:
+        asked, instance = _answer_requests(incoming, outgoing)
+        if instance is not None:
+            instance.close()
+    except BrokenPipeError:
+        pass  # the twin is gone, or this is a copy of the worker without one
+    except OSError as error:
+        os._exit(PIPES_GONE if error.errno == errno.EBADF else OWN_FAILURE)
+    except BaseException:  # noqa: BLE001 - the twin reads the last words in worker.log
+        traceback.print_exc()
+        sys.stderr.flush()
+        os._exit(OWN_FAILURE)
+    # Without the interpreter's shutdown, which third-party libraries may not survive.
+    os._exit(0 if asked else DESERTED)
+
+
+def _answer_requests(incoming: int, outgoing: int) -> tuple[bool, FmuInstance | None]:
+    """Answer requests; return whether the end was asked for, and the instance that is still open."""
+    asked, own_number = False, os.getpid()
     instance: FmuInstance | None = None
     plan: Plan | None = None
     header = bytearray(HEADER.size)
@@ -70,62 +90,50 @@ def serve(incoming: int, outgoing: int, folder: str) -> None:
     request = reply = memoryview(b"")
     poll = select.poll()
     poll.register(incoming, select.POLLIN | select.POLLHUP)
-    try:
-        while receive(incoming, header_view):
-            operation, _, length = HEADER.unpack(header)
-            try:
-                if operation == _STEP:
-                    if not receive(incoming, request) or instance is None:
-                        break
-                    instance.step()
-                    payload: bytes | memoryview = reply
+    while receive(incoming, header_view):
+        operation, _, number, length = HEADER.unpack(header)
+        try:
+            if operation == _STEP:
+                if not receive(incoming, request) or instance is None:
+                    break
+                instance.step()
+                payload: bytes | memoryview = reply
+            else:
+                content = bytearray(length)
+                asked = operation == _CLOSE
+                if not receive(incoming, memoryview(content)) or asked:
+                    break
+                if operation == _OPEN:
+                    plan = Plan.from_json(bytes(content))
+                if operation in (_OPEN, _RENEW) and plan is not None:
+                    if instance is not None:
+                        instance.close()
+                    instance = open_instance(plan)
+                    request = memoryview(instance.request).cast("B")
+                    reply = memoryview(instance.reply).cast("B")
+                if operation == _RUN and instance is not None:
+                    payload = _run(instance, content, outgoing, number)
                 else:
-                    content = bytearray(length)
-                    asked = operation == _CLOSE
-                    if not receive(incoming, memoryview(content)) or asked:
-                        break
-                    if operation in (_OPEN, _RENEW):
-                        if operation == _OPEN:
-                            plan = Plan.from_json(bytes(content))
-                            household.shared = plan.folder
-                        if instance is not None:
-                            instance.close()
-                        instance = None
-                        if plan is not None:
-                            instance = open_instance(plan)
-                            request = memoryview(instance.request).cast("B")
-                            reply = memoryview(instance.reply).cast("B")
-                    if operation == _RUN and instance is not None:
-                        payload = _run(instance, content, outgoing)
-                    else:
-                        payload = _answer(operation, bytes(content), instance, reply)
-                logged = instance is not None and instance.has_log and operation != _LOG
-                HEADER.pack_into(reply_header, 0, RESULT, logged, len(payload))
-            except FmuError as error:
-                lost = instance is None or instance.lost
-                payload = json.dumps([type(error).__name__, error.sentence, error.messages, lost]).encode()
-                HEADER.pack_into(reply_header, 0, FAILURE, 0, len(payload))
-            send(outgoing, reply_header, payload)
-            if operation in QUICK:
-                look(poll)
-        if instance is not None:
-            instance.close()
-    except BrokenPipeError:
-        pass  # the twin is gone
-    except OSError as error:
-        os._exit(PIPES_GONE if error.errno == errno.EBADF else OWN_FAILURE)
-    except BaseException:  # noqa: BLE001 - the twin reads the last words in worker.log
-        traceback.print_exc()
-        sys.stderr.flush()
-        os._exit(OWN_FAILURE)
-    household.leave(asked=asked)
+                    payload = _answer(operation, bytes(content), instance, reply)
+            logged = instance is not None and instance.has_log and operation != _LOG
+            HEADER.pack_into(reply_header, 0, RESULT, logged, number, len(payload))
+        except FmuError as error:
+            lost = instance is None or instance.lost
+            payload = joined(type(error).__name__, "lost" * lost, error.sentence, *error.messages)
+            HEADER.pack_into(reply_header, 0, FAILURE, 0, number, len(payload))
+        if os.getpid() != own_number:
+            os._exit(0)  # a copy that the FMU has made of this process
+        send(outgoing, reply_header, payload)
+        if operation in QUICK:
+            look(poll)
+    return asked, instance
 
 
-def _run(instance: FmuInstance, content: bytearray, outgoing: int) -> memoryview:
+def _run(instance: FmuInstance, content: bytearray, outgoing: int, number: int) -> memoryview:
     """Make the steps of a message; send replies in parts, and return those that are not sent yet."""
     requests = np.frombuffer(content).reshape(-1, len(instance.request))
     series = Series(requests, np.empty((len(requests), len(instance.reply))))
-    sent = 0
+    sent, own_number = 0, os.getpid()
 
     def rest() -> memoryview:
         nonlocal sent
@@ -134,7 +142,9 @@ def _run(instance: FmuInstance, content: bytearray, outgoing: int) -> memoryview
 
     def report() -> None:
         part = rest()
-        send(outgoing, HEADER.pack(PART, instance.has_log, len(part)), part)
+        if os.getpid() != own_number:
+            os._exit(0)
+        send(outgoing, HEADER.pack(PART, instance.has_log, number, len(part)), part)
 
     try:
         instance.run(series, report)
@@ -150,7 +160,7 @@ def _answer(
     if instance is None:
         raise FmuWorkerError("The worker was asked before it had an FMU.")
     if operation == Operation.INITIALISE:
-        setting = json.loads(content)
+        setting = loads(content)
         inputs = bytes.fromhex(setting["inputs"])
         if inputs:
             memoryview(instance.request).cast("B")[16:] = inputs
@@ -165,5 +175,5 @@ def _answer(
     elif operation == Operation.RESET:
         instance.reset()
     elif operation == Operation.LOG:
-        return json.dumps(instance.take_log()).encode()
+        return joined(*(f"{status} {text}" for status, text in instance.take_log()))
     return b""

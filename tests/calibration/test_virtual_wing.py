@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from calibration import virtual_wing
+from calibration.dynamics.records import read_records
+from calibration.dynamics.ringdown import Frequencies
+from calibration.dynamics.trials import fit_trials
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.experiments import published_measurements, read_measurements
 from calibration.geometry import published_lengths, read_lengths
 from calibration.joint import WeighedMass
-from calibration.laboratory import WEIGHED_MASS_FILE, read_weighed_mass, write_lab_folder
-from calibration.ringdown import Frequencies
-from calibration.ringdown_records import read_records
-from calibration.ringdown_trials import fit_trials
+from calibration.static.experiments import published_measurements, read_measurements
 from calibration.virtual_wing import (
     RECORDED_GAUGE,
     SENSITIVITY,
@@ -27,10 +26,11 @@ from calibration.virtual_wing import (
     measure_ring_down,
     weigh,
 )
-from fe.errors import OutsideModelError
-from fe.reduced import ReducedModel
-from fe.state import DigitalState, Geometry
-from fe.transient import ModalIntegrator
+from calibration.wing.laboratory import WEIGHED_MASS_FILE, read_weighed_mass, write_lab_folder
+from fe.runtime.errors import OutsideModelError
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import DigitalState, Geometry
+from fe.runtime.transient import ModalIntegrator
 
 TRUTH = DigitalState(young_modulus_factor=1.0073, damping_alpha=1.03, damping_beta=7.66e-4)
 
@@ -53,7 +53,7 @@ class Beam:
 
 @pytest.fixture(scope="module")
 def wing() -> ReducedModel:
-    from fe.cache import reduced_model
+    from fe.reduction.model_cache import reduced_model
 
     return reduced_model()
 
@@ -72,15 +72,15 @@ def test_the_release_is_the_integrators(wing: ReducedModel) -> None:
         damping_beta=TRUTH.damping_beta,
     )
     state = integrator.released(0.03)
-    strain = [integrator.response(state).strain[RECORDED_GAUGE]]
+    strain = [integrator.response(state).strain[RECORDED_GAUGE - 1]]
     for _ in time[1:]:
-        state = integrator.advance(state, 1e-3, (0.0, 0.0), (0.0, 0.0))
-        strain.append(integrator.response(state).strain[RECORDED_GAUGE])
+        state = integrator.advance(state, 1e-3, (0.0, 0.0))
+        strain.append(integrator.response(state).strain[RECORDED_GAUGE - 1])
     np.testing.assert_allclose(signal, SENSITIVITY * np.array(strain), atol=1e-12)
     held = wing.static_response(1.0073, (0.0, 0.0), 0.0, 1.0)
     holding_force = 0.03 / held.tip_displacement
     # What six modes leave out of the static strain is small.
-    assert signal[0] == pytest.approx(SENSITIVITY * holding_force * held.strain[RECORDED_GAUGE], rel=0.02)
+    assert signal[0] == pytest.approx(SENSITIVITY * holding_force * held.strain[RECORDED_GAUGE - 1], rel=0.02)
 
 
 @pytest.mark.slow
@@ -105,8 +105,8 @@ def test_records_give_back_the_truth(wing: ReducedModel) -> None:
     assert trials.damping_ratio(1).mean == pytest.approx(0.0716, rel=0.04)
     stiffness = wing.tip_stiffness(1.0073)
     assert bench.tip_displacement(9.81) == pytest.approx(9.81 / stiffness, rel=1e-12)
-    with pytest.raises(ExperimentDataError, match="gauges 0 to 23, but 24"):
-        VirtualWing(wing, TRUTH, gauge=24)
+    with pytest.raises(ExperimentDataError, match="gauges 1 to 24, but 25"):
+        VirtualWing(wing, TRUTH, gauge=25)
     with pytest.raises(ExperimentDataError, match="frequency error"):
         VirtualWing(wing, TRUTH, frequency_error=(-1.0, 0.0))
     with pytest.raises(OutsideModelError, match="servo_mass"):
@@ -147,6 +147,8 @@ def test_quantisation_and_bad_settings() -> None:
     np.testing.assert_allclose(record.signal / 5e-5, np.round(record.signal / 5e-5), atol=1e-9)
     with pytest.raises(ExperimentDataError, match="at least one trial"):
         measure_ring_down(Beam(), 1, trials=0)
+    with pytest.raises(ExperimentDataError, match="more than 10,000,000 samples"):
+        measure_ring_down(Beam(), 1, sampling_rate=1e15)
     with pytest.raises(ExperimentDataError, match="step must be positive"):
         measure_ring_down(Beam(), 1, quantisation=0.0)
     with pytest.raises(ExperimentDataError, match="positive duration and sampling rate"):
@@ -183,11 +185,13 @@ def test_the_weighed_mass_file(tmp_path: Path) -> None:
     file = tmp_path / WEIGHED_MASS_FILE
     file.parent.mkdir()
     for text, error, words in (
-        ("mass\n472\n", ExperimentFileError, "one row in grams"),
-        ("mass,standard_deviation\n", ExperimentFileError, "one row in grams"),
+        ("mass\n472\n", ExperimentFileError, "no column 'standard_deviation', which a weighing needs"),
+        ("mass,standard_deviation\n", ExperimentFileError, "no rows"),
+        ("mass,standard_deviation\n472,1\n471,1\n", ExperimentFileError, "one row in grams, and 2 came"),
+        ("mass,standard_deviation\n472,5,1\n", ExperimentFileError, "3 cells came"),
         ("mass,standard_deviation\n0.472,0.001\n", ExperimentDataError, "looks like kg"),
-        ("mass,standard_deviation\n472,-1\n", ExperimentDataError, "standard_deviation is '-1'"),
-        ("mass,standard_deviation\n472,\n", ExperimentDataError, "standard_deviation is ''"),
+        ("mass,standard_deviation\n472,-1\n", ExperimentDataError, "column 'standard_deviation' holds -1"),
+        ("mass,standard_deviation\n472,\n", ExperimentFileError, "'standard_deviation' must hold a number"),
     ):
         file.write_text(text, encoding="utf-8")
         with pytest.raises(error, match=words):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from discrepancy.campaign import Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
-from discrepancy.residuals import FittedTrial, ResidualSet, sensitivity
+from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.location.residuals import FittedTrial, ResidualSet, sensitivity
 
 FloatArray = NDArray[np.float64]
 

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from discrepancy.campaign_file import read_campaign
+from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
-from discrepancy.look_alikes import look_alike_remark
+from discrepancy.judgement.look_alikes import look_alike_remark
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import checked, investigate, without_port
-from fe.patch import ModelPatch
+from fe.runtime.patch import ModelPatch
 
 PAGE = Path(__file__).parents[2] / "docs" / "rig_in_ten_minutes.md"
 RIVALS = ("coulomb_friction", "structural_damping", "quadratic_damping", "clock_error")

@@ -14,17 +14,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from discrepancy.campaign import Campaign, TrialKind
+from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
-from discrepancy.document_file import Origin
 from discrepancy.errors import FitError, ModelError
-from discrepancy.examples import example_campaign, plan_for
+from discrepancy.files.document import Origin
+from discrepancy.files.patch import primitive_intervals, read_patch
+from discrepancy.files.residuals import read_residuals
+from discrepancy.files.verdict import read_verdict
+from discrepancy.judgement.naming import named_effects
+from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability, separability
+from discrepancy.location.residuals import ResidualSet
 from discrepancy.model_choice import ModelKind, choose_model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.wing import WingModel
-from discrepancy.naming import named_effects
-from discrepancy.patch_file import primitive_intervals, read_patch
 from discrepancy.report.check_tables import (
     confused_lines,
     group_lines,
@@ -48,8 +51,6 @@ from discrepancy.report.residual_figures import (
 )
 from discrepancy.report.sizes import si_sizes, size_sentence
 from discrepancy.report.text import formula, headline, listing, number, probability_text, rounded
-from discrepancy.residual_file import read_residuals
-from discrepancy.residuals import ResidualSet
 from discrepancy.self_calibration import (
     NOTHING,
     outcome_of,
@@ -57,14 +58,12 @@ from discrepancy.self_calibration import (
     wilson,
     write_self_calibration,
 )
-from discrepancy.separability import CONFUSED, Separability, separability
-from discrepancy.simulated_campaigns import Simulator
+from discrepancy.sources.examples import example_campaign, plan_for
+from discrepancy.sources.simulated_campaigns import Simulator
 from discrepancy.verdict import Verdict, VerdictKind
-from discrepancy.verdict_file import read_verdict
 from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
 from discrepancy.workflow import Investigation, investigate, patch_draws
-from fe.design import load_design
-from fe.patch import (
+from fe.runtime.patch import (
     ModelPatch,
     PointMass,
     PowerDamping,
@@ -73,6 +72,7 @@ from fe.patch import (
     SensorDrift,
     SensorGain,
 )
+from fe.wing.design import load_design
 from reporting.errors import FileNotWrittenError
 from reporting.page import Page
 from reporting.provenance import collect_provenance
@@ -415,6 +415,22 @@ def test_each_reason_is_given_once_and_each_confusion_by_name(able: Separability
     for line in lines:
         name = line.split()[1]
         assert all(other in line for other in neighbours(able, name))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_an_effect_is_not_the_nearest_to_itself(drag: Investigation, count: int) -> None:
+    hidden = tuple(
+        Detectability(effect, "", "", DETECTED / (n + 2) ** 2, "size", 1.0, "1", 0.5)
+        for n, effect in enumerate(FEW[:count])
+    )
+    (told,) = (
+        line
+        for line in needs(Separability(hidden, (), np.zeros((0, 0)), ()), drag.campaign, FEW)
+        if "would not be seen" in line
+    )
+    first = FEW[0].identifier.replace("_", " ")
+    assert told.count(first) == (1 if count == 1 else 2)
+    assert told.endswith("with noise 2 times smaller or 4 times as many trials.")
 
 
 def test_rows_of_what_can_be_decided(drag: Investigation, able: Separability) -> None:

@@ -1,12 +1,12 @@
 import pytest
 from threadpoolctl import threadpool_limits
 
-from fe.design import WingDesign, load_design
-from fe.operators import AffineOperators, assemble
-from fe.patch_arrays import PatchArrays
-from fe.patch_operators import PatchOperators, assemble_patch_operators
-from fe.patched_wing import PatchedWing
-from fe.reduction import Reduction, reduce_model
+from fe.full.operators import AffineOperators, assemble
+from fe.full.patch_operators import PatchOperators, assemble_patch_operators
+from fe.reduction.reduced_basis import Reduction, reduce_model
+from fe.runtime.patch_arrays import PatchArrays
+from fe.runtime.patched_wing import PatchedWing
+from fe.wing.design import WingDesign, load_design
 
 
 @pytest.fixture(scope="session")
@@ -21,7 +21,7 @@ def coarse_design(shipped_design: WingDesign) -> WingDesign:
 
 @pytest.fixture(scope="session")
 def coarse_operators(coarse_design: WingDesign) -> AffineOperators:
-    with threadpool_limits(1):  # as `fe.cache.build`, so that their bytes can be compared
+    with threadpool_limits(1):  # as `fe.reduction.model_cache.build`, so that their bytes can be compared
         return assemble(coarse_design)
 
 

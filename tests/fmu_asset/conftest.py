@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe.patch_arrays import PatchArrays
-from fe.reduced import ReducedModel
-from fmu_asset.binding import Binding, load_binding, parse_binding
-from fmu_asset.build import build_fmu
+from fe.runtime.patch_arrays import PatchArrays
+from fe.runtime.reduced import ReducedModel
+from fmu_asset.door.binding import Binding, load_binding, parse_binding
+from fmu_asset.packing.wing_fmu import build_fmu
 
 ROOT = Path(__file__).parents[2]
 NODES = 16

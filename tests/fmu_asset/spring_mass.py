@@ -3,6 +3,9 @@
 Copied to a folder of its own and built there; it is never imported by the tests.
 """
 
+import builtins
+import ctypes
+import json
 import math
 import os
 import time
@@ -10,6 +13,7 @@ import time
 from pythonfmu import Boolean, Fmi2Causality, Fmi2Slave, Fmi2Variability, Integer, Real
 
 FINE, NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD, WANDER, TALK, LOOP = range(9)
+HOLD, SPOIL_JSON, SPOIL_BUILTINS, ESCAPES = range(9, 13)
 
 
 class SpringMass(Fmi2Slave):
@@ -46,6 +50,16 @@ class SpringMass(Fmi2Slave):
         elif self.misbehaviour == LOOP:
             while True:
                 pass
+        elif self.misbehaviour == HOLD:
+            ctypes.PyDLL(None).sleep(600)  # a PyDLL keeps the lock of the interpreter
+        elif self.misbehaviour == SPOIL_JSON:
+            json.JSONEncoder.encode = json.dumps = lambda *_, **__: "spoilt"
+            raise ArithmeticError("the spring broke")
+        elif self.misbehaviour == SPOIL_BUILTINS:
+            builtins.len = lambda _: 3
+        elif self.misbehaviour == ESCAPES:
+            self.log("\x1b[2J\x1b]0;owned\x07 the spring \x9b31mcreaks")
+            raise ArithmeticError("\x1b[31mthe spring broke")
         elif self.misbehaviour == DIE:
             os.abort()
         elif self.misbehaviour == RAISE:

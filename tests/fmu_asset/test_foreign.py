@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fmu_asset.archive import read_fmu
-from fmu_asset.binding import Binding, parse_binding
+from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.door.binding import Binding, parse_binding
+from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import (
     BindingError,
     FmuCallError,
@@ -19,7 +20,6 @@ from fmu_asset.errors import (
     FmuUnsupportedError,
     FmuWorkerError,
 )
-from fmu_asset.session import FmiAsset
 
 BOTH = pytest.mark.parametrize("isolated", [True, False], ids=["worker", "in process"])
 

@@ -19,9 +19,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fmu_asset.archive import read_fmu
-from fmu_asset.binding import Binding, parse_binding
-from fmu_asset.draft import draft_binding
+from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.door.binding import Binding, parse_binding
+from fmu_asset.door.draft import draft_binding
+from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import (
     FmuCallError,
     FmuError,
@@ -33,7 +34,8 @@ from fmu_asset.errors import (
     FmuUnsupportedError,
     FmuWorkerError,
 )
-from fmu_asset.session import FmiAsset
+from fmu_asset.worker.client import WorkerInstance
+from fmu_asset.worker.protocol import HEADER, Operation
 
 ROOT = Path(__file__).parents[2]
 HOSTILE: dict[str, Any] = {
@@ -97,6 +99,7 @@ IN_THE_THIRD_STEP = [
     ("FAIL", FmuCallError, r"(?s)returned Error.*no longer to be trusted.*does not converge"),
     ("FATALLY", FmuCallError, r"(?s)returned Fatal.*the instance is lost.*out of memory"),
     ("ASYNCHRONOUS", FmuCallError, r"returned Pending.*asynchronous steps are not supported"),
+    ("NEGATIVE_STATUS", FmuCallError, r"fmi2DoStep returned -1.*the instance is lost"),
     ("ODD_STATUS", FmuCallError, r"returned 42.*the instance is lost"),
     ("CLOSE_FILES", FmuWorkerError, r"could not answer: the FMU's code closed files"),
     ("WRITE_INTO_PIPES", FmuWorkerError, r"closed its pipe, or wrote something else into it"),
@@ -160,6 +163,11 @@ AT_THE_START = [
     ),
     ("NO_INSTANCE", FmuCallError, r"(?s)could not be instantiated.*no licence"),
     ("HANG_IN_INITIALISATION", FmuTimeoutError, r"longer than 2 s for initialisation"),
+    (
+        "NEGATIVE_STATUS_AT_THE_START",
+        FmuCallError,
+        r"fmi2EnterInitializationMode returned -1 in initialisation",
+    ),
     ("REFUSE_INITIALISATION", FmuCallError, r"(?s)returned Error in initialisation.*table file is missing"),
 ]
 
@@ -175,7 +183,9 @@ def test_a_start_that_goes_wrong_is_one_sentence(
         assert not left_behind(scratch)
 
 
-@pytest.mark.parametrize("what", ["CRASH_IN_FREE", "HANG_IN_FREE", "START_PROCESS", "CHATTER"])
+@pytest.mark.parametrize(
+    "what", ["CRASH_IN_FREE", "HANG_IN_FREE", "START_PROCESS", "CHATTER", "NEST_FOLDERS"]
+)
 def test_what_goes_wrong_at_the_end_leaves_nothing(
     foreign_fmu: Any, described: Binding, scratch: Path, what: str
 ) -> None:
@@ -243,14 +253,56 @@ def test_what_cannot_be_replayed_says_so(foreign_fmu: Any) -> None:
             asset.restore_state(saved)
 
 
+ELSEWHERE = [("START_PROCESS_ELSEWHERE", "GROUP=setpgid(0,0)"), ("START_PROCESS_ELSEWHERE", "GROUP=setsid()")]
+
+
+@pytest.mark.parametrize("what", ELSEWHERE, ids=["group", "session"])
+def test_a_process_that_leaves_the_group_is_ended(
+    foreign_fmu: Any, described: Binding, scratch: Path, what: tuple[str, str]
+) -> None:
+    with FmiAsset(foreign_fmu("hostile2", *what), described) as asset:
+        for _ in range(4):
+            asset.step()
+        assert len(processes(scratch)) == 3  # the keeper, the worker, and what the FMU has started
+    assert not left_behind(scratch)
+
+
+@pytest.mark.parametrize("in_one_go", [False, True], ids=["steps", "run"])
+def test_two_processes_that_return_from_one_step(
+    foreign_fmu: Any, described: Binding, scratch: Path, in_one_go: bool
+) -> None:
+    with FmiAsset(foreign_fmu("hostile2", "FORK_AND_RETURN"), described) as asset:
+        pushes = [float(k) for k in range(1, 11)]
+        if in_one_go:
+            seen = asset.simulate({"u": pushes}).values[:, 0].tolist()
+        else:
+            seen = []
+            for push in pushes:
+                seen.append(asset.step({"u": push}).values[0])
+                time.sleep(0.01)
+        assert seen == [sum(pushes[: k + 1]) for k in range(10)]
+    assert not left_behind(scratch)
+
+
+def test_an_answer_to_another_request_is_not_taken(foreign_fmu: Any, described: Binding) -> None:
+    """A reply that is whole but bears another number, as one that comes late."""
+    with FmiAsset(foreign_fmu("hostile2"), described) as asset:
+        asset.step()
+        instance = asset._housing.instance
+        assert isinstance(instance, WorkerInstance)
+        os.write(instance._out, HEADER.pack(Operation.READ, 0, 77, 0))
+        with pytest.raises(FmuWorkerError, match="wrote something else into it"):
+            asset.step()
+
+
 @pytest.mark.parametrize("what", ["HANG", "START_PROCESS"])
 def test_nothing_is_left_when_the_twin_is_killed_during_a_step(
     foreign_fmu: Any, scratch: Path, what: str
 ) -> None:
     program = (
         "import sys\n"
-        "from fmu_asset.binding import parse_binding\n"
-        "from fmu_asset.session import FmiAsset\n"
+        "from fmu_asset.door.binding import parse_binding\n"
+        "from fmu_asset.door.session import FmiAsset\n"
         f"asset = FmiAsset(sys.argv[1], parse_binding({HOSTILE!r}))\n"
         "for _ in range(2): asset.step()\n"
         "print('third', flush=True)\n"
@@ -267,7 +319,7 @@ def test_nothing_is_left_when_the_twin_is_killed_during_a_step(
     assert twin.stdout.readline() == b"third\n"
     if what == "START_PROCESS":
         assert twin.stdout.readline() == b"fourth\n"
-        assert len(processes(scratch)) == 2
+        assert len(processes(scratch)) == 3  # with the keeper
     os.kill(twin.pid, signal.SIGKILL)
     twin.wait()
     twin.stdin.close()
@@ -285,7 +337,7 @@ def test_what_a_dead_twin_left_is_removed_by_the_next(
         asset.step()
     (scratch / own.replace(f"-{os.getpid()}-", f"-{dead.pid}-")).mkdir()
     (scratch / "somebody-else").mkdir()
-    program = "import sys\nfrom fmu_asset.archive import plain_folder\nprint(plain_folder())\n"
+    program = "import sys\nfrom fmu_asset.archive.fmu_file import plain_folder\nprint(plain_folder())\n"
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, check=True, capture_output=True, text=True
     )
@@ -321,6 +373,22 @@ def test_a_description_that_would_fill_the_memory(parts: dict[str, bytes], tmp_p
     laughs = {**parts, "modelDescription.xml": head + b"?>" + entities + rest}
     with pytest.raises(FmuFileError, match="defines a document type or entities"):
         read_fmu(packed(tmp_path / "laughs.fmu", laughs))
+
+
+def test_a_document_type_in_another_encoding(parts: dict[str, bytes], tmp_path: Path) -> None:
+    text = parts["modelDescription.xml"].decode().replace('encoding="UTF-8"', 'encoding="UTF-16"')
+    head, _, rest = text.partition("?>")
+    sound = {**parts, "modelDescription.xml": text.encode("utf-16")}
+    assert read_fmu(packed(tmp_path / "sound.fmu", sound)).model_name == "hostile"
+    laughs = f'{head}?><!DOCTYPE x [<!ENTITY a "{10 * "a"}"><!ENTITY b "&a;&a;&a;">]>{rest}'.encode("utf-16")
+    with pytest.raises(FmuFileError, match="defines a document type or entities"):
+        read_fmu(packed(tmp_path / "laughs.fmu", {**parts, "modelDescription.xml": laughs}))
+
+
+def test_an_archive_of_nested_folders(parts: dict[str, bytes], tmp_path: Path) -> None:
+    deep = packed(tmp_path / "deep.fmu", {**parts, f"{3000 * 'd/'}x": b""})
+    with pytest.raises(FmuFileError, match=r"an entry 3001 folders deep; no tool exports that .*refused"):
+        read_fmu(deep)
 
 
 def test_entries_that_come_twice(parts: dict[str, bytes], tmp_path: Path) -> None:
@@ -380,21 +448,44 @@ def test_an_fmu_without_its_authoring_tool(foreign_fmu: Any, described: Binding,
         FmiAsset(packed(tmp_path / "tool.fmu", entries), described).reset()
 
 
-def test_an_fmu_in_python_that_loops(spring_mass: Path, spring_binding: Binding, scratch: Path) -> None:
+SPOILT = [
+    (10, FmuCallError, r"(?s)fmi2DoStep returned Fatal.*the FMU says: .*the spring broke"),
+    (11, FmuWorkerError, r"wrote something else into it"),
+    (12, FmuCallError, r"(?s)fmi2DoStep returned Fatal.*\\x1b\[2J.*the spring \\x9b31mcreaks"),
+]
+
+
+@pytest.mark.parametrize(("misbehaviour", "kind", "sentence"), SPOILT, ids=["json", "builtins", "escapes"])
+def test_an_fmu_in_python_that_spoils_what_we_share(
+    spring_mass: Path, spring_binding: Binding, misbehaviour: int, kind: type[FmuError], sentence: str
+) -> None:
+    with FmiAsset(spring_mass, spring_binding) as asset:
+        with pytest.raises(kind, match=sentence) as caught:
+            asset.step(load={"misbehaviour": misbehaviour})
+        said = [str(caught.value), *(text for _, text in asset.log)]
+        assert not [text for text in said if re.search(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", text)]
+        asset.reset()
+        assert asset.step({"push": 1.0}).extra == {"steps": 1.0}
+
+
+@pytest.mark.parametrize("misbehaviour", [8, 9], ids=["loop", "hold"])
+def test_an_fmu_in_python_that_loops(
+    spring_mass: Path, spring_binding: Binding, scratch: Path, misbehaviour: int
+) -> None:
     """It holds the interpreter of the worker; neither the limit nor the death of the twin needs that."""
     with (
         FmiAsset(spring_mass, spring_binding, step_timeout=0.5) as asset,
         pytest.raises(FmuTimeoutError, match=r"longer than 0\.5 s for the step"),
     ):
-        asset.step(load={"misbehaviour": 8})
+        asset.step(load={"misbehaviour": misbehaviour})
     program = (
         "import json, sys\n"
-        "from fmu_asset.binding import parse_binding\n"
-        "from fmu_asset.session import FmiAsset\n"
+        "from fmu_asset.door.binding import parse_binding\n"
+        "from fmu_asset.door.session import FmiAsset\n"
         "asset = FmiAsset(sys.argv[1], parse_binding(json.loads(sys.argv[2])))\n"
         "asset.step()\n"
         "print('loops', flush=True)\n"
-        "asset.step(load={'misbehaviour': 8})\n"
+        f"asset.step(load={{'misbehaviour': {misbehaviour}}})\n"
     )
     described = spring_binding.model_dump_json(exclude_none=True)
     twin = subprocess.Popen(

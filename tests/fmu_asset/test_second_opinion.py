@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from fe.reduced import ReducedModel
-from fmu_asset.build import build_fmu
+from fe.runtime.reduced import ReducedModel
 from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.companions.build import build_companion
-from fmu_asset.script import build_script_fmu
+from fmu_asset.packing.script import build_script_fmu
+from fmu_asset.packing.wing_fmu import build_fmu
 from scenarios import asset_scripts
 
 

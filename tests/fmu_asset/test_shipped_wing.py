@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from discrepancy.campaign import Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.models.interface import Conditions
 from discrepancy.models.wing import WingModel
-from fe.cache import reduced_model
-from fe.patch import FreePlay, LocalStiffnessLoss, MicroSlip, ModelPatch
-from fe.patch_cache import patch_arrays
-from fe.patched_wing import PatchedWing
-from fe.state import DigitalState
-from fmu_asset.binding import Binding, parse_binding
-from fmu_asset.build import build_fmu
+from fe.reduction.model_cache import reduced_model
+from fe.reduction.patch_cache import patch_arrays
+from fe.runtime.patch import FreePlay, LocalStiffnessLoss, MicroSlip, ModelPatch
+from fe.runtime.patched_wing import PatchedWing
+from fe.runtime.state import DigitalState
 from fmu_asset.check import check_fmu
-from fmu_asset.patch_file import SCHEMA, parse_patch
-from fmu_asset.patched_runtime import output_channels
-from fmu_asset.session import FmiAsset
+from fmu_asset.door.binding import Binding, parse_binding
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.packing.patch_file import SCHEMA, parse_patch
+from fmu_asset.packing.patched_runtime import output_channels
+from fmu_asset.packing.wing_fmu import build_fmu
 
 
 @pytest.mark.slow

@@ -9,6 +9,9 @@ import pytest
 from reporting import figures
 from reporting.errors import InvalidFigureError
 
+DOLLAR = b'-7"'
+"""End of the name of the dollar sign's outline in DejaVu Sans."""
+
 
 def drawing() -> "figures.Figure":
     with figures.publication_style():
@@ -31,6 +34,28 @@ def test_a_user_setting_changes_nothing() -> None:
     expected = figures.to_svg(drawing())
     with mpl.rc_context({"font.size": 30, "svg.fonttype": "none", "lines.linewidth": 9, "savefig.dpi": 7}):
         assert figures.to_svg(drawing()) == expected
+
+
+def test_text_of_a_user_is_no_mathematics() -> None:
+    """Broken mathematics would end the drawing, and whole mathematics would not be what was written."""
+    with figures.publication_style():
+        figure = figures.new_figure(2.0)
+        axes = figure.add_axes((0.1, 0.1, 0.8, 0.8))
+        axes.set_title(r"of $\frac{1$ and of $x^2$")
+        axes.plot([1, 2], [1, 2], label="$_{$")
+        axes.legend()
+    assert DOLLAR in figures.to_svg(figure)
+    assert figures.to_png(figure, 40)
+
+
+def test_mathematics_and_powers_of_ten_are_typeset() -> None:
+    with figures.publication_style():
+        figure = figures.new_figure(2.0)
+        axes = figure.add_axes((0.1, 0.1, 0.8, 0.8))
+        axes.loglog([1, 1e4], [1, 1e4])
+        axes.set_xlabel("$x^2$", parse_math=True)
+    drawing = figures.to_svg(figure)
+    assert DOLLAR not in drawing
 
 
 def test_no_date_no_address_but_name_spaces() -> None:

@@ -56,3 +56,26 @@ def test_standard_output_stays_free(capsys: pytest.CaptureFixture[str]) -> None:
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "Flying" in captured.err
+
+
+def test_on_a_pipe_a_stage_tells_that_it_begins_and_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = iter([0.0, 1.0, 12.0, 15.0, 23.0, 23.5, 30.0])
+    monkeypatch.setattr("reporting.progress.time.perf_counter", lambda: next(seconds))
+    stream = io.StringIO()
+    progress = RichProgress(Console(file=stream, width=40))
+    with progress.stage("Checking a wing that has a long name", total=4, unit="checks") as stage:
+        assert stream.getvalue() == "Checking a wing that has a long name, 4 checks ...\n"
+        for number in range(4):
+            stage.advance(detail=f"check {number}")
+    assert stream.getvalue().splitlines()[1:] == [
+        "Checking a wing that has a long name: 2 of 4 checks, check 1, 12 s ...",
+        "Checking a wing that has a long name: 4 of 4 checks, check 3, 23 s ...",
+        "Checking a wing that has a long name: done, 23.5 s",
+    ]
+    told = io.StringIO()
+    with (
+        pytest.raises(KeyError),
+        RichProgress(Console(file=told), lines=True).stage("Failing"),
+    ):
+        raise KeyError
+    assert told.getvalue() == "Failing ...\n"

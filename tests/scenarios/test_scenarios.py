@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from scenarios import asset_scripts, binding_files, scenario_files
-from twin_master.scenario_file import load_scenario
-from twin_master.truth import Truth
-from twin_master.twin import build_graphical_model
+from twin_master.mission.truth import Truth
+from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.reading import load_scenario
 
 
 def test_what_is_shipped() -> None:

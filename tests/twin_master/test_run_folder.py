@@ -1,10 +1,76 @@
-"""The run folder: what killed writers leave is removed, and nothing else is."""
+"""The run folder: one process holds it, a killed replacement loses nothing, leftovers go and nothing else."""
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
-from twin_master.run_folder import FIELD_NAME, tidy
+import pytest
+
+from reporting.folders import restore_folder
+from twin_master.errors import RunFolderError
+from twin_master.run_folder import FIELD_NAME, KIND, create_run_folder, lock_run_folder, tidy
+
+
+def make(folder: Path, name: str, *, replace: bool = False) -> None:
+    os.close(create_run_folder(folder, {"kind": KIND, "name": name}, replace=replace))
+
+
+def test_a_run_that_flies_is_not_replaced(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    lock = create_run_folder(folder, {"kind": KIND, "name": "first"})
+    with pytest.raises(RunFolderError, match="another process is flying"):
+        make(folder, "second", replace=True)
+    with pytest.raises(RunFolderError, match="another process is flying"):
+        lock_run_folder(folder)
+    assert "first" in (folder / "config.json").read_text(encoding="utf-8")
+    os.close(lock)
+    make(folder, "second", replace=True)
+    assert "second" in (folder / "config.json").read_text(encoding="utf-8")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("moves", [1, 2, 3])
+def test_a_kill_between_the_moves_of_a_replacement_loses_no_run(tmp_path: Path, moves: int) -> None:
+    folder = tmp_path / "run[1]"
+    make(folder, "first")
+    (folder / "notes.txt").write_text("mine", encoding="utf-8")
+    script = f"""
+import os, signal
+from pathlib import Path
+from twin_master.run_folder import create_run_folder
+rename, count = Path.rename, 0
+def renamed(self, target):
+    global count
+    result = rename(self, target)
+    count += 1
+    if count == {moves}:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return result
+Path.rename = renamed
+create_run_folder(Path({str(folder)!r}), {{"kind": {KIND!r}, "name": "second"}}, replace=True)
+"""
+    ended = subprocess.run([sys.executable, "-c", script], check=False)
+    assert ended.returncode == -signal.SIGKILL
+    assert restore_folder(folder) is (moves == 1)
+    kept = "first" if moves == 1 else "second"
+    assert kept in (folder / "config.json").read_text(encoding="utf-8")
+    assert (folder / "notes.txt").exists() is (moves == 1)
+    assert not list(tmp_path.glob(".*.replaced-*"))
+    assert restore_folder(folder) is False
+
+
+def test_a_folder_that_is_being_replaced_is_not_put_back(tmp_path: Path) -> None:
+    aside = tmp_path / ".run.old-x" / "run"
+    make(aside, "first")
+    lock = lock_run_folder(aside)
+    assert restore_folder(tmp_path / "run") is False
+    os.close(lock)
+    assert restore_folder(tmp_path / "run") is True
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) -> None:

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from fe.cache import reduced_model
-from fe.reduced import ReducedModel
-from fmu_asset.build import build_fmu
+from fe.reduction.model_cache import reduced_model
+from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
+from fmu_asset.packing.wing_fmu import build_fmu
 from twin_master import workflow
-from twin_master.asset_source import ReducedModelSource
-from twin_master.checkpoint import Checkpoint
-from twin_master.crew import prepare_knowledge
-from twin_master.resolution import Overrides
-from twin_master.scenario_file import load_scenario
+from twin_master.assets.resolution import Overrides
+from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.mission.preparation import prepare_knowledge
+from twin_master.scenario.reading import load_scenario
 from twin_master.study import fly_many
 from twin_master.workflow import new_run, resume_run
 
@@ -51,7 +51,7 @@ def test_reliability(wing: ReducedModel) -> None:
 
 
 def test_the_whole_chain_and_its_resumption(
-    wing: ReducedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    wing: ReducedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
 ) -> None:
     monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
     loaded = load_scenario("level_turns")
@@ -65,15 +65,8 @@ def test_the_whole_chain_and_its_resumption(
     config = json.loads((outcome.folder / "config.json").read_text(encoding="utf-8"))
     assert config["inputs"]["design"] == wing.design_hash
     assert (outcome.folder / "wing.vtu").stat().st_size > 10_000
-    write = workflow.write_checkpoint
-
-    def dying(folder: Path, checkpoint: Checkpoint) -> None:
-        write(folder, checkpoint)
-        if checkpoint.turns == 23:
-            raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(workflow, "write_checkpoint", dying)
+        die_after_turn(patch, 23)
         with pytest.raises(KeyboardInterrupt):
             new_run(loaded, tmp_path / "part")
     resume_run(tmp_path / "part")

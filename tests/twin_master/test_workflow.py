@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,19 +16,21 @@ import pytest
 import xarray as xr
 
 from reporting.errors import DiskFullError
+from reporting.progress import SilentProgress
 from twin_master import workflow
-from twin_master.checkpoint import Checkpoint
+from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import (
     InvalidStrainLibraryError,
     MissionInputError,
     NotResumableError,
     RunFolderError,
     RunFolderExistsError,
+    ScenarioError,
 )
-from twin_master.resolution import Overrides, resolve_scenario
+from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import lock_run_folder
-from twin_master.scenario_file import load_scenario
-from twin_master.twin import build_graphical_model
+from twin_master.scenario.reading import load_scenario
+from twin_master.store.outcome import RunOutcome
 from twin_master.workflow import new_run, resume_run
 
 ROOT = Path(__file__).parents[2]
@@ -40,20 +43,8 @@ def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
 
 
-def fly(folder: Path, library: Path, scenario: str = "level_turns", **options: object) -> workflow.RunOutcome:
+def fly(folder: Path, library: Path, scenario: str = "level_turns", **options: object) -> RunOutcome:
     return new_run(load_scenario(scenario), folder, Overrides(strain_library=library, **options))  # type: ignore[arg-type]
-
-
-def stop_after(monkeypatch: pytest.MonkeyPatch, turns: int, error: BaseException) -> None:
-    """Let the run die when the checkpoint of a turn was written."""
-    write = workflow.write_checkpoint
-
-    def failing(folder: Path, checkpoint: Checkpoint) -> None:
-        write(folder, checkpoint)
-        if checkpoint.turns == turns:
-            raise error
-
-    monkeypatch.setattr(workflow, "write_checkpoint", failing)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -126,11 +117,16 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_mission(
     ("scenario", "turns"), [("level_turns", 1), ("growing_damage", 30), ("failing_gauges", 50)]
 )
 def test_a_resumed_run_is_bit_identical(
-    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch, scenario: str, turns: int
+    tmp_path: Path,
+    library_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    die_after_turn: Callable[..., None],
+    scenario: str,
+    turns: int,
 ) -> None:
     whole = contents(fly(tmp_path / "whole", library_file, scenario).folder)
     with monkeypatch.context() as patch:
-        stop_after(patch, turns, KeyboardInterrupt())
+        die_after_turn(patch, turns)
         with pytest.raises(KeyboardInterrupt):
             fly(tmp_path / "part", library_file, scenario)
     assert not (tmp_path / "part" / "run.nc").exists()
@@ -142,24 +138,77 @@ def test_a_resumed_run_is_bit_identical(
     assert contents(tmp_path / "part") == whole
 
 
+def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(
+    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def report(folder: Path) -> Path:
+        (folder / "report.html").write_text("report", encoding="utf-8")
+        return folder / "report.html"
+
+    class Notes(SilentProgress):
+        said: list[str]
+
+        def note(self, message: str) -> None:
+            self.said.append(message)
+
+    monkeypatch.setattr(workflow, "_report", report)
+    flown = fly(tmp_path / "run", library_file)
+    whole = contents(flown.folder)
+    monkeypatch.setattr(workflow, "_run", None)  # nothing is done again
+    notes = Notes()
+    notes.said = []
+    again = resume_run(flown.folder, progress=notes)
+    assert notes.said == [f"The run in {flown.folder} is finished: nothing is flown again."]
+    assert (again.figures, again.report, again.origin) == (flown.figures, flown.report, flown.origin)
+    monkeypatch.undo()
+    monkeypatch.setattr(workflow, "_report", report)
+    (flown.folder / "run.nc").write_bytes((flown.folder / "run.nc").read_bytes()[:5000])
+    resume_run(flown.folder)
+    assert contents(flown.folder) == whole
+    (flown.folder / "report.html").unlink()
+    assert resume_run(flown.folder).report.is_file()
+
+
+def test_a_replacement_that_was_killed_is_put_back_and_said(tmp_path: Path, library_file: Path) -> None:
+    folder = fly(tmp_path / "run", library_file).folder
+    (tmp_path / ".run.old-x").mkdir()
+    folder.rename(tmp_path / ".run.old-x" / "run")
+    with pytest.raises(RunFolderExistsError, match="holds a run already"):
+        fly(folder, library_file)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_seed_that_cannot_be_stored_is_refused_before_the_flight(
+    tmp_path: Path, library_file: Path
+) -> None:
+    with pytest.raises(ScenarioError, match=r"at most 9223372036854775807 .*mission.seed"):
+        fly(tmp_path / "run", library_file, seed=10**40)
+    text = load_scenario("level_turns").path.read_text(encoding="utf-8")
+    (tmp_path / "s.toml").write_text(text.replace("seed = 2021", f"seed = {10**40}"), encoding="utf-8")
+    with pytest.raises(ScenarioError, match=r"64 bits|seed"):
+        fly(tmp_path / "run", library_file, str(tmp_path / "s.toml"))
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_full_disk_loses_nothing(
     tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = contents(fly(tmp_path / "whole", library_file).folder)
-    replace = Path.replace
+    flush = os.fsync
     count = 0
 
-    def full(self: Path, target: Path) -> Path:
+    def full(descriptor: int) -> None:
         nonlocal count
         count += 1
         if count > 20:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return replace(self, target)
+        flush(descriptor)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "replace", full)
+        patch.setattr(os, "fsync", full)
         with pytest.raises(DiskFullError, match="No space is left"):
             fly(tmp_path / "part", library_file)
+    assert (tmp_path / "part" / "checkpoint.jsonl").read_bytes().count(b"\n") > 2
     resume_run(tmp_path / "part")
     assert contents(tmp_path / "part") == whole
 
@@ -186,14 +235,16 @@ def test_existing_folders_are_refused(tmp_path: Path, library_file: Path) -> Non
     fly(tmp_path / "empty", library_file)
 
 
-def test_what_cannot_be_resumed(tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_resumed(
+    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
+) -> None:
     with pytest.raises(NotResumableError, match="there is no run folder"):
         resume_run(tmp_path / "nothing")
     with pytest.raises(NotResumableError, match="is no run folder"):
         resume_run(tmp_path)
     folder = tmp_path / "run"
     with monkeypatch.context() as patch:
-        stop_after(patch, 3, KeyboardInterrupt())
+        die_after_turn(patch, 3)
         with pytest.raises(KeyboardInterrupt):
             fly(folder, library_file)
     with pytest.raises(NotResumableError, match="another scenario"):
@@ -209,7 +260,7 @@ def test_what_cannot_be_resumed(tmp_path: Path, library_file: Path, monkeypatch:
     with pytest.raises(NotResumableError, match="another configuration"):
         resume_run(folder)
     (folder / "config.json").write_text(config, encoding="utf-8")
-    os.close(lock := lock_run_folder(folder))
+    os.close(lock_run_folder(folder))
     lock = lock_run_folder(folder)
     try:
         with pytest.raises(RunFolderError, match="another process"):
@@ -220,14 +271,14 @@ def test_what_cannot_be_resumed(tmp_path: Path, library_file: Path, monkeypatch:
 
 
 def test_a_run_needs_nothing_but_its_folder(
-    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
 ) -> None:
     library = tmp_path / "a library" / "é.json"
     library.parent.mkdir()
     library.write_bytes(library_file.read_bytes())
     whole = contents(fly(tmp_path / "whole", library_file).folder)
     with monkeypatch.context() as patch:
-        stop_after(patch, 3, KeyboardInterrupt())
+        die_after_turn(patch, 3)
         with pytest.raises(KeyboardInterrupt):
             fly(tmp_path / "part", library)
     library.unlink()
@@ -243,10 +294,10 @@ def test_a_run_needs_nothing_but_its_folder(
 
 
 def test_a_copy_that_changed_is_refused(
-    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
 ) -> None:
     with monkeypatch.context() as patch:
-        stop_after(patch, 3, KeyboardInterrupt())
+        die_after_turn(patch, 3)
         with pytest.raises(KeyboardInterrupt):
             fly(tmp_path / "run", library_file)
     copy = tmp_path / "run" / "asset" / "UAVconfig.json"
@@ -255,7 +306,7 @@ def test_a_copy_that_changed_is_refused(
     with pytest.raises(NotResumableError, match="strain library changed"):
         resume_run(tmp_path / "run")
     copy.unlink()
-    with pytest.raises(InvalidStrainLibraryError, match="cannot read"):
+    with pytest.raises(InvalidStrainLibraryError, match="cannot be read"):
         resume_run(tmp_path / "run")
 
 

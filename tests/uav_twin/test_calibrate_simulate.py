@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from calibration.experiments import read_measurements
+from calibration.dynamics.records import read_records
+from calibration.dynamics.ringdown import Frequencies
+from calibration.dynamics.trials import fit_trials
 from calibration.geometry import read_lengths
-from calibration.laboratory import read_weighed_mass
-from calibration.ringdown import Frequencies
-from calibration.ringdown_records import read_records
-from calibration.ringdown_trials import fit_trials
-from fe.design import SHIPPED_DESIGN
+from calibration.static.experiments import read_measurements
+from calibration.wing.laboratory import read_weighed_mass
+from fe.wing.design import SHIPPED_DESIGN
 from uav_twin import cli
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
@@ -50,7 +50,7 @@ def test_a_folder_with_its_truth(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     records = read_records(out)
     assert len(records) == 5
     trials = fit_trials(records, Frequencies.FITTED)
-    from fe.cache import reduced_model
+    from fe.reduction.model_cache import reduced_model
 
     modes = reduced_model().modes(0.99, (0.0, 0.0), 0.18, 0.11)
     first, second = modes.flapwise

@@ -22,17 +22,16 @@ from fmpy.validation import validate_fmu
 
 from calibration.geometry import published_lengths
 from calibration.joint import WeighedMass
-from calibration.laboratory import write_lab_folder
-from calibration.result import STATE, CalibrationResult
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down
-from fe.cache import reduced_model
-from fe.design import SHIPPED_DESIGN, load_design
-from fe.reduced import ReducedModel
-from fe.state import DigitalState
-from fmu_asset.session import FmiAsset
+from calibration.wing.laboratory import write_lab_folder
+from calibration.wing.result import STATE, CalibrationResult
+from calibration.wing.result_file import load_calibration
+from fe.reduction.model_cache import reduced_model
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import DigitalState
+from fe.wing.design import SHIPPED_DESIGN, load_design
+from fmu_asset.door.session import FmiAsset
 from scenarios import scenario_files
-from twin_master import workflow
-from twin_master.checkpoint import Checkpoint
 from twin_master.errors import NotResumableError
 from twin_master.workflow import resume_run
 from uav_twin import cli
@@ -94,7 +93,7 @@ def wings(wing: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> dict[
             places = ["--data", folder / "lab", "--out", folder / "out"]
             code = call(patch, "calibrate", *places, "--asset", name, "--fitted")
         assert code == 0
-        result = CalibrationResult.load(folder / "out" / "calibration.nc")
+        result = load_calibration(folder / "out" / "calibration.nc")
         made[name] = Tailored(truth, folder / "lab", folder / "out", result, said.getvalue())
     return made
 
@@ -266,7 +265,10 @@ def test_the_truth_of_the_scenario_stays_and_is_told(
 
 @pytest.mark.usefixtures("no_report")
 def test_a_run_with_a_calibration_needs_nothing_but_its_folder(
-    wings: dict[str, Tailored], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    wings: dict[str, Tailored],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    die_after_turn: Callable[..., None],
 ) -> None:
     file = tmp_path / "elsewhere" / "wing.nc"
     file.parent.mkdir()
@@ -274,15 +276,8 @@ def test_a_run_with_a_calibration_needs_nothing_but_its_folder(
     assert (
         call(monkeypatch, "run", "level_turns", "--calibration", file, "--out", tmp_path / "whole", "-q") == 0
     )
-    write = workflow.write_checkpoint
-
-    def dying(folder: Path, checkpoint: Checkpoint) -> None:
-        write(folder, checkpoint)
-        if checkpoint.turns == 7:
-            raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(workflow, "write_checkpoint", dying)
+        die_after_turn(patch, 7)
         arguments = ["run", "level_turns", "--calibration", file, "--out", tmp_path / "part", "-q"]
         assert call(patch, *arguments) == 130
     shutil.rmtree(file.parent)
@@ -290,6 +285,7 @@ def test_a_run_with_a_calibration_needs_nothing_but_its_folder(
     assert call(monkeypatch, "run", "--resume", moved, "-q") == 0
     for name in ("run.nc", "config.json", "summary.json", "calibration.json", "asset/asset.fmu", "wing.vtu"):
         assert (moved / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    (moved / "run.nc").unlink()  # of a finished run nothing is computed again
     copy = moved / "asset" / "calibration.nc"
     copy.write_bytes((wings["stiff"].out / "calibration.nc").read_bytes())
     with pytest.raises(NotResumableError, match=r"calibration.* changed since the run"):
@@ -372,7 +368,7 @@ def test_the_model_follows_the_measured_planform(
     arguments = ["--data", lab, "--design", coarse, "--out", out, "--asset", "short wing"]
     assert call(monkeypatch, "calibrate", *arguments) == 0
     capsys.readouterr()
-    result = CalibrationResult.load(out / "calibration.nc")
+    result = load_calibration(out / "calibration.nc")
     assert result.design.planform.semi_span == 1.8181  # prior and measurement together, to 0.1 mm
     assert result.mean_state().geometry.semi_span == 1.8181
     model = reduced_model(result.design)
@@ -458,17 +454,17 @@ def spoil(kind: str, lab: Path) -> None:
 
 
 SENTENCES = {
-    "renamed column": "lacks the column load",
-    "missing column of lengths": "lacks the column manufactured",
+    "renamed column": "no column 'load', which a load test needs",
+    "missing column of lengths": "no column 'manufactured', which the measured planform needs",
     "load in kgf": "looks like kgf: give it in N",
     "lengths in m": "looks like m: give it in mm",
-    "lost value": "is 'nan', but a positive finite number is needed",
+    "lost value": "line 4: column 'load' holds nan, and a finite number is needed",
     "empty pairs": "is empty",
     "empty record": "is empty",
     "record that does not decay": "decay",
     "clipped record": "clipped",
     "one mode": "two spectral peaks are needed",
-    "record with a gap": "must not hold lost values",
+    "record with a gap": "line 201: column 'spanwise' holds nan, and a finite number is needed",
     "masses that cannot be": "cannot weigh 0.95 kg",
     "no step": "holds none of the folders step1, step2 and step3",
     "renamed file": "does not hold step2/load_displacement_measurements.csv",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from reporting import terminal
 from twin_master.errors import ScenarioError
 from uav_twin import cli
 
@@ -75,6 +77,14 @@ def test_run_prints_figures_and_report(
     captured = capsys.readouterr()
     assert captured.out == captured.err == ""
     assert call(monkeypatch, "run", "--resume", str(out), "--quiet") == 0
+    (out / "report.html").unlink(missing_ok=True)
+    assert call(monkeypatch, *arguments, "--replace", "--json", "--no-report") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["folder"] == str(out)
+    assert record["report"] is None
+    assert record["scenario"] == "level_turns"
+    assert {figure["key"] for figure in record["figures"]} >= {"fallback_delay", "policy_switch_damage"}
+    assert not (out / "report.html").exists()
 
 
 @pytest.mark.usefixtures("no_report")
@@ -107,7 +117,7 @@ def test_errors_of_the_packages_are_one_sentence_and_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     broken = tmp_path / "broken.toml"
-    broken.write_text("format = 2", encoding="utf-8")
+    broken.write_text("format = 3", encoding="utf-8")
     for arguments, word in (
         (["run", "no_such_scenario"], "no_such_scenario"),
         (["run", str(broken)], "format"),
@@ -133,7 +143,7 @@ def test_an_error_that_is_not_ours_is_not_hidden(monkeypatch: pytest.MonkeyPatch
     def broken() -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(cli, "app", lambda **_: broken())
+    monkeypatch.setattr(terminal, "with_common_options", lambda _app: lambda **_: broken())
     monkeypatch.setattr(sys, "argv", ["uav-twin"])
     with pytest.raises(ZeroDivisionError):
         cli.main()

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from discrepancy.patch_file import read_patch
-from discrepancy.verdict_file import read_verdict
+from discrepancy.files.patch import read_patch
+from discrepancy.files.verdict import read_verdict
 from uav_twin import cli
 
 RIG = ("--model", "single_mass_rig")

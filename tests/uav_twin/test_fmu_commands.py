@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -31,20 +32,28 @@ def test_an_fmu_is_bound_and_checked(foreign_fmu: Any, tmp_path: Path) -> None:
     again = call("bind", fmu, "--out", file)
     assert again.returncode != 0
     assert "exists: choose another --out or give --replace" in again.stderr
-    checked = call("check", fmu, "--binding", file, "--cycles", "5")
+    checked = call("check", fmu, "--binding", file, "--cycles", "5", "--json")
     assert checked.returncode == 0, checked.stderr
-    rows = [line.split("│")[1:4] for line in checked.stdout.splitlines() if line.startswith("│")]
-    found = {name.strip(): verdict.strip() for name, verdict, _ in rows if name.strip()}
+    record = json.loads(checked.stdout)
+    assert record["passed"] is True
+    found = {finding["check"]: finding["verdict"] for finding in record["findings"]}
     assert found["fmpy validate"] == "ok"
     assert found["state"] == "warning"
     assert found["instances"] == "ok"
-    assert "no problem found" in checked.stdout
+    shown = call("check", fmu, "--binding", file, "--cycles", "0")
+    assert "no problem found" in shown.stdout
+    assert all(finding in shown.stdout for finding in found if finding != "instances")
+    assert "..." in shown.stderr  # a stage tells that it has begun, in a pipe too
+    assert call("check", fmu, "--binding", file, "--cycles", "0", "-q").stdout == ""
 
 
 def test_a_problem_is_named_and_the_exit_code_says_so(foreign_fmu: Any, tmp_path: Path) -> None:
     checked = call("check", foreign_fmu("hostile2", "SEGFAULT"), "--cycles", "0")
     assert checked.returncode == 1
     assert "SIGSEGV" in checked.stdout
+    told = json.loads(call("check", foreign_fmu("hostile2", "SEGFAULT"), "--cycles", "0", "--json").stdout)
+    assert told["passed"] is False
+    assert any(finding["verdict"] == "problem" for finding in told["findings"])
     assert "1 problem." in checked.stderr
     assert "Traceback" not in checked.stdout + checked.stderr
     for command in ("bind", "check"):
@@ -56,3 +65,23 @@ def test_a_problem_is_named_and_the_exit_code_says_so(foreign_fmu: Any, tmp_path
     wrong = call("check", foreign_fmu("ball2"), "--binding", tmp_path / "wrong.toml")
     assert wrong.returncode != 0
     assert "wrong.toml" in wrong.stderr
+
+
+def test_names_of_an_fmu_are_whole_in_a_pipe_and_on_a_narrow_terminal(foreign_fmu: Any) -> None:
+    fmu = foreign_fmu("ball2")
+    record = json.loads(call("info", fmu, "--json").stdout)
+    names = [variable["name"] for variable in record["variables"]]
+    assert names
+    assert record["file"] == str(fmu)
+    environment = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
+    for columns in ({}, {"COLUMNS": "80"}):
+        shown = subprocess.run(
+            [sys.executable, "-m", "uav_twin", "fmu", "info", str(fmu)],
+            cwd=ROOT, env=environment | columns, check=True, capture_output=True, text=True,
+        ).stdout  # fmt: skip
+        assert "…" not in shown
+        assert str(fmu) in shown.splitlines()[0]
+        for name in names:
+            assert name in "".join(line.split(" ", 2)[1] for line in shown.splitlines() if " " in line)
+        if columns:
+            assert max(map(len, shown.splitlines()[1:])) <= 80

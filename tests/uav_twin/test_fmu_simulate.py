@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fmu_asset.binding import load_binding
+from fmu_asset.door.binding import load_binding
+from fmu_asset.door.history_file import read_histories
+from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError
-from fmu_asset.history_file import read_histories
-from fmu_asset.session import FmiAsset
 
 ROOT = Path(__file__).parents[2]
 ROOM = """

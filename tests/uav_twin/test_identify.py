@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from calibration.identification.design_file import design_toml
-from fe.design import load_design, parse_design
+from fe.wing.design import load_design, parse_design
 from uav_twin import cli
 
 HEADER = (
@@ -56,7 +56,7 @@ def test_files_that_are_missing_or_wrong_end_in_one_sentence(
     text = results.read_text()
     results.write_text(text.replace("mass_pitot", "pitot"))
     assert call(monkeypatch, "--data", str(data), "--out", str(out)) == 1
-    assert "lacks the column mass_pitot" in capsys.readouterr().err
+    assert "no column 'mass_pitot'" in capsys.readouterr().err
     results.write_text(text.replace("5.6492", "nan", 1))
     assert call(monkeypatch, "--data", str(data), "--out", str(out)) == 1
     assert capsys.readouterr().err.count("\n") == 1

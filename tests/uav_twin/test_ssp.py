@@ -11,7 +11,7 @@ import pytest
 
 from uav_twin import cli
 
-HERE = Path(__file__).parents[1] / "twin_master" / "heat_exchanger"
+HERE = Path(__file__).parents[1] / "twin_master" / "assets" / "heat_exchanger"
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -88,9 +88,9 @@ def test_a_strain_library_cannot_be_exported(
     from scenarios import scenario_files
 
     text = scenario_files()["level_turns"].read_text(encoding="utf-8")
-    text = text.replace('kind = "fmu"\ndesign = "uav_wing"\nbinding = "uav_wing"',
-                        f'kind = "strain_library"\nfile = "{library_file}"')  # fmt: skip
-    text = text.replace("parameters = { young_modulus_factor = 1.0073 }\n", "")
+    flown, after = text.index("[asset]"), text.index("[calibration]")
+    library = f'[asset]\nkind = "strain_library"\nfile = "{library_file}"\n\n[belief]\nkind = "asset"\n\n'
+    text = text[:flown] + library + text[after:]
     path = tmp_path / "library.toml"
     path.write_text(text, encoding="utf-8")
     assert call(monkeypatch, "ssp", "export", str(path), "--out", str(tmp_path / "x.ssp")) == 1

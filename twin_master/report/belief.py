@@ -53,42 +53,13 @@ def _joint_figure(record: RunRecord) -> Figure:
         rows, columns, left=0.075, right=0.02 + width + 0.045, top=1 - 0.52 / height, bottom=0.43 / height,
         wspace=0.12, hspace=0.30,
     )  # fmt: skip
-    scales = state_scales(record)
     image = None
     for number, turn in enumerate(turns):
         row, column = divmod(number, columns)
         axes = figure.add_subplot(grid[row, column])
         image = _map(axes, record, joint_belief(record, turn), cmap=_PROBABILITY_COLORS, vmin=0.0, vmax=1.0)
         axes.set_title(f"{record.step_word} {turn}", fontweight="normal", pad=3.0)
-        mean = scales * record.filtered.mean[turn]
-        axes.plot(
-            *mean,
-            marker="D",
-            markersize=4.0,
-            color="white",
-            markeredgecolor=style.PRESENT,
-            markeredgewidth=1.1,
-        )
-        if record.truth_state is not None:
-            x, y = scales * record.truth_state[turn]
-            axes.plot(
-                x,
-                y,
-                marker="o",
-                markersize=9.0,
-                markerfacecolor="none",
-                markeredgecolor="white",
-                markeredgewidth=2.6,
-            )
-            axes.plot(
-                x,
-                y,
-                marker="o",
-                markersize=9.0,
-                markerfacecolor="none",
-                markeredgecolor=style.TRUTH,
-                markeredgewidth=1.2,
-            )
+        _mark_states(axes, record, turn)
         if row == rows - 1:
             axes.set_xlabel(state_label(record, 0), labelpad=2.0)
         else:
@@ -114,6 +85,22 @@ def _joint_figure(record: RunRecord) -> Figure:
         )  # fmt: skip
     figure.legend(handles=handles, loc="upper center", ncols=2, bbox_to_anchor=(0.5, 1.0))
     return figure
+
+
+def _mark_states(axes: Axes, record: RunRecord, turn: int) -> None:
+    """Mark the mean of the belief and the truth of a turn in a map of the joint states."""
+    scales = state_scales(record)
+    x, y = scales * record.filtered.mean[turn]
+    axes.plot(
+        x, y, marker="D", markersize=4.0, color="white", markeredgecolor=style.PRESENT, markeredgewidth=1.1
+    )
+    if record.truth_state is not None:
+        x, y = scales * record.truth_state[turn]
+        for color, width in (("white", 2.6), (style.TRUTH, 1.2)):
+            axes.plot(
+                x, y, marker="o", markersize=9.0, markerfacecolor="none", markeredgecolor=color,
+                markeredgewidth=width,
+            )  # fmt: skip
 
 
 def _marginal_figure(record: RunRecord) -> Figure:

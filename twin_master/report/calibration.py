@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from calibration.result import QUANTITIES, STATE
+from calibration.wing.result import QUANTITIES, STATE
 from reporting import figures as style
 from twin_master.report.data import RunRecord
 from twin_master.report.text import number

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.scenario import Scenario
-from twin_master.twin import build_graphical_model
+from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.schema import Scenario
 
 Float = NDArray[np.floating[Any]]
 Index = NDArray[np.int64]

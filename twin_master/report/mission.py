@@ -34,6 +34,7 @@ Float = NDArray[np.floating[Any]]
 _ROW_HEIGHT = 1.22
 _NARROW = 0.19
 _MANY_TURNS = 120  # more have no room for gaps between bars
+_MANY_DOTS = 1000
 _DASHES = (0, (3, 1.2))
 _TRUTH: dict[str, Any] = {
     "color": style.TRUTH,
@@ -160,7 +161,8 @@ def _sensor_panel(axes: Axes, record: RunRecord, sensor: int, now: int) -> str:
         observation = scale * record.observation[: now + 1 + record.horizon, sensor]
         turn = np.arange(len(observation))
         seen, later = turn <= now, turn > now
-        axes.plot(turn[seen], observation[seen], **_DOT, label="observed")
+        many = len(turn) > _MANY_DOTS  # as outlines they would make the page too large
+        axes.plot(turn[seen], observation[seen], **_DOT, label="observed", rasterized=many)
         axes.plot(turn[later], observation[later], **_DOT, markerfacecolor="none", label="observed later")
         lost = turn[seen & np.isnan(observation)]
         if len(lost):
@@ -177,9 +179,14 @@ def _sensor_panel(axes: Axes, record: RunRecord, sensor: int, now: int) -> str:
 def _control_panel(axes: Axes, record: RunRecord, _index: int, now: int) -> str:
     tallest, width = 0.82, 0.8 if now + record.horizon < _MANY_TURNS else 1.0
     for control in range(len(record.controls)):
-        flown = np.flatnonzero(record.control_index[: now + 1] == control)
-        colors = [style.PRESENT if turn == now else style.PAST for turn in flown]
-        axes.bar(flown, np.full(len(flown), tallest), width=width, bottom=control, color=colors, linewidth=0)
+        past = np.flatnonzero(record.control_index[:now] == control)
+        parts = np.split(past, np.flatnonzero(np.diff(past) > 1) + 1) if width == 1.0 else past[:, None]
+        bars = [(part[0] - width / 2, part[-1] - part[0] + width) for part in parts if len(part)]
+        axes.broken_barh(bars, (control, tallest), facecolors=style.PAST, linewidth=0)
+        if record.control_index[now] == control:
+            axes.broken_barh(
+                [(now - width / 2, width)], (control, tallest), facecolors=style.PRESENT, linewidth=0
+            )
         if record.control_probability is not None and record.horizon:
             axes.bar(
                 now + 1.0 + np.arange(record.horizon), tallest * record.control_probability[now, :, control],

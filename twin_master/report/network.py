@@ -21,7 +21,7 @@ _PLACES = {
     "S": (0.0, 2.3),
     "O": (0.0, 1.2),
     "D": (0.0, 0.0),
-    "Q": (-0.55, -1.15),
+    "Q": (0.75, -1.15),
     "R": (0.0, -2.3),
     "U": (1.0, 1.2),
 }
@@ -36,11 +36,20 @@ _LANES = {
 
 @dataclass(frozen=True)
 class Edge:
-    """An arrow of the network from one node to another, each named by letter and slice."""
+    """An arrow of the network from one node to another, each named by letter and slice.
+
+    A decision follows the policy: in the mission a control is decided in the step before, as it is flown; in
+    the prediction by the state of its own step.
+    """
 
     start: tuple[str, int]
     end: tuple[str, int]
     decision: bool = False
+
+    @property
+    def flown(self) -> bool:
+        """Whether it is a decision of the mission, not of the prediction."""
+        return self.decision and self.start[1] < self.end[1]
 
 
 def network_nodes() -> list[tuple[str, int]]:
@@ -64,9 +73,11 @@ def network_edges() -> list[Edge]:
             Edge(("D", number), ("Q", number)),
             Edge(("D", number), ("R", number)),
             Edge(("Q", number), ("R", number)),
+            Edge(("U", number), ("O", number)),
+            Edge(("U", number), ("Q", number)),
             Edge(("U", number), ("R", number)),
             Edge(("O", number), ("R", number)),
-            Edge(("D", number), ("U", number), decision=True),
+            Edge(("D", number), ("U", number + (number < _PAST_SLICES)), decision=True),
             Edge(("S", number), ("S", number + 1)),
             Edge(("D", number), ("D", number + 1)),
             Edge(("U", number), ("S", number + 1)),
@@ -102,8 +113,9 @@ def network_figure() -> Figure:
                 color=style.DECISION,
                 linestyle=(0, (3, 2)),
                 linewidth=1.3,
-                label="decides through the policy",
+                label="policy in the prediction",
             ),
+            Line2D([], [], color=style.DECISION, linewidth=1.3, label="decides what is flown next"),
         ]
         figure.legend(handles=handles, loc="lower center", ncols=len(handles), bbox_to_anchor=(0.5, 0.0))
     return figure
@@ -131,7 +143,14 @@ def _background(axes: Axes) -> None:
     for number, (name, step) in enumerate(zip(names, steps, strict=True)):
         x = _SPACING * number
         axes.text(
-            x, 2.95, f"{name}, {step}", ha="center", va="center", color=_color(number), fontweight="bold"
+            x,
+            2.95,
+            f"{name}, {step}",
+            ha="center",
+            va="center",
+            color=_color(number),
+            fontweight="bold",
+            parse_math=True,
         )
     for letter, lane in _LANES.items():
         axes.text(-2.28, _PLACES[letter][1], lane, ha="left", va="center", color=style.OBSERVED)
@@ -142,11 +161,14 @@ def _arrow(axes: Axes, edge: Edge) -> None:
     curvature = 0.0
     if edge.start[0] == "O" and edge.end[0] == "R":
         curvature = 0.70
+    if edge.flown:
+        curvature = 0.12  # clear of the observation
     axes.add_patch(
         FancyArrowPatch(
             _position(*edge.start), _position(*edge.end), arrowstyle="-|>", mutation_scale=8.0,
             connectionstyle=f"arc3,rad={curvature}", shrinkA=15.5, shrinkB=16.5,
-            linewidth=1.3 if edge.decision else 0.9, linestyle=(0, (3, 2)) if edge.decision else "-",
+            linewidth=1.3 if edge.decision else 0.9,
+            linestyle=(0, (3, 2)) if edge.decision and not edge.flown else "-",
             color=style.DECISION if edge.decision else style.OBSERVED, zorder=1.0,
         )
     )  # fmt: skip
@@ -173,4 +195,13 @@ def _node(axes: Axes, letter: str, number: int) -> None:
         axes.add_patch(Circle((x, y), _RADIUS, **outline))
     offset = number - (_PAST_SLICES - 1)
     index = "t_c" if offset == 0 else f"t_c{offset:+d}"
-    axes.text(x, y - 0.01, f"${letter}_{{{index}}}$", ha="center", va="center", fontsize=6.8, zorder=3.0)
+    axes.text(
+        x,
+        y - 0.01,
+        f"${letter}_{{{index}}}$",
+        ha="center",
+        va="center",
+        fontsize=6.8,
+        zorder=3.0,
+        parse_math=True,
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,8 +38,9 @@ from twin_master.report.text import (
     turn_ranges,
 )
 from twin_master.report.view import choose_sensors, default_now, sensor_title, sensor_word, state_scale
+from twin_master.store.outcome import REPORT_NAME
+from twin_master.store.summary import control_changes
 
-REPORT_NAME = "report.html"
 FIGURE_FOLDER = "figures"
 TRUTH_IS_OFF = 3.0
 """Standard deviations of the calibration beyond which a true parameter is pointed out."""
@@ -75,7 +76,17 @@ class ReportFigure:
     caption: str
 
 
-def write_report(run_folder: Path, *, now: int | None = None) -> Path:
+@dataclass(frozen=True)
+class Drawing:
+    """A figure as it stands in the page; the attributes are those of `ReportFigure`."""
+
+    name: str
+    svg: bytes
+    title: str
+    caption: str
+
+
+def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
     """Write ``report.html`` and ``figures/`` of a run; return the path of the page.
 
     Equal runs give equal bytes: wall-clock figures stay in ``timing.json``.
@@ -95,24 +106,34 @@ def write_report(run_folder: Path, *, now: int | None = None) -> Path:
         The disk is full or the folder cannot be written.
     """
     record = read_run(Path(run_folder))
-    present = default_now(record) if now is None else now
-    figures = {figure.name: figure for figure in report_figures(record, present)}
-    drawings = {name: to_svg(figure.figure) for name, figure in figures.items()}
     folder = Path(run_folder) / FIGURE_FOLDER
-    for name, drawing in drawings.items():
-        atomic_write_bytes(folder / f"{name}.svg", drawing)
-    atomic_write_bytes(folder / f"{MAIN_FIGURE}.png", to_png(figures[MAIN_FIGURE].figure))
-    return atomic_write_text(Path(run_folder) / REPORT_NAME, render_page(record, figures, drawings))
+    drawings = []
+    for figure in report_figures(record, now):
+        drawing = to_svg(figure.figure)
+        drawings.append(Drawing(figure.name, drawing, figure.title, figure.caption))
+        atomic_write_bytes(folder / f"{figure.name}.svg", drawing)
+        if figure.name == MAIN_FIGURE:
+            atomic_write_bytes(folder / f"{MAIN_FIGURE}.png", to_png(figure.figure))
+    return atomic_write_text(Path(run_folder) / REPORT_NAME, render_page(record, drawings))
 
 
-def report_figures(record: RunRecord, now: int) -> list[ReportFigure]:
-    """Draw every figure for which the run has data.
+def report_figures(run: RunRecord | Path | str, now: int | None = None) -> Iterator[ReportFigure]:
+    """Draw every figure for which a run has data, one after the other: those of a long mission are large.
+
+    Parameters
+    ----------
+    run : RunRecord or path
+        The run, or its folder.
+    now : int, optional
+        The present turn of the first figure; by default shortly before the control first changes.
 
     Raises
     ------
     RunFolderError
-        `now` is no turn of the run.
+        There is no run, it is damaged or of another layout, or `now` is no turn of it.
     """
+    record = run if isinstance(run, RunRecord) else read_run(Path(run))
+    now = default_now(record) if now is None else now
     sensors = choose_sensors(record)
     last = record.step_count - 1
     if not 0 <= now <= last:
@@ -120,40 +141,30 @@ def report_figures(record: RunRecord, now: int) -> list[ReportFigure]:
     step = record.step_word
     drawing = mission_figure(record, now, sensors)
     title = f"The mission as the twin sees it at {step} {now}"
-    figures = [ReportFigure(MAIN_FIGURE, drawing, title, mission_caption(record, now))]
+    yield ReportFigure(MAIN_FIGURE, drawing, title, mission_caption(record, now))
     if now != last:
         drawing = mission_figure(record, last, sensors)
         title = f"The whole mission, seen from its last {step}"
-        figures.append(ReportFigure("mission_whole", drawing, title, mission_caption(record, last)))
-    figures.append(
-        ReportFigure("belief", belief_figure(record), "The belief about the state", belief_caption(record))
-    )
+        yield ReportFigure("mission_whole", drawing, title, mission_caption(record, last))
+    yield ReportFigure("belief", belief_figure(record), "The belief about the state", belief_caption(record))
     policy = policy_figure(record)
     if policy is not None:
-        figures.append(ReportFigure("policy", policy, "The policy", policy_caption(record)))
+        yield ReportFigure("policy", policy, "The policy", policy_caption(record))
     check = predictive_check(record)
     if check is not None:
         drawing = check_figure(record, check)
-        figures.append(
-            ReportFigure("check", drawing, "Posterior predictive check", check_caption(record, check))
-        )
+        yield ReportFigure("check", drawing, "Posterior predictive check", check_caption(record, check))
     view = calibration_view(record)
     if view is not None:
         drawing = calibration_figure(view)
-        title = "What the model was tailored with"
-        figures.append(ReportFigure("calibration", drawing, title, calibration_caption(view)))
-    figures.append(
-        ReportFigure(
-            "network",
-            network_figure(),
-            f"The dynamic decision network for a few {step}s",
-            network_caption(record),
+        yield ReportFigure(
+            "calibration", drawing, "What the model was tailored with", calibration_caption(view)
         )
-    )
-    return figures
+    title = f"The dynamic decision network for a few {step}s"
+    yield ReportFigure("network", network_figure(), title, network_caption(record))
 
 
-def render_page(record: RunRecord, figures: Mapping[str, ReportFigure], drawings: Mapping[str, bytes]) -> str:
+def render_page(record: RunRecord, drawings: Sequence[Drawing]) -> str:
     """Return the page: outcome, mission, belief, decision, check, model and run."""
     mission = record.scenario.get("mission")
     mission = mission if isinstance(mission, Mapping) else {}
@@ -172,11 +183,11 @@ def render_page(record: RunRecord, figures: Mapping[str, ReportFigure], drawings
         ("Whether the data agree", ("check",)),
         ("The model", ("calibration", "network")),
     ):
-        present = [figures[key] for key in names if key in figures]
+        present = [drawing for drawing in drawings if drawing.name in names]
         if present:
             page.add_section(title)
         for figure in present:
-            page.add_figure(drawings[figure.name], figure.caption, title=figure.title)
+            page.add_figure(figure.svg, figure.caption, title=figure.title)
             if figure.name == "calibration":
                 _add_calibrated_wing(page, calibration_view(record))
     page.add_section("The run")
@@ -195,6 +206,8 @@ def _summary_figures(record: RunRecord) -> list[Mapping[str, Any]]:
 
 
 def _add_outcome(page: Page, record: RunRecord) -> None:
+    said = control_changes(record.controls, record.control_index, record.step_word)
+    page.add_paragraph(f"The twin {said}." if said.startswith("left") else f"The twin flew {said}.")
     page.add_highlights(_highlights(record))
     for text in _notices(record):
         page.add_notice(text)
@@ -241,7 +254,7 @@ def _highlights(record: RunRecord) -> list[tuple[str, str]]:
     if len(changes):
         first = int(changes[0])
         before, after = (record.controls[record.control_index[turn]] for turn in (first - 1, first))
-        items.append((f"{record.step_word} {first}", f"first change of control, from {before} to {after}"))
+        items.append((f"{record.step_word} {first}", f"left {before} for {after}"))
     else:
         items.append((record.controls[record.control_index[0]], f"control of every {record.step_word}"))
     check = predictive_check(record)

@@ -11,10 +11,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from reporting.errors import DamagedFileError
+from reporting.folders import restore_folder
+from reporting.netcdf import read_groups
 from twin_master.errors import RunFolderError
 from twin_master.report.data import NORMAL_95, Estimate, PolicyTable, RunRecord, Uncertain, moments
 
 Float = NDArray[np.floating[Any]]
+
+_ROUNDING = 1e-6
 
 
 def read_run(folder: Path) -> RunRecord:
@@ -26,28 +31,77 @@ def read_run(folder: Path) -> RunRecord:
         There is no ``run.nc``, it is damaged, or it has another layout.
     """
     path = folder / "run.nc"
-    if not path.is_file():
-        raise RunFolderError(
-            f"{folder} holds no run.nc, so there is no run to report: fly or resume the run first."
-        )
-    groups, attributes = _read_groups(path)
+    tree = open_run(folder)
+    groups = {name: tree[name].to_dataset() for name in tree.children}
+    attributes = {str(name): value for name, value in tree.attrs.items()}
     try:
-        return _record(groups, attributes, folder)
-    except (KeyError, ValueError, IndexError, TypeError) as error:
+        record = _record(groups, attributes, folder)
+        _check_values(record)
+    except (KeyError, ValueError, IndexError, TypeError, AttributeError, OverflowError) as error:
         reason = error.args[0] if error.args else error
         raise RunFolderError(
             f"{path} does not have the layout of a run of this version ({reason}): fly the run again."
         ) from error
+    return record
 
 
-def _read_groups(path: Path) -> tuple[dict[str, xr.Dataset], dict[str, Any]]:
+def open_run(folder: Path | str) -> xr.DataTree:
+    """Return everything that a run left, `run.nc`, as labelled arrays in memory.
+
+    Parameters
+    ----------
+    folder : path
+        The run folder.
+
+    Returns
+    -------
+    xarray.DataTree
+        The groups `observed`, `filtered`, `smoothed`, `predicted`, `policy`, `calibration` and `truth`; each
+        variable has its unit in `.attrs["units"]`. See `docs/run_folder.md`.
+
+    Raises
+    ------
+    RunFolderError
+        There is no ``run.nc``, or it is damaged.
+    """
+    path = Path(folder) / "run.nc"
+    restore_folder(path.parent)
+    if not path.is_file():
+        raise RunFolderError(
+            f"{folder} holds no run.nc, so there is no run to report: fly or resume the run first."
+        )
     try:
-        with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as tree:
-            groups = {name: tree[name].to_dataset().load() for name in tree.children}
-            attributes = {str(name): value for name, value in tree.attrs.items()}
-    except (OSError, ValueError, KeyError, RuntimeError, AttributeError) as error:
-        raise RunFolderError(f"{path} is damaged and cannot be read ({error}): fly the run again.") from error
-    return groups, attributes
+        return read_groups(path)
+    except DamagedFileError as error:
+        raise RunFolderError(
+            f"{error}, so that it cannot be read: resume the run or fly it again."
+        ) from error
+
+
+def _check_values(record: RunRecord) -> None:
+    """Refuse what no twin has ever stored; the figures rely on it."""
+    controls, (lowest, highest) = len(record.controls), (0, len(record.controls) - 1)
+    indices = [("observed/control_index", record.control_index)]
+    if record.policy is not None:
+        indices.append(("policy/control_index", record.policy.control_index))
+    for name, values in indices:
+        if values.size and not (lowest <= values.min() and values.max() <= highest):
+            raise ValueError(f"{name} goes beyond its {controls} controls")
+    for name, estimate in (
+        ("filtered", record.filtered),
+        ("smoothed", record.smoothed),
+        ("predicted", record.predicted),
+    ):
+        if estimate is None:
+            continue
+        total = estimate.probability.sum(axis=-1)
+        if not (np.all(estimate.probability >= 0.0) and np.all(np.abs(total - 1.0) < _ROUNDING)):
+            raise ValueError(f"a row of {name}/probability is no distribution")
+        for part in (estimate.mean, estimate.standard_deviation):
+            if not np.all(np.isfinite(part)):
+                raise ValueError(f"a moment of {name} is not finite")
+    if not np.all(np.isfinite(record.coordinates)):
+        raise ValueError("a level of the state is not finite")
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -94,15 +148,18 @@ def _estimate(dataset: xr.Dataset | None, group: str, coordinates: Float, *lead:
     if dataset is None or "probability" not in dataset:
         return None
     probability = _needed(dataset, group, "probability", *lead, "state")
-    mean, deviation = moments(probability, coordinates)
-    stored_mean = _array(dataset, "mean", *lead, "region")
-    stored_deviation = _array(dataset, "standard_deviation", *lead, "region")
+    mean = _array(dataset, "mean", *lead, "region")
+    deviation = _array(dataset, "standard_deviation", *lead, "region")
+    if mean is None or deviation is None:
+        mean, deviation = moments(probability, coordinates)
     return Estimate(
         probability=probability,
-        mean=mean if stored_mean is None else stored_mean,
-        standard_deviation=deviation if stored_deviation is None else stored_deviation,
+        mean=mean,
+        standard_deviation=deviation,
         quantity=_uncertain(dataset, "quantity", *lead, "sensor"),
-        quantity_standard_deviation=_array(dataset, "quantity_standard_deviation", *lead, "sensor"),
+        quantity_standard_deviation=None
+        if group == "predicted"  # nothing of the report shows it, and it is large
+        else _array(dataset, "quantity_standard_deviation", *lead, "sensor"),
         reward=_uncertain(dataset, "reward", *lead, "reward"),
     )
 
@@ -115,8 +172,11 @@ def _uncertain(dataset: xr.Dataset, name: str, *dimensions: str) -> Uncertain | 
     )
     if mean is None:
         return None
-    half = np.zeros_like(mean) if deviation is None else NORMAL_95 * deviation
-    return Uncertain(mean, mean - half if lower is None else lower, mean + half if upper is None else upper)
+    if lower is None or upper is None:
+        half = np.zeros_like(mean) if deviation is None else NORMAL_95 * deviation
+        lower = mean - half if lower is None else lower
+        upper = mean + half if upper is None else upper
+    return Uncertain(mean, lower, upper)
 
 
 def _coordinates(groups: Mapping[str, xr.Dataset], names: tuple[str, ...]) -> Float:

@@ -1,4 +1,4 @@
-/* The reduced model: what fe/reduced_arrays.py describes, with a few arrays laid out anew for speed. */
+/* The reduced model: what fe/runtime/reduced_arrays.py describes, with a few arrays laid out anew for speed. */
 #ifndef WING_MODEL_H
 #define WING_MODEL_H
 

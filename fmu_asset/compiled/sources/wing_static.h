@@ -1,6 +1,6 @@
 /* The steady turn: static response to lift and tip force, with its certified error bound.
 
-   Kapteyn et al. 2021, eqs. (13), (15); the bound is that of fe/reduced.py. The response is linear in the loads,
+   Kapteyn et al. 2021, eqs. (13), (15); the bound is that of fe/runtime/reduced.py. The response is linear in the loads,
    so that the solutions under one unit of each load are kept as long as the stiffness stays. What is kept never
    changes a result: it is a function of the stiffness alone. */
 #ifndef WING_STATIC_H

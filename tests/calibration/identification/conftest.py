@@ -12,7 +12,7 @@ from calibration.identification.comparison import outputs
 from calibration.identification.local_model import LocalModel, build_local_model
 from calibration.identification.parameters import FreeParameter, wing_parameters
 from calibration.identification.targets import LEVELS, MASS_TOTAL, REFERENCE_PITOT, Targets, read_targets
-from fe.design import WingDesign, load_design
+from fe.wing.design import WingDesign, load_design
 
 ROWS = 12
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.identification.design_file import DIGITS, _number, design_toml, rounded
-from fe.design import SHIPPED_DESIGN, load_design, parse_design
+from fe.wing.design import SHIPPED_DESIGN, load_design, parse_design
 
 
 def test_a_written_design_is_read_back() -> None:

@@ -8,11 +8,11 @@ import pytest
 from calibration.errors import IdentificationError
 from calibration.identification import least_squares
 from calibration.identification.identifiability import analyse, profile
-from calibration.identification.least_squares import Fit, identify, minimise_local
+from calibration.identification.least_squares import DesignFit, identify, minimise_local
 from calibration.identification.local_model import LocalModel
 from calibration.identification.parameters import FreeParameter, scaled, values_of, with_values
 from calibration.identification.targets import Targets, Weights
-from fe.design import WingDesign
+from fe.wing.design import WingDesign
 
 FREE = ("skin modulus at 0", "flap root spring", "net lift at 3g", "skin density", "cluster 1 chord")
 
@@ -31,7 +31,9 @@ def free(some_parameters: tuple[FreeParameter, ...], virtual_design: WingDesign)
 
 
 @pytest.fixture(scope="module")
-def recovered(virtual_design: WingDesign, free: tuple[FreeParameter, ...], virtual_targets: Targets) -> Fit:
+def recovered(
+    virtual_design: WingDesign, free: tuple[FreeParameter, ...], virtual_targets: Targets
+) -> DesignFit:
     truth = values_of(virtual_design, free)
     offset = np.array([0.05, -0.06, 0.1, -0.05, 0.06])
     width = np.array([parameter.standard_deviation for parameter in free])
@@ -40,7 +42,7 @@ def recovered(virtual_design: WingDesign, free: tuple[FreeParameter, ...], virtu
 
 
 def test_known_numbers_are_recovered(
-    recovered: Fit, virtual_design: WingDesign, free: tuple[FreeParameter, ...]
+    recovered: DesignFit, virtual_design: WingDesign, free: tuple[FreeParameter, ...]
 ) -> None:
     assert recovered.converged
     assert recovered.iterations[0].objective > 100.0 * recovered.iterations[-1].objective
@@ -50,7 +52,7 @@ def test_known_numbers_are_recovered(
 
 
 def test_the_solution_is_a_fixed_point(
-    recovered: Fit, free: tuple[FreeParameter, ...], virtual_targets: Targets
+    recovered: DesignFit, free: tuple[FreeParameter, ...], virtual_targets: Targets
 ) -> None:
     again = identify(recovered.design, free, virtual_targets, tolerance=2e-4)
     assert again.converged
@@ -93,7 +95,7 @@ def test_a_start_outside_the_bounds_is_refused(
         identify(virtual_design, [narrow], virtual_targets)
 
 
-def test_the_analysis_tells_known_from_unknown(recovered: Fit, virtual_targets: Targets) -> None:
+def test_the_analysis_tells_known_from_unknown(recovered: DesignFit, virtual_targets: Targets) -> None:
     analysis = analyse(recovered, virtual_targets, Weights())
     jacobian = analysis.singular_values[:, None] * analysis.directions
     covariance = np.linalg.inv(jacobian.T @ jacobian + np.eye(len(FREE)))
@@ -106,7 +108,9 @@ def test_the_analysis_tells_known_from_unknown(recovered: Fit, virtual_targets: 
     assert nothing.width == pytest.approx(np.ones(len(FREE)))
 
 
-def test_a_profile_of_a_nearly_linear_number_is_a_parabola(recovered: Fit, virtual_targets: Targets) -> None:
+def test_a_profile_of_a_nearly_linear_number_is_a_parabola(
+    recovered: DesignFit, virtual_targets: Targets
+) -> None:
     analysis = analyse(recovered, virtual_targets, Weights())
     found = profile(recovered, virtual_targets, Weights(), analysis, "net lift at 3g")
     assert found.rise.min() == pytest.approx(0.0, abs=1e-3)

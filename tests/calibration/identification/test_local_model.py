@@ -8,10 +8,10 @@ from calibration.identification.parameters import FreeParameter, deviations, val
 from calibration.identification.pieces import reduced, wing_pieces
 from calibration.identification.residuals import fitted_residuals
 from calibration.identification.targets import Targets, Weights
-from fe.design import WingDesign
-from fe.modes import eigenmodes
-from fe.operators import assemble
-from fe.statics import solve_static, tip_stiffness
+from fe.full.modes import eigenmodes
+from fe.full.operators import assemble
+from fe.full.statics import solve_static, tip_stiffness
+from fe.wing.design import WingDesign
 
 
 @pytest.mark.parametrize("relief", [False, True])

@@ -17,7 +17,7 @@ from calibration.identification.parameters import (
     wing_parameters,
     with_values,
 )
-from fe.design import WingDesign, load_design
+from fe.wing.design import WingDesign, load_design
 
 DESIGN = load_design()
 PARAMETERS = wing_parameters(DESIGN)

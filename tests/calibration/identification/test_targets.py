@@ -93,12 +93,12 @@ def test_a_renamed_column_and_a_nan_are_named(published_folder: Path) -> None:
     results = published_folder / RESULTS
     text = results.read_text()
     results.write_text(text.replace("freq_2\n", "second\n"))
-    with pytest.raises(ExperimentFileError, match="lacks the column freq_2"):
+    with pytest.raises(ExperimentFileError, match="no column 'freq_2'"):
         read_targets(published_folder)
     lines = text.splitlines()
     lines[3] = ",".join(["nan", *lines[3].split(",")[1:]])
     results.write_text("\n".join(lines) + "\n")
-    with pytest.raises(ExperimentDataError, match="e_sample of row 3 is 'nan'"):
+    with pytest.raises(ExperimentDataError, match="line 4: column 'e_sample' holds nan"):
         read_targets(published_folder)
     results.write_text("\n".join(text.splitlines()[:6]) + "\n")
     with pytest.raises(ExperimentDataError, match="holds 5 rows; at least 10"):

@@ -13,16 +13,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from benchmarks.cantilever import LENGTH, TIP, Cantilever, campaign
-from discrepancy.campaign import Campaign, Channel, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.noise import aliased
+from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
 from discrepancy.catalogue.clock_and_lines import mains_lines
 from discrepancy.catalogue.damping import loss_integral
 from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Effect, Prior, Setting
 from discrepancy.catalogue.library import library
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import Conditions
-from discrepancy.noise import aliased
-from discrepancy.sensing import observe
-from fe.patch import (
+from discrepancy.models.sensing import observe
+from fe.runtime.patch import (
     EVERY_CHANNEL,
     SENSORS,
     DecayingLine,

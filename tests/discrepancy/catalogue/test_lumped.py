@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from benchmarks.cantilever import campaign
-from discrepancy.campaign import Channel, NoiseRecord, Quantity, Release
+from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Release
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.sensing import observe
-from fe.patch import ModelPatch
+from discrepancy.models.sensing import observe
+from fe.runtime.patch import ModelPatch
 
 OUTPUTS = {"tip": ("x3", Quantity.DISPLACEMENT), "g0": ("base_strain", Quantity.STRAIN)}
 

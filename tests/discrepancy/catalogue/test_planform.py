@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from discrepancy.campaign import Campaign, Release, TrialKind
+from discrepancy.campaign.records import Campaign, Release, TrialKind
 from discrepancy.catalogue.damping import loss_integral
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import library
 from discrepancy.models.wing import WingModel
-from fe.patch import PowerDamping, PowerStiffness
-from fe.patch_arrays import PatchArrays
+from fe.runtime.patch import PowerDamping, PowerStiffness
+from fe.runtime.patch_arrays import PatchArrays
 from tests.discrepancy.models.test_wing import RING
 
 RELEASE = 0.03

@@ -12,8 +12,8 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library, load_catalogue
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import Conditions
-from discrepancy.sensing import observe
-from fe.patch import PointMass, PowerDamping, PowerStiffness
+from discrepancy.models.sensing import observe
+from fe.runtime.patch import PointMass, PowerDamping, PowerStiffness
 
 PYLON = """
 id = "store_pylon"
@@ -185,7 +185,7 @@ def test_an_effect_whose_place_is_no_port(write, setting: Setting) -> None:
         ('station = "length / 2"', "station = \"__import__('os')\"", "may hold numbers, names"),
         ('station = "length / 2"', "station = [1.0]", "'station' must be a finite number"),
         ("[[primitives]]", "[[primitive]]", "unknown key 'primitive'"),
-        ('id = "store_pylon"', "id = store", "is not TOML"),
+        ('id = "store_pylon"', "id = store", "is not valid TOML"),
     ],
 )
 def test_a_bad_entry_is_refused_with_one_sentence(write, old: str, new: str, sentence: str) -> None:

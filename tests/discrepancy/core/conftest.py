@@ -11,15 +11,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from discrepancy.campaign import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
-from discrepancy.candidate import Candidate
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.linearisation import Point
+from discrepancy.fits.problem import Problem
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.problem import Point, Problem
-from discrepancy.sensing import observe
-from fe.patch import ModelPatch, Primitive, RunOffset, SensorDrift
+from discrepancy.models.sensing import observe
+from fe.runtime.patch import ModelPatch, Primitive, RunOffset, SensorDrift
 
 FloatArray = NDArray[np.float64]
 

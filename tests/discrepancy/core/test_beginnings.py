@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from discrepancy.beginnings import Beginnings
-from discrepancy.candidate import Candidate, Term
-from discrepancy.fitting import fit
-from discrepancy.problem import Point
-from discrepancy.promising import are_related
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.linearisation import Point
+from discrepancy.search.growing_records import Beginnings
+from discrepancy.search.starting_points import are_related
 
 
 @pytest.mark.parametrize(

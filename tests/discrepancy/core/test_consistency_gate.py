@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom, kstest
 
-from discrepancy.campaign import NoiseRecord, TrialKind
-from discrepancy.candidate import Candidate, Term
+from discrepancy.campaign.records import NoiseRecord, TrialKind
 from discrepancy.catalogue.entry import Setting
-from discrepancy.consistency_gate import (
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.gates import absolute_gate
+from discrepancy.fits.problem import Problem
+from discrepancy.judgement.consistency_gate import (
     CONSISTENCY_LEVEL,
     _by_channel,
     _by_run,
@@ -20,10 +23,7 @@ from discrepancy.consistency_gate import (
     consistency_tests,
     score_tests,
 )
-from discrepancy.fitting import fit
-from discrepancy.gates import absolute_gate
-from discrepancy.naming import name
-from discrepancy.problem import Problem
+from discrepancy.judgement.naming import name
 from discrepancy.verdict import VerdictKind
 
 STATIONS = {"y1": 0.2, "y2": 0.6, "y3": 0.9}

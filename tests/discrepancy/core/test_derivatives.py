@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from discrepancy.campaign import NoiseRecord
-from discrepancy.candidate import Candidate, Term
+from discrepancy.campaign.records import NoiseRecord
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier
-from discrepancy.fitting import fit
-from discrepancy.problem import PARAMETER_STEP, Problem
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.linearisation import PARAMETER_STEP
+from discrepancy.fits.problem import Problem
 
 FloatArray = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
-from discrepancy.campaign import NoiseRecord
-from discrepancy.candidate import Candidate, Term
-from discrepancy.fitting import fit
-from discrepancy.problem import Problem
+from discrepancy.campaign.records import NoiseRecord
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.problem import Problem
 
 CANDIDATES = ("none", "offset", "both")
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from discrepancy.look_alikes import look_alike_remark
+from discrepancy.judgement.look_alikes import look_alike_remark
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
-from fe.patch import ModelPatch
+from fe.runtime.patch import ModelPatch
 
 
 def verdict_on(catalogue, *identifiers: str, kind: VerdictKind = VerdictKind.NAMED) -> Verdict:  # type: ignore[no-untyped-def]

@@ -9,7 +9,7 @@ import numpy as np
 
 from discrepancy.models.interface import Conditions
 from discrepancy.models.memo import MemoModel
-from fe.patch import ModelPatch
+from fe.runtime.patch import ModelPatch
 
 
 def test_trials_that_came_and_went_are_not_mistaken_for_each_other(kit) -> None:  # type: ignore[no-untyped-def]

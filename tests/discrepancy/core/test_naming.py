@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from discrepancy.candidate import Candidate, Term
-from discrepancy.fitting import fit
-from discrepancy.gates import SHAPE_GAIN
-from discrepancy.hypotheses import LARGEST_SET, key_of
-from discrepancy.naming import _open, name
-from discrepancy.search import FINE_JOINT
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.gates import SHAPE_GAIN
+from discrepancy.judgement.naming import _open, name
+from discrepancy.search.hypotheses import key_of
+from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Verdict, VerdictKind
-from fe.patch import ModelPatch, PowerDamping
+from fe.runtime.patch import ModelPatch, PowerDamping
 
 NO_NAME = (
     VerdictKind.NOTHING_MISSING,
@@ -87,7 +87,7 @@ def test_a_joint_that_slips_is_named_with_many_elements(small, catalogue, slip_r
     (effect,) = verdict.effects
     assert effect.identifier == "joint_micro_slip"
     (found,) = effect.patch
-    assert found.element_count == FINE_JOINT
+    assert found.element_count == SEARCH.fine_joint
     for estimate in effect.parameters:
         middle, half = 0.5 * (estimate.low + estimate.high), 0.5 * (estimate.high - estimate.low)
         assert abs(values[estimate.name] - middle) <= 2.0 * half, estimate
@@ -277,7 +277,7 @@ def test_a_law_of_free_shape_beside_two_effects_is_no_verdict(small, effects) ->
     run = next(item for item in effects if item.identifier == "seating_offset").places(small.setting)[0]
     others = others + small.patch("seating_offset", {"offset_ratio": 0.05}, run)
     verdict, found, _ = name(small.problem(small.measured(3, law + others)), effects)
-    assert len(found.best().candidate.terms) == LARGEST_SET
+    assert len(found.best().candidate.terms) == SEARCH.largest_set
     assert verdict.kind is VerdictKind.UNEXPLAINED, verdict.sentence
     assert "shape of its own" in verdict.sentence
     assert {"gauge_gain", "seating_offset"} < set(verdict.resembles)

@@ -10,13 +10,14 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from discrepancy.campaign import Campaign, Channel, NoiseRecord, Quantity, TrialKind
-from discrepancy.candidate import Candidate, Term
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier
-from discrepancy.fitting import fit
-from discrepancy.next_experiment import Proposal, mutual_information, next_experiments, proposals
-from discrepancy.problem import Point, Problem
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.linearisation import Point
+from discrepancy.fits.problem import Problem
+from discrepancy.judgement.next_experiment import Proposal, mutual_information, next_experiments, proposals
 
 TIGHT = {"slope": (1.0, 1e-9), "curvature": (0.5, 1e-9)}
 

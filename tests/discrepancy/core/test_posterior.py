@@ -8,14 +8,14 @@ from math import sin
 import numpy as np
 import pytest
 
-from discrepancy.candidate import Candidate, Term
 from discrepancy.catalogue.entry import Effect
-from discrepancy.fitting import fit
-from discrepancy.naming import named_effects
-from discrepancy.posterior import ensemble, with_draws
-from discrepancy.screening import Screen
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.posterior import ensemble, with_draws
+from discrepancy.fits.screening import Screen
+from discrepancy.judgement.naming import named_effects
 from discrepancy.workflow import patch_draws
-from fe.patch import ModelPatch, RunOffset
+from fe.runtime.patch import ModelPatch, RunOffset
 
 RIPPLES = 200.0
 """Waves of the ripple in a metre, over 2 pi."""

@@ -7,11 +7,12 @@ from math import inf
 
 import numpy as np
 
-from discrepancy.campaign import NoiseRecord
-from discrepancy.candidate import Candidate
-from discrepancy.fitting import fit
-from discrepancy.predictive import residual_set
-from discrepancy.problem import Point, Problem
+from discrepancy.campaign.records import NoiseRecord
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.linearisation import Point
+from discrepancy.fits.predictive import residual_set
+from discrepancy.fits.problem import Problem
 
 
 def held_out_problem(kit, seed, **more):  # type: ignore[no-untyped-def]

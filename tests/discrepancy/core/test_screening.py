@@ -7,10 +7,11 @@ from math import sqrt
 import numpy as np
 import pytest
 
-from discrepancy.candidate import Candidate, Term
-from discrepancy.fitting import fit
-from discrepancy.promising import pairs
-from discrepancy.screening import LINEAR, Change, Screen, grid, rescaled
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.screening import Change, Screen, grid, rescaled
+from discrepancy.search.starting_points import pairs
+from discrepancy.search_settings import SEARCH
 
 
 def separation(first: Change, second: Change, sign: np.ndarray) -> float:
@@ -135,7 +136,7 @@ def test_grids_hold_one_scale_and_every_level(catalogue) -> None:  # type: ignor
                 assert len(found) == first.levels
                 assert min(found) == pytest.approx(-max(found))
             else:
-                assert found == ({1.0, LINEAR} if signed else {0.0})
+                assert found == ({1.0, SEARCH.linear} if signed else {0.0})
         # none of them is the model as it was
         for point in points:
             values = term.values(point)

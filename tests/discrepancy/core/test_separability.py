@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from benchmarks.cantilever import Cantilever, campaign
-from discrepancy.campaign import Campaign, Channel, NoiseRecord, Quantity, Release, TrialKind
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, TrialKind
 from discrepancy.catalogue.entry import Setting
+from discrepancy.judgement.separability import CONFUSED, Separability, _groups, as_predicted, separability
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.separability import CONFUSED, Separability, _groups, as_predicted, separability
 
 ONE_MODE = """
 format = 1
@@ -145,6 +145,22 @@ def test_a_whole_laboratory_test_separates(bench, catalogue) -> None:  # type: i
     np.testing.assert_array_equal(np.diag(found.distance), 0.0)
     for item in found.detectability:
         assert item.detectable < item.typical
+
+
+def test_an_effect_that_nobody_sees_is_not_confused_with_all_others(bench, catalogue) -> None:  # type: ignore[no-untyped-def]
+    """A gain of a millionth is within the noise of anything; at a size that is seen, of none."""
+    effects = []
+    for effect in chosen(catalogue, ("root_compliance", "quadratic_damping", "gauge_gain")):
+        if effect.identifier == "gauge_gain":
+            (gain,) = effect.parameters
+            small = replace(gain.prior, low=1e-4 * gain.prior.low, high=1e-4 * gain.prior.high)
+            effect = replace(effect, parameters=(replace(gain, prior=small),))
+        effects.append(effect)
+    found = decided(bench.model, bench.campaign, effects)
+    sizes = {item.effect.identifier: item.distance for item in found.detectability}
+    assert 1e-6 < sizes["gauge_gain"] < 0.1 * CONFUSED
+    assert "gauge_gain" in found.identifiers
+    assert found.groups == ()
 
 
 def test_measured_values_do_not_count(bench, catalogue) -> None:  # type: ignore[no-untyped-def]

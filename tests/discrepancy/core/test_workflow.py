@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from discrepancy.candidate import Candidate
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
 from discrepancy.errors import CampaignDataError
-from discrepancy.examples import example_campaign, plan_for
+from discrepancy.fits.candidate import Candidate
+from discrepancy.judgement.separability import as_predicted
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.separability import as_predicted
+from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate, open_hypotheses, patch_draws, solver_share, without_port
 

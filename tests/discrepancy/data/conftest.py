@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from discrepancy.campaign import Campaign, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
-from fe.patch import ModelPatch, Primitive
+from fe.runtime.patch import ModelPatch, Primitive
 
 # Gauges of a square patch of skin in plane stress: strain along, across, shear per metre of displacement.
 GAUGES = {

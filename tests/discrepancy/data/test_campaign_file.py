@@ -12,12 +12,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from discrepancy.campaign import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
-from discrepancy.campaign_file import read_campaign
-from discrepancy.campaign_schema import INPUT_COLUMNS
-from discrepancy.campaign_writer import write_campaign
+from discrepancy.campaign.noise_records import pre_trigger_record
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.schema import INPUT_COLUMNS
+from discrepancy.campaign.writing import write_campaign
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
-from discrepancy.noise_records import pre_trigger_record
 
 TOML = """
 format = 1
@@ -317,7 +317,7 @@ WRONG_TOML = [
     ("reference_temperature = 20.0", "", "the campaign has no `reference_temperature`"),
     ("standard_deviation = 0.05", "standard_deviation = 0", "should be greater than 0"),
     ("z1 = 0.2", "z1 = 20", "less than or equal to 1, and 20 came"),
-    ("[noise]", "[noise", "is not a TOML file"),
+    ("[noise]", "[noise", "is not valid TOML"),
 ]  # fmt: skip
 WRONG_TABLES = [
     ("tip_up", "load,g17\n1,2\n", CampaignFileError, "tip_up.csv has no column 'force', .*are load, g17"),
@@ -361,7 +361,7 @@ def test_a_wrong_key_is_named_in_one_sentence(tmp_path: Path, old: str, new: str
     folder = folder_of(tmp_path, TOML.replace(old, new, 1))
     with pytest.raises(CampaignFileError, match=sentence) as caught:
         read_campaign(folder)
-    if "not a TOML" not in sentence:
+    if "not valid TOML" not in sentence:
         check_sentence(str(caught.value))
 
 

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from discrepancy.campaign import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
-from discrepancy.data_quality import (
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
+from discrepancy.checks.outliers import sample_outliers, wrong_ends
+from discrepancy.checks.quality import (
     FaultKind,
     check_against_model,
     check_data,
@@ -19,9 +20,8 @@ from discrepancy.data_quality import (
     require_sound,
 )
 from discrepancy.errors import CampaignDataError
-from discrepancy.examples import ExamplePlan, example_campaign
-from discrepancy.outliers import sample_outliers, wrong_ends
-from fe.patch import HighPass, ModelPatch, SensorDrift, SensorGain
+from discrepancy.sources.examples import ExamplePlan, example_campaign
+from fe.runtime.patch import HighPass, ModelPatch, SensorDrift, SensorGain
 
 PLAN = ExamplePlan(
     (

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from discrepancy.campaign import TrialKind
-from discrepancy.campaign_file import read_campaign
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.records import TrialKind
 
 PAGE = Path(__file__).parents[3] / "docs" / "campaign.md"
 

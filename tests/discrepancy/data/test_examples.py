@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from discrepancy.campaign import TrialKind
-from discrepancy.data_quality import FaultKind, check_against_model, check_data, mark_outliers
+from discrepancy.campaign.held_out import choose_held_out
+from discrepancy.campaign.records import TrialKind
+from discrepancy.checks.quality import FaultKind, check_against_model, check_data, mark_outliers
 from discrepancy.errors import CampaignFileError, ModelError
-from discrepancy.examples import example_campaign, plan_for, wing_plan, write_example
-from discrepancy.held_out import choose_held_out
 from discrepancy.models.lumped import LumpedModel
-from fe.patch import HighPass, ModelPatch, PointMass, PowerDamping, RootCompliance, SensorGain
+from discrepancy.sources.examples import example_campaign, plan_for, wing_plan, write_example
+from fe.runtime.patch import HighPass, ModelPatch, PointMass, PowerDamping, RootCompliance, SensorGain
 
 OUTPUTS = ("x3", "x1", "base_strain", "joint_strain")
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from discrepancy.campaign import Campaign, Channel, Quantity, Release, Trial, TrialKind
-from discrepancy.held_out import choose_held_out, level
+from discrepancy.campaign.held_out import choose_held_out, level
+from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
 
 
 def trial(name: str, kind: TrialKind, top: float, count: int = 4, run: str = "A", channels=("x",)) -> Trial:

@@ -5,11 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from discrepancy.campaign import Campaign, Channel, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import Conditions
-from discrepancy.sensing import observe
-from fe.patch import Clock, DecayingLine, HighPass, ModelPatch, SensorDrift, SensorGain, SensorRotation
+from discrepancy.models.sensing import observe
+from fe.runtime.patch import (
+    Clock,
+    DecayingLine,
+    HighPass,
+    ModelPatch,
+    SensorDrift,
+    SensorGain,
+    SensorRotation,
+)
 
 CONDITIONS = Conditions(np.array([1.0]))
 

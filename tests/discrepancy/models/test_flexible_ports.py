@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from discrepancy.campaign import Quantity, Release
-from discrepancy.compiled_motion import compiled_kernel
+from discrepancy.campaign.records import Quantity, Release
+from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.second_order_motion import Motion
-from fe.motion import ModalMotion, ModalSystem, laws_of, simulate, slip_displacements
-from fe.patch import (
+from fe.runtime.laws.micro_slip import slip_displacements
+from fe.runtime.modal_system import ModalSystem
+from fe.runtime.motion import ModalMotion, laws_of, simulate
+from fe.runtime.patch import (
     BoucWen,
     FreePlay,
     MicroSlip,

@@ -11,19 +11,19 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from discrepancy.campaign import Campaign, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Quantity, Release, Trial, TrialKind
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.errors import ModelError
-from discrepancy.examples import example_campaign, plan_for
 from discrepancy.model_choice import choose_model
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.fmu_file import parse_fmu_model
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
+from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
-from fe.patch import (
+from fe.runtime.patch import (
     BoucWen,
     FreePlay,
     InertiaRelief,

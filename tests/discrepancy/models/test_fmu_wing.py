@@ -10,14 +10,14 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from discrepancy.campaign import Campaign, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Conditions
 from discrepancy.models.wing import WingModel
-from fe.patch import ModelPatch, PointMass, PowerDamping, Primitive, RootCompliance
-from fmu_asset.build import build_fmu
-from fmu_asset.patch_file import parse_patch
+from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, Primitive, RootCompliance
+from fmu_asset.packing.patch_file import parse_patch
+from fmu_asset.packing.wing_fmu import build_fmu
 
 OUTPUTS = (
     ("strain[1]", Quantity.STRAIN), ("strain[9]", Quantity.STRAIN),

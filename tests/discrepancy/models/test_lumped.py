@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
-from discrepancy.campaign import Campaign, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
 from discrepancy.models.second_order import SecondOrderSystem
-from fe.motion import NO_LAWS, slip_displacements
-from fe.patch import (
+from fe.runtime.laws.micro_slip import slip_displacements
+from fe.runtime.motion import NO_LAWS
+from fe.runtime.patch import (
     BoucWen,
     FreePlay,
     LoadGain,

@@ -13,14 +13,15 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 
-from calibration.result import CalibrationResult
-from discrepancy.campaign import Campaign, Quantity, Release, Trial, TrialKind
+from calibration.wing.result import CalibrationResult
+from calibration.wing.result_file import save_calibration
+from discrepancy.campaign.records import Campaign, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
-from fe.design import load_design
-from fe.kept import cache_folder
-from fe.patch import (
+from fe.reduction.built_once import cache_folder
+from fe.reduction.patch_cache import patch_cache_key
+from fe.runtime.patch import (
     PRIMITIVES,
     LoadGain,
     LoadPlace,
@@ -35,9 +36,9 @@ from fe.patch import (
     SensorGain,
     Washout,
 )
-from fe.patch_arrays import PatchArrays
-from fe.patch_cache import patch_cache_key
-from fe.planform_forces import STATION_PORTS
+from fe.runtime.patch_arrays import PatchArrays
+from fe.runtime.planform_forces import STATION_PORTS
+from fe.wing.design import load_design
 
 NONE = ModelPatch()
 OUTPUTS = (
@@ -377,7 +378,7 @@ def test_the_posterior_of_a_calibration_is_the_prior(
     cache_folder().mkdir()
     coarse_patch_arrays.save(cache_folder() / f"wing-{patch_cache_key(design)}-patches.npz")
     result = replace(make_calibration(), design=design)
-    result.save(tmp_path / "wing.nc")
+    save_calibration(result, tmp_path / "wing.nc")
     model = WingModel.of_calibration(tmp_path / "wing.nc")
     assert model.name == result.asset
     assert [item.mean for item in model.parameters] == pytest.approx(result.samples.mean(axis=0))

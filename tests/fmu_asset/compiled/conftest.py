@@ -20,11 +20,11 @@ from fmpy.fmi2 import (
 )
 from fmpy.logging import addLoggerProxy
 
-from fe.reduced import ReducedModel
-from fmu_asset.archive import extract_fmu, read_fmu
-from fmu_asset.build import build_fmu
+from fe.runtime.reduced import ReducedModel
+from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
+from fmu_asset.packing.wing_fmu import build_fmu
 
 OK, DISCARD, ERROR = 0, 2, 3
 

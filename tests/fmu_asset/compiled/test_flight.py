@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fe.cache import reduced_model
-from fmu_asset.binding import Binding
-from fmu_asset.build import build_fmu
-from fmu_asset.session import FmiAsset
-from fmu_asset.variables import (
+from fe.reduction.model_cache import reduced_model
+from fmu_asset.door.binding import Binding
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.packing.wing_fmu import build_fmu
+from fmu_asset.slaves.variables import (
     STATUS_BAD_CALL,
     STATUS_BAD_STATE,
     STATUS_BAD_STEP,

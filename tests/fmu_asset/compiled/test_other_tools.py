@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe.reduced import ReducedModel
-from fmu_asset.archive import read_fmu
+from fe.runtime.reduced import ReducedModel
+from fmu_asset.archive.fmu_file import read_fmu
 
 COURSE = [(1.0 + 0.25 * k, 0.1 * (k // 3), 0.2, -5.0 if k % 2 else 0.0) for k in range(9)]
 

@@ -17,14 +17,14 @@ import pytest
 from fmpy import read_model_description
 from fmpy.validation import validate_fmu
 
-from fe.reduced import ReducedModel
-from fe.state import DigitalState
-from fmu_asset.binding import Binding
-from fmu_asset.build import build_fmu, recorded_content_hash
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import DigitalState
 from fmu_asset.check import check_fmu
 from fmu_asset.compiled.compiler import compile_library, find_compiler
+from fmu_asset.door.binding import Binding
+from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError, FmuCallError, FmuUnsupportedError
-from fmu_asset.session import FmiAsset
+from fmu_asset.packing.wing_fmu import build_fmu, recorded_content_hash
 
 BIN = Path(sys.executable).parent
 

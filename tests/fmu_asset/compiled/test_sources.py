@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe.reduced import ReducedModel
+from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.data_file import MAGIC, NAME_BYTES, data_file_bytes, pack_arrays
 
 DRIVER = Path(__file__).with_name("driver.c")

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmu_asset.binding import Binding, parse_binding
 from fmu_asset.companions.build import build_companion
 from fmu_asset.coupling.structure import (
     Component,
@@ -23,6 +22,7 @@ from fmu_asset.coupling.structure import (
     SystemStructure,
     expand_connection,
 )
+from fmu_asset.door.binding import Binding, parse_binding
 
 
 @pytest.fixture(scope="session")

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmu_asset.binding import Binding, parse_binding
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component, Setting, SystemStructure
+from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.errors import FmuInputError, FmuOutputError, FmuStateError, FmuWorkerError
 
 from .conftest import linear, system, watch

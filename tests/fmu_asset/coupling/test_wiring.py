@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from fmu_asset.binding import parse_binding
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component, Connection, Connector, Endpoint, Setting, SystemStructure
 from fmu_asset.coupling.structure import expand_connection as expand
 from fmu_asset.coupling.wiring import Wiring
+from fmu_asset.door.binding import parse_binding
 from fmu_asset.errors import CouplingError, FmuFileError
 
 from .conftest import watch

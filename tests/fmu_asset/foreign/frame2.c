@@ -34,12 +34,24 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
 void fmi2FreeInstance(fmi2Component c) { model_free(M); free(c); }
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean t, fmi2Real tolerance, fmi2Real start, fmi2Boolean s, fmi2Real stop) {
     M->time = start;
+    M->r[63] = t ? tolerance : 0.0;
     return fmi2OK;
 }
-fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return fmi2OK; }
+fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
+#ifdef NEGATIVE_STATUS_AT_THE_START
+    return -1;
+#endif
+    return fmi2OK;
+}
 fmi2Status fmi2ExitInitializationMode(fmi2Component c) { return (fmi2Status)model_initialise(M); }
-fmi2Status fmi2Terminate(fmi2Component c) { return fmi2OK; }
+fmi2Status fmi2Terminate(fmi2Component c) {
+    M->i[15] = 1;
+    return fmi2OK;
+}
 fmi2Status fmi2Reset(fmi2Component c) {
+#ifdef RESET_DOES_NOTHING
+    return fmi2OK;
+#endif
     Model fresh = {0};
     memcpy(fresh.parts, M->parts, sizeof fresh.parts);
     memcpy(fresh.name, M->name, sizeof fresh.name);
@@ -88,8 +100,11 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
 fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], const fmi2Real value[]) { return fmi2Error; }
 fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], fmi2Real value[]) { return fmi2Error; }
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real size, fmi2Boolean no_return) {
+#ifdef STANDS_STILL_ONCE_TERMINATED
+    if (M->i[15]) return fmi2OK;
+#endif
     int status = model_step(M, time, size);
-    if (status <= WARNING) {
+    if (status == OK || status == WARNING) {
         M->time = time + size;
         M->stepped++;
     }

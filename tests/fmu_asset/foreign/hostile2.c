@@ -4,6 +4,7 @@
 #include <math.h>
 #include <signal.h>
 #include <stdio.h>
+#include <sys/stat.h>
 #include <unistd.h>
 #include "model.h"
 enum { Y, U, DAMAGE, FACTOR };
@@ -11,7 +12,8 @@ enum { Y, U, DAMAGE, FACTOR };
 #define AFTER 2 /* steps that go well */
 #endif
 
-void model_start(Model *m) { m->r[FACTOR] = 1.0; }
+static int starts; /* of the process, so that a reset shows */
+void model_start(Model *m) { m->r[FACTOR] = 1.0; starts++; }
 static void hang(void) { for (volatile long k = 0;; k++) {} }
 static void *volatile kept; /* so that the compiler does not leave the memory out */
 static void take(size_t size) { kept = memset(malloc(size), 1, size); }
@@ -67,6 +69,8 @@ int model_initialise(Model *m) {
 int model_step(Model *m, double time, double size) {
 #ifdef STATELESS
     m->r[Y] = m->r[FACTOR] * m->r[U] * (1.0 - m->r[DAMAGE]);
+#elif defined NEGATIVE_ZERO_AFTER_RESET
+    m->r[Y] = starts > 1 ? -0.0 : 0.0;
 #else
     m->r[Y] += m->r[U] * size;
 #endif
@@ -126,6 +130,17 @@ int model_step(Model *m, double time, double size) {
     for (int k = 3; k < 64; k++) if (write(k, "rubbish rubbish rubbish", 23) < 0) continue;
 #elif defined START_PROCESS
     if (m->stepped == 2 && fork() == 0) for (;;) pause();
+#elif defined FORK_AND_RETURN
+    if (m->stepped == AFTER) fork(); /* two processes return from this step, and would answer */
+#elif defined START_PROCESS_ELSEWHERE
+    if (m->stepped == AFTER && fork() == 0) {
+        GROUP;
+        for (;;) pause();
+    }
+#elif defined NEST_FOLDERS
+    for (int k = 0; k < 3000; k++) if (mkdir("d", 0755) || chdir("d")) return ERROR;
+#elif defined NEGATIVE_STATUS
+    return -1;
 #elif defined CHATTER
     for (int k = 0; k < 100000; k++) puts("step step step step step step step step");
     fflush(stdout);

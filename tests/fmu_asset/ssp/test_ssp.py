@@ -15,8 +15,7 @@ from fmpy.ssp.ssd import read_ssd
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fmu_asset.archive import UnitInfo
-from fmu_asset.binding import Binding, parse_binding
+from fmu_asset.archive.fmu_file import UnitInfo
 from fmu_asset.companions.build import build_companion
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import (
@@ -29,6 +28,7 @@ from fmu_asset.coupling.structure import (
     expand_connection,
 )
 from fmu_asset.coupling.wiring import Wiring
+from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.errors import SspError
 from fmu_asset.ssp.check import check_ssp, join_ssp
 from fmu_asset.ssp.reader import read_ssp

@@ -1,0 +1,1 @@
+"""Calibration step 3: ring-downs, masses and damping."""

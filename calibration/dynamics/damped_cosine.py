@@ -1,0 +1,126 @@
+"""A sum of damped cosines, an offset and a drift: Kapteyn et al. 2021, eq. (22)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+_GREATEST_GROWTH = 50.0  # exponent at the end of a record; an iteration may pass through growing waves
+
+
+class Solution(NamedTuple):
+    """The fitted signal at given decay rates and frequencies.
+
+    `amplitude` (K,) holds the complex amplitudes at the first sample [V]; `covariance` (2 K, 2 K) belongs to
+    the K decay rates and then the K angular frequencies [1/s, rad/s], zero for those that were not fitted.
+    """
+
+    amplitude: NDArray[np.complex128]
+    fitted: NDArray[np.float64]
+    residual_deviation: float
+    covariance: NDArray[np.float64]
+
+
+class DampedCosines:
+    """K damped cosines against one record.
+
+    The signal is the real part of sum_k A_k g(s_k) exp(s_k t) with s_k = -decay_k + i omega_k, plus a line.
+    A value that is the average over an interval of width w carries g(s) = sinh(s w / 2) / (s w / 2).
+
+    Parameters
+    ----------
+    time, signal : (N,) array
+        The record [s], [V].
+    averaging_width : float
+        w [s]; 0 for samples.
+    """
+
+    def __init__(
+        self, time: NDArray[np.float64], signal: NDArray[np.float64], averaging_width: float
+    ) -> None:
+        self._time = time - time[0]
+        self._signal = signal
+        self._width = averaging_width
+        self._line = np.column_stack([np.ones(time.size), self._time - self._time.mean()])
+
+    def residual(self, decay: NDArray[np.float64], omega: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the residuals [V], (N,), with the best amplitudes, offset and drift."""
+        basis = self._basis(decay, omega)
+        orthogonal = np.linalg.qr(basis)[0]
+        return np.asarray(self._signal - orthogonal @ (orthogonal.T @ self._signal))
+
+    def solve(
+        self, decay: NDArray[np.float64], omega: NDArray[np.float64], *, frequencies_fitted: bool
+    ) -> Solution:
+        """Return amplitudes, fitted signal and the covariance of decay rates and frequencies."""
+        basis = self._basis(decay, omega)
+        coefficient = np.linalg.lstsq(basis, self._signal, rcond=None)[0]
+        fitted = basis @ coefficient
+        modes = decay.size
+        amplitude = coefficient[0 : 2 * modes : 2] - 1j * coefficient[1 : 2 * modes : 2]
+        slope = np.stack([self._derivative(-d + 1j * w) for d, w in zip(decay, omega, strict=True)])
+        slope = amplitude[:, np.newaxis] * slope
+        columns = [*(-slope).real] + ([*(1j * slope).real] if frequencies_fitted else [])
+        jacobian = np.column_stack([*columns, basis])
+        # Columns of very different size: scale before inverting.
+        size = np.linalg.norm(jacobian, axis=0)
+        inverse = np.linalg.pinv(jacobian / size)
+        freedom = max(self._signal.size - jacobian.shape[1], 1)
+        variance = float(np.sum((self._signal - fitted) ** 2)) / freedom
+        covariance = variance * (inverse @ inverse.T) / np.outer(size, size)
+        whole = np.zeros((2 * modes, 2 * modes))
+        count = len(columns)
+        whole[:count, :count] = covariance[:count, :count]
+        return Solution(amplitude, fitted, variance**0.5, whole)
+
+    def _basis(self, decay: NDArray[np.float64], omega: NDArray[np.float64]) -> NDArray[np.float64]:
+        columns = []
+        for d, w in zip(decay, omega, strict=True):
+            s = -max(d, -_GREATEST_GROWTH / self._time[-1]) + 1j * w
+            wave = self._gain(s) * np.exp(s * self._time)
+            columns += [wave.real, wave.imag]
+        return np.column_stack([*columns, self._line])
+
+    def _gain(self, s: complex) -> complex:
+        half = 0.5 * s * self._width
+        return complex(np.sinh(half) / half) if self._width else 1.0 + 0.0j
+
+    def _derivative(self, s: complex) -> NDArray[np.complex128]:
+        """Return d/ds of g(s) exp(s t)."""
+        half = 0.5 * s * self._width
+        slope = 0.5 * self._width * (np.cosh(half) / half - np.sinh(half) / half**2) if self._width else 0.0
+        return np.asarray((slope + self._gain(s) * self._time) * np.exp(s * self._time))
+
+
+class NaturalMode(NamedTuple):
+    """Natural frequency [Hz] and damping ratio [1] of a mode, each with its standard error."""
+
+    frequency: float
+    frequency_standard_error: float
+    damping_ratio: float
+    damping_ratio_standard_error: float
+
+
+def natural_mode(decay: float, damped: float, covariance: NDArray[np.float64]) -> NaturalMode:
+    """Return a mode's natural frequency and damping ratio from those of its damped oscillation.
+
+    With w_n = sqrt(s^2 + w_d^2): f = w_n / 2 pi and zeta = s / w_n. Errors are propagated to first order with
+    all of the covariance, that between decay rate and damped frequency too.
+
+    Parameters
+    ----------
+    decay, damped : float
+        Decay rate s [1/s] and damped angular frequency w_d [rad/s].
+    covariance : (2, 2) array
+        Of the two [1/s^2].
+    """
+    natural = math.hypot(damped, decay)
+    of_frequency = np.array([decay, damped]) / natural / (2.0 * math.pi)
+    of_ratio = np.array([damped**2, -decay * damped]) / natural**3
+    frequency_error, ratio_error = (
+        math.sqrt(max(float(slope @ covariance @ slope), 0.0)) for slope in (of_frequency, of_ratio)
+    )
+    return NaturalMode(natural / (2.0 * math.pi), frequency_error, decay / natural, ratio_error)

@@ -1,0 +1,233 @@
+"""Ring-down records: the strain signal after the tip is let go, raw or read off the published plots."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import ExperimentDataError, ExperimentFileError
+from calibration.lab_folder import LAB_ERRORS, places_of
+from reporting.table_file import TextTable, parse_table
+from reporting.text_file import read_text
+from reporting.words import counted
+
+STEP_FOLDER = Path("step3")
+"""Folder of step 3 in the authors' calibration folder."""
+
+FILE_PATTERNS = ("initialconditiondata_*.DAT", "initialconditiondata_*.dat", "ringdown_trial*_digitised.csv")
+"""Names of the records there, best first: raw at 100 kHz, or read off the published plots."""
+
+MINIMUM_COUNT = 64
+"""Fewest samples that a record may have."""
+
+_RAW_COLUMNS = ["time", "spanwise", "chordwise"]
+_TIME_NAMES = ("time", "t", "t_s")
+_SIGNAL_NAMES = ("spanwise", "V_mid", "middle")
+_LOWEST_NAMES = ("V_low", "lowest")
+_HIGHEST_NAMES = ("V_high", "highest")
+_ROUNDING = 1e-4  # s; a time printed to few digits may stand still at 100 kHz
+_CLIPPED_DURATION = 3e-3  # s at the extreme value; natural peaks of a 30 Hz mode are sharper
+
+
+@dataclass(frozen=True, eq=False)
+class RingDownRecord:
+    """One trial of the initial-condition test.
+
+    Attributes
+    ----------
+    time : (N,) array
+        Instants, evenly spaced but for the rounding of a printed time, 0.1 ms at most [s].
+    signal : (N,) array
+        Spanwise strain signal [V]; its scale does not matter.
+    lowest, highest : (N,) array or None
+        Extremes of the signal within each interval, for a record read off a plot [V].
+    averaging_width : float
+        Interval over which each value is an average: the width of a column of pixels; 0 for samples [s].
+    source : str
+        Where the record comes from.
+
+    Raises
+    ------
+    ExperimentDataError
+        If values are lost or not finite, the record is shorter than `MINIMUM_COUNT`, time does not run
+        evenly upwards, or the signal stands still at an extreme for 3 ms, as a clipped one does.
+    """
+
+    time: NDArray[np.float64]
+    signal: NDArray[np.float64]
+    lowest: NDArray[np.float64] | None = None
+    highest: NDArray[np.float64] | None = None
+    averaging_width: float = 0.0
+    source: str = "unnamed record"
+
+    def __post_init__(self) -> None:
+        for name in ("time", "signal", "lowest", "highest"):
+            if (column := getattr(self, name)) is None:
+                continue
+            column = np.array(column, dtype=np.float64)
+            column.setflags(write=False)
+            object.__setattr__(self, name, column)
+            if column.ndim != 1 or column.shape != self.time.shape:
+                raise ExperimentDataError(
+                    f"{self.source}: {name} must be a vector as long as time, but its shape is "
+                    f"{column.shape} beside {self.time.shape}."
+                )
+            wrong = np.flatnonzero(~np.isfinite(column))
+            if wrong.size:
+                raise ExperimentDataError(
+                    f"{self.source}: {name} of sample {wrong[0] + 1} is {column[wrong[0]]:g}; a record must "
+                    "not hold lost values, because its spectrum needs even spacing."
+                )
+        if self.count < MINIMUM_COUNT:
+            raise ExperimentDataError(
+                f"{self.source}: the record has {self.count} samples; at least {MINIMUM_COUNT} are needed."
+            )
+        step = np.diff(self.time)
+        usual = float(self.time[-1] - self.time[0]) / (self.count - 1)
+        astray = np.abs(self.time - np.linspace(self.time[0], self.time[-1], self.count)).max()
+        if not (step.min() >= 0.0 and usual > 0.0 and astray <= max(0.05 * usual, _ROUNDING)):
+            place = int(np.argmax(np.abs(step - np.median(step))))
+            raise ExperimentDataError(
+                f"{self.source}: time must run upwards in even steps, but after sample {place + 1} it moves "
+                f"by {step[place]:.6g} s where {np.median(step):.6g} s is usual."
+            )
+        _refuse_clipped(self)
+
+    @property
+    def count(self) -> int:
+        """Number of samples."""
+        return int(self.time.size)
+
+    @property
+    def sampling_rate(self) -> float:
+        """Samples per second [Hz]."""
+        return float((self.count - 1) / (self.time[-1] - self.time[0]))
+
+
+def read_records(path: Path) -> tuple[RingDownRecord, ...]:
+    """Read the ring-down trials from the authors' calibration folder, or one record from its file.
+
+    Parameters
+    ----------
+    path : Path
+        The folder that holds `step3` (also the folder above it in the authors' repository), a folder that
+        holds the records themselves, or one file. A text file without header has the columns time [s],
+        spanwise and chordwise signal [V], as published at 100 kHz; a CSV file has a header with `time` and
+        `spanwise`; a record read off a plot has `t_s`, `V_low`, `V_mid`, `V_high`.
+
+    Raises
+    ------
+    ExperimentFileError
+        If there is no record, or a file is empty or lacks a column.
+    ExperimentDataError
+        If a record holds values that none can have; see `RingDownRecord`.
+    """
+    files = find_records(path)
+    if not files:
+        raise ExperimentFileError(
+            f"{path} holds no ring-down record; {FILE_PATTERNS[0]} or {FILE_PATTERNS[-1]} is needed, there "
+            f"or in its folder {STEP_FOLDER}."
+        )
+    return tuple(_read_record(file) for file in files)
+
+
+def find_records(path: Path) -> tuple[Path, ...]:
+    """Return the files that `read_records` reads, best kind first; none if there are none.
+
+    Raises
+    ------
+    ExperimentFileError
+        If the path does not exist.
+    """
+    path = Path(path)
+    if path.is_file():
+        return (path,)
+    if not path.exists():
+        raise ExperimentFileError(f"{path} does not exist; give a folder of ring-down records or one file.")
+    for pattern in FILE_PATTERNS:
+        for folder in (*places_of(path, STEP_FOLDER), path):
+            if files := sorted(folder.glob(pattern)):
+                return tuple(files)
+    return ()
+
+
+def _read_record(file: Path) -> RingDownRecord:
+    text = read_text(file, ExperimentFileError)
+    first = next((line for line in text.splitlines() if line.strip()), "").strip()
+    if not first:
+        raise ExperimentFileError(f"{file} is empty; columns of time [s] and spanwise signal [V] are needed.")
+    separator = "," if "," in first and "\t" not in first else None
+    header = _header(first, separator)
+    if header is None:
+        count = len(first.split(separator))
+        if not 2 <= count <= len(_RAW_COLUMNS):
+            raise ExperimentFileError(
+                f"{file} has {counted(count, 'column')}; time [s], spanwise and, if there is one, chordwise "
+                "signal [V] are needed, without header."
+            )
+        header = _RAW_COLUMNS[:count]
+    elif not first.startswith("#"):
+        text = text.replace(first, f"#{first}", 1)
+    _refuse_other_time(file, header)
+    names = [_name(cell) for cell in header]
+    table = parse_table(text, str(file), LAB_ERRORS, header=names, separator=separator)
+    time, signal = (_column(table, spellings) for spellings in (_TIME_NAMES, _SIGNAL_NAMES))
+    if "spanwise" in names:
+        return RingDownRecord(time=time, signal=signal, source=file.name)
+    lowest, highest = (_column(table, spellings) for spellings in (_LOWEST_NAMES, _HIGHEST_NAMES))
+    width = float(np.median(np.diff(time))) if time.size > 1 else 0.0
+    return RingDownRecord(time, signal, lowest, highest, averaging_width=width, source=file.name)
+
+
+def _header(first: str, separator: str | None) -> list[str] | None:
+    """Return the names of the columns, or None if the first line holds nothing that is a word."""
+    text = first.lstrip("#").strip()
+    if not re.search(r"[^\d\s.,;eE+-]", text):
+        return None
+    # A remark in brackets may hold separators of its own.
+    between = separator or (r"\t+" if "\t" in text else r"\s+")
+    return [cell.strip().strip('"') for cell in re.split(between + r"(?![^(\[]*[)\]])", text)]
+
+
+def _name(cell: str) -> str:
+    """Return the name in a header's cell without unit or remark in brackets."""
+    return re.split(r"\s*[(\[]", cell, maxsplit=1)[0]
+
+
+def _column(table: TextTable, spellings: tuple[str, ...]) -> NDArray[np.float64]:
+    for name in spellings:
+        if name in table.columns:
+            return table.numbers(name, "a ring-down")
+    raise ExperimentFileError(
+        f"{table.name} lacks the column {' or '.join(spellings)}; its columns are {', '.join(table.columns)}."
+    )
+
+
+def _refuse_other_time(file: Path, header: list[str]) -> None:
+    for cell in header:
+        unit = re.search(r"[(\[]\s*(\w+)\s*[)\]]", cell)
+        if _name(cell) in _TIME_NAMES and unit and unit[1] not in ("s", "sec", "second", "seconds"):
+            raise ExperimentDataError(f"{file} gives {_name(cell)} in {unit[1]}: give it in s.")
+
+
+def _refuse_clipped(record: RingDownRecord) -> None:
+    lowest = record.signal if record.lowest is None else record.lowest
+    highest = record.signal if record.highest is None else record.highest
+    if np.ptp(record.signal) == 0.0:
+        raise ExperimentDataError(f"{record.source}: the signal is constant; nothing rings.")
+    for column, extreme, name in ((lowest, lowest.min(), "smallest"), (highest, highest.max(), "largest")):
+        run = _longest_run(np.abs(column - extreme) <= 1e-9 * np.ptp(column))
+        if run >= 3 and run / record.sampling_rate >= _CLIPPED_DURATION:
+            raise ExperimentDataError(
+                f"{record.source}: {run} samples in a row have the {name} value {extreme:g}, as if the "
+                "recorder had clipped the signal; repeat the test with a wider range."
+            )
+
+
+def _longest_run(where: NDArray[np.bool_]) -> int:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
+    return int(np.max(edges[1::2] - edges[::2]))

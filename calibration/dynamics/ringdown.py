@@ -1,0 +1,332 @@
+"""Calibration step 3, first half: two damped modes from ring-down records.
+
+Kapteyn et al. 2021, eq. (22): the signal is a sum of two damped cosines; eqs. (23) and (24) turn damped
+frequency and decay rate into natural frequency and damping ratio.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.signal import decimate, detrend, find_peaks
+
+from calibration.errors import RingDownError
+
+from .damped_cosine import DampedCosines, natural_mode
+from .records import MINIMUM_COUNT, RingDownRecord
+
+FIRST_PEAK = 0.00548
+"""Instant of the first peak in the published records, at which the authors crop them [s]."""
+
+WORKING_RATE = 2000.0
+"""Rate to which faster records are decimated, as in the authors' script [Hz]."""
+
+SEARCH_BAND = (2.0, 80.0)
+"""Band in which the two spectral peaks are sought; drift lies below [Hz]."""
+
+_PADDING = 64  # zero padding of the spectrum: bins of 1/64 of the record's own resolution
+_PROMINENCE = 3.5  # of a spectral peak, over the median amplitude of the noise
+# Smallest peak, of the highest amplitude: smaller ripples come from the end of a record that still rings
+# there, and from the skirts of the first mode where it has died away.
+_SMALLEST_PEAK = (0.003, 0.02)
+_END_SHARE = 0.05  # of a record, in which its end is judged
+_SEARCH_DECAY = 3.0  # 1/s, put upon a record in which the first search finds too little
+_STARTING_RATIOS = (0.01, 0.03, 0.08)
+_STEADY_SHARE = 0.7  # rms of the last third over the first; above it nothing decays
+
+
+class Frequencies(Enum):
+    """How the damped frequencies are found.
+
+    `PEAKS` is the authors' procedure: the two highest peaks of the spectrum, held fixed while amplitudes,
+    decay rates and phases are fitted. `FITTED` fits the frequencies along with them.
+    """
+
+    PEAKS = "peaks"
+    FITTED = "fitted"
+
+
+@dataclass(frozen=True)
+class RingDownMode:
+    """One mode of one record.
+
+    Attributes
+    ----------
+    frequency : float
+        Natural frequency, eq. (23) [Hz].
+    damping_ratio : float
+        Eq. (24) [1].
+    damped_frequency : float
+        Frequency of the damped cosine [Hz].
+    decay_rate : float
+        Of its exponential [1/s].
+    amplitude, phase : float
+        At the start of the cropped record [V], [rad].
+    frequency_standard_error, damping_ratio_standard_error : float
+        From the least-squares fit, for independent residuals of equal variance [Hz], [1]. A frequency
+        taken from the spectrum is not fitted: its error then holds the share of the decay rate alone.
+    """
+
+    frequency: float
+    damping_ratio: float
+    damped_frequency: float
+    decay_rate: float
+    amplitude: float
+    phase: float
+    frequency_standard_error: float
+    damping_ratio_standard_error: float
+
+
+@dataclass(frozen=True, eq=False)
+class RingDownFit:
+    """Two modes of one record.
+
+    Attributes
+    ----------
+    modes : (RingDownMode, RingDownMode)
+        By ascending frequency.
+    record : RingDownRecord
+        The record as fitted: decimated and cropped.
+    fitted : (N,) array
+        The fitted signal [V].
+    residual_deviation : float
+        Standard deviation of the residuals [V].
+    spectrum_frequency, spectrum_amplitude : (K,) array
+        Amplitude spectrum of the detrended record within the band [Hz], [V].
+    procedure : Frequencies
+        How the frequencies were found.
+    """
+
+    modes: tuple[RingDownMode, RingDownMode]
+    record: RingDownRecord
+    fitted: NDArray[np.float64]
+    residual_deviation: float
+    spectrum_frequency: NDArray[np.float64]
+    spectrum_amplitude: NDArray[np.float64]
+    procedure: Frequencies
+
+
+def prepare(record: RingDownRecord, start: float | None = FIRST_PEAK) -> RingDownRecord:
+    """Decimate a fast record to about 2 kHz and crop it to begin at `start` [s] (None: as it is).
+
+    Decimation runs forwards and backwards through a low-pass in stages of at most 10, so that it shifts no
+    phase. Drift is not taken out here but fitted along with the modes, which biases neither.
+
+    Raises
+    ------
+    RingDownError
+        If the record is too short, or less than a quarter of it remains.
+    """
+    time, signal = record.time, record.signal
+    lowest, highest = record.lowest, record.highest
+    factor = int(record.sampling_rate / WORKING_RATE + 0.5)
+    if factor > 1 and record.count // factor < MINIMUM_COUNT:
+        raise RingDownError(
+            f"{record.source}: {record.count} samples at {record.sampling_rate:.4g} Hz last "
+            f"{record.time[-1] - record.time[0]:.3g} s, too short for a ring-down; is the time in s?"
+        )
+    while factor > 1:
+        stage = max(divisor for divisor in range(1, 11) if factor % divisor == 0)
+        if stage == 1:
+            factor -= 1
+            continue
+        time, signal = time[::stage], np.asarray(decimate(signal, stage, zero_phase=True))
+        lowest = highest = None
+        factor //= stage
+    after = time > start if start is not None else np.ones(time.shape, dtype=bool)
+    if np.count_nonzero(after) < 0.25 * time.size:
+        raise RingDownError(
+            f"{record.source}: cropped at {start:g} s, {np.count_nonzero(after)} of {time.size} samples "
+            "remain; give the instant of release."
+        )
+    return RingDownRecord(
+        time[after],
+        signal[after],
+        None if lowest is None else lowest[after],
+        None if highest is None else highest[after],
+        record.averaging_width,
+        record.source,
+    )
+
+
+def spectrum(
+    record: RingDownRecord, band: tuple[float, float] = SEARCH_BAND
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return frequency [Hz] and amplitude [V] of the zero-padded spectrum of the detrended record."""
+    size = _PADDING * record.count
+    transform = np.fft.rfft(detrend(record.signal), size)
+    frequency = np.fft.rfftfreq(size, 1.0 / record.sampling_rate)
+    inside = (frequency >= band[0]) & (frequency <= min(band[1], 0.5 * record.sampling_rate))
+    amplitude = np.asarray(2.0 / record.count * np.abs(transform[inside]), dtype=np.float64)
+    return np.asarray(frequency[inside], dtype=np.float64), amplitude
+
+
+def _noise_floor(record: RingDownRecord, band: tuple[float, float]) -> float:
+    """Return the median amplitude of the noise in a spectrum [V].
+
+    A Hann window, of mean square 3/8, hides a mode that dies away at the record's start.
+    """
+    weight = np.hanning(record.count) / math.sqrt(0.375)
+    amplitude = 2.0 / record.count * np.abs(np.fft.rfft(weight * detrend(record.signal)))
+    frequency = np.fft.rfftfreq(record.count, 1.0 / record.sampling_rate)
+    return float(np.median(amplitude[(frequency >= band[0]) & (frequency <= band[1])]))
+
+
+def _smallest_peak(record: RingDownRecord) -> float:
+    """Return the share of the highest amplitude from which a peak counts."""
+    signal = detrend(record.signal)
+    end = signal[-max(int(_END_SHARE * record.count), 8) :]
+    left = math.sqrt(2.0 * float(np.mean(end**2))) / float(np.abs(signal).max())
+    return min(max(left, _SMALLEST_PEAK[0]), _SMALLEST_PEAK[1])
+
+
+def spectral_peaks(record: RingDownRecord, band: tuple[float, float] = SEARCH_BAND) -> tuple[float, float]:
+    """Return the two most prominent peaks of the spectrum, by ascending frequency [Hz].
+
+    Raises
+    ------
+    RingDownError
+        If the record is sampled too slowly, or fewer than two peaks rise by 3.5 times the median noise
+        and by 2 % of the highest amplitude (less, down to 0.3 %, if the record has died away at its end),
+        in the record itself or in its beginning.
+    """
+    if 0.5 * record.sampling_rate < 4.0 * band[0]:
+        raise RingDownError(
+            f"{record.source}: a sampling rate of {record.sampling_rate:.3g} Hz shows nothing above "
+            f"{0.5 * record.sampling_rate:.3g} Hz; is the time in s?"
+        )
+    found = _peaks(record, band, 0.0)
+    if len(found) < 2:
+        found = _peaks(record, band, _SEARCH_DECAY)
+    if len(found) < 2:
+        seen = "none" if not found else f"one, at {found[0]:.3g} Hz"
+        top = min(band[1], 0.5 * record.sampling_rate)
+        raise RingDownError(
+            f"{record.source}: two spectral peaks are needed between {band[0]:.3g} and "
+            f"{top:.3g} Hz, but there is {seen}; check the record, its sampling and the release."
+        )
+    first, second = sorted(found[:2])
+    return first, second
+
+
+def _peaks(record: RingDownRecord, band: tuple[float, float], decay: float) -> list[float]:
+    """Return the peaks that count [Hz], the most prominent first, of a record times exp(-decay t).
+
+    A second mode that is gone after a tenth of the record drowns in the noise of the rest and in the skirts
+    of the first; the decay [1/s] takes both away and moves no frequency.
+    """
+    weight = np.exp(-decay * (record.time - record.time[0]))
+    floor = _noise_floor(record, band) * math.sqrt(float(np.mean(weight**2)))
+    faded = RingDownRecord(record.time, weight * detrend(record.signal), source=record.source)
+    frequency, amplitude = spectrum(faded if decay else record, band)
+    needed = max(_PROMINENCE * floor, _smallest_peak(faded) * float(amplitude.max()))
+    places, found = find_peaks(amplitude, prominence=needed)
+    return [float(frequency[places[place]]) for place in np.argsort(found["prominences"])[::-1]]
+
+
+def fit_ring_down(
+    record: RingDownRecord,
+    procedure: Frequencies = Frequencies.PEAKS,
+    *,
+    start: float | None = FIRST_PEAK,
+    band: tuple[float, float] = SEARCH_BAND,
+) -> RingDownFit:
+    """Fit two damped cosines, an offset and a drift to one record by Levenberg-Marquardt.
+
+    Decay rates (and, for `Frequencies.FITTED`, damped frequencies) are the unknowns of the iteration; the
+    cosine and sine amplitudes, offset and drift are eliminated by linear least squares at each step. Where a
+    record holds averages over intervals, the model is averaged over them too, exactly.
+
+    Parameters
+    ----------
+    record : RingDownRecord
+        One trial, as read.
+    procedure : Frequencies
+        How the frequencies are found.
+    start : float, optional
+        Where the record is cropped [s]; None if it begins at the release already.
+    band : (float, float)
+        Where spectral peaks are sought [Hz].
+
+    Raises
+    ------
+    RingDownError
+        If the record does not decay, or shows fewer than two modes.
+    """
+    record = prepare(record, start)
+    _refuse_steady(record)
+    peaks = np.array(spectral_peaks(record, band))
+    frequency, amplitude = spectrum(record, band)
+    model = DampedCosines(record.time, record.signal, record.averaging_width)
+    omega = 2.0 * math.pi * peaks
+    fixed = procedure is Frequencies.PEAKS
+
+    def residual(unknown: NDArray[np.float64]) -> NDArray[np.float64]:
+        scaled = unknown * scale
+        return model.residual(scaled[:2], omega if fixed else scaled[2:])
+
+    best = None
+    for ratio in _STARTING_RATIOS:
+        scale = ratio * omega if fixed else np.concatenate([ratio * omega, omega])
+        trial = least_squares(residual, np.ones(scale.size), method="lm", xtol=1e-12, ftol=1e-14, gtol=1e-14)
+        if best is None or trial.cost < best[0]:
+            best = trial.cost, trial.x * scale
+    assert best is not None
+    decay = best[1][:2]
+    omega = omega if fixed else best[1][2:]
+    for number in range(2):
+        if not 0.0 < decay[number] < omega[number]:
+            raise RingDownError(
+                f"{record.source}: mode {number + 1} at {omega[number] / (2.0 * math.pi):.3g} Hz is not a "
+                f"decaying oscillation (fitted rate {decay[number]:.3g} 1/s); a ring-down record is needed."
+            )
+    solution = model.solve(decay, omega, frequencies_fitted=not fixed)
+    order = np.argsort(omega)
+    modes = tuple(
+        _mode(
+            float(decay[place]),
+            float(omega[place]),
+            complex(solution.amplitude[place]),
+            solution.covariance[np.ix_([place, 2 + place], [place, 2 + place])],
+        )
+        for place in order
+    )
+    return RingDownFit(
+        modes=(modes[0], modes[1]),
+        record=record,
+        fitted=solution.fitted,
+        residual_deviation=solution.residual_deviation,
+        spectrum_frequency=frequency,
+        spectrum_amplitude=amplitude,
+        procedure=procedure,
+    )
+
+
+def _mode(decay: float, damped: float, amplitude: complex, covariance: NDArray[np.float64]) -> RingDownMode:
+    natural = natural_mode(decay, damped, covariance)
+    return RingDownMode(
+        frequency=natural.frequency,
+        damping_ratio=natural.damping_ratio,
+        damped_frequency=damped / (2.0 * math.pi),
+        decay_rate=decay,
+        amplitude=abs(amplitude),
+        phase=math.atan2(amplitude.imag, amplitude.real),
+        frequency_standard_error=natural.frequency_standard_error,
+        damping_ratio_standard_error=natural.damping_ratio_standard_error,
+    )
+
+
+def _refuse_steady(record: RingDownRecord) -> None:
+    signal = detrend(record.signal)
+    third = record.count // 3
+    first, last = (math.sqrt(float(np.mean(part**2))) for part in (signal[:third], signal[-third:]))
+    if last > _STEADY_SHARE * first:
+        raise RingDownError(
+            f"{record.source}: the signal does not decay (its last third has {last / first:.2g} times the "
+            "rms of its first); a record of free vibration from the release on is needed."
+        )

@@ -1,0 +1,40 @@
+"""The layout of a laboratory's folder, which is that of the paper's authors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from reporting.table_file import TableErrors
+
+from .errors import ExperimentDataError, ExperimentFileError
+
+LAB_ERRORS = TableErrors(layout=ExperimentFileError, value=ExperimentDataError)
+"""What the reader of a laboratory's table raises."""
+
+# Where the folders of the steps lie in the authors' repository, seen from what a user may call its folder.
+_FOLDERS_OF_STEPS = (Path(), Path("datafiles"), Path("src") / "datafiles")
+
+
+def places_of(folder: Path, name: Path) -> Iterator[Path]:
+    """Yield where a file or folder such as `step1/geometry_data.csv` may lie, seen from a user's folder."""
+    for above in _FOLDERS_OF_STEPS:
+        yield folder / above / name
+
+
+def find_lab_file(path: Path, name: Path) -> Path:
+    """Return the path if it is a file, or the file `name` of the laboratory's (or its step's) folder `path`.
+
+    Raises
+    ------
+    ExperimentFileError
+        If there is neither.
+    """
+    if path.is_file():
+        return path
+    for place in (*places_of(path, name), path / name.name):
+        if place.is_file():
+            return place
+    if not path.exists():
+        raise ExperimentFileError(f"{path} does not exist; give the folder that holds {name}.")
+    raise ExperimentFileError(f"{path} does not hold {name}; give the authors' calibration folder.")

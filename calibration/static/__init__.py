@@ -1,0 +1,1 @@
+"""Calibration step 2: stiffness from load tests."""

@@ -1,0 +1,202 @@
+"""Densities of one unknown: the Gaussian prior, and a posterior given on a grid."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtri
+
+from calibration.errors import PosteriorError
+
+Seed = int | np.random.SeedSequence
+"""A seed: a whole number, or a SeedSequence spawned for the purpose."""
+
+PRIOR_HALF_WIDTH = 0.05
+"""Half-width of the prior's 95 % interval of e (Kapteyn et al. 2021, calibration step 2)."""
+
+
+def child_seed(seed: Seed, purpose: int) -> np.random.SeedSequence:
+    """Return the seed of one purpose, always the same for the same `seed` (spawning would count calls)."""
+    root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    return np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, purpose))
+
+
+MOST_SAMPLES = 10_000_000
+"""Most samples that are drawn at once: beyond, they need gigabytes and tell nothing more."""
+
+
+def check_count(count: int, error: type[Exception], *, most: int = MOST_SAMPLES) -> None:
+    """Raise `error` for a number of samples that is not positive, or greater than `most`."""
+    if count < 1:
+        raise error(f"the number of samples must be positive, but {count} were asked for.")
+    if count > most:
+        raise error(f"at most {most:,} samples can be drawn at once, but {count:,} were asked for.")
+
+
+_NORMALISED = 1e-12
+
+
+@dataclass(frozen=True)
+class GaussianPrior:
+    """A Gaussian prior; by default that of the paper, e ~ N(1, (0.05 / 1.96)^2).
+
+    Attributes
+    ----------
+    mean, standard_deviation : float
+        Of the Young's modulus factor [1].
+
+    Raises
+    ------
+    PosteriorError
+        If a figure is not finite or the standard deviation is not positive.
+    """
+
+    mean: float = 1.0
+    standard_deviation: float = PRIOR_HALF_WIDTH / 1.96
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.mean) and 0.0 < self.standard_deviation < math.inf):
+            raise PosteriorError(
+                "a Gaussian prior needs a finite mean and a positive standard deviation, but "
+                f"{self.mean:g} and {self.standard_deviation:g} were given."
+            )
+
+    def log_density(self, value: ArrayLike) -> NDArray[np.float64]:
+        """Return the logarithm of the density, elementwise."""
+        standard = (np.asarray(value, dtype=float) - self.mean) / self.standard_deviation
+        return np.asarray(-0.5 * standard**2 - math.log(self.standard_deviation * math.sqrt(2.0 * math.pi)))
+
+    def density(self, value: ArrayLike) -> NDArray[np.float64]:
+        """Return the density, elementwise."""
+        return np.exp(self.log_density(value))
+
+    def quantile(self, probability: ArrayLike) -> NDArray[np.float64]:
+        """Return quantiles, elementwise."""
+        return np.asarray(self.mean + self.standard_deviation * ndtri(np.asarray(probability, dtype=float)))
+
+
+@dataclass(frozen=True, eq=False)
+class ScalarPosterior:
+    """p(value | measurements) on a grid; the density is linear between grid points and zero outside.
+
+    Attributes
+    ----------
+    grid : (N,) array
+        Ascending values of the unknown.
+    density : (N,) array
+        Density there, not negative; it is scaled to integrate to one.
+    unit : str
+        Unit of `grid` ("1" if dimensionless).
+    mean, standard_deviation : float
+        Of this density, unless given (a particle filter gives those of its particles).
+
+    Raises
+    ------
+    PosteriorError
+        If the grid does not ascend, or the density is negative, not finite or zero everywhere.
+    """
+
+    grid: NDArray[np.float64]
+    density: NDArray[np.float64]
+    unit: str = "1"
+    mean: float = math.nan
+    standard_deviation: float = math.nan
+    _cumulative: NDArray[np.float64] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        grid = np.array(self.grid, dtype=float)
+        density = np.array(self.density, dtype=float)
+        if grid.ndim != 1 or grid.size < 3 or grid.shape != density.shape:
+            raise PosteriorError(
+                "a posterior needs a grid and a density of one length with at least three points, but their "
+                f"shapes are {grid.shape} and {density.shape}."
+            )
+        if not np.all(np.isfinite(grid)) or np.any(np.diff(grid) <= 0.0):
+            raise PosteriorError("the grid of a posterior must be finite and ascend.")
+        if not np.all(np.isfinite(density)) or np.any(density < 0.0) or not np.any(density > 0.0):
+            raise PosteriorError(
+                "the density of a posterior must be finite, not negative, and positive somewhere."
+            )
+        integral = float(np.trapezoid(density / density.max(), grid)) * float(density.max())
+        if abs(integral - 1.0) > _NORMALISED:  # so that a stored posterior comes back bit for bit
+            density /= density.max()  # guards the integral against overflow
+            density /= np.trapezoid(density, grid)
+        cumulative = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(grid))])
+        cumulative /= cumulative[-1]
+        for array in (grid, density, cumulative):
+            array.setflags(write=False)
+        object.__setattr__(self, "grid", grid)
+        object.__setattr__(self, "density", density)
+        object.__setattr__(self, "_cumulative", cumulative)
+        if math.isnan(self.mean):
+            object.__setattr__(self, "mean", float(np.trapezoid(density * grid, grid)))
+        if math.isnan(self.standard_deviation):
+            variance = float(np.trapezoid(density * (grid - self.mean) ** 2, grid))
+            object.__setattr__(self, "standard_deviation", math.sqrt(variance))
+
+    def cumulative(self, value: ArrayLike) -> NDArray[np.float64]:
+        """Return the distribution function, elementwise (exact for the piecewise linear density)."""
+        inside = np.clip(np.asarray(value, dtype=float), self.grid[0], self.grid[-1])
+        cell = np.clip(np.searchsorted(self.grid, inside, side="right") - 1, 0, self.grid.size - 2)
+        step = inside - self.grid[cell]
+        left = self.density[cell]
+        gradient = (self.density[cell + 1] - left) / (self.grid[cell + 1] - self.grid[cell])
+        return np.asarray(np.clip(self._cumulative[cell] + step * (left + 0.5 * gradient * step), 0.0, 1.0))
+
+    def quantile(self, probability: ArrayLike) -> NDArray[np.float64]:
+        """Return quantiles, elementwise: the inverse of `cumulative`.
+
+        Raises
+        ------
+        PosteriorError
+            If a probability lies outside [0, 1].
+        """
+        wanted = np.asarray(probability, dtype=float)
+        if not np.all((wanted >= 0.0) & (wanted <= 1.0)):
+            raise PosteriorError("a quantile needs probabilities from 0 to 1.")
+        cell = np.clip(np.searchsorted(self._cumulative, wanted, side="right") - 1, 0, self.grid.size - 2)
+        width = self.grid[cell + 1] - self.grid[cell]
+        left = self.density[cell]
+        gradient = (self.density[cell + 1] - left) / width
+        rest = np.maximum(wanted - self._cumulative[cell], 0.0)
+        root = left + np.sqrt(np.maximum(left**2 + 2.0 * gradient * rest, 0.0))
+        step = np.divide(2.0 * rest, root, out=np.zeros_like(root), where=root > 0.0)
+        return np.asarray(self.grid[cell] + np.minimum(step, width))
+
+    def interval(self, probability: float = 0.95) -> tuple[float, float]:
+        """Return the central interval that holds `probability`."""
+        tail = 0.5 * (1.0 - probability)
+        lower, upper = self.quantile([tail, 1.0 - tail])
+        return float(lower), float(upper)
+
+    def samples(self, seed: Seed, count: int, *, stratified: bool = False) -> NDArray[np.float64]:
+        """Draw samples by the inverse of the distribution function.
+
+        Parameters
+        ----------
+        seed : int or SeedSequence
+            The same seed gives the same samples, bit for bit.
+        count : int
+            Number of samples.
+        stratified : bool
+            Draw one sample from each of `count` strata of equal probability, in shuffled order: sample
+            means then have far less variance than independent draws.
+
+        Returns
+        -------
+        (count,) array, unit as `grid`
+
+        Raises
+        ------
+        PosteriorError
+            If `count` is not positive, or greater than `MOST_SAMPLES`.
+        """
+        check_count(count, PosteriorError)
+        generator = np.random.default_rng(child_seed(seed, 0))
+        probability = generator.random(count)
+        if stratified:
+            probability = generator.permutation((np.arange(count) + probability) / count)
+        return self.quantile(probability)

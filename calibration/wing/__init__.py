@@ -1,0 +1,1 @@
+"""The whole calibration of one wing: its record, file and report."""

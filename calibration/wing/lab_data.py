@@ -1,0 +1,198 @@
+"""What a lab folder holds for the three steps of the calibration, and what is published instead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from calibration.dynamics.extremes import refine_by_extremes
+from calibration.dynamics.masses_and_damping import DynamicCalibration
+from calibration.dynamics.published import RESULTS_FILE, read_published_results
+from calibration.dynamics.records import STEP_FOLDER, find_records, read_records
+from calibration.dynamics.ringdown import Frequencies
+from calibration.dynamics.trials import RingDownTrials, fit_trials
+from calibration.errors import ExperimentFileError
+from calibration.geometry import GEOMETRY_FILE, GeometryCalibration, published_lengths, read_lengths
+from calibration.joint import WeighedMass
+from calibration.lab_folder import places_of
+from calibration.static.experiments import (
+    MEASUREMENTS_FILE,
+    LoadDisplacementData,
+    published_measurements,
+    read_measurements,
+)
+from reporting.provenance import hash_file, hash_record
+
+from .laboratory import WEIGHED_MASS_FILE, read_weighed_mass
+
+Targets = Literal["measured", "published"]
+"""Whose frequencies and damping ratios step 3 aims at."""
+
+
+class StepOrigin(NamedTuple):
+    """Where the figures of one step come from: its number, whether they were read, and a few words."""
+
+    step: int
+    read: bool
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class LabData:
+    """The measurements of one wing, step by step.
+
+    Attributes
+    ----------
+    lengths : GeometryCalibration
+        Step 1.
+    pairs : LoadDisplacementData
+        Step 2.
+    total_mass : WeighedMass
+        Weighed mass of two servos and the pitot tube.
+    trials : RingDownTrials or None
+        Step 3, fitted; None where the published frequencies and damping ratios stand in.
+    authors : DynamicCalibration or None
+        The authors' own results of step 3, to be drawn beside ours.
+    origins : tuple of StepOrigin
+        Where the figures of each step come from.
+    input_hashes : dict
+        Name of an input -> SHA-256 of its content.
+    """
+
+    lengths: GeometryCalibration
+    pairs: LoadDisplacementData
+    total_mass: WeighedMass
+    trials: RingDownTrials | None
+    authors: DynamicCalibration | None
+    origins: tuple[StepOrigin, ...]
+    input_hashes: dict[str, str]
+
+
+def published_data() -> LabData:
+    """Return the published measurements of the wing of Kapteyn et al. 2021."""
+    lengths, pairs = published_lengths(), published_measurements()
+    return LabData(
+        lengths=lengths,
+        pairs=pairs,
+        total_mass=WeighedMass(),
+        trials=None,
+        authors=None,
+        origins=tuple(StepOrigin(step, False, text) for step, text in _PUBLISHED.items()),
+        input_hashes={"lengths": _hash_of_lengths(lengths), "load_test": pairs.sha256},
+    )
+
+
+def read_lab_folder(
+    path: Path, targets: Targets | None = None, frequencies: Frequencies = Frequencies.PEAKS
+) -> LabData:
+    """Read a lab folder in the authors' layout; a step that is not there is taken as published.
+
+    Parameters
+    ----------
+    path : Path
+        The folder that holds `step1`, `step2`, `step3`, or some of them (also the folder above it in the
+        authors' repository). Ring-down records may also lie in the folder itself.
+    targets : {"measured", "published"}, optional
+        Whether step 3 aims at the ring-down records; by default where there are any.
+    frequencies : Frequencies
+        How the frequencies of a record are found: from its spectrum as the authors do, or fitted.
+
+    Raises
+    ------
+    ExperimentFileError
+        If the folder does not exist, holds no step at all, or a step's folder lacks its file; and where
+        records are asked for and there are none.
+    ExperimentDataError, RingDownError
+        If what is there cannot be a measurement; see the readers of the steps.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise ExperimentFileError(
+            f"{path} is {'no folder' if path.exists() else 'not there'}; give the folder that holds "
+            "step1, step2 and step3."
+        )
+    steps = {step for step in (1, 2, 3) if _step_folder(path, step) is not None}
+    records = find_records(path)
+    if not steps and not records:
+        raise ExperimentFileError(
+            f"{path} holds none of the folders step1, step2 and step3; give the authors' calibration folder "
+            "or one laid out like it."
+        )
+    published = published_data()
+    lengths, pairs, mass = published.lengths, published.pairs, published.total_mass
+    hashes = dict(published.input_hashes)
+    origins = {origin.step: origin for origin in published.origins}
+    if 1 in steps:
+        lengths = read_lengths(path)
+        hashes["lengths"] = _hash_of_lengths(lengths)
+        origins[1] = StepOrigin(1, True, f"{GEOMETRY_FILE.as_posix()} read")
+    if 2 in steps:
+        pairs = read_measurements(path)
+        hashes["load_test"] = pairs.sha256
+        origins[2] = StepOrigin(2, True, f"{MEASUREMENTS_FILE.as_posix()} read, {pairs.count} pairs")
+    weighed = _weighed(path)
+    if weighed is not None:
+        mass = weighed
+        hashes["weighed_mass"] = hash_record([*mass])
+    trials = None
+    if targets == "measured" and not records:
+        raise ExperimentFileError(
+            f"{path} holds no ring-down record, and --measured asks for them; give --published instead."
+        )
+    if records and targets != "published":
+        trials = _fitted(path, frequencies)
+        hashes |= {f"ring_down_{number}": hash_file(file) for number, file in enumerate(records, start=1)}
+        names = records[0].name if len(records) == 1 else f"{records[0].name} to {records[-1].name}"
+        origins[3] = StepOrigin(3, True, f"{names} read")
+    elif records:
+        origins[3] = StepOrigin(3, False, "records left aside as asked; " + _PUBLISHED[3])
+    if weighed is not None:
+        origins[3] = origins[3]._replace(text=f"{origins[3].text}; {WEIGHED_MASS_FILE.as_posix()} read")
+    return LabData(
+        lengths=lengths,
+        pairs=pairs,
+        total_mass=mass,
+        trials=trials,
+        authors=_authors(path),
+        origins=tuple(origins[step] for step in (1, 2, 3)),
+        input_hashes=hashes,
+    )
+
+
+_PUBLISHED = {
+    1: "not measured; published lengths (Kapteyn et al. 2021, Table 1)",
+    2: "not measured; published pairs (Kapteyn et al. 2021, Fig. 5)",
+    3: "published frequencies and damping ratios (the authors' step 3)",
+}
+
+
+def _step_folder(path: Path, step: int) -> Path | None:
+    return next((place for place in places_of(path, Path(f"step{step}")) if place.is_dir()), None)
+
+
+def _fitted(path: Path, frequencies: Frequencies) -> RingDownTrials:
+    records = read_records(path)
+    trials = fit_trials(records, frequencies)
+    # Of a record read off a plot the extremes are averages of the signal; the middle of the ink is none.
+    return refine_by_extremes(trials) if all(record.lowest is not None for record in records) else trials
+
+
+def _weighed(path: Path) -> WeighedMass | None:
+    file = next((place for place in places_of(path, WEIGHED_MASS_FILE) if place.is_file()), None)
+    return None if file is None else read_weighed_mass(file.parents[1])
+
+
+def _authors(path: Path) -> DynamicCalibration | None:
+    places = places_of(path, STEP_FOLDER / RESULTS_FILE)
+    file = next((place for place in places if place.is_file()), None)
+    return None if file is None else read_published_results(file)
+
+
+def _hash_of_lengths(lengths: GeometryCalibration) -> str:
+    return hash_record(
+        [
+            [item.name, item.designed, item.measured, item.tolerance, item.reading_uncertainty]
+            for item in lengths.lengths
+        ]
+    )

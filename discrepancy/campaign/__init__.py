@@ -1,0 +1,1 @@
+"""What was measured: records, files, units, noise, and what is held out."""

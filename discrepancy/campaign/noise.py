@@ -1,0 +1,214 @@
+"""What the noise record of a channel says: its variance, lines of the mains in it, its correlation in time.
+
+Coloured noise is whitened by an autoregression fitted to the record, so that samples that repeat each other
+are not counted as evidence. Lines of the mains are taken out first: they are an effect, not noise.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import ceil, inf
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_toeplitz
+from scipy.optimize import minimize_scalar
+from scipy.signal import lfilter
+from scipy.stats import chi2
+
+from .noise_tests import ljung_box
+from .records import Channel
+
+FloatArray = NDArray[np.float64]
+
+MAINS = (50.0, 60.0, 400.0)
+"""Mains frequencies [Hz], of land and aircraft: an effect, and looked for in noise records."""
+MAINS_DEVIATION = 1e-3
+"""Share of its frequency by which the mains may be off."""
+LINE_STEPS = 4
+"""Frequencies that are looked at within the resolution of a record."""
+LARGEST_ORDER = 12
+WHITE_LEVEL = 1e-6
+"""Noise is taken as white unless the Ljung-Box test of the record rejects it at this level.
+
+Whitening by a chance correlation would colour white data."""
+LINE_LEVEL = 1e-4
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Noise of one channel.
+
+    Attributes
+    ----------
+    standard_deviation : float
+        s0 of the white innovation for dynamic trials, after whitening [channel's unit].
+    static_deviation : float
+        s0 of a single reading [channel's unit].
+    degrees_of_freedom : float
+        n0; infinite where s0 is exact, zero where nothing is known.
+    autoregression : (p,) ndarray
+        Coefficients a of e_t = x_t - sum_k a_k x_(t-k); empty for white noise.
+    interval : float or None
+        Sampling interval to which the autoregression belongs [s].
+    lines : tuple of float
+        Mains frequencies found in the record [Hz].
+    """
+
+    standard_deviation: float
+    static_deviation: float
+    degrees_of_freedom: float
+    autoregression: FloatArray
+    interval: float | None
+    lines: tuple[float, ...]
+
+    def whiten(self, columns: FloatArray, interval: float) -> FloatArray:
+        """Return the columns (..., N) of a dynamic record filtered so that this noise becomes white.
+
+        Parameters
+        ----------
+        columns : (..., N) ndarray
+            Residuals or derivatives, along the last axis.
+        interval : float
+            Their sampling interval [s]; the filter applies only at the record's own interval.
+        """
+        if not self.applies(interval):
+            return columns
+        white = np.asarray(lfilter(np.r_[1.0, -self.autoregression], [1.0], columns, axis=-1))
+        for row, weights in enumerate(self._beginning[: columns.shape[-1]]):
+            white[..., row] = columns[..., : row + 1] @ weights
+        return white
+
+    @cached_property
+    def _beginning(self) -> tuple[FloatArray, ...]:
+        """Weights (t + 1,) of the samples up to t that make sample t < p white: it has no longer history.
+
+        The best predictors of lower order, by the Levinson-Durbin recursion backwards.
+        """
+        weights: list[FloatArray] = []
+        coefficients, share = (
+            self.autoregression,
+            1.0,
+        )  # variance of the innovation over that of the prediction
+        while coefficients.size:
+            last = coefficients[-1]
+            share *= 1.0 - last**2
+            coefficients = (coefficients[:-1] + last * coefficients[-2::-1]) / (1.0 - last**2)
+            weights.append(np.sqrt(share) * np.r_[-coefficients[::-1], 1.0])
+        return tuple(reversed(weights))
+
+    def applies(self, interval: float) -> bool:
+        """Whether the autoregression belongs to this sampling interval."""
+        return bool(
+            self.autoregression.size
+            and self.interval is not None
+            and abs(interval - self.interval) <= 1e-3 * self.interval
+        )
+
+
+def aliased(frequency: float, interval: float) -> float:
+    """Return where a line shows [Hz] when sampled at `interval` [s]: 50 Hz shows at 10 Hz with 1/60 s."""
+    rate = 1.0 / interval
+    return abs(frequency - rate * round(frequency / rate))
+
+
+def noise_model(channel: Channel, fallback: float) -> NoiseModel:
+    """Return the noise of a channel from its record.
+
+    Parameters
+    ----------
+    channel : Channel
+        With its noise record, or none.
+    fallback : float
+        Scale that stands in for an unknown deviation [channel's unit]; only ratios to it matter then.
+    """
+    record = channel.noise
+    if record is None:
+        return NoiseModel(fallback, fallback, 0.0, np.empty(0), None, ())
+    samples, interval = record.samples, record.interval
+    deviation, freedom = record.standard_deviation, record.degrees_of_freedom
+    white = NoiseModel(deviation, deviation, freedom, np.empty(0), interval, ())
+    if samples is None or interval is None or len(samples) < 50:
+        return white
+    rest, lines = without_lines(samples - samples.mean(), interval)
+    freedom = len(rest) - 1.0 - 3.0 * len(lines)  # cosine, sine and frequency
+    deviation = float(np.sqrt(rest @ rest / freedom))
+    if ljung_box(rest)[1] > WHITE_LEVEL:
+        return NoiseModel(deviation, deviation, freedom, np.empty(0), interval, lines)
+    coefficients, innovation = autoregression(rest)
+    return NoiseModel(
+        float(np.sqrt(innovation)), deviation, freedom - len(coefficients), coefficients, interval, lines
+    )
+
+
+def without_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tuple[float, ...]]:
+    """Return the record without the mains lines that stand out of it, and their nominal frequencies [Hz].
+
+    The mains wander by `MAINS_DEVIATION` of their frequency, which a long record resolves.
+    """
+    found: list[float] = []
+    rest = samples
+    resolution = 1.0 / (len(samples) * interval)
+    for frequency in MAINS:
+        shown = aliased(frequency, interval)
+        if shown < 2.0 * resolution or shown > 0.5 / interval - 2.0 * resolution:
+            continue
+        reach = MAINS_DEVIATION * frequency
+        line = _strongest_line(rest, interval, shown - reach, shown + reach)
+        left = rest - line
+        # against the neighbourhood of the line, so that coloured noise is not taken for one
+        spectrum = np.abs(np.fft.rfft(left)) ** 2
+        index = round(shown / resolution)
+        wide = 3 + ceil(reach / resolution)
+        near = np.r_[
+            spectrum[max(1, index - wide - 9) : max(1, index - wide + 1)],
+            spectrum[index + wide : index + wide + 10],
+        ]
+        level = near.mean() * 2.0 / len(samples)  # mean power that a line of noise alone takes from the sum
+        independent = 1.0 + 2.0 * reach / resolution
+        if level > 0.0 and line @ line > 0.5 * chi2.isf(LINE_LEVEL / independent, 2) * level:
+            found.append(frequency)
+            rest = left
+    return rest, tuple(found)
+
+
+def _strongest_line(samples: FloatArray, interval: float, low: float, high: float) -> FloatArray:
+    """Return the line of most power between two frequencies [Hz]."""
+    count = LINE_STEPS * len(samples)
+    power = np.abs(np.fft.rfft(samples, count)) ** 2
+    step = 1.0 / (count * interval)
+    first = max(int(np.ceil(low / step)), 1)
+    inside = power[first : int(high / step) + 1]
+    best = step * (first + int(np.argmax(inside))) if inside.size else 0.5 * (low + high)
+
+    def missed(frequency: float) -> float:
+        line = _line(samples, interval, frequency)
+        return -float(line @ line)
+
+    bounds = (max(best - step, low, step), min(best + step, high))
+    if bounds[1] > bounds[0]:
+        best = float(
+            minimize_scalar(missed, bounds=bounds, method="bounded", options={"xatol": 1e-3 * step}).x
+        )
+    return _line(samples, interval, best)
+
+
+def _line(samples: FloatArray, interval: float, frequency: float) -> FloatArray:
+    """Return the line of a frequency in a record, by least squares."""
+    phase = 2.0 * np.pi * frequency * interval * np.arange(len(samples))
+    waves = np.stack((np.cos(phase), np.sin(phase)), axis=1)
+    amplitude, *_ = np.linalg.lstsq(waves, samples, rcond=None)
+    return np.asarray(waves @ amplitude)
+
+
+def autoregression(series: FloatArray) -> tuple[FloatArray, float]:
+    """Return coefficients (p,) and innovation variance of the autoregression with the least BIC."""
+    size = len(series)
+    covariance = np.array([series[: size - lag] @ series[lag:] / size for lag in range(LARGEST_ORDER + 1)])
+    best, least = (np.empty(0), float(covariance[0])), inf
+    for order in range(LARGEST_ORDER + 1):
+        coefficients = solve_toeplitz(covariance[:order], covariance[1 : order + 1]) if order else np.empty(0)
+        innovation = float(covariance[0] - coefficients @ covariance[1 : order + 1])
+        score = size * np.log(innovation) + order * np.log(size)
+        if score < least:
+            best, least = (coefficients, innovation * size / (size - order - 1.0)), score
+    return best

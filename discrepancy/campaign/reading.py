@@ -1,0 +1,369 @@
+"""Reading a campaign: a folder with `campaign.toml` and tables in, a checked `Campaign` in SI units out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from math import inf
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.noise_records import pre_trigger_record, with_noise
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.sampling import check_sampling
+from discrepancy.campaign.schema import (
+    INPUT_COLUMNS,
+    CampaignSection,
+    ChannelSection,
+    ReleaseSection,
+    TrialSection,
+    parse_campaign,
+)
+from discrepancy.campaign.table import read_table
+from discrepancy.campaign.units import difference, si_value
+from discrepancy.errors import CampaignDataError, CampaignFileError
+from reporting.provenance import hash_file, hash_record
+from reporting.table_file import TextTable
+from reporting.toml_file import read_toml
+from reporting.words import be, counted
+
+FloatArray = NDArray[np.float64]
+
+CAMPAIGN_FILE = "campaign.toml"
+"""Name of the file that describes a campaign, in its folder."""
+
+
+def read_campaign(folder: str | Path) -> Campaign:
+    """Read a campaign from its folder (or from its `campaign.toml`).
+
+    Parameters
+    ----------
+    folder : path
+        Holds `campaign.toml` and the tables that it names.
+
+    Returns
+    -------
+    Campaign
+        SI units; readings that are left out are marked so, and remarks say what the reader did.
+
+    Raises
+    ------
+    CampaignFileError
+        A file, key or column is missing or is not of its kind; the sentence names place and remedy.
+    CampaignDataError
+        NaN or infinite readings, uneven sampling, a gap in time, or a noise record that is none.
+    """
+    folder = Path(folder)
+    if folder.name == CAMPAIGN_FILE:
+        folder = folder.parent
+    section, printed = _read_section(folder)
+    names = {CAMPAIGN_FILE, *(trial.file for trial in section.trial)}
+    if section.noise is not None:
+        names.add(section.noise.file)
+    for name in sorted(names):
+        _check_inside(name)
+    tables = {name: read_table(folder, name) for name in sorted(names - {CAMPAIGN_FILE})}
+    remarks: list[str] = []
+    trials = tuple(
+        _trial(trial, raw, tables[trial.file], section, remarks)
+        for trial, raw in zip(section.trial, printed["trial"], strict=True)
+    )
+    _check_every_channel_is_measured(section, trials, tables)
+    channels = _channels(section, printed, tables, trials, remarks)
+    return Campaign(
+        name=section.name,
+        channels=channels,
+        trials=trials,
+        reference_temperature=section.reference_temperature,
+        parameters={name: (item.mean, item.deviation) for name, item in section.parameters.items()},
+        data_hash=hash_record({name: hash_file(folder / name) for name in sorted(names)}),
+        remarks=(*section.remarks, *(remark for remark in remarks if remark not in section.remarks)),
+    )
+
+
+def _read_section(folder: Path) -> tuple[CampaignSection, Mapping[str, Any]]:
+    """Return the checked content, and the same with its decimal numbers as printed."""
+    path = folder / CAMPAIGN_FILE
+    if not path.exists():
+        missing = f"{CAMPAIGN_FILE} in {folder}" if folder.is_dir() else f"folder {folder}"
+        raise CampaignFileError(f"There is no {missing}: give the folder of a campaign.")
+    table = read_toml(path, CampaignFileError, what="campaign")
+    printed = read_toml(path, CampaignFileError, what="campaign", parse_float=str)
+    return parse_campaign(table, str(path)), printed
+
+
+def _check_inside(name: str) -> None:
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
+        raise CampaignFileError(
+            f"The file {name!r} must lie in the campaign's folder: give its place in there, with forward "
+            "slashes."
+        )
+
+
+def _check_every_channel_is_measured(
+    section: CampaignSection, trials: tuple[Trial, ...], tables: Mapping[str, TextTable]
+) -> None:
+    for channel in section.channel:
+        if not any(channel.name in trial.channels for trial in trials):
+            name = section.trial[0].file
+            raise CampaignFileError(
+                f"The channel {channel.name!r} is in no trial: no table has a column "
+                f"{channel.table_column!r}; "
+                f"the columns of {name} are {', '.join(tables[name].columns)}."
+            )
+
+
+# ---------------------------------------------------------------- trials
+
+
+def _trial(
+    section: TrialSection,
+    printed: Mapping[str, Any],
+    table: TextTable,
+    campaign: CampaignSection,
+    remarks: list[str],
+) -> Trial:
+    user = f"the trial {section.name!r}"
+    dynamic = section.kind in (TrialKind.RINGDOWN, TrialKind.FORCED)
+    count = len(table)
+    start = section.start or 0.0
+    if dynamic:
+        time = check_sampling(table.numbers("time", user), table.cells("time", user), user, table.name)
+    elif "time" in table.columns:
+        time = table.numbers("time", user)
+        start = section.start if section.start is not None else float(time[0])
+        if np.any(np.diff(time) < 0.0):
+            raise CampaignDataError(
+                f"{table.name}: the times of {user} run backwards; put its rows in order."
+            )
+    else:
+        time = np.full(count, start)
+    zeros = np.zeros(count)
+    forced = section.kind in (TrialKind.STATIC, TrialKind.FORCED)
+    chosen = _measured(section, table, campaign)
+    known = {*INPUT_COLUMNS, *(channel.table_column for channel in campaign.channel)}
+    unknown = [name for name in table.columns if name not in known]
+    if unknown:
+        remarks.append(
+            f"{table.name}: no channel has the column {', '.join(map(repr, unknown))}, which is left out; "
+            "if that is not meant, check its spelling."
+        )
+    columns, used = zip(*(_readings(channel, section, table, remarks) for channel in chosen), strict=True)
+    health, health_deviation = _health(section, table, user)
+    return Trial(
+        name=section.name,
+        kind=section.kind,
+        channels=tuple(channel.name for channel in chosen),
+        values=np.stack(columns, axis=1),
+        used=np.stack(used, axis=1),
+        time=time,
+        force=table.numbers("force", user) if forced else zeros,
+        load_factor=table.numbers("load_factor", user) if section.kind is TrialKind.FLIGHT else zeros,
+        load_place=section.load_place,
+        temperature=_temperature(section, table, campaign, user),
+        start=start,
+        run=section.run,
+        health=health,
+        health_deviation=health_deviation,
+        release=None
+        if section.release is None
+        else _release(section.release, str(printed["release"]["displacement"])),
+        held_out=section.held_out,
+        noise_factor=section.noise_factor,
+    )
+
+
+def _measured(
+    section: TrialSection, table: TextTable, campaign: CampaignSection
+) -> tuple[ChannelSection, ...]:
+    """Return the channels of a trial: those that it names, or all whose columns are there."""
+    channels = {channel.name: channel for channel in campaign.channel}
+    if section.channels is not None:
+        chosen = tuple(channels[name] for name in section.channels)
+        for channel in chosen:
+            table.cells(channel.table_column, f"the channel {channel.name!r}")
+    else:
+        chosen = tuple(channel for channel in channels.values() if channel.table_column in table.columns)
+    if not chosen:
+        raise CampaignFileError(
+            f"{table.name} of the trial {section.name!r} holds no channel: its columns are "
+            f"{', '.join(table.columns)}, and those of the channels "
+            f"{', '.join(channel.table_column for channel in channels.values())}."
+        )
+    return chosen
+
+
+def _readings(
+    channel: ChannelSection, section: TrialSection, table: TextTable, remarks: list[str]
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return a channel's readings and which of them are used; an empty cell is bridged and left out."""
+    values = table.numbers(
+        channel.table_column,
+        f"the channel {channel.name!r}",
+        lambda text: si_value(text, channel.quantity, channel.unit),
+        empty_allowed=True,
+    )
+    used = np.isfinite(values)
+    if not used.any():
+        raise CampaignDataError(
+            f"{table.name} has no reading in the column {channel.table_column!r} of the trial "
+            f"{section.name!r}."
+        )
+    if not used.all():
+        rows = np.arange(len(values))
+        values[~used] = np.interp(rows[~used], rows[used], values[used])
+        remarks.append(
+            f"{int((~used).sum())} of {len(values)} readings of {channel.name!r} in the trial "
+            f"{section.name!r} {be(int((~used).sum()))} empty and left out."
+        )
+    for row in section.left_out.get(channel.name, ()):
+        if row > len(values):
+            raise CampaignFileError(
+                f"The trial {section.name!r} leaves out row {row} of {channel.name!r}, and {table.name} has "
+                f"{counted(len(values), 'row')}."
+            )
+        used[row - 1] = False
+    return values, used
+
+
+def _temperature(section: TrialSection, table: TextTable, campaign: CampaignSection, user: str) -> FloatArray:
+    reference = campaign.reference_temperature
+    column = "temperature" in table.columns
+    if column and section.temperature is not None:
+        raise CampaignFileError(
+            f"{user.capitalize()} gives its temperature twice: remove `temperature` or the column of "
+            f"{table.name}."
+        )
+    if not column and section.temperature is None:
+        return np.zeros(len(table))
+    if reference is None:
+        raise CampaignFileError(
+            f"{user.capitalize()} has a temperature, but the campaign has no `reference_temperature`: "
+            "give it, "
+            "in degC."
+        )
+    if column:
+        return table.numbers("temperature", user, lambda text: difference(text, reference))
+    return np.full(len(table), difference(repr(section.temperature), reference))
+
+
+def _health(section: TrialSection, table: TextTable, user: str) -> tuple[FloatArray, FloatArray]:
+    """Return stiffness losses and their deviations, (N, 2), from columns, keys, or healthy."""
+    health, deviation = np.zeros((len(table), 2)), np.zeros((len(table), 2))
+    for index, name in enumerate(("z1", "z2")):
+        stated = None if section.health is None else getattr(section.health, name)
+        if name in table.columns:
+            if stated is not None:
+                raise CampaignFileError(
+                    f"{user.capitalize()} gives {name} twice: remove it from `health` or from {table.name}."
+                )
+            health[:, index] = table.numbers(name, user)
+            outside = np.flatnonzero((health[:, index] < 0.0) | (health[:, index] > 1.0))
+            if outside.size:
+                raise CampaignFileError(
+                    f"{table.name}, line {table.lines[int(outside[0])]}: {name} is a fraction from 0 to "
+                    "1, and "
+                    f"{health[outside[0], index]:g} came."
+                )
+        elif stated is not None:
+            health[:, index] = stated
+        if f"{name}_deviation" in table.columns:
+            deviation[:, index] = table.numbers(f"{name}_deviation", user)
+            negative = np.flatnonzero(deviation[:, index] < 0.0)
+            if negative.size:
+                raise CampaignFileError(
+                    f"{table.name}, line {table.lines[int(negative[0])]}: {name}_deviation is a standard "
+                    f"deviation, and {deviation[negative[0], index]:g} came."
+                )
+        elif section.health is not None:
+            deviation[:, index] = section.health.deviation
+    return health, deviation
+
+
+def _release(section: ReleaseSection, displacement: str) -> Release:
+    quantity = Quantity.DISPLACEMENT if section.unit in ("m", "mm", "um") else Quantity.SIGNAL
+    return Release(
+        displacement=si_value(displacement, quantity, section.unit),
+        deviation=section.deviation,
+        at_rest=section.at_rest,
+        mode_count=section.mode_count,
+        time_zero_deviation=section.time_zero_deviation,
+    )
+
+
+# ---------------------------------------------------------------- channels
+
+
+def _channels(
+    section: CampaignSection,
+    printed: Mapping[str, Any],
+    tables: Mapping[str, TextTable],
+    trials: tuple[Trial, ...],
+    remarks: list[str],
+) -> dict[str, Channel]:
+    recorded = _recorded_noise(section, tables)
+    channels = {}
+    for item, raw in zip(section.channel, printed["channel"], strict=True):
+        channel = Channel(
+            name=item.name,
+            quantity=item.quantity,
+            output=item.output,
+            noise=None,
+            gain_deviation=inf if item.gain_deviation == "free" else item.gain_deviation,
+            offset_deviation=inf
+            if item.offset_deviation == "free"
+            else si_value(str(raw.get("offset_deviation", 0.0)), item.quantity, item.unit),
+            station=item.station,
+            chord=item.chord,
+        )
+        stated = None
+        if item.noise is not None:
+            stated = NoiseRecord(
+                si_value(str(raw["noise"]["standard_deviation"]), item.quantity, item.unit),
+                item.noise.degrees_of_freedom,
+                source=item.noise.source,
+            )
+        noise, remark = with_noise(channel, recorded, stated, trials)
+        if remark:
+            remarks.append(remark)
+        channels[item.name] = replace(channel, noise=noise)
+    return channels
+
+
+def _recorded_noise(section: CampaignSection, tables: Mapping[str, TextTable]) -> dict[str, NoiseRecord]:
+    """Return the records of the samples at rest; a shorter record has empty cells at its end."""
+    if section.noise is None:
+        return {}
+    table = tables[section.noise.file]
+    user = "the noise record"
+    interval = section.noise.interval
+    if interval is None:
+        time = check_sampling(table.numbers("time", user), table.cells("time", user), user, table.name)
+        interval = float(time[-1] - time[0]) / (len(time) - 1)
+    records = {}
+    for item in section.channel:
+        if item.table_column not in table.columns:
+            continue
+        values = table.numbers(
+            item.table_column,
+            user,
+            lambda text, item=item: si_value(text, item.quantity, item.unit),  # type: ignore[misc]
+            empty_allowed=True,
+        )
+        there = np.isfinite(values)
+        count = int(there.sum())
+        if not there[:count].all():
+            raise CampaignDataError(
+                f"{table.name}: the column {item.table_column!r} has an empty cell between readings; a noise "
+                "record must be without gaps."
+            )
+        records[item.name] = pre_trigger_record(values[:count], interval, item.name, table.name)
+    if not records:
+        raise CampaignFileError(
+            f"{table.name} holds the noise of no channel: its columns are {', '.join(table.columns)}."
+        )
+    return records

@@ -1,0 +1,252 @@
+"""A measurement campaign: trials, channels, noise records and states, as records in SI units.
+
+`discrepancy.campaign.reading` reads one from a folder; strain is dimensionless here, displacement in metres.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+class Quantity(StrEnum):
+    """What a channel measures; the unit of its values here."""
+
+    STRAIN = "strain"  # 1
+    DISPLACEMENT = "displacement"  # m
+    VELOCITY = "velocity"  # m/s
+    ACCELERATION = "acceleration"  # m/s^2
+    SIGNAL = "signal"  # uncalibrated, e.g. V: the channel's gain is unknown and fitted
+
+    def derivatives_of(self, output: "Quantity") -> int:
+        """Return how often an output of a model is derived in time for a channel of this quantity."""
+        moving = (Quantity.DISPLACEMENT, Quantity.VELOCITY, Quantity.ACCELERATION)
+        if self not in moving or output not in moving:
+            return 0
+        return max(moving.index(self) - moving.index(output), 0)
+
+    def shows(self, output: "Quantity") -> bool:
+        """Whether a channel of this quantity can measure what an output of a model is."""
+        return self in (output, Quantity.SIGNAL) or self.derivatives_of(output) > 0
+
+    @property
+    def is_rate(self) -> bool:
+        """Whether it is nought at rest."""
+        return self in (Quantity.VELOCITY, Quantity.ACCELERATION)
+
+
+class TrialKind(StrEnum):
+    """What was done in a trial."""
+
+    STATIC = "static"  # rows are load levels at rest: an applied force
+    RINGDOWN = "ringdown"  # rows are samples in time after a release; no external load
+    FORCED = "forced"  # rows are samples in time under a recorded force, from rest
+    FLIGHT = "flight"  # rows are steady turns: a load factor
+
+
+@dataclass(frozen=True)
+class NoiseRecord:
+    """What is known of a channel's noise.
+
+    Attributes
+    ----------
+    standard_deviation : float
+        s0 [channel's unit].
+    degrees_of_freedom : float
+        n0; infinite if the standard deviation is taken as exact.
+    samples : (n,) ndarray or None
+        The recorded noise itself, mean removed, if there is one.
+    interval : float or None
+        Sampling interval of `samples` [s].
+    source : str
+        "pre-trigger", "repeats" or "stated".
+    """
+
+    standard_deviation: float
+    degrees_of_freedom: float
+    samples: FloatArray | None = None
+    interval: float | None = None
+    source: Literal["pre-trigger", "repeats", "stated"] = "stated"
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One measuring channel.
+
+    Attributes
+    ----------
+    name : str
+        Unique in the campaign; also the column of the CSV files unless the file says otherwise.
+    quantity : Quantity
+        What it measures.
+    output : str
+        The model's output that it is compared with, such as "strain[17]" or "tip_displacement".
+    noise : NoiseRecord or None
+        None: nothing is known, and no absolute statement about the fit can be made.
+    gain_deviation : float
+        Prior standard deviation of the channel's relative gain error [1]; infinite for a signal of unknown
+        scale (one of them is then the scale of the release amplitudes).
+    offset_deviation : float
+        Prior standard deviation of its zero in each trial [channel's unit]; infinite: a free zero.
+    station : float or None
+        Place along the span [m], for maps.
+    chord : float or None
+        Place along the chord [fraction], for maps.
+    """
+
+    name: str
+    quantity: Quantity
+    output: str
+    noise: NoiseRecord | None
+    gain_deviation: float = 0.0
+    offset_deviation: float = 0.0
+    station: float | None = None
+    chord: float | None = None
+
+
+@dataclass(frozen=True)
+class Release:
+    """How a ring-down began.
+
+    Attributes
+    ----------
+    displacement : float
+        Nominal displacement of the release point before the release [m or the signal's unit].
+    deviation : float
+        Prior relative standard deviation of it [1].
+    at_rest : bool
+        True: the first sample is at the release, from the static shape under the holding force, and higher
+        modes start as that shape says, within `deviation`; False: the record starts later, and displacement
+        and velocity of each of `mode_count` modes are free.
+    mode_count : int
+        Modes whose initial state is free in addition.
+    time_zero_deviation : float
+        Prior standard deviation of the time between release and first sample [s].
+    """
+
+    displacement: float
+    deviation: float = 0.05
+    at_rest: bool = True
+    mode_count: int = 3
+    time_zero_deviation: float = 0.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One trial: known inputs, measured values, labels of its state.
+
+    Attributes
+    ----------
+    name : str
+        Unique in the campaign.
+    kind : TrialKind
+        What was done.
+    channels : tuple of str
+        Names of the measured channels.
+    values : (N, C) ndarray
+        Measured values, units of the channels.
+    used : (N, C) ndarray of bool
+        False where a sample is left out (an outlier, a gap), with the reason in the campaign's `remarks`.
+    time : (N,) ndarray
+        Ring-down, forced: time since the trial's start [s], evenly spaced. Static, flight: time of each row
+        since the campaign's start [s].
+    force : (N,) ndarray
+        Applied force [N], upwards positive; zero in ring-downs and flights.
+    load_factor : (N,) ndarray
+        Load factor [1]; zero except in flight.
+    load_place : str or tuple of float
+        Where the force acts: a named place of the model ("tip_load" is the wing's own), or (y [m] from the
+        root, x [fraction of the chord]).
+    temperature : (N,) ndarray
+        Temperature less the campaign's reference temperature [K].
+    start : float
+        Start of the trial since the campaign's start [s].
+    run : str
+        Label of the run (set-up) that the trial belongs to.
+    health : (N, 2) ndarray
+        Known stiffness losses z1, z2 (fractions); prior means where `health_deviation` is positive.
+    health_deviation : (N, 2) ndarray
+        Prior standard deviations; zero where they are known.
+    release : Release or None
+        Ring-downs only.
+    held_out : bool
+        True: not used to find or fit anything, only for proof.
+    noise_factor : float
+        Standard deviation of the noise in this trial over that of the channels' noise records, as known from
+        the acquisition (averaging, another range) [1].
+    """
+
+    name: str
+    kind: TrialKind
+    channels: tuple[str, ...]
+    values: FloatArray
+    used: BoolArray
+    time: FloatArray
+    force: FloatArray
+    load_factor: FloatArray
+    load_place: str | tuple[float, float]
+    temperature: FloatArray
+    start: float
+    run: str
+    health: FloatArray
+    health_deviation: FloatArray
+    release: Release | None = None
+    held_out: bool = False
+    noise_factor: float = 1.0
+
+    @property
+    def is_dynamic(self) -> bool:
+        """Whether the rows are samples in time of a motion."""
+        return self.kind in (TrialKind.RINGDOWN, TrialKind.FORCED)
+
+    @property
+    def interval(self) -> float:
+        """Sampling interval [s] of a dynamic trial."""
+        return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """All trials of one structure.
+
+    Attributes
+    ----------
+    name : str
+        Title.
+    channels : mapping of str to Channel
+        By name.
+    trials : tuple of Trial
+        In the order of the file.
+    reference_temperature : float or None
+        [degC]; None where temperatures were not recorded.
+    parameters : mapping of str to (float, float)
+        Mean and standard deviation that replace the model's own prior of calibrated parameters.
+    data_hash : str
+        SHA-256 of the campaign's files.
+    remarks : tuple of str
+        What the reader noticed and did: samples left out and why, a missing noise record.
+    """
+
+    name: str
+    channels: Mapping[str, Channel]
+    trials: tuple[Trial, ...]
+    reference_temperature: float | None
+    parameters: Mapping[str, tuple[float, float]]
+    data_hash: str
+    remarks: tuple[str, ...] = field(default=())
+
+    @property
+    def fitted(self) -> tuple[Trial, ...]:
+        """Trials that may be used to find and fit an effect."""
+        return tuple(trial for trial in self.trials if not trial.held_out)
+
+    @property
+    def held_out(self) -> tuple[Trial, ...]:
+        """Trials kept for proof."""
+        return tuple(trial for trial in self.trials if trial.held_out)

@@ -1,0 +1,258 @@
+"""The schema of `campaign.toml`: what it may say, checked strictly; units are still those of the file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from discrepancy.campaign.records import Quantity, TrialKind
+from discrepancy.campaign.units import units_of
+from discrepancy.errors import CampaignFileError
+from fe.runtime.patch import EVERY_CHANNEL
+from reporting.section import Section, shown
+
+FORMAT = 1
+"""Version of the format."""
+INPUT_COLUMNS = (
+    "time", "force", "load_factor", "temperature", "z1", "z2", "z1_deviation", "z2_deviation",
+)  # fmt: skip
+"""Columns of the tables that are no channels."""
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0)]
+NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0)]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Deviation = Annotated[float, Field(allow_inf_nan=False, ge=0.0)] | Literal["free"]
+MOST_MODES = 100
+
+
+class ParameterSection(Section):
+    """`[parameters.NAME]`: what replaces the model's own prior [SI]."""
+
+    mean: Number
+    deviation: NotNegative
+
+
+class NoiseFileSection(Section):
+    """`[noise]`: the table of samples at rest; `interval` [s] replaces its column `time`."""
+
+    file: Name
+    interval: Positive | None = None
+
+
+class StatedNoise(Section):
+    """`noise` of a channel [its unit]; exact without degrees of freedom."""
+
+    standard_deviation: Positive
+    degrees_of_freedom: Positive = float("inf")
+    source: Literal["stated", "repeats", "pre-trigger"] = "stated"
+
+
+class ChannelSection(Section):
+    """`[[channel]]`."""
+
+    name: Name
+    quantity: Quantity = Field(strict=False)
+    unit: Name
+    output: Name
+    column: Name | None = None
+    station: Number | None = None
+    chord: Number | None = None
+    gain_deviation: Deviation = 0.0
+    offset_deviation: Deviation = 0.0
+    noise: StatedNoise | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.unit not in units_of(self.quantity):
+            raise ValueError(
+                f"the channel {self.name!r} measures {self.quantity.value} and must have one of the units "
+                f"{', '.join(units_of(self.quantity))}, and {self.unit!r} came"
+            )
+        if self.name == EVERY_CHANNEL or self.name.startswith("#"):
+            raise ValueError(f"a channel cannot be called {self.name!r}")
+        if self.table_column in INPUT_COLUMNS:
+            raise ValueError(
+                f"the column {self.table_column!r} holds an input of the trial: give the channel "
+                f"{self.name!r} "
+                "another column"
+            )
+        return self
+
+    @property
+    def table_column(self) -> str:
+        """Column of the tables."""
+        return self.column or self.name
+
+
+class ReleaseSection(Section):
+    """`release` of a ring-down."""
+
+    displacement: Number
+    unit: Literal["m", "mm", "um", "V", "mV", "1"] = "m"
+    deviation: Positive = 0.05
+    at_rest: bool = True
+    mode_count: Annotated[int, Field(ge=0, le=MOST_MODES)] = 3
+    time_zero_deviation: NotNegative = 0.0
+
+    @field_validator("displacement")
+    @classmethod
+    def _somewhere(cls, displacement: float) -> float:
+        if displacement == 0.0:
+            raise ValueError("must not be zero: its sign is the side to which the structure is held")
+        return displacement
+
+
+class HealthSection(Section):
+    """`health` of a trial: fractions."""
+
+    z1: Fraction | None = None
+    z2: Fraction | None = None
+    deviation: NotNegative = 0.0
+
+
+class TrialSection(Section):
+    """`[[trial]]`."""
+
+    name: Name
+    kind: TrialKind = Field(strict=False)
+    file: Name
+    run: str = ""
+    held_out: bool = False
+    noise_factor: Positive = 1.0
+    start: NotNegative | None = None
+    temperature: Number | None = None
+    load_place: Name | tuple[Number, Number] = Field(default="tip_load", union_mode="left_to_right")
+    health: HealthSection | None = None
+    release: ReleaseSection | None = None
+    channels: tuple[Name, ...] | None = None
+    left_out: dict[str, tuple[Annotated[int, Field(ge=1)], ...]] = Field(default_factory=dict)
+
+    @field_validator("load_place", mode="before")
+    @classmethod
+    def _place(cls, value: object) -> object:
+        if isinstance(value, list):
+            if len(value) != 2:
+                raise ValueError(
+                    "`load_place` must be a name or [y, x] (m from the root, fraction of the chord), "
+                    f"and {value} "
+                    "came"
+                )
+            return tuple(value)
+        return value
+
+    @field_validator("channels", mode="before")
+    @classmethod
+    def _tuple(cls, value: object) -> object:
+        return tuple(value) if isinstance(value, list) else value
+
+    @field_validator("left_out", mode="before")
+    @classmethod
+    def _tuples(cls, value: object) -> object:
+        if not isinstance(value, Mapping):
+            return value
+        return {key: tuple(rows) if isinstance(rows, list) else rows for key, rows in value.items()}
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.kind is TrialKind.RINGDOWN and self.release is None:
+            raise ValueError(f"the ring-down {self.name!r} needs `release` with its displacement")
+        if self.kind is not TrialKind.RINGDOWN and self.release is not None:
+            raise ValueError(f"the trial {self.name!r} is no ring-down and cannot have a `release`")
+        return self
+
+
+class CampaignSection(Section):
+    """The whole file."""
+
+    format: Literal[1]
+    name: str
+    reference_temperature: Number | None = None
+    parameters: dict[Name, ParameterSection] = Field(default_factory=dict)
+    noise: NoiseFileSection | None = None
+    channel: tuple[ChannelSection, ...] = Field(min_length=1)
+    trial: tuple[TrialSection, ...] = Field(min_length=1)
+    remarks: tuple[str, ...] = ()
+
+    @field_validator("channel", "trial", "remarks", mode="before")
+    @classmethod
+    def _tuple(cls, value: object) -> object:
+        return tuple(value) if isinstance(value, list) else value
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for kind, names in (
+            ("channel", [item.name for item in self.channel]),
+            ("trial", [item.name for item in self.trial]),
+        ):
+            twice = sorted({name for name in names if names.count(name) > 1})
+            if twice:
+                raise ValueError(f"there is more than one {kind} called {twice[0]!r}: rename one")
+        columns = [item.table_column for item in self.channel]
+        twice = sorted({column for column in columns if columns.count(column) > 1})
+        if twice:
+            raise ValueError(
+                f"more than one channel reads the column {twice[0]!r}: give each its own `column`"
+            )
+        known = {item.name for item in self.channel}
+        for item in self.trial:
+            for name in (*(item.channels or ()), *item.left_out):
+                if name not in known:
+                    raise ValueError(
+                        f"the trial {item.name!r} names the channel {name!r}, which is not among the "
+                        "channels "
+                        f"{', '.join(sorted(known))}"
+                    )
+        return self
+
+
+def parse_campaign(table: Mapping[str, Any], source: str) -> CampaignSection:
+    """Return the checked content of a campaign's TOML file.
+
+    Raises
+    ------
+    CampaignFileError
+        The table breaks the schema; one sentence with file and key.
+    """
+    if table.get("format") != FORMAT or isinstance(table.get("format"), bool):
+        came = f"`format` is {table['format']!r}" if "format" in table else "`format` is missing"
+        raise CampaignFileError(f"{source}: {came}; this version reads campaigns with `format = {FORMAT}`.")
+    try:
+        return CampaignSection.model_validate(dict(table))
+    except ValidationError as error:
+        errors = error.errors(include_url=False, include_context=True)
+        # A misspelt key shows up twice, as unknown and as missing: the unknown one tells more.
+        first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
+        raise CampaignFileError(f"{source}: {_sentence(first, table)}") from None
+
+
+def _sentence(error: Mapping[str, Any], table: Mapping[str, Any]) -> str:
+    where = _written(error["loc"], table)
+    if error["type"] == "extra_forbidden":
+        return f"unknown key `{where}`; check its spelling and the table that it stands in."
+    if error["type"] == "missing":
+        return f"`{where}` is missing."
+    if error["type"] == "value_error":
+        return f"{error['ctx']['error']}."
+    if error["type"] == "too_short":
+        return f"`{where}` must have at least one entry."
+    expected = str(error["msg"]).replace("Input should", "should", 1)
+    return f"`{where}` {expected}, and {shown(error['input'])} came."
+
+
+def _written(location: tuple[int | str, ...], table: Mapping[str, Any]) -> str:
+    """Return a place as the file has it: entries of arrays counted from one, branches of unions left out."""
+    node: Any = table
+    text = ""
+    for number, part in enumerate(location):
+        last = number == len(location) - 1
+        if isinstance(part, int):
+            text += f"[{part + 1}]"
+            node = node[part] if isinstance(node, list | tuple) and part < len(node) else None
+        elif isinstance(node, Mapping) and (part in node or last):
+            text += f".{part}" if text else part
+            node = node.get(part)
+    return text

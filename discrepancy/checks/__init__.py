@@ -1,0 +1,1 @@
+"""Faults of data, alone and beside a model."""

@@ -1,0 +1,284 @@
+"""Single readings that cannot be right: found by their neighbours or repeats, and left out with a remark."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.noise_records import repeated
+from discrepancy.campaign.records import Campaign, Channel, Trial
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+LARGEST_SHARE = 0.03
+"""Largest share of a record in time that may be left out; above it the record is at fault."""
+SIGNIFICANT = 5.0
+"""A sample is an outlier if it is this many robust deviations off what its neighbours say."""
+WRONG_END = 8.0
+"""The same at the ends of a record, beside what a model predicts."""
+SIGNIFICANT_ROW = 8.0
+"""The same for a row of a static or flight trial, in deviations of the noise record."""
+_SHAPES = ((3, 5), (4, 5), (6, 5), (9, 5), (13, 5), (18, 5), (6, 9), (9, 9), (9, 13), (13, 13), (18, 13))
+_EDGE = 3  # samples at either end that are not judged, and the narrowest half width
+_NEAR = 25  # half width of the neighbourhood whose roughness a sample is compared with
+_PASSES = 8
+_NORMAL = 1.4826  # standard deviation of a normal variable over its median absolute deviation
+
+
+def mark_outliers(campaign: Campaign) -> Campaign:
+    """Return the campaign with isolated outliers left out, and a remark for each channel and trial.
+
+    Records in time: a sample is compared with a local polynomial through its neighbours, whose width is the
+    one that predicts the record best. It is an outlier if it is five robust deviations off, in the scatter
+    of the whole record and in that of its surroundings, and alone: three of five samples in a row are an
+    event, such as an impact, and stay, and so does a sample at a kink or a step. The first and last three
+    samples are not judged. Where more than 3 % of a record would go, nothing is left out (`check_data`
+    reports a fault).
+
+    Static and flight trials: a row of at least three repeats is compared with their median; else, in trials
+    of eight or more rows, one row may go if a parabola through the others explains them within twice the
+    noise and misses this one by eight deviations. Both ask for a noise record.
+    """
+    trials = {trial.name: trial for trial in campaign.trials}
+    remarks = list(campaign.remarks)
+    for name, channel, found in find_outliers(campaign):
+        trial = trials[name]
+        count, total = int(found.sum()), len(found)
+        if trial.is_dynamic and count > LARGEST_SHARE * total:
+            continue
+        used = trial.used.copy()
+        used[found, trial.channels.index(channel)] = False
+        trials[name] = replace(trial, used=used)
+        said = "is an outlier" if count == 1 else "are outliers"
+        remarks.append(
+            f"{count} of {total} readings of {channel!r} in the trial {name!r} {said} and left out."
+        )
+    return replace(campaign, trials=tuple(trials.values()), remarks=tuple(remarks))
+
+
+def find_outliers(campaign: Campaign) -> Iterator[tuple[str, str, BoolArray]]:
+    """Yield trial, channel and the outliers (N,) of every record that has any."""
+    for name, channel in campaign.channels.items():
+        by_repeats = _repeat_outliers(campaign, channel)
+        for trial in campaign.trials:
+            if name not in trial.channels:
+                continue
+            column = trial.channels.index(name)
+            values, used = trial.values[:, column], trial.used[:, column]
+            if trial.is_dynamic:
+                found = sample_outliers(values, used)
+            elif trial.name in by_repeats:
+                found = by_repeats[trial.name] & used
+            else:
+                found = _row_outlier(trial, values, used, channel)
+            if found.any():
+                yield trial.name, name, found
+
+
+def sample_outliers(values: FloatArray, used: BoolArray | None = None) -> BoolArray:
+    """Return which samples of an even record are isolated outliers, (N,); see `mark_outliers`.
+
+    Parameters
+    ----------
+    values : (N,) ndarray
+        The record.
+    used : (N,) ndarray of bool, optional
+        Samples that count; the others are bridged and never reported.
+    """
+    count = len(values)
+    none = np.zeros(count, dtype=bool)
+    if count < 4 * _EDGE + 4 or (used is not None and used.sum() < 0.5 * count):
+        return none
+    size = float(np.max(np.abs(values)))
+    if size == 0.0:
+        return none
+    clean = values / size  # squares of readings of any size stay in range
+    if used is not None and not used.all():
+        rows = np.arange(count)
+        clean[~used] = np.interp(rows[~used], rows[used], clean[used])
+    judged = clean.copy()
+    shapes = [shape for shape in _SHAPES if 4 * shape[0] + 4 <= count]
+    shape = min(shapes, key=lambda item: _scatter(_rest(clean, item)))
+    suspects = none.copy()
+    events = none.copy()
+    edge = _EDGE if shape[1] == _SHAPES[0][1] else shape[0]
+    for _ in range(_PASSES):
+        rest = _rest(clean, shape)
+        share = np.abs(rest) / _scale(rest)
+        share[:edge] = share[-edge:] = 0.0
+        # Only the worst of each neighbourhood: it spoils the prediction of the samples around it.
+        peaks = share == _running_maximum(share, shape[0])
+        new = np.flatnonzero((share > SIGNIFICANT) & peaks & ~suspects & ~events)
+        if not new.size:
+            break
+        event = np.array([_is_event(rest, int(index), shape) for index in new])
+        events[new[event]] = True
+        suspects[new[~event]] = True
+        clean[new[~event]] -= rest[new[~event]]
+    # Judge again with clean neighbours, and let events stay: three of five in a row are no single readings.
+    rest = _rest(clean, shape)
+    found = suspects & (np.abs(judged - clean + rest) > SIGNIFICANT * _scale(rest))
+    if used is not None:
+        found &= used
+    crowded = np.convolve(found, np.ones(5), mode="same") >= 3
+    event = np.convolve(crowded, np.ones(5), mode="same") > 0
+    result: BoolArray = found & ~event
+    return result
+
+
+def wrong_ends(residual: FloatArray, used: BoolArray) -> BoolArray:
+    """Return which samples at the ends of a trial's records are single wrong readings, (N, C).
+
+    `sample_outliers` cannot judge the ends; beside a model they can be. What several channels show at once,
+    or several samples in a row, is no single reading: a release, an impact, a trigger that came late.
+
+    Parameters
+    ----------
+    residual : (N, C) ndarray
+        Measured less predicted; the model need not fit.
+    used : (N, C) ndarray of bool
+        Samples that count.
+    """
+    found = np.zeros(residual.shape, dtype=bool)
+    for column in range(residual.shape[1]):
+        rows = np.flatnonzero(used[:, column])
+        if len(rows) < 8 * _EDGE:
+            continue
+        rest = residual[rows, column]
+        around = np.stack([_shifted(rest, shift) for shift in (-2, -1, 1, 2)])
+        beside = rest - np.nanmedian(around, axis=0)
+        alone = np.abs(rest) > 2.0 * np.nanmax(np.abs(around), axis=0)
+        for end in (slice(0, _EDGE), slice(-_EDGE, None)):
+            # beside the roughness near that end, where the motion may be fastest
+            near = beside[: 4 * _NEAR] if end.stop else beside[-4 * _NEAR :]
+            scale = max(_NORMAL * float(np.median(np.abs(near))), 1e-300)
+            far = alone[end] & (np.abs(beside[end]) > WRONG_END * scale)
+            found[rows[end][far], column] = far.sum() == 1
+    for end in (slice(0, _EDGE), slice(-_EDGE, None)):
+        if found[end].any(axis=0).sum() > 1:
+            found[end] = False
+    return found
+
+
+def _shifted(values: FloatArray, shift: int) -> FloatArray:
+    """Return each sample's neighbour, NaN beyond the ends."""
+    result = np.full(len(values), np.nan)
+    if shift > 0:
+        result[:-shift] = values[shift:]
+    else:
+        result[-shift:] = values[:shift]
+    return result
+
+
+def _is_event(rest: FloatArray, index: int, shape: tuple[int, int]) -> bool:
+    """Return whether a kink or a step explains the rest near a sample better than one wrong reading."""
+    width = shape[0]
+    low, high = max(index - width, 0), min(index + width + 1, len(rest))
+    window = rest[low:high]
+    patterns = _patterns(*shape)[:, low - index + width : high - index + width]
+    explained = (patterns @ window) ** 2 / np.sum(patterns**2, axis=1)
+    return int(np.argmax(explained)) > 0
+
+
+@lru_cache(maxsize=32)
+def _patterns(width: int, degree: int) -> FloatArray:
+    """Return what the local polynomial leaves of a wrong reading (row 0), of kinks and of steps, near it."""
+    places = np.arange(-2 * width, 2 * width + 1)
+    signals = [places == 0, *(np.abs(places - shift) for shift in (-1.0, -0.5, 0.0, 0.5, 1.0))]
+    signals += [places > shift for shift in (-0.5, 0.5)]
+    weights = _weights(width, degree)
+    return np.stack([np.convolve(np.asarray(signal, dtype=float), weights, "valid") for signal in signals])
+
+
+def _rest(values: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Return what a local polynomial through the neighbours leaves of each sample; zero at the edges.
+
+    `shape` is the half width of the neighbourhood and the degree.
+    """
+    rest = np.zeros(len(values))
+    # Near the edges narrower neighbourhoods do; the wider overwrite the inside.
+    for width, degree in [*((item, 5) for item in (3, 4, 6, 9, 13) if item < shape[0]), shape]:
+        rest[width : len(values) - width] = np.convolve(values, _weights(width, degree), mode="valid")
+    return rest
+
+
+@lru_cache(maxsize=32)
+def _weights(width: int, degree: int) -> FloatArray:
+    """Return the weights of a sample and its neighbours in the rest of a local polynomial, (2 width + 1,)."""
+    places = np.arange(-width, width + 1) / width
+    neighbours = places != 0.0
+    basis = np.vander(places[neighbours], degree + 1, increasing=True)
+    weights = np.ones(2 * width + 1)
+    weights[neighbours] = -np.linalg.pinv(basis)[0]  # value of the polynomial at the middle
+    return weights
+
+
+def _scatter(rest: FloatArray) -> float:
+    return _NORMAL * float(np.median(np.abs(rest[_EDGE:-_EDGE])))
+
+
+def _scale(rest: FloatArray) -> FloatArray:
+    """Return the scatter that a sample is measured by: of the record or its surroundings, the larger."""
+    whole = max(_scatter(rest), 1e-300)
+    inner = np.abs(rest[_EDGE:-_EDGE])
+    if len(inner) <= 2 * _NEAR:
+        return np.full(len(rest), whole)
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(inner, _NEAR, mode="reflect"), 2 * _NEAR + 1)
+    near = np.pad(np.median(windows, axis=1), _EDGE, mode="edge")
+    return np.maximum(whole, _NORMAL * near)
+
+
+def _running_maximum(values: FloatArray, width: int) -> FloatArray:
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(values, width), 2 * width + 1)
+    return np.asarray(windows.max(axis=1))
+
+
+# ---------------------------------------------------------------- rows of static and flight trials
+
+
+def _repeat_outliers(campaign: Campaign, channel: Channel) -> dict[str, BoolArray]:
+    """Return outliers of trials with at least two repeats, by trial: against the median of each row."""
+    result: dict[str, BoolArray] = {}
+    if channel.noise is None:
+        return result
+    for group in repeated(campaign.trials, channel.name):
+        if len(group) < 3:
+            continue
+        stack = np.stack([trial.values[:, trial.channels.index(channel.name)] for trial in group])
+        if channel.offset_deviation > 0.0:
+            stack = stack - np.median(stack - np.median(stack, axis=0), axis=1, keepdims=True)
+        rest = stack - np.median(stack, axis=0)
+        noise = channel.noise.standard_deviation * group[0].noise_factor
+        scale = max(noise, _NORMAL * float(np.median(np.abs(rest))))
+        far = np.abs(rest) > SIGNIFICANT_ROW * scale
+        # A trial that is off in several rows has an offset or a gain of its own; that is no single reading.
+        for trial, row in zip(group, far, strict=True):
+            result[trial.name] = row if row.sum() == 1 and len(row) > 1 else np.zeros(len(row), dtype=bool)
+    return result
+
+
+def _row_outlier(trial: Trial, values: FloatArray, used: BoolArray, channel: Channel) -> BoolArray:
+    """Return the one row that a parabola through the others misses, if they agree among themselves."""
+    found = np.zeros(len(values), dtype=bool)
+    load = trial.force if np.any(trial.force) else trial.load_factor
+    rows = np.flatnonzero(used)
+    if channel.noise is None or len(rows) < 8 or np.ptp(load[rows]) == 0.0:
+        return found
+    basis = np.vander(load[rows] / np.max(np.abs(load[rows])), 3)
+    noise = channel.noise.standard_deviation * trial.noise_factor
+    best, worst = np.inf, -1
+    for index in range(len(rows)):
+        others = np.arange(len(rows)) != index
+        coefficients, _, rank, _ = np.linalg.lstsq(basis[others], values[rows][others], rcond=None)
+        rest = values[rows] - basis @ coefficients
+        spread = float(np.sqrt(np.sum(rest[others] ** 2) / max(len(rows) - 1 - rank, 1)))
+        if spread < best and abs(rest[index]) > SIGNIFICANT_ROW * noise:
+            best, worst = spread, index
+    if worst >= 0 and best < 2.0 * noise:
+        found[rows[worst]] = True
+    return found

@@ -1,0 +1,205 @@
+"""Faults that a campaign shows without a model: no noise record, clipping, dead channels, too many outliers.
+
+What makes a campaign unreadable (missing columns, uneven sampling, gaps, NaN) is refused by the reader at
+once; what only a model can tell (units, signs, swapped channels, length) is in
+`discrepancy.checks.model_check`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f as fisher
+
+from discrepancy.campaign.noise_records import repeat_record
+from discrepancy.campaign.records import Campaign, Channel, Trial
+from discrepancy.checks.fault import DataFault, FaultKind
+from discrepancy.checks.model_check import check_against_model
+from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers, mark_outliers
+from discrepancy.errors import CampaignDataError
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+__all__ = ["DataFault", "FaultKind", "check_against_model", "check_data", "mark_outliers", "require_sound"]
+
+CLIPPED_RUN = 3
+"""Consecutive samples at the very extreme value that make a record clipped, if it gets there in a jump."""
+_ALPHA = 1e-3
+_NOISE_FACTOR = 2.0
+
+
+def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
+    """Return the faults that a campaign shows by itself, by channel and trial.
+
+    A channel without a noise record, or whose noise record contradicts repeats (F test at 0.1 %) or the
+    record itself (by a factor of two), is reported as a limit; a dead or clipped channel, or more than 3 %
+    of outliers in a record in time, as a fault of the data (`DataFault.fatal`).
+    """
+    faults: list[DataFault] = []
+    for name, channel in campaign.channels.items():
+        if channel.noise is None:
+            faults.append(
+                DataFault(
+                    FaultKind.NO_NOISE_RECORD,
+                    f"The channel {name!r} has no noise record, so whether a model explains it cannot be "
+                    "said: add "
+                    "samples at rest, repeats, or a standard deviation with its degrees of freedom.",
+                    name,
+                )
+            )
+        else:
+            faults += _noise_faults(campaign, channel)
+    for trial in campaign.trials:
+        for column, name in enumerate(trial.channels):
+            faults += _record_faults(trial, name, trial.values[:, column], trial.used[:, column])
+    for trial_name, name, found in find_outliers(campaign):
+        trial = next(item for item in campaign.trials if item.name == trial_name)
+        if trial.is_dynamic and found.sum() > LARGEST_SHARE * len(found):
+            faults.append(
+                DataFault(
+                    FaultKind.OUTLIERS,
+                    f"{found.mean():.1%} of the readings of {name!r} in the trial {trial_name!r} are "
+                    "outliers, and "
+                    f"at most {LARGEST_SHARE:.0%} may be left out: mend the cause (loose wire, radio "
+                    "link) and "
+                    "repeat the trial, or leave the channel out of it.",
+                    name,
+                    trial_name,
+                )
+            )
+    return tuple(faults)
+
+
+def require_sound(faults: tuple[DataFault, ...]) -> None:
+    """Raise `CampaignDataError` with the sentences of all fatal faults, if there are any."""
+    sentences = [fault.sentence for fault in faults if fault.fatal]
+    if sentences:
+        raise CampaignDataError(" ".join(sentences))
+
+
+# ---------------------------------------------------------------- noise
+
+
+def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
+    record = channel.noise
+    if record is None or record.source == "repeats":
+        return
+    stated = record.standard_deviation
+    found = repeat_record(channel, campaign.trials)
+    if found is not None:
+        ratio = (found.standard_deviation / stated) ** 2
+        freedom = min(record.degrees_of_freedom, 1e9)
+        tail = min(
+            fisher.sf(ratio, found.degrees_of_freedom, freedom),
+            fisher.cdf(ratio, found.degrees_of_freedom, freedom),
+        )
+        if 2.0 * tail < _ALPHA and not 1.0 / _NOISE_FACTOR**2 < ratio < _NOISE_FACTOR**2:
+            yield _noise_fault(channel, stated, found.standard_deviation, "repeated trials scatter")
+            return
+    rough = [
+        roughness(trial.values[:, column]) / trial.noise_factor
+        for trial in campaign.trials
+        if trial.is_dynamic
+        for column, name in enumerate(trial.channels)
+        if name == channel.name and len(trial.time) >= 50
+    ]
+    # Only downwards: a fast mode may well be rougher than the noise, but nothing is smoother than its noise.
+    if rough:
+        white = min(rough)
+        if 0.0 < white < stated / _NOISE_FACTOR:
+            yield _noise_fault(channel, stated, white, "neighbouring samples scatter")
+
+
+def _noise_fault(channel: Channel, stated: float, found: float, what: str) -> DataFault:
+    return DataFault(
+        FaultKind.NOISE_LABEL,
+        f"The noise record of the channel {channel.name!r} says {stated:.3g} (SI), but its "
+        f"{what} by {found:.3g}: check the record and its unit, and whether the noise is coloured.",
+        channel.name,
+    )
+
+
+def roughness(values: FloatArray) -> float:
+    """Return the standard deviation of white noise that the sixth differences of a record would show.
+
+    Robust (median absolute deviation); differences of the sixth order take out motions of more than some
+    eight samples per period.
+    """
+    differences = np.diff(values, 6)
+    return float(1.4826 * np.median(np.abs(differences)) / np.sqrt(924.0))  # sum of squared binomials
+
+
+# ---------------------------------------------------------------- records
+
+
+def _record_faults(trial: Trial, name: str, values: FloatArray, used: BoolArray) -> Iterator[DataFault]:
+    kept = values[used]
+    if len(kept) < 3:
+        return
+    load = trial.load_factor if np.any(trial.load_factor) else trial.force
+    excited = trial.is_dynamic or np.ptp(load[used]) > 0.0
+    if excited and np.ptp(kept) == 0.0:
+        yield DataFault(
+            FaultKind.DEAD,
+            f"The channel {name!r} shows the same value throughout the trial {trial.name!r}: check its "
+            "wiring, or "
+            "leave it out of the trial.",
+            name,
+            trial.name,
+        )
+        return
+    order = np.arange(len(kept)) if trial.is_dynamic else np.argsort(load[used], kind="stable")
+    sorted_load = None if trial.is_dynamic else load[used][order]
+    for extreme, side in ((kept.max(), "largest"), (kept.min(), "smallest")):
+        run = clipped_run(kept[order], float(extreme), sorted_load)
+        if run:
+            yield DataFault(
+                FaultKind.CLIPPED,
+                f"The channel {name!r} is clipped in the trial {trial.name!r}: {run} readings in a row "
+                "are at its "
+                f"{side} value {extreme:.6g} (SI), reached in a jump; widen the range of the amplifier "
+                "and repeat "
+                "the trial, or leave the channel out of it.",
+                name,
+                trial.name,
+            )
+
+
+def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = None) -> int:
+    """Return the longest run of readings that stand at an extreme where they should not; 0 if there is none.
+
+    Records in time: a parabola through three samples on either side of the run must go beyond the extreme by
+    more than three digits (the least difference of two readings) and six deviations of the record's white
+    noise; a record of few digits is flat at its turning points too, but by a digit. Static readings, in the
+    order of their load: the run must span three loads, and nowhere else may two neighbours be alike.
+    """
+    distinct = np.unique(values)
+    if len(distinct) < 3:
+        return 0
+    at = np.concatenate([[False], values == extreme, [False]])
+    edges = np.flatnonzero(np.diff(at.astype(np.int8)))
+    runs = [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+    runs = [(start, stop) for start, stop in runs if stop - start >= CLIPPED_RUN]
+    if load is not None:
+        for start, stop in runs:
+            outside = np.concatenate([np.diff(values[:start]), np.diff(values[stop:])])
+            if outside.size and np.all(outside != 0.0) and np.unique(load[start:stop]).size >= CLIPPED_RUN:
+                return stop - start
+        return 0
+    if not runs:
+        return 0
+    limit = 3.0 * float(np.diff(distinct).min()) + 6.0 * roughness(values)
+    return max((stop - start for start, stop in runs if _overshoot(values, start, stop) > limit), default=0)
+
+
+def _overshoot(values: FloatArray, start: int, stop: int) -> float:
+    """Return by how much a parabola through the samples beside a run goes beyond the run's value."""
+    beside = np.concatenate([np.arange(start - 3, start), np.arange(stop, stop + 3)])
+    if beside[0] < 0 or beside[-1] >= len(values):
+        return 0.0
+    middle = 0.5 * (start + stop - 1)
+    parabola = np.polynomial.Polynomial.fit(beside - middle, values[beside], 2)
+    return float(abs(parabola(0.0) - values[start]))

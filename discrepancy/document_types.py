@@ -1,0 +1,103 @@
+"""How records stand in JSON: numbers that JSON lacks, and patches by their primitives.
+
+A number that is not a number is null, an infinite one "Infinity" or "-Infinity", because JSON has neither.
+The records themselves (`verdict`) say what a file holds; pydantic checks it against them.
+"""
+
+from dataclasses import fields
+from math import inf, isfinite, nan
+from typing import Annotated, Any
+
+from pydantic import PlainValidator, WithJsonSchema
+
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.laws import LAWS
+from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
+
+CHANNEL_UNIT = "channel's unit"
+
+PRIMITIVE_UNITS: dict[str, dict[str, str]] = {
+    "point_mass": {"mass": "kg", "station": "m"},
+    "root_compliance": {"compliance": "rad/(N m)"},
+    "local_stiffness_loss": {"loss": "1", "start": "m", "length": "m"},
+    "modulus_temperature": {"coefficient": "1/K"},
+    "stiffness_drift": {"rate": "1/s"},
+    **{law.kind: law.units for law in LAWS},
+    "load_place": {"along_span": "m", "along_chord": "m"},
+    "load_gain": {"gain": "1", "tare": "N"},
+    "washout": {"coefficient": "1", "exponent": "1"},
+    "inertia_relief": {"fraction": "1"},
+    "sensor_gain": {"gain": "1"},
+    "sensor_drift": {"amplitude": CHANNEL_UNIT, "time": "s", "exponent": "1"},
+    "sensor_rotation": {"angle": "rad"},
+    "thermal_strain": {"coefficient": "1/K"},
+    "high_pass": {"time_constant": "s", "order": "1"},
+    "clock": {"rate": "1", "zero": "s"},
+    "line": {"frequency": "Hz", "cosine": CHANNEL_UNIT, "sine": CHANNEL_UNIT},
+    "decaying_line": {
+        "frequency": "Hz", "damping_ratio": "1",
+        "cosine": f"{CHANNEL_UNIT} per release amplitude", "sine": f"{CHANNEL_UNIT} per release amplitude",
+    },
+    "run_offset": {"offset": CHANNEL_UNIT},
+}  # fmt: skip
+"""Unit of every real parameter of every primitive (translational or rotational port: the first or second)."""
+
+_WORDS = {None: nan, "Infinity": inf, "-Infinity": -inf}
+_JSON_TYPES: dict[Any, str] = {float: "number", int: "integer", str: "string"}
+
+
+def _number(value: object) -> float:
+    if value is None or isinstance(value, str):
+        if value not in _WORDS:
+            raise ValueError(f'a number, null, "Infinity" or "-Infinity" is expected, and {value!r} came')
+        return _WORDS[value]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+        raise ValueError(f"a finite number is expected, and {value!r} came")
+    return float(value)
+
+
+def _patch(rows: object) -> ModelPatch:
+    try:
+        return ModelPatch.from_list(rows)
+    except InvalidPatchError as cause:
+        raise ValueError(str(cause)) from cause
+
+
+def _primitive_schema(primitive: type[Primitive]) -> dict[str, Any]:
+    """Return the JSON Schema of one kind of primitive, from its own fields."""
+    units = PRIMITIVE_UNITS[primitive.kind]
+    columns: dict[str, Any] = {"kind": {"const": primitive.kind, "type": "string"}}
+    for item in fields(primitive):
+        columns[item.name] = {"type": _JSON_TYPES[item.type]}
+        if item.name in units:
+            columns[item.name]["description"] = f"[{units[item.name]}]"
+    return {
+        "type": "object",
+        "title": primitive.__name__,
+        "description": (primitive.__doc__ or "").split("\n")[0],
+        "properties": columns,
+        "required": list(columns),
+        "additionalProperties": False,
+    }
+
+
+Number = Annotated[
+    float,
+    PlainValidator(_number),
+    WithJsonSchema(
+        {
+            "anyOf": [{"type": "number"}, {"enum": ["Infinity", "-Infinity"]}, {"type": "null"}],
+            "description": "null: not a number, or not known.",
+        }
+    ),
+]
+Patch = Annotated[
+    ModelPatch,
+    PlainValidator(_patch),
+    WithJsonSchema(
+        {
+            "type": "array",
+            "items": {"oneOf": [_primitive_schema(primitive) for primitive in PRIMITIVES.values()]},
+        }
+    ),
+]

@@ -1,0 +1,1 @@
+"""Verdict, patch and residuals on disk."""

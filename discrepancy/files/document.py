@@ -1,0 +1,186 @@
+"""What `verdict.json` and `patch.json` share: origin, numbers that JSON lacks, checks, atomic writing.
+
+A document is the JSON form of a record; the record's own fields say what it holds. Keys are described in
+docs/verdict.md.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from enum import Enum
+from importlib import resources
+from math import isfinite, isnan
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from discrepancy.errors import VerdictFileError
+from fe.runtime.patch import ModelPatch
+from reporting.files import atomic_write_text
+from reporting.provenance import Provenance
+
+_Record = TypeVar("_Record")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a verdict was reached from.
+
+    Attributes
+    ----------
+    campaign, model : str
+        Names for people.
+    data_hash, model_hash : str
+        SHA-256 of the campaign's files and of the model.
+    command : str
+        The command that repeats it, without absolute paths.
+    provenance : Provenance
+        Seed, versions, hashes of the sources.
+    """
+
+    campaign: str
+    model: str
+    data_hash: str
+    model_hash: str
+    command: str
+    provenance: Provenance
+
+
+def shipped_schema(name: str) -> dict[str, Any]:
+    """Return the JSON Schema that is shipped for "verdict" or "patch".
+
+    Raises
+    ------
+    VerdictFileError
+        If there is none of that name.
+    """
+    if name not in ("verdict", "patch"):
+        raise VerdictFileError(f"There are JSON Schemas for verdict and patch, but not for {name!r}.")
+    text = resources.files("discrepancy").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
+    schema: dict[str, Any] = json.loads(text)
+    return schema
+
+
+def json_schema(record: type, schema: str) -> str:
+    """Return the JSON Schema (draft 2020-12) of a document as it is shipped: every key is always there."""
+    parts = [TypeAdapter(kind).json_schema() for kind in (Origin, record)]
+    properties = {"schema": {"const": schema, "type": "string"}}
+    definitions: dict[str, Any] = {}
+    for part in parts:
+        definitions |= part.get("$defs", {})
+        properties |= part["properties"]
+    for table in definitions.values():
+        table["description"] = table.get("description", "").split("\n")[0]
+        if "properties" in table:
+            table |= {"required": list(table["properties"]), "additionalProperties": False}
+    content = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": schema,
+        "type": "object",
+        "properties": properties,
+        "required": list(properties),
+        "additionalProperties": False,
+        "$defs": definitions,
+    }
+    return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+
+
+def plain(value: Any) -> Any:
+    """Return records as plain data that JSON can hold."""
+    if isinstance(value, ModelPatch):
+        return value.to_list()
+    if isinstance(value, Enum):
+        return value.value
+    if is_dataclass(value) and not isinstance(value, type):
+        return {item.name: plain(getattr(value, item.name)) for item in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(name): plain(item) for name, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not isfinite(value):
+        return None if isnan(value) else "Infinity" if value > 0.0 else "-Infinity"
+    return value
+
+
+def write_document(path: Path, schema: str, origin: Origin, record: object) -> Path:
+    """Check a document and write it in one step.
+
+    Raises
+    ------
+    VerdictFileError
+        If it could not be read again.
+    reporting.errors.FileNotWrittenError
+        If it cannot be written.
+    """
+    content = plain(record)
+    _checked(type(record), content, f"{Path(path).name} cannot be written: ", ".")
+    whole = {"schema": schema, **plain(origin), **content}
+    return atomic_write_text(path, json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def read_document(path: Path, schema: str, kind: type[_Record]) -> tuple[_Record, Origin]:
+    """Return the record of a document and its origin.
+
+    Raises
+    ------
+    VerdictFileError
+        If the file is missing, damaged, of another schema or does not fit the record.
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError as cause:
+        raise VerdictFileError(
+            f"There is no file {path}; give the one that the discrepancy workflow left."
+        ) from cause
+    except OSError as cause:
+        raise VerdictFileError(f"{path} cannot be read: {cause.strerror}.") from cause
+    except (ValueError, RecursionError) as cause:
+        raise VerdictFileError(f"{path} is damaged or no JSON file ({cause}); write it again.") from cause
+    came = content.pop("schema", None) if isinstance(content, dict) else None
+    if came != schema:
+        raise VerdictFileError(
+            f"{path} is {f'of the schema {came!r}' if came else 'no file of this kind'}, but {schema!r} is "
+            "needed."
+        )
+    of_origin = {item.name for item in fields(Origin)}
+    before, after = f"{path} does not fit its schema: ", "; write it again."
+    origin = _checked(Origin, {k: v for k, v in content.items() if k in of_origin}, before, after)
+    return _checked(kind, {k: v for k, v in content.items() if k not in of_origin}, before, after), origin
+
+
+def _checked(kind: type[_Record], content: dict[str, Any], before: str, after: str) -> _Record:
+    """Return the record of plain data that holds what it should, all of it and nothing else."""
+    try:
+        record = TypeAdapter(kind).validate_python(content)
+    except ValidationError as cause:
+        error = cause.errors()[0]
+        place = ".".join(str(part) for part in error["loc"])
+        more = f" (and {cause.error_count() - 1} more)" if cause.error_count() > 1 else ""
+        raise VerdictFileError(f"{before}{place}: {error['msg']}{more}{after}") from cause
+    odd = _difference(content, plain(record), "")
+    if odd:
+        raise VerdictFileError(f"{before}{odd}{after}")
+    return record
+
+
+def _difference(came: Any, expected: Any, place: str) -> str:
+    """Return the first place where plain data are not those of the record that was made of them."""
+    pairs: list[tuple[Any, Any, str]] = []
+    if isinstance(came, Mapping) and isinstance(expected, Mapping):
+        for name in {**expected, **came}:
+            where = f"{place}.{name}".lstrip(".")
+            if name not in came:
+                return f"{where} is missing"
+            if name not in expected:
+                return f"{where} is no key that is known"
+            pairs.append((came[name], expected[name], where))
+    elif isinstance(came, list) and isinstance(expected, list):
+        pairs = [(*both, f"{place}.{n}") for n, both in enumerate(zip(came, expected, strict=True))]
+    elif came != expected or isinstance(came, bool) is not isinstance(expected, bool):
+        return f"{place} is {came!r}"
+    return next((found for pair in pairs if (found := _difference(*pair))), "")

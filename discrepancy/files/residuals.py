@@ -1,0 +1,210 @@
+"""`residuals.nc`: measured, predicted and residual values of every trial, with units (NetCDF-4).
+
+One group for each trial (`trial_001` ..) with its name as an attribute, and a group `noise` for what was
+recorded of the noise.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.units import UNITS
+from discrepancy.errors import DiscrepancyError, VerdictFileError
+from discrepancy.location.residuals import FittedTrial, ResidualSet
+from reporting.files import atomic_write_bytes
+
+RESIDUALS_NAME = "residuals.nc"
+
+SCHEMA = "uav-twin residuals 1"
+"""Value of the attribute `schema` of the root."""
+
+_BY_CHANNEL = {
+    "measured": "measured value",
+    "prediction": "mean of the posterior prediction, gains and offsets included",
+    "residual": "measured less predicted",
+    "predictive_deviation": "standard deviation of a measured value under the posterior prediction",
+}
+_BY_ROW = {
+    "force": ("N", "applied force, upwards positive"),
+    "load_factor": ("1", "load factor"),
+    "temperature": ("K", "temperature less the reference"),
+}
+
+
+def write_residuals(path: Path, residuals: ResidualSet, attributes: Mapping[str, str] | None = None) -> Path:
+    """Write a set of residuals, whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        Destination.
+    residuals : ResidualSet
+        All trials; sensitivities are not stored.
+    attributes : mapping of str to str, optional
+        Further attributes of the root, such as the hypothesis, the data hash and the command.
+
+    Raises
+    ------
+    reporting.errors.FileNotWrittenError
+        If the file cannot be written.
+    """
+    root = {
+        **(attributes or {}),
+        "schema": SCHEMA,
+        "channels": json.dumps([_channel_row(channel) for channel in residuals.channels.values()]),
+    }
+    groups: dict[str, xr.Dataset] = {"/": xr.Dataset(attrs=root)}
+    for number, item in enumerate(residuals.trials, start=1):
+        groups[f"trial_{number:03d}"] = _dataset(item, residuals.channels)
+    for number, (name, channel) in enumerate(residuals.channels.items(), start=1):
+        if channel.noise is not None and channel.noise.samples is not None:
+            groups[f"noise/channel_{number:03d}"] = xr.Dataset(
+                {"noise": ("sample", channel.noise.samples, {"units": UNITS[channel.quantity].si})},
+                attrs={"channel": name, "interval": _or_nan(channel.noise.interval)},
+            )
+    return atomic_write_bytes(path, bytes(xr.DataTree.from_dict(groups).to_netcdf(engine="h5netcdf")))
+
+
+def read_residuals(path: Path) -> ResidualSet:
+    """Read what `write_residuals` wrote; values are equal to the last bit, sensitivities are not there.
+
+    Raises
+    ------
+    VerdictFileError
+        If the file is missing, damaged or of another schema.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise VerdictFileError(f"There is no file {path}; give the one that the discrepancy workflow left.")
+    try:
+        with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as tree:
+            root = dict(tree.attrs)
+            groups = {name: tree[name].to_dataset().load() for name in tree.children if name != "noise"}
+            noise = {
+                str(group.attrs["channel"]): group.to_dataset().load()
+                for group in (tree["noise"].children.values() if "noise" in tree.children else ())
+            }
+    except (OSError, ValueError, KeyError, RuntimeError, AttributeError, TypeError) as error:
+        raise VerdictFileError(
+            f"{path} is damaged or no file of residuals: it cannot be read as NetCDF; write it again."
+        ) from error
+    if root.get("schema") != SCHEMA:
+        raise VerdictFileError(f"{path} has the schema {root.get('schema')!r}, but {SCHEMA!r} is needed.")
+    try:
+        channels = {row["name"]: _channel(row, noise) for row in json.loads(root["channels"])}
+        return ResidualSet(channels, tuple(_trial(groups[name]) for name in sorted(groups)))
+    except (KeyError, TypeError, ValueError, AttributeError, DiscrepancyError) as error:
+        raise VerdictFileError(
+            f"{path} is damaged ({type(error).__name__}: {error}); write it again."
+        ) from error
+
+
+def _or_nan(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+def _channel_row(channel: Channel) -> dict[str, Any]:
+    noise = channel.noise
+    return {
+        "name": channel.name,
+        "quantity": channel.quantity.value,
+        "output": channel.output,
+        # JSON as Python writes it knows Infinity; this text is read by Python only.
+        "gain_deviation": channel.gain_deviation,
+        "offset_deviation": channel.offset_deviation,
+        "station": channel.station,
+        "chord": channel.chord,
+        "noise": None
+        if noise is None
+        else [noise.standard_deviation, noise.degrees_of_freedom, noise.interval, noise.source],
+    }
+
+
+def _channel(row: Mapping[str, Any], samples: Mapping[str, xr.Dataset]) -> Channel:
+    noise = None
+    if row["noise"] is not None:
+        deviation, freedom, interval, source = row["noise"]
+        recorded = samples[row["name"]]["noise"].values if row["name"] in samples else None
+        noise = NoiseRecord(deviation, freedom, recorded, interval, source)
+    others = ("name", "output", "gain_deviation", "offset_deviation", "station", "chord")
+    return Channel(quantity=Quantity(row["quantity"]), noise=noise, **{key: row[key] for key in others})
+
+
+def _dataset(item: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
+    trial, plane = item.trial, ("row", "channel")
+    note = "unit of each channel: see the coordinate `unit`"
+    values = {"measured": trial.values, "prediction": item.prediction, "residual": item.residual,
+              "predictive_deviation": item.predictive_deviation}  # fmt: skip
+    variables: dict[str, Any] = {
+        name: (plane, values[name], {"long_name": text, "comment": note})
+        for name, text in _BY_CHANNEL.items()
+    }
+    variables["standardised"] = (plane, item.standardised, {"long_name": "residual over noise", "units": "1"})
+    variables["leverage"] = (plane, item.leverage, {"units": "1"})
+    variables["used"] = (plane, item.used.astype(np.int8), {"long_name": "1 where the sample counts"})
+    variables["noise_deviation"] = ("channel", item.noise_deviation, {"comment": note})
+    if item.rates is not None:
+        text = "time derivative of the prediction"
+        variables["rates"] = (plane, item.rates, {"long_name": text, "comment": f"{note}, per s"})
+    for name, (unit, text) in _BY_ROW.items():
+        variables[name] = ("row", getattr(trial, name), {"units": unit, "long_name": text})
+    for name in ("health", "health_deviation"):
+        variables[name] = (("row", "region"), getattr(trial, name), {"units": "1"})
+    attributes: dict[str, Any] = {
+        "name": trial.name,
+        "kind": trial.kind.value,
+        "run": trial.run,
+        "start": trial.start,
+        "held_out": int(trial.held_out),
+        "load_place": json.dumps(trial.load_place),
+    }
+    if trial.release is not None:
+        release = trial.release
+        attributes["release"] = json.dumps(
+            [release.displacement, release.deviation, release.at_rest, release.mode_count,
+             release.time_zero_deviation]
+        )  # fmt: skip
+    coordinates = {
+        "time": ("row", trial.time, {"units": "s"}),
+        "channel": ("channel", list(trial.channels)),
+        "unit": ("channel", [UNITS[channels[name].quantity].si for name in trial.channels]),
+    }
+    return xr.Dataset(variables, coords=coordinates, attrs=attributes)
+
+
+def _trial(group: xr.Dataset) -> FittedTrial:
+    attributes = group.attrs
+    place = json.loads(attributes["load_place"])
+    release = json.loads(attributes["release"]) if "release" in attributes else None
+    trial = Trial(
+        name=str(attributes["name"]),
+        kind=TrialKind(attributes["kind"]),
+        channels=tuple(str(name) for name in group["channel"].values),
+        values=group["measured"].values,
+        used=group["used"].values.astype(bool),
+        time=group["time"].values,
+        force=group["force"].values,
+        load_factor=group["load_factor"].values,
+        load_place=place if isinstance(place, str) else (float(place[0]), float(place[1])),
+        temperature=group["temperature"].values,
+        start=float(attributes["start"]),
+        run=str(attributes["run"]),
+        health=group["health"].values,
+        health_deviation=group["health_deviation"].values,
+        release=None if release is None else Release(*release),
+        held_out=bool(attributes["held_out"]),
+    )
+    return FittedTrial(
+        trial=trial,
+        prediction=group["prediction"].values,
+        residual=group["residual"].values,
+        noise_deviation=group["noise_deviation"].values,
+        predictive_deviation=group["predictive_deviation"].values,
+        leverage=group["leverage"].values,
+        rates=group["rates"].values if "rates" in group else None,
+    )

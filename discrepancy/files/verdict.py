@@ -1,0 +1,102 @@
+"""`verdict.json`: what was concluded, what it rests on, and the proof."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from discrepancy.files.document import Origin, read_document, write_document
+from discrepancy.files.patch import PATCH_NAME, read_patch
+from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
+from discrepancy.location.residuals import ResidualSet
+from discrepancy.verdict import Proof, Verdict
+from fe.runtime.patch import ModelPatch
+
+VERDICT_SCHEMA = "uav-twin verdict 1"
+"""Value of the key `schema`."""
+VERDICT_NAME = "verdict.json"
+
+
+@dataclass(frozen=True)
+class VerdictDocument:
+    """Content of verdict.json after its origin."""
+
+    verdict: Verdict
+    proof: Proof | None
+
+
+@dataclass(frozen=True)
+class StoredVerdict(VerdictDocument):
+    """Content of verdict.json."""
+
+    origin: Origin
+
+
+@dataclass(frozen=True)
+class VerdictFolder:
+    """What `uav-twin discrepancy run` left.
+
+    Attributes
+    ----------
+    verdict, proof, origin : Verdict, Proof or None, Origin
+        Of `verdict.json`.
+    patch : ModelPatch or None
+        The effects that were found, identical to what was found; None without `patch.json`.
+    residuals : ResidualSet or None
+        Data minus model with the effects, in standard deviations of the noise; None where faults of the data
+        stopped the work.
+    """
+
+    verdict: Verdict
+    proof: Proof | None
+    origin: Origin
+    patch: ModelPatch | None
+    residuals: ResidualSet | None
+
+
+def write_verdict(path: Path, verdict: Verdict, proof: Proof | None, origin: Origin) -> Path:
+    """Write verdict.json, whole or not at all; equal verdicts give equal bytes.
+
+    Raises
+    ------
+    VerdictFileError
+        If a record does not fit the schema.
+    reporting.errors.FileNotWrittenError
+        If the file cannot be written.
+    """
+    return write_document(path, VERDICT_SCHEMA, origin, VerdictDocument(verdict, proof))
+
+
+def read_verdict(path: Path) -> StoredVerdict:
+    """Read the verdict.json that `write_verdict` wrote; the records are equal, nan included.
+
+    Raises
+    ------
+    VerdictFileError
+        If the file is missing, damaged, of another schema, or holds something else than it should.
+    """
+    found, origin = read_document(path, VERDICT_SCHEMA, VerdictDocument)
+    return StoredVerdict(found.verdict, found.proof, origin)
+
+
+def read_verdict_folder(folder: Path | str) -> VerdictFolder:
+    """Read the folder of a verdict.
+
+    Parameters
+    ----------
+    folder : path
+        As `uav-twin discrepancy run --out` leaves it.
+
+    Raises
+    ------
+    VerdictFileError
+        If a file is missing, damaged, of another schema, or holds something else than it should.
+    """
+    place = Path(folder)
+    stored = read_verdict(place / VERDICT_NAME)
+    patch, residuals = place / PATCH_NAME, place / RESIDUALS_NAME
+    return VerdictFolder(
+        stored.verdict,
+        stored.proof,
+        stored.origin,
+        read_patch(patch).patch if patch.is_file() else None,
+        read_residuals(residuals) if residuals.is_file() else None,
+    )

@@ -1,0 +1,1 @@
+"""A candidate explanation against a campaign: residuals, screen, maximum, evidence, draws, gates."""

@@ -1,0 +1,449 @@
+"""Fit of a candidate: maximum of the posterior by Levenberg-Marquardt, and its Laplace evidence.
+
+Local unknowns are eliminated trial by trial (Schur complement). The derivatives by what all hypotheses share
+change little with an effect; away from the end they may be those of the fit without effect (chord steps).
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from discrepancy.errors import FitError, ModelError
+
+from .candidate import Candidate
+from .derivatives import TrialDerivatives
+from .linearisation import Base, Linearisation, Point
+from .problem import Problem
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+LARGEST_EFFECT = 8.0
+"""Effect parameters stay within this many prior deviations of their median."""
+CONVERGED = 1e-2
+"""A step that promises less than this [nat] ends a fit."""
+STALLED = 1
+"""So do more than this many steps in a row that gain less, whatever they promised."""
+WHOLE_STEP, LARGEST_DAMPING = 1e-2, 1.0
+"""Damping below which a step is nearly that of Gauss and Newton, and above which it is a mere trial."""
+STEP_SHARES = (1.0, 0.3)
+"""Shares of a step that are tried before the damping grows; chord steps are rough and try the first only."""
+CREEPING, NEAR_END = 0.2, 30.0
+"""Derivatives are renewed where a step promises less than `NEAR_END` [nat], but more than this share of what
+the one before it promised: close to the end, promises should fall fast."""
+
+
+@dataclass(frozen=True)
+class TrialBlock:
+    """Normal equations of one trial."""
+
+    local: FloatArray  # (L, L) with prior
+    cross: FloatArray  # (L, K)
+    shared: FloatArray  # (K, K)
+    local_gradient: FloatArray  # (L,)
+    shared_gradient: FloatArray  # (K,)
+    derivatives: TrialDerivatives
+    products: FloatArray  # (C, M, M) of the derivatives of each channel
+    precision: FloatArray  # (C,) of each channel
+
+    @property
+    def index(self) -> IntArray:
+        """Which shared unknowns (K,) the trial knows."""
+        return self.derivatives.index
+
+
+@dataclass(frozen=True)
+class CandidateFit:
+    """A fitted candidate.
+
+    Attributes
+    ----------
+    candidate : Candidate
+        What was fitted.
+    point : Point
+        Maximum of the posterior.
+    objective : float
+        -ln posterior there, up to a constant shared by all candidates [nat].
+    log_evidence : float
+        Laplace, up to the same constant [nat].
+    covariance : (Q + E, Q + E) ndarray
+        Of global unknowns and effect parameters (scaled), local ones marginalised.
+    residuals : tuple of (N, C) ndarray
+        Standardised.
+    responses : tuple of (N, C) ndarray
+        Without gain and zero.
+    sums : (channels,) ndarray
+        Sum of squared residuals by channel.
+    spent : (channels,) ndarray
+        Degrees of freedom that the unknowns took from each channel.
+    linearisations : tuple of Linearisation
+        At the point (or older, after chord steps).
+    converged : bool
+        Whether the last step was short enough.
+    draws : (N, E) ndarray or None
+        From the posterior of the scaled effect parameters, where it is wider than their covariance (see
+        `posterior`).
+    """
+
+    candidate: Candidate
+    point: Point
+    objective: float
+    log_evidence: float
+    covariance: FloatArray
+    residuals: tuple[FloatArray, ...]
+    responses: tuple[FloatArray, ...]
+    sums: FloatArray
+    spent: FloatArray
+    linearisations: tuple[Linearisation, ...] = field(repr=False)
+    converged: bool = True
+    draws: FloatArray | None = field(default=None, repr=False)
+
+    @property
+    def effect_covariance(self) -> FloatArray:
+        """Covariance (E, E) of the scaled effect parameters."""
+        count = self.candidate.size
+        return self.covariance[len(self.covariance) - count :, len(self.covariance) - count :]
+
+    @property
+    def base(self) -> Base:
+        """What chord steps of other candidates need of this fit."""
+        return Base(self.point, self.linearisations)
+
+    @property
+    def chi_square(self) -> float:
+        """Sum of squared standardised residuals."""
+        return float(self.sums.sum())
+
+
+def trial_block(
+    problem: Problem,
+    number: int,
+    point: Point,
+    parts: Linearisation,
+    candidate: Candidate,
+    residual: FloatArray,
+    precision: FloatArray,
+) -> TrialBlock:
+    """Return the normal equations of a trial."""
+    data = problem.trials[number]
+    derivatives = problem.derivatives(number, point, parts, candidate)
+    products = derivatives.products()
+    weights = precision[data.groups]
+    normal = derivatives.normal(products, weights)
+    gradient = derivatives.onto(residual.T * weights[:, np.newaxis])
+    u, prior, count = point.local[number], data.unknowns.precision, derivatives.local_size
+    return TrialBlock(
+        local=normal[:count, :count] + np.diag(prior + 1e-12),
+        cross=normal[:count, count:],
+        shared=normal[count:, count:],
+        local_gradient=gradient[:count] - prior * u,
+        shared_gradient=gradient[count:],
+        derivatives=derivatives,
+        products=products,
+        precision=weights,
+    )
+
+
+def fit(
+    problem: Problem,
+    candidate: Candidate,
+    start: Point,
+    *,
+    base: Base | None = None,
+    iterations: int = 20,
+    evidence: bool = True,
+    local_only: bool = False,
+    give_up: float | None = None,
+) -> CandidateFit:
+    """Fit a candidate.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    candidate : Candidate
+        What may act.
+    start : Point
+        Where to begin.
+    base : Base, optional
+        Chord steps: the model is evaluated at the base's shared and local unknowns only.
+    iterations : int
+        Largest number of steps.
+    evidence : bool
+        Whether covariance, evidence and spent degrees of freedom are wanted.
+    local_only : bool
+        Shared unknowns and effects stay: only the trials' own nuisances are fitted (held-out trials).
+    give_up : float, optional
+        A fit whose objective has no prospect of coming below this ends early, not converged.
+
+    Raises
+    ------
+    FitError
+        If the model gives numbers that are not finite at the start.
+    """
+    # without evidence the step needs a direction only: one side is half the work
+    descent = _Descent(problem, candidate, base, local_only, central=evidence)
+    damping = 1e-3
+    state = descent.state(_bounded(start))
+    if not np.isfinite(state.objective):
+        raise FitError(
+            f"The model gives values that are not finite for {candidate.identifiers or ('no effect',)}; "
+            "check the ranges of its parameters."
+        )
+    converged, fresh, before, stalled = False, True, np.inf, 0
+    for _ in range(iterations):
+        step, promised = descent.step(state, damping)
+        if not fresh and CREEPING * before < promised < NEAR_END:
+            # old derivatives turn a long valley into a row of short steps, each of which keeps its promise
+            state, fresh = descent.state(state.point), True
+            step, promised = descent.step(state, damping)
+        before = promised
+        if promised < CONVERGED and fresh:
+            converged = damping < LARGEST_DAMPING  # else only short steps are left to promise little
+            break
+        if promised < CONVERGED:
+            state, fresh = descent.state(state.point), True
+            continue
+        following = descent.following(state, step, damping)
+        if following is not None:
+            gain = state.objective - following.objective
+            damping = max(damping * (0.1 if gain > 0.5 * promised else 0.5), 1e-9)
+            state, fresh = following, base is not None
+            if gain < 0.7 * promised and base is None:  # derivatives have grown old
+                state, fresh = descent.state(state.point), True
+            if give_up is not None and damping < WHOLE_STEP and state.objective - 2.0 * promised > give_up:
+                break
+            stalled = stalled + 1 if gain < CONVERGED and damping < WHOLE_STEP else 0
+            if stalled > STALLED and fresh:
+                converged = True
+                break
+        elif not fresh:
+            state, fresh = descent.state(state.point), True
+        else:
+            damping = max(10.0 * damping, 1e-4)
+            if damping > 1e6:
+                break
+    if not fresh and evidence:
+        state = descent.state(state.point)
+    return _finished(problem, candidate, state, converged, evidence)
+
+
+def attempt(problem: Problem, candidate: Candidate, start: Point, **options: Any) -> CandidateFit | None:
+    """Return what `fit` does, or None where the structure cannot carry what the fit comes to."""
+    try:
+        return fit(problem, candidate, start, **options)
+    except (FitError, ModelError):
+        return None
+
+
+def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
+    """Return -ln posterior of a candidate at a point, up to a constant shared by all candidates [nat].
+
+    Raises
+    ------
+    ModelError
+        If the structure cannot carry the effects.
+    """
+    return _Descent(problem, candidate, None, False).state(_bounded(point), derivatives=False).objective
+
+
+@dataclass(frozen=True)
+class _State:
+    point: Point
+    objective: float
+    residuals: tuple[FloatArray, ...]
+    responses: tuple[FloatArray, ...]
+    sums: FloatArray
+    parts: tuple[Linearisation, ...]
+
+
+@dataclass
+class _Descent:
+    """What a descent needs at every point: problem, candidate, and the steps of its derivatives."""
+
+    problem: Problem
+    candidate: Candidate
+    base: Base | None
+    local_only: bool
+    central: bool = True
+    deviation: FloatArray | None = None  # (E,) of the effect parameters, once known
+
+    def state(
+        self, point: Point, *, derivatives: bool = True, known: tuple[Linearisation, ...] | None = None
+    ) -> _State:
+        """Return objective and derivatives at a point; `known` are derivatives by nuisances, near enough."""
+        problem = self.problem
+        parts: list[Linearisation] = []
+        residuals, responses = [], []
+        for number in range(len(problem.trials)):
+            part = problem.linearise(
+                number, point, self.candidate, self.base, derivatives=derivatives,
+                known=None if known is None else known[number], effect_steps=self.deviation,
+                central=self.central,
+            )  # fmt: skip
+            parts.append(part)
+            responses.append(part.response)
+            residuals.append(problem.residual(number, point, part.response))
+        sums = problem.group_sums(residuals)
+        prior = 0.5 * float(problem.shared.precision @ point.shared**2)
+        prior += 0.5 * float(point.effect @ point.effect)
+        for data, u in zip(problem.trials, point.local, strict=True):
+            prior += 0.5 * float(data.unknowns.precision @ u**2)
+        objective = problem.misfit(sums) + prior
+        return _State(
+            point,
+            objective if np.isfinite(objective) else np.inf,
+            tuple(residuals),
+            tuple(responses),
+            sums,
+            tuple(parts),
+        )
+
+    def step(self, state: _State, damping: float) -> tuple[Point, float]:
+        """Return the step and the decrease it promises [nat]."""
+        step, promised, self.deviation = _step(
+            self.problem, self.candidate, state, damping, local_only=self.local_only
+        )
+        return step, promised
+
+    def following(self, state: _State, step: Point, damping: float) -> _State | None:
+        """Return the state after a step, or None if none better was found.
+
+        Where the phases of a record bend the valley that the step follows, its end lies on the slope; a
+        second step with the same derivatives by the nuisances leads back to the bottom (the second-order
+        correction of Transtrum and Sethna 2012, arXiv:1201.5885, with the whole step as difference).
+        """
+        for share in STEP_SHARES if self.base is None else STEP_SHARES[:1]:
+            try:
+                ahead = _ahead(self.candidate, state.point, step, share)
+                proposal = self.state(ahead, derivatives=False)
+                bent = not proposal.objective < state.objective and np.isfinite(proposal.objective)
+                if bent and share == 1.0:
+                    correction, _ = self.step(self.state(ahead, known=state.parts), damping)
+                    ahead = _ahead(self.candidate, ahead, correction)
+                    proposal = self.state(ahead, derivatives=False)
+                if proposal.objective < state.objective:
+                    return self.state(ahead, known=state.parts)
+            except (FitError, ModelError):  # outside what the structure can carry: a shorter step
+                continue
+        return None
+
+
+def _blocks(problem: Problem, candidate: Candidate, state: _State) -> list[TrialBlock]:
+    precision = problem.precisions(state.sums)
+    return [
+        trial_block(problem, n, state.point, state.parts[n], candidate, state.residuals[n], precision)
+        for n in range(len(problem.trials))
+    ]
+
+
+def _step(
+    problem: Problem, candidate: Candidate, state: _State, damping: float, *, local_only: bool = False
+) -> tuple[Point, float, FloatArray]:
+    """Return the step, the decrease it promises [nat], and the deviations (E,) of the effect parameters."""
+    shared_size = problem.shared.size
+    size = shared_size + candidate.size
+    prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
+    position = np.concatenate((state.point.shared, state.point.effect))
+    matrix = np.diag(prior + 1e-12)
+    gradient = -prior * position
+    blocks = _blocks(problem, candidate, state)
+    damped_diagonal = np.zeros(size)
+    eliminated = []
+    for block in blocks:
+        local = block.local + damping * np.diag(np.diag(block.local))
+        solved = np.linalg.solve(local, np.column_stack((block.cross, block.local_gradient)))
+        inner, inner_gradient = solved[:, :-1], solved[:, -1]
+        matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
+        np.add.at(damped_diagonal, block.index, np.diag(block.shared))
+        gradient_part = block.shared_gradient - block.cross.T @ inner_gradient
+        np.add.at(gradient, block.index, gradient_part)
+        eliminated.append((inner, inner_gradient))
+    try:
+        effect = np.eye(size)[:, shared_size:]
+        variance = np.diag(cho_solve(cho_factor(matrix), effect)[shared_size:])
+        damped = matrix + damping * np.diag(damped_diagonal + prior)
+        step = np.zeros(size) if local_only else cho_solve(cho_factor(damped), gradient)
+    except LinAlgError as cause:
+        raise FitError("The normal equations of a fit are singular; a parameter has no influence.") from cause
+    promised = 0.5 * float(gradient @ step)
+    local_steps = []
+    for block, (inner, inner_gradient) in zip(blocks, eliminated, strict=True):
+        local_step = inner_gradient - inner @ step[block.index]
+        promised += 0.5 * float(block.local_gradient @ inner_gradient)
+        local_steps.append(np.asarray(local_step, dtype=np.float64))
+    return Point(step[:shared_size], tuple(local_steps), step[shared_size:]), promised, np.sqrt(variance)
+
+
+def _finished(
+    problem: Problem, candidate: Candidate, state: _State, converged: bool, evidence: bool
+) -> CandidateFit:
+    size = problem.shared.size + candidate.size
+    covariance, log_evidence = np.zeros((size, size)), -state.objective
+    spent = np.zeros(len(problem.channel_names))
+    if evidence:
+        precision = problem.precisions(state.sums)
+        prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
+        matrix = np.diag(prior + 1e-12)
+        pieces = []
+        log_determinant = 0.0
+        for n in range(len(problem.trials)):
+            block = trial_block(
+                problem, n, state.point, state.parts[n], candidate, state.residuals[n], precision
+            )
+            factor = cho_factor(block.local)
+            inner = cho_solve(factor, block.cross)
+            matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
+            log_determinant += 2.0 * float(np.log(np.diag(factor[0])).sum())
+            pieces.append((block, factor, inner))
+        factor = cho_factor(matrix)
+        log_determinant += 2.0 * float(np.log(np.diag(factor[0])).sum())
+        covariance = cho_solve(factor, np.eye(size))
+        log_evidence -= 0.5 * log_determinant
+        for n, (block, local_factor, inner) in enumerate(pieces):
+            # leverage of each channel: trace of J Cov J^T; local unknowns follow the shared ones
+            count = len(block.local)
+            known = covariance[np.ix_(block.index, block.index)]
+            joint = np.empty((count + len(known), count + len(known)))
+            followed = inner @ known
+            joint[:count, :count] = cho_solve(local_factor, np.eye(count)) + followed @ inner.T
+            joint[:count, count:], joint[count:, :count] = -followed, -followed.T
+            joint[count:, count:] = known
+            leverage = block.derivatives.spread(block.products, block.precision, joint)
+            np.add.at(spent, problem.trials[n].groups, leverage)
+    return CandidateFit(
+        candidate,
+        state.point,
+        state.objective,
+        log_evidence,
+        covariance,
+        state.residuals,
+        state.responses,
+        state.sums,
+        spent,
+        state.parts,
+        converged,
+    )
+
+
+def _ahead(candidate: Candidate, point: Point, step: Point, share: float = 1.0) -> Point:
+    """Return the point a share of a step ahead."""
+    parameters = [item for term in candidate.terms for item in term.parameters]
+    effect = [
+        item.prior.stepped(u, du) if getattr(item, "magnitude", False) else u + du
+        for item, u, du in zip(parameters, point.effect.tolist(), (share * step.effect).tolist(), strict=True)
+    ]
+    return _bounded(
+        Point(
+            point.shared + share * step.shared,
+            tuple(u + share * du for u, du in zip(point.local, step.local, strict=True)),
+            np.array(effect, dtype=np.float64),
+        )
+    )
+
+
+def _bounded(point: Point) -> Point:
+    return Point(point.shared, point.local, np.clip(point.effect, -LARGEST_EFFECT, LARGEST_EFFECT))

@@ -1,0 +1,137 @@
+"""Gates that a name must pass: absolute fit against the noise record, shape against its family."""
+
+import numpy as np
+from scipy.stats import chi2
+
+from discrepancy.campaign.noise_tests import (
+    SHORTEST_SERIES,
+    combine,
+    ljung_box,
+    pooled_variance_p_value,
+    variance_p_value,
+)
+from discrepancy.verdict import Gate
+
+from .fitting import CandidateFit
+from .problem import Problem
+
+ABSOLUTE_LEVEL = 1e-3
+"""Level of the absolute gate; a true name fails it this often."""
+SHAPE_GAIN = 2.0
+"""Log evidence that the free-shape family may gain before the name gives way to it [nat]."""
+
+
+def absolute_gate(problem: Problem, fit: CandidateFit) -> Gate:
+    """Judge whether what is left is what the noise records say, and white.
+
+    Tests, by Holm together at `ABSOLUTE_LEVEL`: the sum over all channels, F of each channel against its
+    record, Ljung-Box of each channel over its dynamic records.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    fit : CandidateFit
+        What is judged.
+
+    Returns
+    -------
+    Gate
+        `passed` is None where no channel has a noise record and more readings than unknowns; whiteness is
+        judged all the same and can fail.
+    """
+    tests = absolute_tests(problem, fit)
+    known = any(name.startswith("variance") for name, _ in tests)
+    recorded = bool(np.any(problem.freedom[problem.counts > 0.0] > 0.0))
+    why = "Too few readings for the unknowns" if recorded else "No noise record"
+    if not tests:
+        return Gate("absolute fit", None, np.nan, ABSOLUTE_LEVEL, f"{why}: the fit cannot be judged.")
+    name, least = min(tests, key=lambda test: test[1])
+    statistic = min(1.0, least * len(tests))
+    if statistic < ABSOLUTE_LEVEL:
+        reason = f"More is left than noise and priors allow: {name}."
+        return Gate("absolute fit", False, statistic, ABSOLUTE_LEVEL, reason)
+    if not known:
+        return Gate(
+            "absolute fit", None, statistic, ABSOLUTE_LEVEL,
+            f"{why}: only priors and the whiteness of what is left could be judged, and they agree.",
+        )  # fmt: skip
+    return Gate(
+        "absolute fit", True, statistic, ABSOLUTE_LEVEL, "What is left agrees with the noise records."
+    )
+
+
+def absolute_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
+    """Return name and p-value of each test of the absolute gate."""
+    tests: list[tuple[str, float]] = []
+    freedom = problem.counts - fit.spent
+    known = np.flatnonzero((problem.freedom > 0.0) & (freedom >= 1.0))
+    p_values = []
+    for number in known:
+        square = fit.sums[number] / freedom[number]
+        p_values.append(variance_p_value(square, freedom[number], problem.freedom[number]))
+        tests.append((f"variance of {problem.channel_names[number]}", p_values[-1]))
+    if len(known) > 1:
+        together = pooled_variance_p_value(np.array(p_values), freedom[known], problem.freedom[known])
+        tests.append(("variance of all channels", together))
+    return [*tests, *prior_tests(problem, fit), *whiteness_tests(problem, fit)]
+
+
+def prior_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
+    """Return name and p-value of the tests that unknowns stayed within their priors.
+
+    A wrong model can fit by leaving what was calibrated, and a law by becoming another one: a joint that
+    slips at nothing is a soft one. An effect's size may be what it will. Conservative: estimates scatter less
+    than the prior.
+    """
+    count = len(problem.shared.parameter_mean)
+    proper = problem.shared.gain_precision > 0.0
+    groups = {
+        "calibrated parameters beside their priors": fit.point.shared[:count],
+        "gains beside their priors": fit.point.shared[count:][proper],
+    }
+    tests = [(name, float(chi2.sf(u @ u, u.size))) for name, u in groups.items() if u.size]
+    for term, part in zip(fit.candidate.terms, fit.candidate.parts(fit.point.effect), strict=True):
+        count = len(term.effect.parameters)
+        forms = zip(term.effect.parameters, part[:count].tolist(), strict=True)
+        tests += [
+            (f"{item.name} of {term.effect.identifier} beside its prior", float(chi2.sf(u**2, 1)))
+            for item, u in forms
+            if not item.magnitude and item.prior.shape != "uniform"  # whose ends are no less likely
+        ]
+    return tests
+
+
+def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
+    """Return name and p-value of the Ljung-Box test of each channel, its dynamic records combined."""
+    found: dict[str, list[float]] = {}
+    for data, residual in zip(problem.trials, fit.residuals, strict=True):
+        if not data.trial.is_dynamic or len(residual) < SHORTEST_SERIES:
+            continue
+        whole = bool(np.all(data.weight > 0.0))
+        for column, name in enumerate(data.trial.channels):
+            used = None if whole else data.weight[:, column] > 0.0
+            found.setdefault(name, []).append(ljung_box(residual[:, column], used=used)[1])
+    return [(f"whiteness of {name}", combine(p_values)) for name, p_values in found.items()]
+
+
+def shape_gate(named: CandidateFit, family: CandidateFit | None) -> Gate:
+    """Judge whether the free-shape family explains more than the named effect.
+
+    Parameters
+    ----------
+    named, family : CandidateFit
+        With canonical and with free shape; None where the effect has no shape to free.
+    """
+    if family is None:
+        return Gate("shape", True, 0.0, SHAPE_GAIN, "The effect has no shape that could be free.")
+    gain = family.log_evidence - named.log_evidence
+    if gain > SHAPE_GAIN:
+        return Gate(
+            "shape",
+            False,
+            gain,
+            SHAPE_GAIN,
+            f"Its family with a free shape gains {gain:.1f} nats over the name.",
+        )
+    return Gate("shape", True, gain, SHAPE_GAIN, "A free shape explains no more than the named one.")

@@ -1,0 +1,83 @@
+"""Beside an optimum: other optima of the same candidate, and its law with a free shape."""
+
+import numpy as np
+
+from discrepancy.search_settings import SEARCH
+
+from .candidate import Candidate, Term
+from .fitting import CandidateFit, attempt
+from .linearisation import Point
+from .problem import Problem
+from .screening import is_magnitude
+
+
+def is_box(candidate: Candidate) -> bool:
+    """Whether an effect has more than one parameter that is no mere size, as a place and a length.
+
+    Its edges pass sensors and lines of the mesh, and optima on either side may fit within the noise.
+    """
+    return any(sum(not is_magnitude(item) for item in term.parameters) > 1 for term in candidate.terms)
+
+
+def around(problem: Problem, found: CandidateFit) -> CandidateFit:
+    """Return the best fit of the same candidate beside an optimum, or the fit itself.
+
+    Hysteresis of several elements has many local optima along the direction that the data tell least of, and
+    a place has them at each sensor that it passes.
+    """
+    parameters = [item for term in found.candidate.terms for item in term.parameters]
+    free = [number for number, item in enumerate(parameters) if not is_magnitude(item)]
+    for _ in range(SEARCH.rounds):
+        moves = [step * axis for axis in np.eye(found.candidate.size)[free] for step in SEARCH.place_steps]
+        if found.candidate.size > 1:
+            _, directions = np.linalg.eigh(found.effect_covariance)
+            moves += [step * directions[:, -1] for step in SEARCH.ridge_steps]
+        better = found
+        for move in moves:
+            start = Point(found.point.shared, found.point.local, found.point.effect + move)
+            item = attempt(
+                problem,
+                found.candidate,
+                start,
+                iterations=SEARCH.neighbour_iterations,
+                give_up=better.objective,
+            )
+            if item is not None and item.log_evidence > better.log_evidence + SEARCH.neighbour_gain:
+                better = item
+        if better is found:
+            break
+        found = better
+    return found
+
+
+def free_shape(
+    problem: Problem, named: CandidateFit, number: int, *, give_up: float | None = None
+) -> CandidateFit | None:
+    """Fit the family of one effect of a fit: its shape free, from the canonical one.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the fit.
+    named : CandidateFit
+        With canonical shapes.
+    number : int
+        Of the effect among its terms.
+    give_up : float, optional
+        See `fit`.
+
+    Returns
+    -------
+    CandidateFit or None
+        None where no shape is to free, or the structure cannot follow.
+    """
+    terms, parts = list(named.candidate.terms), list(named.candidate.parts(named.point.effect))
+    effect = terms[number].effect
+    if not effect.shape:
+        return None
+    terms[number] = Term(effect, terms[number].place, free_shape=True)
+    parts[number] = np.append(parts[number], [item.prior.normal(item.canonical) for item in effect.shape])
+    start = Point(named.point.shared, named.point.local, np.concatenate(parts))
+    return attempt(
+        problem, Candidate(tuple(terms)), start, iterations=SEARCH.shape_iterations, give_up=give_up
+    )

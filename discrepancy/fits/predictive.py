@@ -1,0 +1,126 @@
+"""Residuals of a fit with what their variance should be, for locating, proof and report."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from discrepancy.campaign.records import Trial
+from discrepancy.location.residuals import FittedTrial, ResidualSet
+
+from .fitting import CandidateFit, TrialBlock, fit, trial_block
+from .linearisation import Point
+from .problem import Problem
+
+FloatArray = NDArray[np.float64]
+
+
+def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool = True) -> ResidualSet:
+    """Return the fitted and the held-out trials of a campaign beside their predictions.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the fit.
+    found : CandidateFit
+        With covariance.
+    sensitivities : bool
+        Whether the exact covariance of the residuals is wanted (P columns a sample) or its diagonal only.
+    """
+    fitted = _fitted(problem, found, sensitivities=sensitivities)
+    held_out = problem.campaign.held_out
+    trials = {item.trial.name: item for item in fitted}
+    if held_out:
+        trials.update({item.trial.name: item for item in _held_out(problem, found, held_out)})
+    return ResidualSet(
+        problem.campaign.channels,
+        tuple(trials[trial.name] for trial in problem.campaign.trials if trial.name in trials),
+    )
+
+
+def _fitted(problem: Problem, found: CandidateFit, *, sensitivities: bool) -> list[FittedTrial]:
+    shared_root = np.linalg.cholesky(found.covariance + 1e-14 * np.eye(len(found.covariance)))
+    shared_size = len(shared_root)
+    total = shared_size + sum(data.unknowns.size for data in problem.trials)
+    at, items = shared_size, []
+    ones = np.ones(len(problem.channel_names))
+    for number, data in enumerate(problem.trials):
+        block = trial_block(
+            problem, number, found.point, found.linearisations[number], found.candidate,
+            found.residuals[number], ones,
+        )  # fmt: skip
+        local, shared = _halves(block)
+        factor = cho_factor(block.local, lower=True)
+        own = solve_triangular(np.tril(factor[0]), local, lower=True)
+        # local unknowns follow the shared ones: J_s - J_l A^-1 B, then what is their own
+        follow = (shared - cho_solve(factor, block.cross).T @ local).T @ shared_root[block.index]
+        leverage = np.einsum("nk,nk->n", follow, follow) + np.einsum("kn,kn->n", own, own)
+        shape = found.residuals[number].shape
+        sensitive = None
+        if sensitivities:
+            sensitive = np.zeros((*shape, total))
+            sensitive[..., :shared_size] = follow.reshape(*shape, shared_size)
+            sensitive[..., at : at + len(own)] = own.T.reshape(*shape, len(own))
+        items.append(
+            _item(problem, number, found, np.minimum(leverage, 1.0).reshape(shape), sensitive, held_out=False)
+        )
+        at += data.unknowns.size
+    return items
+
+
+def _halves(block: TrialBlock) -> tuple[FloatArray, FloatArray]:
+    """Return the derivatives (L, N C) and (K, N C) by the trial's own and by the shared unknowns."""
+    dense = block.derivatives.dense()
+    return dense[: len(block.local)], dense[len(block.local) :]
+
+
+def _held_out(problem: Problem, found: CandidateFit, trials: tuple[Trial, ...]) -> list[FittedTrial]:
+    """Predict held-out trials: what is shared stays as fitted, their own nuisances adapt to them."""
+    there = problem.with_trials(trials)
+    start = Point(
+        found.point.shared, tuple(np.zeros(data.unknowns.size) for data in there.trials), found.point.effect
+    )
+    adapted = fit(there, found.candidate, start, local_only=True)
+    items = []
+    ones = np.ones(len(there.channel_names))
+    for number in range(len(there.trials)):
+        block = trial_block(
+            there, number, adapted.point, adapted.linearisations[number], adapted.candidate,
+            adapted.residuals[number], ones,
+        )  # fmt: skip
+        local, shared = _halves(block)
+        factor = cho_factor(block.local, lower=True)
+        follow = shared - cho_solve(factor, block.cross).T @ local
+        own = np.einsum("kn,kn->n", local, cho_solve(factor, local))
+        covariance = found.covariance[np.ix_(block.index, block.index)]
+        carried = np.einsum("kn,kn->n", follow, covariance @ follow)
+        leverage = np.maximum(carried - own, -1.0 + 1e-9).reshape(adapted.residuals[number].shape)
+        items.append(_item(there, number, adapted, leverage, None, held_out=True))
+    return items
+
+
+def _item(
+    problem: Problem,
+    number: int,
+    found: CandidateFit,
+    leverage: FloatArray,
+    sensitive: FloatArray | None,
+    *,
+    held_out: bool,
+) -> FittedTrial:
+    data = problem.trials[number]
+    trial = data.trial
+    prediction = problem.prediction(number, found.point, found.responses[number])
+    variance = 1.0 + leverage if held_out else 1.0 + np.maximum(leverage, 0.0)
+    rates = None
+    if trial.is_dynamic:
+        rates = np.gradient(prediction, trial.interval, axis=0)
+    return FittedTrial(
+        trial=trial,
+        prediction=prediction,
+        residual=found.residuals[number] * data.deviation,
+        noise_deviation=data.deviation,
+        predictive_deviation=data.deviation * np.sqrt(np.maximum(variance, 1e-9)),
+        leverage=leverage,
+        rates=rates,
+        sensitivity=sensitive,
+    )

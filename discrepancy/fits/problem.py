@@ -1,0 +1,398 @@
+"""Campaign and model brought together: standardised residuals of every trial and their derivatives.
+
+A residual is (measured - (1 + gain) model - zero) / s0, whitened in time where the noise record is coloured.
+The variance of each channel's noise is marginalised under the inverse gamma distribution that its record
+leaves: -ln L = sum over channels of (n0 + n) / 2 ln(1 + RSS / n0) + constant, RSS in units of s0^2.
+"""
+
+from collections.abc import Sequence
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.noise import NoiseModel
+from discrepancy.campaign.records import Campaign, Trial
+from discrepancy.catalogue.entry import Setting
+from discrepancy.errors import CampaignDataError
+from discrepancy.models.interface import Model
+from discrepancy.models.memo import MemoModel
+from discrepancy.models.sensing import observe
+from fe.runtime.patch import ModelPatch
+
+from .candidate import Candidate
+from .derivatives import TrialDerivatives
+from .linearisation import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Base, Linearisation, Point, moved
+from .trial_data import TrialData, noise_models
+from .unknowns import GlobalUnknowns, global_unknowns
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+QUIETEST = 1e-12
+"""Least variance of an unknown noise over its stand-in: a billionth of the range, from rounding."""
+
+
+_NOTHING = np.empty((0, 0, 0))
+
+
+class Problem:
+    """A campaign and a model, with everything that does not depend on the hypothesis.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        With its noise records.
+    model : Model
+        The model as it is.
+    setting : Setting
+        Scales for the catalogue.
+    trials : tuple of Trial, optional
+        Those to compare; the fitted ones if left out.
+    like : Problem, optional
+        Noise models and global unknowns are taken from it (for held-out trials).
+    """
+
+    def __init__(
+        self,
+        campaign: Campaign,
+        model: Model,
+        setting: Setting,
+        trials: tuple[Trial, ...] | None = None,
+        like: "Problem | None" = None,
+    ) -> None:
+        self.campaign, self.setting = campaign, setting
+        self.model = model if isinstance(model, MemoModel) else MemoModel(model)
+        chosen = campaign.fitted if trials is None else trials
+        if not chosen:
+            raise CampaignDataError(
+                f"The campaign {campaign.name!r} has no trial to fit: all are held out; mark fewer."
+            )
+        self.channel_names = tuple(campaign.channels)
+        self.refinement: int = 1 if like is None else like.refinement
+        self.noise: dict[str, NoiseModel] = like.noise if like is not None else noise_models(campaign)
+        self.trials = tuple(TrialData.of(campaign, trial, self.noise) for trial in chosen)
+        counts = np.zeros(len(self.channel_names))
+        for data in self.trials:
+            np.add.at(counts, data.groups, data.weight.sum(axis=0))
+        self.counts = counts
+        self.freedom = np.array([self.noise[name].degrees_of_freedom for name in self.channel_names])
+        self._responses: dict[object, tuple[FloatArray, FloatArray | None]] = {}
+        self._gains: dict[tuple[str, ...], tuple[IntArray, IntArray]] = {}
+        self.shared: GlobalUnknowns
+        if like is not None:
+            self.shared = like.shared
+        else:
+            self.shared = global_unknowns(campaign, model, chosen, {})
+            ratios = self._unit_responses()
+            if ratios:
+                self.shared = global_unknowns(campaign, model, chosen, ratios)
+
+    def _unit_responses(self) -> dict[str, float]:
+        """Estimate data over model for signals of unknown scale."""
+        found: dict[str, float] = {}
+        point = self.start(Candidate())
+        for number, data in enumerate(self.trials):
+            for column, name in enumerate(data.trial.channels):
+                channel = self.campaign.channels[name]
+                if channel.gain_deviation != inf or name in found:
+                    continue
+                measured = data.trial.values[:, column] - np.median(data.trial.values[:, column])
+                if data.trial.release is not None and not data.trial.release.at_rest:
+                    unit = np.zeros_like(point.local[number])
+                    unit[data.unknowns.zeros] = 1.0 / data.unknowns.initial_scale
+                    response, _ = self.response(number, point.shared, unit, ModelPatch())
+                else:
+                    response, _ = self.response(number, point.shared, point.local[number], ModelPatch())
+                size = float(np.abs(response[:, column]).max())
+                if size > 0.0:
+                    same = data.trial.release is not None or measured @ response[:, column] > 0.0
+                    found[name] = float(np.abs(measured).max()) / size * (1.0 if same else -1.0)
+        return found
+
+    # -------------------------------------------------------------------------- values
+
+    def start(self, candidate: Candidate) -> Point:
+        """Return the prior means, and the start of the candidate."""
+        return Point(
+            np.zeros(self.shared.size),
+            tuple(np.zeros(data.unknowns.size) for data in self.trials),
+            candidate.start(),
+        )
+
+    def response(
+        self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch, finer: int = 1
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Return the response (N, C) of a trial without gain and zero, and its rates; kept while it is used.
+
+        Time steps are `refinement` times `finer` smaller than the model's own.
+        """
+        data = self.trials[number]
+        refinement = self.refinement * finer
+        conditions = data.unknowns.conditions(data.trial, self.shared.parameters(shared), local)
+        key = (
+            number, refinement, patch.primitives, conditions.parameters.tobytes(),
+            conditions.initial.tobytes(), conditions.clock, conditions.health.tobytes(),
+        )  # fmt: skip
+        kept = self._responses.get(key)
+        if kept is None:
+            observed = observe(
+                self.model, self.campaign, data.trial, patch, conditions, refinement=refinement
+            )
+            kept = (observed.values, observed.rates)
+            if len(self._responses) > 2000:
+                self._responses.clear()
+            self._responses[key] = kept
+        return kept
+
+    def prediction(self, number: int, point: Point, response: FloatArray) -> FloatArray:
+        """Return the prediction (N, C) with gains and zeros."""
+        data = self.trials[number]
+        gains = self.shared.gains(point.shared, data.trial.channels)
+        zero = data.unknowns.zero(point.local[number], len(data.trial.channels))
+        return np.asarray((1.0 + gains) * response + zero)
+
+    def residual(self, number: int, point: Point, response: FloatArray) -> FloatArray:
+        """Return the standardised residuals (N, C) of a trial."""
+        data = self.trials[number]
+        return data.standardised(data.trial.values - self.prediction(number, point, response))
+
+    # -------------------------------------------------------------------------- derivatives
+
+    def linearise(
+        self,
+        number: int,
+        point: Point,
+        candidate: Candidate,
+        base: Base | None = None,
+        *,
+        derivatives: bool = True,
+        known: Linearisation | None = None,
+        effect_steps: FloatArray | None = None,
+        central: bool = True,
+    ) -> Linearisation:
+        """Return response and derivatives of a trial.
+
+        Parameters
+        ----------
+        number : int
+            Of the trial.
+        point : Point
+            Where.
+        candidate : Candidate
+            Effects that act.
+        base : Base, optional
+            With it, only the effect is evaluated, at the base's shared and local unknowns; their own steps
+            are added to first order (chord).
+        derivatives : bool
+            False: the response only.
+        known : Linearisation, optional
+            Derivatives by shared and local unknowns that are near enough.
+        effect_steps : (E,) ndarray, optional
+            Deviations of the effect parameters. Differences over one of them, at most a hundredth of the
+            prior's, average over the kinks of friction and hysteresis and do not reach beyond where the
+            parameters may lie.
+        central : bool
+            Whether derivatives by effect parameters are central differences; never so with a base.
+
+        Notes
+        -----
+        What nuisances can do as well is left of a derivative by an effect once these are fitted: a
+        ten-thousandth where the effect moves frequencies. The curvature in a one-sided difference is more
+        than that, and would count as information.
+        """
+        data = self.trials[number]
+        kind = data.trial.kind
+        patch = candidate.patch(self.setting, point.effect) if kind in candidate.acts_on else ModelPatch()
+        if base is not None:
+            shared, local = base.point.shared, base.point.local[number]
+            there = base.parts[number]
+            response, _ = self.response(number, shared, local, patch)
+            at_base = response
+            move = (point.shared - shared)[: len(there.parameters)]
+            response = response + np.tensordot(move, there.parameters, 1)
+            response += np.tensordot((point.local[number] - local)[data.unknowns.zeros :], there.local, 1)
+            parameters, by_local = there.parameters, there.local
+        else:
+            shared, local = point.shared, point.local[number]
+            response, rates = self.response(number, shared, local, patch)
+            at_base = response
+            if known is not None:
+                parameters, by_local = known.parameters, known.local
+            elif derivatives:
+                parameters = self._by_parameters(number, shared, local, patch, response)
+                by_local = self._by_local(data, number, shared, local, patch, response, rates)
+        if not derivatives:
+            return Linearisation(response, _NOTHING, _NOTHING, _NOTHING)
+        effect = np.zeros((candidate.size, *response.shape))
+        steps = np.full(candidate.size, PARAMETER_STEP)
+        if effect_steps is not None:
+            steps = np.clip(effect_steps, LEAST_STEP, PARAMETER_STEP)
+        for k in range(candidate.size):
+            if kind in candidate.acting(k):
+                sides = (1.0, -1.0) if central and base is None else (1.0,)
+                ends = []
+                for side in sides:
+                    patched = candidate.patch(self.setting, moved(point.effect, k, side * steps[k]))
+                    ends.append(self.response(number, shared, local, patched)[0])
+                other, width = (ends[1], 2.0) if len(ends) == 2 else (at_base, 1.0)
+                effect[k] = (ends[0] - other) / (width * steps[k])
+        return Linearisation(response, parameters, by_local, effect)
+
+    def _by_parameters(
+        self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch, response: FloatArray
+    ) -> FloatArray:
+        columns = [
+            (self.response(number, moved(shared, k, SHARED_STEP), local, patch)[0] - response) / SHARED_STEP
+            for k in range(len(self.shared.parameter_mean))
+        ]
+        return np.stack(columns) if columns else np.zeros((0, *response.shape))
+
+    def _by_local(
+        self,
+        data: TrialData,
+        number: int,
+        shared: FloatArray,
+        local: FloatArray,
+        patch: ModelPatch,
+        response: FloatArray,
+        rates: FloatArray | None,
+    ) -> FloatArray:
+        unknowns = data.unknowns
+        first = unknowns.zeros
+        columns = [
+            (self.response(number, shared, moved(local, first + k), patch)[0] - response) / PARAMETER_STEP
+            for k in range(unknowns.initials)
+        ]
+        if unknowns.time_zero_scale > 0.0:
+            if rates is None:
+                at = first + unknowns.initials
+                rates = (self.response(number, shared, moved(local, at), patch)[0] - response) / (
+                    PARAMETER_STEP * unknowns.time_zero_scale
+                )
+            columns.append(rates * unknowns.time_zero_scale)
+        if len(unknowns.health_rows):
+            at = unknowns.size - len(unknowns.health_rows)
+            by_entry = np.zeros((len(unknowns.health_rows), *response.shape))
+            for region in range(2):
+                entries = np.flatnonzero(unknowns.health_columns == region)
+                if not len(entries):
+                    continue
+                there = local.copy()
+                # away from the limits of the loss; rows do not act on each other
+                sign = np.where(there[at + entries] > 0.0, -1.0, 1.0)
+                there[at + entries] += sign * PARAMETER_STEP
+                change = (self.response(number, shared, there, patch)[0] - response) / PARAMETER_STEP
+                if data.trial.is_dynamic:
+                    by_entry[entries] = sign[:, np.newaxis, np.newaxis] * change
+                else:
+                    rows = unknowns.health_rows[entries]
+                    by_entry[entries, rows] = sign[:, np.newaxis] * change[rows]
+            columns.extend(by_entry)
+        return np.stack(columns) if columns else np.zeros((0, *response.shape))
+
+    def jacobian(
+        self, number: int, point: Point, parts: Linearisation, candidate: Candidate
+    ) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Return standardised derivatives of the prediction of a trial.
+
+        Returns
+        -------
+        local : (L, N C) ndarray
+            By the local unknowns.
+        shared : (K, N C) ndarray
+            By those shared unknowns and effect parameters that touch the trial.
+        index : (K,) ndarray of int
+            Which these are: global unknowns first, then effect parameters.
+        """
+        found = self.derivatives(number, point, parts, candidate)
+        dense = found.dense()
+        return dense[: found.local_size], dense[found.local_size :], found.index
+
+    def derivatives(
+        self, number: int, point: Point, parts: Linearisation, candidate: Candidate
+    ) -> TrialDerivatives:
+        """Return standardised derivatives of the prediction of a trial, channel by channel."""
+        data = self.trials[number]
+        channels, zeros = data.trial.channels, data.unknowns.zeros
+        gains = 1.0 + self.shared.gains(point.shared, channels)
+        position, column = self._gain_entries(channels)
+        acting = [k for k in range(candidate.size) if data.trial.kind in candidate.acting(k)]
+        own, count = len(parts.local), len(parts.parameters)
+        blocks = [parts.local * gains, parts.parameters * gains]
+        if acting:
+            blocks.append(parts.effect[acting] * gains)
+        if len(position):
+            scale = np.zeros(len(channels))
+            scale[column] = self.shared.gain_scale[position]
+            blocks.append((parts.response * scale)[np.newaxis])
+        dense = data.standardised(np.concatenate(blocks))
+
+        # order of the unknowns: zeros, own, calibrated parameters, gains, effect; rows: zero, own,
+        # calibrated parameters, effect, gain
+        local = zeros + own
+        first_effect = local + count + len(position)
+        size = first_effect + len(acting)
+        everywhere = np.array(
+            [*range(zeros, local), *range(local, local + count), *range(first_effect, size)], dtype=np.int64
+        )
+        head = int(zeros > 0)
+        rows = np.empty((len(channels), head + len(dense), dense.shape[1]))
+        owners = np.full(rows.shape[:2], size)
+        if head:
+            rows[:, 0] = data.by_zero
+            owners[data.unknowns.zero_columns, 0] = np.arange(zeros)
+        rows[:, head:] = dense.transpose(2, 0, 1)
+        owners[:, head : head + len(everywhere)] = everywhere
+        if len(position):
+            owners[column, -1] = local + count + np.arange(len(position))
+        index = np.array(
+            [*range(count), *(count + position), *(self.shared.size + k for k in acting)], dtype=np.int64
+        )
+        return TrialDerivatives(rows, owners, local, index)
+
+    def _gain_entries(self, channels: tuple[str, ...]) -> tuple[IntArray, IntArray]:
+        """Return which gains act in a trial, and on which of its columns."""
+        found = self._gains.get(channels)
+        if found is None:
+            entries = [
+                (position, channels.index(name))
+                for position, name in enumerate(self.shared.gain_channels)
+                if name in channels
+            ]
+            table = np.array(entries, dtype=np.int64).reshape(-1, 2)
+            found = self._gains[channels] = (table[:, 0], table[:, 1])
+        return found
+
+    # -------------------------------------------------------------------------- likelihood
+
+    def group_sums(self, residuals: Sequence[FloatArray]) -> FloatArray:
+        """Return the sum of squared standardised residuals of each channel."""
+        sums = np.zeros(len(self.channel_names))
+        for data, residual in zip(self.trials, residuals, strict=True):
+            np.add.at(sums, data.groups, np.einsum("nc,nc->c", residual, residual))
+        return sums
+
+    def misfit(self, sums: FloatArray) -> float:
+        """Return -ln L with the noise variances marginalised, up to a constant."""
+        n0, n = self.freedom, self.counts
+        with np.errstate(divide="ignore", invalid="ignore"):
+            known = 0.5 * (n0 + n) * np.log1p(sums / n0)
+            terms = np.where(
+                np.isinf(n0),
+                0.5 * sums,
+                np.where(n0 > 0.0, known, 0.5 * n * np.log(np.maximum(sums, QUIETEST * n))),
+            )
+        return float(terms[n > 0].sum())
+
+    def precisions(self, sums: FloatArray) -> FloatArray:
+        """Return the expected precision of each channel's noise over 1 / s0^2, given the residuals."""
+        n0, n = self.freedom, self.counts
+        with np.errstate(divide="ignore", invalid="ignore"):
+            left = np.where(n0 > 0.0, sums, np.maximum(sums, QUIETEST * n))
+            weights = np.where(np.isinf(n0), 1.0, (n0 + n) / (n0 + left))
+        return np.where(n > 0, weights, 1.0)
+
+    def with_trials(self, trials: tuple[Trial, ...]) -> "Problem":
+        """Return the same problem on other trials, with the same noise and global unknowns."""
+        return Problem(self.campaign, self.model, self.setting, trials, like=self)

@@ -1,0 +1,322 @@
+"""Screening: what an effect could explain, before any fit, to first order in the nuisances.
+
+With d the standardised change that an effect makes to the prediction at the fitted nuisances, J their
+derivatives and H the Hessian of the fit, the misfit after the nuisances have adapted is
+
+    F(d) = F(0) - b(d) + G(d, d) / 2,   G(c, d) = c.d - (J c)' H^-1 (J d),   b(d) = r.d - g' H^-1 (J d).
+
+Changes of several effects add, so pairs and scales cost inner products only. G is also what separates two
+effects before data are looked at.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from math import sqrt
+from typing import NamedTuple, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.special import ndtri
+
+from discrepancy.campaign.records import TrialKind
+from discrepancy.catalogue.entry import EffectParameter, ShapeParameter
+from discrepancy.errors import ModelError
+from discrepancy.search_settings import SEARCH
+from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch
+
+from .candidate import Candidate, Term
+from .derivatives import TrialDerivatives
+from .fitting import LARGEST_EFFECT, CandidateFit, trial_block
+from .problem import Problem
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Change:
+    """What an effect at given values does to the prediction, adapted nuisances taken off.
+
+    Attributes
+    ----------
+    term : Term
+        The effect at a place.
+    start : (E,) ndarray
+        Scaled parameters.
+    vector : (D,) ndarray
+        Change and its projections, such that G(c, d) = c.sign.d.
+    fits : float
+        b(d): its overlap with the residual [nat].
+    size : float
+        G(d, d): squared distance from the model without it [sigma^2].
+    """
+
+    term: Term
+    start: FloatArray
+    vector: FloatArray
+    fits: float
+    size: float
+
+    @property
+    def scale(self) -> float:
+        """Factor on the change that explains most."""
+        return self.fits / self.size if self.size > 0.0 else 0.0
+
+    @property
+    def gain(self) -> float:
+        """Decrease of the misfit at the best scale [nat]; none where a positive size would turn negative."""
+        if self.fits < 0.0 and not self.may_turn:
+            return 0.0
+        return 0.5 * self.fits * self.scale
+
+    @property
+    def may_turn(self) -> bool:
+        """Whether its scale may be negative."""
+        sizes = [item.prior.shape for item in self.term.parameters if is_magnitude(item)]
+        return not sizes or any(shape != "log_normal" for shape in sizes)
+
+
+class _Piece(NamedTuple):
+    """One trial of a screen."""
+
+    derivatives: TrialDerivatives
+    own: FloatArray  # (L, L): what a change leaves to the trial's own unknowns
+    followed: FloatArray  # (K, L): what these take from the shared ones
+    root: FloatArray  # (C, 1), weights
+    residual: FloatArray  # (C, N), weighted
+    gradient: FloatArray  # (L,)
+    nothing: FloatArray  # (C N,), no change
+
+
+class Screen:
+    """Inner products of changes at a fit.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    fit : CandidateFit
+        Where the nuisances stand; its own effects stay as they are.
+    record_noise : bool
+        Whether residuals count by the noise record (else by what the fit left).
+    """
+
+    def __init__(self, problem: Problem, fit: CandidateFit, *, record_noise: bool = True) -> None:
+        self.problem, self.fit = problem, fit
+        known = problem.freedom > 0.0
+        left = problem.precisions(fit.sums)
+        precision = np.where(known, 1.0, left) if record_noise else left
+        candidate = Candidate()
+        size = problem.shared.size
+        matrix = np.diag(problem.shared.precision + 1e-12)
+        gradient = -problem.shared.precision * fit.point.shared
+        self._pieces: list[_Piece] = []
+        for number in range(len(problem.trials)):
+            block = trial_block(
+                problem, number, fit.point, fit.linearisations[number], candidate,
+                fit.residuals[number], precision,
+            )  # fmt: skip
+            factor = cho_factor(block.local, lower=True)
+            inner = cho_solve(factor, block.cross)
+            matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner
+            np.add.at(gradient, block.index, block.shared_gradient - inner.T @ block.local_gradient)
+            root = np.sqrt(block.precision)[:, np.newaxis]
+            own = solve_triangular(np.tril(factor[0]), np.eye(len(block.local)), lower=True)
+            self._pieces.append(
+                _Piece(
+                    block.derivatives,
+                    own,
+                    inner.T,
+                    root,
+                    np.ascontiguousarray(fit.residuals[number].T) * root,
+                    own @ block.local_gradient,
+                    np.zeros(fit.residuals[number].size),
+                )
+            )
+        lower = np.tril(cho_factor(matrix, lower=True)[0])
+        self._inverse = solve_triangular(lower, np.eye(size), lower=True)
+        self._gradient = self._inverse @ gradient
+        self._size = size
+
+    def change(self, term: Term, start: FloatArray) -> Change:
+        """Return what a term does at scaled parameters, besides the effects of the fit."""
+        candidate = self.fit.candidate.plus(term)
+        channels = _channels_of(term.effect.patch(self.problem.setting, term.values(start), term.place))
+        vector, fits, size = self._moved(
+            candidate, np.concatenate((self.fit.point.effect, start)), term.effect.acts_on, channels
+        )
+        return Change(term, start, vector, fits, max(size, 0.0))
+
+    def rise(self, effect: FloatArray) -> float:
+        """Return by how much the misfit rises [nat] when the fit's own effect parameters (E,) are these."""
+        candidate = self.fit.candidate
+        _, fits, size = self._moved(candidate, effect, candidate.acts_on, frozenset())
+        return 0.5 * size - fits
+
+    def _moved(
+        self,
+        candidate: Candidate,
+        effect: FloatArray,
+        acting: frozenset[TrialKind],
+        channels: frozenset[str],
+    ) -> tuple[FloatArray, float, float]:
+        """Return vector, b and G of the change to a candidate, in trials and channels that it touches."""
+        problem, fit = self.problem, self.fit
+        total = np.zeros(self._size)
+        parts, fits, square = [], 0.0, 0.0
+        tail = []
+        patch = candidate.patch(problem.setting, effect)
+        for number, (data, piece) in enumerate(zip(problem.trials, self._pieces, strict=True)):
+            touched = None
+            if channels:
+                touched = [column for column, name in enumerate(data.trial.channels) if name in channels]
+            if data.trial.kind not in acting or touched == []:
+                parts.append(piece.nothing)
+                tail.append(np.zeros(len(piece.own)))
+                continue
+            change = np.zeros(piece.residual.shape)
+            parts.append(change.reshape(-1))
+            at = slice(None) if touched is None else touched
+            response, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch)
+            gains = 1.0 + problem.shared.gains(fit.point.shared, data.trial.channels)
+            moved = gains[at] * (response[:, at] - fit.responses[number][:, at])
+            d = data.standardised(moved, touched).T * piece.root[at]
+            change[at] = d
+            onto = piece.derivatives.onto(d * piece.root[at], touched)
+            local = onto[: len(piece.own)]
+            z = piece.own @ local
+            total[piece.derivatives.index] += onto[len(piece.own) :] - piece.followed @ local
+            fits += float(np.vdot(piece.residual[at], d)) - float(piece.gradient @ z)
+            square += float(np.vdot(d, d)) - float(z @ z)
+            tail.append(z)
+        y = self._inverse @ total
+        fits -= float(self._gradient @ y)
+        square -= float(y @ y)
+        return np.concatenate((*parts, *tail, y)), fits, square
+
+    def shrunk(self, change: Change) -> tuple[Change, float]:
+        """Return a change made so small that it is of first order, and by which factor.
+
+        Effects that move a frequency turn phases by many radians at their medians, which says nothing of what
+        they do in small.
+        """
+        whole = float((change.vector[self.sign > 0.0] ** 2).sum())  # before the nuisances take their share
+        factor = sqrt(SEARCH.first_order / whole) if whole > 0.0 else 1.0
+        if factor >= 1.0:
+            return change, 1.0
+        start = change.start.copy()
+        for number, item in enumerate(change.term.parameters):
+            if is_magnitude(item):
+                start[number] = item.prior.normal(factor * item.prior.value(float(start[number])))
+        return self.change(change.term, start), factor
+
+    def _peaks(self, term: Term) -> tuple[float, ...]:
+        """Return peaks of the residuals' mean spectrum at a term's channel, over the first frequency."""
+        if not term.effect.spectral:
+            return ()
+        problem = self.problem
+        spectra: dict[tuple[int, float], FloatArray] = {}
+        for data, residual in zip(problem.trials, self.fit.residuals, strict=True):
+            if data.trial.kind not in term.effect.acts_on or term.place not in data.trial.channels:
+                continue
+            series = residual[:, data.trial.channels.index(term.place)]
+            key = (len(series), data.trial.interval)
+            power = np.abs(np.fft.rfft(series - series.mean(), SEARCH.padded * len(series))) ** 2
+            spectra[key] = spectra.get(key, 0.0) + power
+        found: list[float] = []
+        for (count, interval), power in spectra.items():
+            resolution = 1.0 / (SEARCH.padded * count * interval)
+            inner = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
+            best = inner[np.argsort(power[inner])[::-1][: 4 * SEARCH.peaks]]
+            kept: list[int] = []
+            for index in best:
+                if all(abs(index - other) > 2 * SEARCH.padded for other in kept) and len(kept) < SEARCH.peaks:
+                    kept.append(int(index))
+            first = problem.setting.scales.angular_frequency / (2.0 * np.pi)
+            found += [index * resolution / first for index in kept]
+        return tuple(found)
+
+    @property
+    def sign(self) -> FloatArray:
+        """Signs (D,) of the inner product: changes count, their projections are taken off."""
+        samples = sum(piece.residual.size for piece in self._pieces)
+        rest = sum(len(piece.own) for piece in self._pieces) + self._size
+        return np.concatenate((np.ones(samples), -np.ones(rest)))
+
+    def changes(self, term: Term, *, fine: bool = True) -> Iterator[Change]:
+        """Yield the changes of a term over the grid of its parameters, where the model can follow.
+
+        Without `fine`, signed magnitudes are tried at one size only, enough for what is linear in them,
+        unless they ask for levels of their own.
+        """
+        for start in grid(term, self._peaks(term), fine=fine):
+            try:
+                yield self.change(term, start)
+            except ModelError:  # such as a spring softer than what is taken from it
+                continue
+
+
+def _channels_of(patch: ModelPatch) -> frozenset[str]:
+    """Return the channels that a patch touches if it touches named ones only, else nothing."""
+    names = [getattr(item, "channel", EVERY_CHANNEL) for item in patch if isinstance(item, SENSORS)]
+    if len(names) < len(patch) or EVERY_CHANNEL in names or not names:
+        return frozenset()
+    return frozenset(names)
+
+
+def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Iterator[FloatArray]:
+    """Yield scaled parameters to try: magnitudes at one value or at levels of theirs, since changes scale.
+
+    A spectral parameter is tried at the given peaks.
+    """
+    axes: list[tuple[float, ...]] = []
+    scaled = False
+    count = sum(1 for item in term.parameters if not is_magnitude(item))
+    levels = SEARCH.levels.get(count, SEARCH.levels_of_many)
+    for item in term.parameters:
+        if is_magnitude(item):
+            signed = item.prior.value(0.0) == 0.0
+            if item.levels and not scaled:
+                axes.append(_spread_levels(item))
+                scaled = True
+            elif scaled:
+                axes.append((-1.0, 0.0, 1.0) if signed else (0.0,))
+            else:
+                axes.append((1.0, *((SEARCH.linear,) if fine else ())) if signed else (0.0,))
+                scaled = True
+        elif item.name == term.effect.spectral and peaks:
+            axes.append(tuple(float(np.clip(item.prior.normal(peak), -3.0, 3.0)) for peak in peaks))
+        elif isinstance(item, EffectParameter) and item.levels:
+            axes.append(_spread_levels(item))
+        elif item in term.effect.shape:
+            axes.append((item.prior.normal(item.canonical),))
+        else:
+            axes.append(levels)
+    for values in product(*axes):
+        yield np.array(values)
+
+
+def _spread_levels(item: EffectParameter) -> tuple[float, ...]:
+    """Return the scaled values of a parameter that asks for so many, evenly over its prior."""
+    return tuple(float(ndtri((k + 0.5) / item.levels)) for k in range(item.levels))
+
+
+def is_magnitude(item: EffectParameter | ShapeParameter) -> TypeGuard[EffectParameter]:
+    """Whether an effect vanishes with a parameter."""
+    return isinstance(item, EffectParameter) and item.magnitude
+
+
+def rescaled(change: Change) -> FloatArray:
+    """Return the scaled parameters at which the magnitude is that of the best scale."""
+    start = change.start.copy()
+    factor = change.scale
+    for number, item in enumerate(change.term.parameters):
+        if not is_magnitude(item):
+            continue
+        prior = item.prior
+        value = prior.value(float(start[number])) * factor
+        if prior.shape == "log_normal":  # it cannot change its sign
+            value = max(value, prior.value(-0.7 * LARGEST_EFFECT))
+        start[number] = np.clip(prior.normal(value), -0.7 * LARGEST_EFFECT, SEARCH.largest_start)
+    return start

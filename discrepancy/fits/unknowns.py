@@ -1,0 +1,225 @@
+"""The unknowns that every hypothesis shares: calibrated parameters and the nuisances of the measurement.
+
+Each unknown is a scaled variable u with prior N(0, 1), or flat where nothing is known; the value is
+centre + scale u. Global ones: calibrated parameters, gains of channels. Local to a trial: zeros of its
+channels, initial state and time zero of a ring-down, health where it is uncertain.
+"""
+
+from dataclasses import dataclass
+from math import isinf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
+from discrepancy.models.interface import Conditions, Model
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+FREE_MOTION = 3.0
+"""Prior deviation of a free initial state, in units of the release displacement."""
+LEAST_LOSS, LARGEST_LOSS = -0.5, 0.95
+"""Limits of an uncertain stiffness loss. A loss below zero means nothing, but a limit at zero, where most of
+a flight is, would stop fits: half of the readings of a healthy wing pull below it."""
+
+
+@dataclass(frozen=True)
+class GlobalUnknowns:
+    """Layout of the global unknowns.
+
+    Attributes
+    ----------
+    parameter_mean, parameter_scale, parameter_low, parameter_high : (P,) ndarray
+        Of the calibrated parameters.
+    gain_channels : tuple of str
+        Channels whose gain is unknown.
+    gain_centre, gain_scale, gain_precision : (G,) ndarray
+        Their gain errors; precision 1, or 0 for a flat prior.
+    fixed_gain : dict of str to float
+        Gain errors of signals that define the scale of the release amplitudes, which are not fitted.
+    """
+
+    parameter_mean: FloatArray
+    parameter_scale: FloatArray
+    parameter_low: FloatArray
+    parameter_high: FloatArray
+    gain_channels: tuple[str, ...]
+    gain_centre: FloatArray
+    gain_scale: FloatArray
+    gain_precision: FloatArray
+    fixed_gain: dict[str, float]
+
+    @property
+    def size(self) -> int:
+        """Number of global unknowns."""
+        return len(self.parameter_mean) + len(self.gain_channels)
+
+    @property
+    def precision(self) -> FloatArray:
+        """Prior precision of each scaled variable."""
+        return np.concatenate((np.ones_like(self.parameter_mean), self.gain_precision))
+
+    def parameters(self, u: FloatArray) -> FloatArray:
+        """Return the calibrated parameters, kept within the range of the model."""
+        values = self.parameter_mean + self.parameter_scale * u[: len(self.parameter_mean)]
+        return np.clip(values, self.parameter_low, self.parameter_high)
+
+    def gains(self, u: FloatArray, channels: tuple[str, ...]) -> FloatArray:
+        """Return the gain errors (C,) of channels."""
+        found = dict(self.fixed_gain)
+        values = self.gain_centre + self.gain_scale * u[len(self.parameter_mean) :]
+        found.update(zip(self.gain_channels, values, strict=True))
+        return np.array([found.get(name, 0.0) for name in channels])
+
+
+@dataclass(frozen=True)
+class LocalUnknowns:
+    """Layout of the unknowns of one trial, in the order: zeros, initial state, time zero, health.
+
+    Attributes
+    ----------
+    zero_columns : (Z,) ndarray of int
+        Columns whose zero is unknown.
+    zero_scale, zero_precision : (Z,) ndarray
+        Scale and prior precision.
+    initial_shape : tuple of int
+        (R, 1) or (R, 2): entries of the initial state that are unknown.
+    initial_scale : float
+        Their prior deviation.
+    time_zero_scale : float
+        Zero if it is known.
+    health_rows, health_columns : (H,) ndarray of int
+        Uncertain entries of the health, those of the first region first.
+    """
+
+    zero_columns: IntArray
+    zero_scale: FloatArray
+    zero_precision: FloatArray
+    initial_shape: tuple[int, int]
+    initial_scale: float
+    time_zero_scale: float
+    health_rows: IntArray
+    health_columns: IntArray
+
+    @property
+    def zeros(self) -> int:
+        """Number Z of unknown zeros."""
+        return len(self.zero_columns)
+
+    @property
+    def initials(self) -> int:
+        """Number of unknown initial entries."""
+        return self.initial_shape[0] * self.initial_shape[1]
+
+    @property
+    def size(self) -> int:
+        """Number of local unknowns."""
+        return self.zeros + self.initials + (self.time_zero_scale > 0.0) + len(self.health_rows)
+
+    @property
+    def precision(self) -> FloatArray:
+        """Prior precision of each scaled variable."""
+        return np.concatenate((self.zero_precision, np.ones(self.size - self.zeros)))
+
+    def zero(self, u: FloatArray, columns: int) -> FloatArray:
+        """Return the zeros (C,) of the trial's channels."""
+        values = np.zeros(columns)
+        values[self.zero_columns] = self.zero_scale * u[: self.zeros]
+        return values
+
+    def conditions(self, trial: Trial, parameters: FloatArray, u: FloatArray) -> Conditions:
+        """Return the conditions of the trial's response."""
+        at = self.zeros
+        initial = np.zeros((self.initial_shape[0], 2))
+        if self.initials:
+            entries = self.initial_scale * u[at : at + self.initials]
+            initial[:, : self.initial_shape[1]] = entries.reshape(self.initial_shape)
+            at += self.initials
+        time_zero = 0.0
+        if self.time_zero_scale > 0.0:
+            time_zero = self.time_zero_scale * float(u[at])
+            at += 1
+        health = trial.health[:1] if trial.is_dynamic else trial.health
+        if len(self.health_rows):
+            health = health.copy()
+            entry = (self.health_rows, self.health_columns)
+            health[entry] = np.clip(
+                health[entry] + trial.health_deviation[entry] * u[at:], LEAST_LOSS, LARGEST_LOSS
+            )
+        return Conditions(parameters, initial, (0.0, time_zero), health)
+
+
+def global_unknowns(
+    campaign: Campaign, model: Model, trials: tuple[Trial, ...], unit_responses: dict[str, float]
+) -> GlobalUnknowns:
+    """Return the layout of the global unknowns.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Its `parameters` replace priors of the model.
+    model : Model
+        With calibrated parameters.
+    trials : tuple of Trial
+        Trials that are fitted; only gains of channels in them are unknowns.
+    unit_responses : dict of str to float
+        For signals of unknown scale: data over model, as a first estimate of 1 + gain.
+    """
+    prior = [campaign.parameters.get(item.name, (item.mean, item.deviation)) for item in model.parameters]
+    used = {name for trial in trials for name in trial.channels}
+    names, centre, scale, precision = [], [], [], []
+    fixed: dict[str, float] = {}
+    for name, channel in campaign.channels.items():
+        if name not in used:
+            continue
+        if isinf(channel.gain_deviation):
+            estimate = unit_responses.get(name, 1.0) - 1.0
+            if channel.quantity is Quantity.SIGNAL and not fixed:
+                fixed[name] = estimate  # it defines the scale of the release amplitudes
+                continue
+            names.append(name)
+            centre.append(estimate)
+            scale.append(max(abs(1.0 + estimate), 1e-12))
+            precision.append(0.0)
+        elif channel.gain_deviation > 0.0:
+            names.append(name)
+            centre.append(0.0)
+            scale.append(channel.gain_deviation)
+            precision.append(1.0)
+    return GlobalUnknowns(
+        parameter_mean=np.array([mean for mean, _ in prior], dtype=np.float64),
+        parameter_scale=np.array([deviation for _, deviation in prior], dtype=np.float64),
+        parameter_low=np.array([item.low for item in model.parameters], dtype=np.float64),
+        parameter_high=np.array([item.high for item in model.parameters], dtype=np.float64),
+        gain_channels=tuple(names),
+        gain_centre=np.array(centre, dtype=np.float64),
+        gain_scale=np.array(scale, dtype=np.float64),
+        gain_precision=np.array(precision, dtype=np.float64),
+        fixed_gain=fixed,
+    )
+
+
+def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray) -> LocalUnknowns:
+    """Return the layout of the unknowns of one trial; `deviation` (C,) scales zeros nothing is known of."""
+    zero_scale = np.array([campaign.channels[name].offset_deviation for name in trial.channels])
+    columns = np.flatnonzero(zero_scale > 0.0)
+    free = np.isinf(zero_scale[columns])
+    release = trial.release if trial.kind is TrialKind.RINGDOWN else None
+    shape, scale, time_zero = (0, 1), 1.0, 0.0
+    if release is not None:
+        shape = (release.mode_count, 1 if release.at_rest else 2)
+        scale = release.deviation if release.at_rest else FREE_MOTION
+        time_zero = release.time_zero_deviation
+    uncertain = trial.health_deviation[:1] if trial.is_dynamic else trial.health_deviation
+    of_health, rows = np.nonzero(uncertain.T)  # region by region, as their derivatives are taken
+    return LocalUnknowns(
+        zero_columns=columns,
+        zero_scale=np.where(free, deviation[columns], zero_scale[columns]),
+        zero_precision=np.where(free, 0.0, 1.0),
+        initial_shape=shape,
+        initial_scale=scale,
+        time_zero_scale=time_zero,
+        health_rows=rows,
+        health_columns=of_health,
+    )

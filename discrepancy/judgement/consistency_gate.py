@@ -1,0 +1,346 @@
+"""The gate of consistency: what a named effect leaves must not follow loads, runs, or its own channel.
+
+An effect that is not in the catalogue can be imitated by one that is, closely enough for the sum of squares
+of many thousand samples. The difference then lies along few directions: the response of one kind of test has
+another size, slope over the span or zero than the name allows. A score test (Rao 1948, Proc. Camb. Phil. Soc.
+44) looks along these directions only, with nuisances and effect free to follow.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import isinf
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.stats import chi2, f
+
+from discrepancy.campaign.records import Quantity, TrialKind
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import CandidateFit, trial_block
+from discrepancy.fits.problem import Problem
+from discrepancy.fits.trial_data import TrialData
+from discrepancy.verdict import Gate
+from fe.runtime.patch import SENSORS
+
+FloatArray = NDArray[np.float64]
+
+CONSISTENCY_LEVEL = 1e-3
+"""Level of the gate, by Bonferroni over its tests; a true name fails it this often."""
+IDENTIFIED = 0.5
+"""Posterior over prior deviation of an effect parameter below which its prior does not count in the test."""
+SEPARATE = 1e-6
+"""Share of a direction that must be left when all else has followed."""
+LEAST_FREEDOM = 20.0
+"""Degrees of freedom from which the noise of the readings concerned is known well enough."""
+LEAST_STATIONS = 3
+
+
+@dataclass(frozen=True)
+class ScoreTest:
+    """Outcome of a score test.
+
+    Attributes
+    ----------
+    name : str
+        What was freed.
+    statistic : float
+        Fall of the sum of squares (in units of the noise) that the directions promise.
+    count : int
+        Number of directions that can be told from what is free already.
+    p_value : float
+        Of a fall as large, if the fit is right.
+    strongest : str
+        The direction that departs most by itself, with its size in deviations.
+    """
+
+    name: str
+    statistic: float
+    count: int
+    p_value: float
+    strongest: str
+
+
+Direction = Mapping[int, FloatArray]
+"""Change of the prediction (N, C) by trial number."""
+
+
+def consistency_gate(problem: Problem, fit: CandidateFit) -> Gate:
+    """Judge whether what is left departs along loads, runs or the channel of the effect.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    fit : CandidateFit
+        What would be named.
+
+    Returns
+    -------
+    Gate
+        `passed` is None where there is no static trial, no flight, and no effect of a single channel, or too
+        few readings.
+    """
+    tests = consistency_tests(problem, fit)
+    if not tests:
+        return Gate(
+            "consistency", None, np.nan, CONSISTENCY_LEVEL,
+            "No trial under a stated load, or too few readings: what is left cannot be judged by load.",
+        )  # fmt: skip
+    worst = min(tests, key=lambda test: test.p_value)
+    statistic = min(1.0, worst.p_value * len(tests))
+    if statistic < CONSISTENCY_LEVEL:
+        reason = (
+            f"What is left follows the {worst.name}: χ² {worst.statistic:.0f} along {worst.count} "
+            f"direction{'s' if worst.count > 1 else ''}, most of all {worst.strongest}."
+        )
+        return Gate("consistency", False, statistic, CONSISTENCY_LEVEL, reason)
+    return Gate(
+        "consistency", True, statistic, CONSISTENCY_LEVEL,
+        "What is left follows neither loads, runs nor the effect's own channel.",
+    )  # fmt: skip
+
+
+def consistency_tests(problem: Problem, fit: CandidateFit) -> list[ScoreTest]:
+    """Return the tests of the gate that can be made.
+
+    Static trials: size, zero and slope over the span of the response, for each load place. Flights: size and
+    slope over the span. Runs of static trials: a zero for each quantity. Effects of single channels: size of
+    each such channel's response by load place and kind of trial, and a zero that moves in time.
+    """
+    groups = {
+        "static loads": _by_load(problem, fit, TrialKind.STATIC),
+        "loads of flight": _by_load(problem, fit, TrialKind.FLIGHT),
+        "zeros of the static runs": _by_run(problem),
+    }
+    for term in fit.candidate.terms:
+        channel = _own_channel(problem, term)
+        if channel:
+            groups[f"channel {channel}"] = _by_channel(problem, fit, channel)
+    return score_tests(problem, fit, {name: group for name, group in groups.items() if group})
+
+
+def score_tests(
+    problem: Problem, fit: CandidateFit, groups: Mapping[str, Mapping[str, Direction]]
+) -> list[ScoreTest]:
+    """Test groups of directions at a fit, each group by itself.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    fit : CandidateFit
+        Converged, with its linearisations.
+    groups : mapping of str to mapping of str to Direction
+        Names of tests, names of their directions.
+
+    Returns
+    -------
+    list of ScoreTest
+        Of the groups of which a direction is left and whose channels have enough readings.
+    """
+    directions = [item for group in groups.values() for item in group.values()]
+    if not directions:
+        return []
+    gradient, information, whole = _projected(problem, fit, directions)
+    tests = []
+    at = 0
+    for name, group in groups.items():
+        rows = np.arange(at, at + len(group))
+        at += len(group)
+        rows = rows[whole[rows] > 0.0]
+        if not len(rows):
+            continue
+        size = np.sqrt(whole[rows])
+        values, vectors = np.linalg.eigh(information[np.ix_(rows, rows)] / np.outer(size, size))
+        kept = values > SEPARATE
+        along = vectors.T @ (gradient[rows] / size)
+        statistic, count = float(np.sum(along[kept] ** 2 / values[kept])), int(kept.sum())
+        freedom, share = _freedom(problem, fit, list(group.values()))
+        if not count or freedom - count < LEAST_FREEDOM:
+            continue
+        own = np.diag(information)[rows]
+        alone = np.divide(
+            np.abs(gradient[rows]), np.sqrt(own), out=np.zeros(len(rows)), where=own > SEPARATE * size**2
+        )
+        labels = list(group)
+        most = int(np.argmax(alone))
+        tests.append(
+            ScoreTest(
+                name, statistic, count, _p_value(statistic, count, freedom, share),
+                f"{labels[rows[most] - (at - len(group))]} ({alone[most]:.1f} deviations)",
+            )
+        )  # fmt: skip
+    return tests
+
+
+def _p_value(statistic: float, count: int, freedom: float, share: float) -> float:
+    """Return the tail probability; the noise is known with `freedom`, `share` of it left by the unknowns."""
+    if isinf(freedom):
+        return float(chi2.sf(statistic, count))
+    scaled = statistic * share
+    if scaled >= freedom:
+        return 0.0
+    return float(f.sf((scaled / count) / ((freedom - scaled) / (freedom - count)), count, freedom - count))
+
+
+def _freedom(problem: Problem, fit: CandidateFit, directions: list[Direction]) -> tuple[float, float]:
+    """Return degrees of freedom of the noise of the channels concerned, and their share not spent."""
+    channels: set[int] = set()
+    for direction in directions:
+        for number, column in direction.items():
+            channels.update(problem.trials[number].groups[np.any(column != 0.0, axis=0)].tolist())
+    rows = sorted(channels)
+    if not rows:
+        return 0.0, 1.0
+    known = problem.freedom[rows] + problem.counts[rows]
+    if np.any(np.isinf(known)):
+        return np.inf, 1.0
+    left = float(np.sum(known - fit.spent[rows]))
+    return left, left / float(known.sum())
+
+
+def _projected(
+    problem: Problem, fit: CandidateFit, directions: list[Direction]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return gradient (K,) and information (K, K) of directions as all unknowns follow, and sizes (K,).
+
+    Effect parameters that the data determine follow without their prior: that they are unlikely says nothing
+    of what they leave.
+    """
+    shared_size, count = problem.shared.size, len(directions)
+    size = shared_size + fit.candidate.size
+    determined = np.diag(fit.effect_covariance) < IDENTIFIED**2
+    precision = np.concatenate((problem.shared.precision, np.where(determined, 0.0, 1.0)))
+    position = np.concatenate((fit.point.shared, fit.point.effect))
+    matrix = np.zeros((size + count, size + count))
+    matrix[:size, :size] = np.diag(precision + 1e-12)
+    gradient = np.concatenate((-precision * position, np.zeros(count)))
+    whole = np.zeros(count)
+    weights = problem.precisions(fit.sums)
+    for number, data in enumerate(problem.trials):
+        residual = fit.residuals[number]
+        block = trial_block(
+            problem, number, fit.point, fit.linearisations[number], fit.candidate, residual, weights
+        )
+        acting = np.array([k for k, item in enumerate(directions) if number in item], dtype=np.int64)
+        extra = [data.standardised(directions[k][number]) for k in acting]
+        weighted = [column * weights[data.groups] for column in extra]
+        products = np.array([[np.vdot(a, b) for b in weighted] for a in extra]).reshape(2 * (len(acting),))
+        whole[acting] += np.diag(products)
+        local_size = len(block.local)
+        onto = np.array([block.derivatives.onto(column.T) for column in weighted])
+        onto = onto.reshape(len(acting), block.derivatives.size).T
+        cross = np.concatenate((block.cross, onto[:local_size]), axis=1)
+        between = onto[local_size:]
+        shared = np.block([[block.shared, between], [between.T, products]])
+        along = np.array([np.vdot(residual, column) for column in weighted])
+        index = np.concatenate((block.index, size + acting))
+        inner = cho_solve(cho_factor(block.local), cross)
+        matrix[np.ix_(index, index)] += shared - cross.T @ inner
+        np.add.at(
+            gradient, index,
+            np.concatenate((block.shared_gradient, along)) - inner.T @ block.local_gradient,
+        )  # fmt: skip
+    known, between = matrix[:size, :size], matrix[:size, size:]
+    scale = 1.0 / np.sqrt(np.diag(known))
+    factor = cho_factor(known * np.outer(scale, scale) + 1e-12 * np.eye(size))
+    followed = scale[:, np.newaxis] * cho_solve(factor, scale[:, np.newaxis] * between)
+    return (
+        gradient[size:] - followed.T @ gradient[:size],
+        matrix[size:, size:] - between.T @ followed,
+        whole,
+    )
+
+
+def _by_load(problem: Problem, fit: CandidateFit, kind: TrialKind) -> dict[str, Direction]:
+    """Return size, zero (static only) and slope over the span of the response, by load place."""
+    found: dict[str, dict[int, FloatArray]] = {}
+    for number, data in enumerate(problem.trials):
+        if data.trial.kind is not kind:
+            continue
+        response = _response(problem, fit, number)
+        where = "in flight" if kind is TrialKind.FLIGHT else f"under load at {_place(data)}"
+        found.setdefault(f"the size {where}", {})[number] = response
+        if kind is TrialKind.STATIC:
+            found.setdefault(f"the zero {where}", {})[number] = np.broadcast_to(
+                response[np.argmax(np.abs(data.trial.force))], response.shape
+            )
+        along = _along_span(problem, data)
+        if along is not None:
+            found.setdefault(f"the slope over the span {where}", {})[number] = response * along
+    return dict(found)
+
+
+def _by_run(problem: Problem) -> dict[str, Direction]:
+    """Return a zero that all channels of a quantity share in the static trials of a run."""
+    found: dict[str, dict[int, FloatArray]] = {}
+    for number, data in enumerate(problem.trials):
+        if data.trial.kind is not TrialKind.STATIC:
+            continue
+        quantities = [problem.campaign.channels[name].quantity for name in data.trial.channels]
+        for quantity in sorted(set(quantities)):
+            columns = np.array([item is quantity for item in quantities])
+            zero = np.broadcast_to(columns * _scale(problem, quantity), data.weight.shape)
+            where = f"in run {data.trial.run}" if data.trial.run else "in the runs without a label"
+            found.setdefault(f"the zero of {quantity.value} {where}", {})[number] = zero
+    return dict(found)
+
+
+def _by_channel(problem: Problem, fit: CandidateFit, channel: str) -> dict[str, Direction]:
+    """Return the size of a channel's response by kind of trial and load place, and its drift."""
+    found: dict[str, dict[int, FloatArray]] = {}
+    last = max(abs(data.trial.start) for data in problem.trials) or 1.0
+    scale = _scale(problem, problem.campaign.channels[channel].quantity)
+    for number, data in enumerate(problem.trials):
+        if channel not in data.trial.channels:
+            continue
+        column = data.trial.channels.index(channel)
+        size, drift = np.zeros(data.weight.shape), np.zeros(data.weight.shape)
+        size[:, column] = _response(problem, fit, number)[:, column]
+        drift[:, column] = scale * data.trial.start / last
+        static = data.trial.kind is TrialKind.STATIC
+        where = f"under load at {_place(data)}" if static else f"in the trials {data.trial.kind.value}"
+        found.setdefault(f"the size {where}", {})[number] = size
+        found.setdefault("the zero over time", {})[number] = drift
+    return dict(found)
+
+
+def _response(problem: Problem, fit: CandidateFit, number: int) -> FloatArray:
+    """Return what a trial's motion or load does to the readings (N, C)."""
+    trial, response = problem.trials[number].trial, fit.responses[number]
+    if trial.kind is TrialKind.STATIC:  # temperature and the offset of a run are no response to the load
+        response = response - response[np.argmin(np.abs(trial.force))]
+    return np.asarray((1.0 + problem.shared.gains(fit.point.shared, trial.channels)) * response)
+
+
+def _scale(problem: Problem, quantity: Quantity) -> float:
+    """Return a size for zeros, the same in all trials, however noisy each was."""
+    channels = problem.campaign.channels.values()
+    return min(problem.noise[item.name].static_deviation for item in channels if item.quantity is quantity)
+
+
+def _place(data: TrialData) -> str:
+    place = data.trial.load_place
+    return place if isinstance(place, str) else f"({place[0]:g}, {place[1]:g})"
+
+
+def _along_span(problem: Problem, data: TrialData) -> FloatArray | None:
+    """Return the station of each channel (C,) from their mean over their range; 0 where it is not known."""
+    stations = [problem.campaign.channels[name].station for name in data.trial.channels]
+    known = np.array([np.nan if station is None else station for station in stations])
+    values = known[np.isfinite(known)]
+    if len(np.unique(values)) < LEAST_STATIONS:
+        return None
+    return np.asarray(np.where(np.isfinite(known), (known - values.mean()) / np.ptp(values), 0.0))
+
+
+def _own_channel(problem: Problem, term: Term) -> str:
+    """Return the channel that a term acts on if it is one alone, else nothing."""
+    candidate = Candidate((term,))
+    patch = candidate.patch(problem.setting, candidate.start() + 1.0)
+    channels = {getattr(item, "channel", "") for item in patch if isinstance(item, SENSORS)}
+    if len(channels) != 1 or not all(isinstance(item, SENSORS) for item in patch):
+        return ""
+    (channel,) = channels
+    return channel if channel in problem.campaign.channels else ""

@@ -1,0 +1,392 @@
+"""From fitted candidates to a verdict: named, a family, a group, unexplained, or nothing missing."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from discrepancy.catalogue.entry import NINETY, Effect
+from discrepancy.fits.candidate import FREE_SHAPE, Candidate
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, shape_gate
+from discrepancy.fits.other_optima import free_shape
+from discrepancy.fits.posterior import with_draws
+from discrepancy.fits.problem import Problem
+from discrepancy.search.strategy import Search, search
+from discrepancy.search_settings import SEARCH
+from discrepancy.verdict import Estimate, Gate, Hypothesis, NamedEffect, Verdict, VerdictKind
+from fe.runtime.patch import INTERNAL_FORCES
+
+from .consistency_gate import consistency_gate
+
+
+def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, CandidateFit]:
+    """Name what is missing.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    effects : sequence of Effect
+        The catalogue.
+
+    Returns
+    -------
+    Verdict
+        Without next experiments and data faults, which others add.
+    Search
+        All candidates.
+    CandidateFit
+        The one that stands for the verdict: of the named set, of the family, of the most probable member of a
+        group or of what is too small to tell; else the one without effect.
+    """
+    found = search(problem, effects)
+    probabilities = _settled_probabilities(found)
+    top, p_top = next(iter(probabilities.items()))
+    best = _best_of(found, top) if top else found.best()
+    told = _Conclusion(
+        problem,
+        found,
+        top,
+        log_bayes_factor=_single_evidence(found, best) - found.none.log_evidence,
+        hypotheses=_hypotheses(problem, found, probabilities),
+        inclusion={
+            effect.identifier: sum(
+                p for names, p in probabilities.items() if effect.identifier in _plain(names)
+            )
+            for effect in found.effects
+        },
+    )
+    none_gate = absolute_gate(problem, found.none)
+    if not top or (told.log_bayes_factor < SEARCH.bayes_factor and none_gate.passed is not False):
+        if none_gate.passed is False:
+            sentence = f"There is a gap that no effect of the catalogue explains. {none_gate.reason}"
+            return told.unexplained(sentence, p_top, (none_gate,))
+        if top and probabilities.get((), 0.0) < SEARCH.unsure:
+            return _open(problem, found, probabilities, told.verdict, best)
+        sentence = (
+            "The model explains the data within their noise."
+            if none_gate.passed
+            else "No effect of the catalogue explains the data better than the model does. "
+            f"{none_gate.reason}"
+        )
+        verdict = told.verdict(
+            VerdictKind.NOTHING_MISSING, sentence, probabilities.get((), 0.0), gates=(none_gate,)
+        )
+        return verdict, found, found.none
+
+    # sets that hold the best one and more agree with it; they only leave a further effect open
+    p_top = min(sum(p for names, p in probabilities.items() if set(_plain(top)) <= set(_plain(names))), 1.0)
+    if best.candidate.is_family:  # reached from several members or places, it is one family
+        p_top = max(p_top, _family_probability(found, best.candidate.terms[0].effect.family))
+    if p_top < SEARCH.sure or told.log_bayes_factor < SEARCH.bayes_factor:
+        return _open(problem, found, probabilities, told.verdict, best)
+    return _judged(told, best, p_top)
+
+
+@dataclass(frozen=True)
+class _Conclusion:
+    """What every verdict on a search says alike, and the kinds of it."""
+
+    problem: Problem
+    found: Search
+    top: tuple[str, ...]
+    log_bayes_factor: float
+    hypotheses: tuple[Hypothesis, ...]
+    inclusion: dict[str, float]
+
+    def verdict(self, kind: VerdictKind, sentence: str, probability: float, **more: Any) -> Verdict:
+        """Return a verdict."""
+        return Verdict(
+            kind=kind,
+            sentence=sentence,
+            probability=probability,
+            log_bayes_factor=self.log_bayes_factor,
+            hypotheses=self.hypotheses,
+            inclusion=self.inclusion,
+            **more,
+        )
+
+    def family(
+        self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...]
+    ) -> tuple[Verdict, Search, CandidateFit]:
+        """Return the verdict that names the family of a fit with a free shape."""
+        drawn = with_draws(self.problem, fit)
+        named = named_effects(self.problem, drawn)
+        text, sentence = _family(named)
+        more = {"effects": named, "family": text, "gates": gates}
+        return self.verdict(VerdictKind.FAMILY, sentence, probability, **more), self.found, drawn
+
+    def unexplained(
+        self, sentence: str, probability: float, gates: tuple[Gate, ...]
+    ) -> tuple[Verdict, Search, CandidateFit]:
+        """Return the verdict that there is a gap without a name."""
+        more = {"gates": gates, "resembles": _plain(self.top)}
+        verdict = self.verdict(VerdictKind.UNEXPLAINED, sentence, probability, **more)
+        return verdict, self.found, self.found.none
+
+
+def _judged(told: _Conclusion, best: CandidateFit, p_top: float) -> tuple[Verdict, Search, CandidateFit]:
+    """Return the verdict on the best set, probable enough for a name: by the gates."""
+    problem, found = told.problem, told.found
+    gate, consistent = absolute_gate(problem, best), consistency_gate(problem, best)
+    if best.candidate.is_family:
+        if _pass(gate, consistent):
+            return told.family(best, p_top, (gate, consistent))
+        reason = _failing(gate, consistent).reason
+        return told.unexplained(
+            f"There is a gap that no effect of the catalogue fits. {reason}", p_top, (gate, consistent)
+        )
+    shape, family = _shape(found, best)
+    if _pass(gate, shape, consistent):
+        best = with_draws(problem, best)
+        named = named_effects(problem, best)
+        more = {"effects": named, "gates": (gate, shape, consistent)}
+        return (
+            told.verdict(VerdictKind.NAMED, _named_sentence(named, p_top, gate), p_top, **more),
+            found,
+            best,
+        )
+    nearest = f"There is a gap that no effect of the catalogue fits; the nearest is {' with '.join(told.top)}"
+    if family is not None and not shape.passed:
+        if not _may_be_free(found, best):
+            return told.unexplained(
+                f"{nearest}, but one of them would need a shape of its own, and with so much freedom nearly "
+                "anything fits.",
+                p_top,
+                (gate, shape, consistent),
+            )
+        gate, consistent = absolute_gate(problem, family), consistency_gate(problem, family)
+        if _pass(gate, consistent):
+            return told.family(family, p_top, (gate, shape, consistent))
+    reason = _failing(gate, consistent).reason
+    return told.unexplained(
+        f"{nearest}, but {reason[0].lower()}{reason[1:]}", p_top, (gate, shape, consistent)
+    )
+
+
+def _pass(*gates: Gate) -> bool:
+    return all(gate.passed is not False for gate in gates)
+
+
+def _failing(absolute: Gate, consistent: Gate) -> Gate:
+    """Return the gate that says why; the absolute one where it failed too."""
+    return consistent if absolute.passed is not False and consistent.passed is False else absolute
+
+
+def _settled_probabilities(found: Search) -> dict[tuple[str, ...], float]:
+    """Return the probabilities of sets, those that matter fitted exactly: few steps give rough evidence."""
+    probabilities = found.set_probabilities()
+    for _ in range(SEARCH.largest_group):
+        exact = {item.candidate.identifiers for item in found.exact.values()}
+        rough = [names for names in _members(probabilities) if names not in exact]
+        if not rough:
+            break
+        _best_of(found, rough[0])
+        probabilities = found.set_probabilities()
+    return probabilities
+
+
+def _members(probabilities: Mapping[tuple[str, ...], float]) -> list[tuple[str, ...]]:
+    """Return the most probable sets that together reach the probability of a name."""
+    members: list[tuple[str, ...]] = []
+    total = 0.0
+    for names, p in probabilities.items():
+        members.append(names)
+        total += p
+        if total >= SEARCH.sure:
+            break
+    return members
+
+
+def _family_probability(found: Search, family: str) -> float:
+    """Return the probability of a family: of all single effects of it, named or of free shape."""
+    kept = found.all().values()
+    scores = np.array([found.score(item) for item in kept])
+    members = np.array(
+        [len(item.candidate.terms) == 1 and item.candidate.terms[0].effect.family == family for item in kept]
+    )
+    weights = np.exp(scores - scores.max())
+    return float(weights[members].sum() / weights.sum())
+
+
+def _plain(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return identifiers without the mark of a free shape."""
+    return tuple(name.removesuffix(FREE_SHAPE) for name in names)
+
+
+def _open(
+    problem: Problem,
+    found: Search,
+    probabilities: Mapping[tuple[str, ...], float],
+    verdict: Callable[..., Verdict],
+    best: CandidateFit,
+) -> tuple[Verdict, Search, CandidateFit]:
+    """Return the verdict where no set reaches the probability that a name needs, as `name` does."""
+    members = _members(probabilities)
+    total = sum(probabilities[names] for names in members)
+    fits = [_best_of(found, names) for names in members]
+    if () in members:
+        hints = sorted({name for names in members for name in _plain(names)})
+        return (
+            verdict(
+                VerdictKind.BELOW_LIMIT,
+                "Something may be missing, but too small for these data to tell from noise"
+                + (f"; the nearest are {', '.join(hints[:4])}." if hints else "."),
+                total, group=tuple(hints), gates=(absolute_gate(problem, best),),
+            ),
+            found, best,
+        )  # fmt: skip
+    gates = [absolute_gate(problem, item) for item in fits]
+    fitting: list[tuple[tuple[str, ...], CandidateFit, Gate]] = []
+    together = 0.0
+    for names, item, each in zip(members, fits, gates, strict=True):
+        if each.passed is False:  # those that do not fit take their probability with them
+            continue
+        together += probabilities[names]
+        if _plain(names) not in [_plain(other) for other, _, _ in fitting]:  # else a law and its family
+            fitting.append((names, with_draws(problem, item), each))
+    if not fitting or len(fitting) > SEARCH.largest_group:
+        return (
+            verdict(
+                VerdictKind.UNEXPLAINED,
+                f"There is a gap that no effect of the catalogue fits. {gates[0].reason}"
+                if not fitting
+                else f"There is a gap, and {len(fitting)} explanations fit it alike.",
+                total, gates=(gates[0],), resembles=_plain(members[0]),
+            ),
+            found, found.none,
+        )  # fmt: skip
+    group = tuple(" + ".join(_plain(names)) for names, _, _ in fitting)
+    labels = [" + ".join(names) for names, _, _ in fitting]
+    effects = tuple(effect for _, item, _ in fitting for effect in named_effects(problem, item))
+    _, nearest, gate = fitting[0]
+    sentence = (
+        f"Either {', '.join(labels[:-1])} or {labels[-1]} is missing; these data cannot tell which."
+        if len(group) > 1
+        else f"There is a gap that {labels[0]} fits, but not with the probability that a name needs."
+    )
+    return (
+        verdict(VerdictKind.GROUP, sentence, together, effects=effects, group=group, gates=(gate,)),
+        found, nearest,
+    )  # fmt: skip
+
+
+def _best_of(found: Search, identifiers: tuple[str, ...]) -> CandidateFit:
+    options = [item for item in found.all().values() if item.candidate.identifiers == identifiers]
+    best = max(options, key=found.score)
+    return found.exactly(best)
+
+
+def _single_evidence(found: Search, best: CandidateFit) -> float:
+    """Log evidence of the best set, averaged over its places."""
+    places = 0.0
+    for term in best.candidate.terms:
+        places += np.log(len(term.effect.places(found.problem.setting)))
+    return best.log_evidence - places
+
+
+def _may_be_free(found: Search, best: CandidateFit) -> bool:
+    """Whether a set may be stated with one law of free shape.
+
+    A free shape counts as one more effect, and beside a second law it would imitate nearly anything.
+    """
+    laws = 0
+    for term, part in zip(best.candidate.terms, best.candidate.parts(best.point.effect), strict=True):
+        alone = Candidate((term,)).patch(found.problem.setting, part)
+        laws += len(alone.of(*INTERNAL_FORCES)) > 0
+    return laws < 2 and len(best.candidate.terms) < SEARCH.largest_set
+
+
+def _shape(found: Search, best: CandidateFit) -> tuple[Gate, CandidateFit | None]:
+    """Free the shape of each effect of the best set in turn; return the outcome that matters most."""
+    outcome, kept = shape_gate(best, None), None
+    for number in range(len(best.candidate.terms)):
+        family = free_shape(found.problem, best, number)
+        if family is None:
+            continue
+        gate = shape_gate(best, family)
+        if kept is None or gate.statistic > outcome.statistic:
+            outcome, kept = gate, family
+    return outcome, kept if kept is not None and outcome.statistic > SHAPE_GAIN else None
+
+
+def named_effects(problem: Problem, found: CandidateFit) -> tuple[NamedEffect, ...]:
+    """Return the effects of a fit with values and 90 % intervals of their parameters.
+
+    Intervals are those of the fit's draws, else of its covariance.
+    """
+    named = []
+    deviation = np.sqrt(np.diag(found.effect_covariance))
+    low, high = found.point.effect - NINETY * deviation, found.point.effect + NINETY * deviation
+    if found.draws is not None:
+        low, high = np.quantile(found.draws, (0.05, 0.95), axis=0)
+        # the most probable value may be one of many optima along a ridge
+        low, high = np.minimum(low, found.point.effect), np.maximum(high, found.point.effect)
+    at = 0
+    for term, part in zip(found.candidate.terms, found.candidate.parts(found.point.effect), strict=True):
+        estimates = []
+        rows = slice(at, at + len(part))
+        for item, u, *interval in zip(term.parameters, part, low[rows], high[rows], strict=True):
+            ends = [item.prior.value(float(end)) for end in interval]
+            estimates.append(
+                Estimate(
+                    item.name,
+                    item.prior.value(float(u)),
+                    min(ends),
+                    max(ends),
+                    getattr(item, "unit", "1"),
+                    item.description,
+                )
+            )
+        count = len(term.effect.parameters)
+        named.append(
+            NamedEffect(
+                term.effect.identifier,
+                term.effect.name,
+                term.place,
+                term.effect.family,
+                tuple(estimates[:count]),
+                tuple(estimates[count:]),
+                Candidate((term,)).patch(problem.setting, part),
+            )
+        )
+        at += len(part)
+    return tuple(named)
+
+
+def _hypotheses(
+    problem: Problem, found: Search, probabilities: dict[tuple[str, ...], float]
+) -> tuple[Hypothesis, ...]:
+    rows = []
+    for identifiers, probability in probabilities.items():
+        options = [item for item in found.all().values() if item.candidate.identifiers == identifiers]
+        best = max(options, key=found.score)
+        rows.append(
+            Hypothesis(
+                named_effects(problem, best),
+                best.log_evidence,
+                probability,
+                best.chi_square,
+                float(problem.counts.sum() - best.spent.sum()),
+            )
+        )
+    return tuple(rows)
+
+
+def _family(named: tuple[NamedEffect, ...]) -> tuple[str, str]:
+    """Return the families whose shape is free, and the sentence of the verdict."""
+    text = ", ".join(sorted({effect.family for effect in named if effect.shape}))
+    beside = ", ".join(effect.name for effect in named if not effect.shape)
+    return text, (
+        f"An effect of the family {text} is missing, with a shape of its own"
+        f"{f', beside {beside}' if beside else ''}."
+    )
+
+
+def _named_sentence(named: tuple[NamedEffect, ...], probability: float, gate: Gate) -> str:
+    what = " and ".join(f"{effect.name}{f' at {effect.place}' if effect.place else ''}" for effect in named)
+    certain = "> 0.999" if probability > 0.9995 else f"{probability:.3f}"  # never one
+    limit = "" if gate.passed else f" {gate.reason}"
+    return f"The model lacks {what} (probability {certain}).{limit}"

@@ -1,0 +1,310 @@
+"""Proof: what an effect does to the trials, before and after, at the same scale.
+
+Scores follow Gneiting and Raftery 2007 (J. Am. Stat. Assoc. 102, 359-378); predictions are Gaussian with the
+predictive deviations handed over by the fit.
+"""
+
+from collections.abc import Sequence
+from math import nan, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from discrepancy.campaign.noise_tests import SHORTEST_SERIES, ljung_box, variance_p_value
+from discrepancy.errors import FitError
+from discrepancy.location.locate import Location
+from discrepancy.location.omnibus_tests import mean_square
+from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.verdict import Proof, Scores
+
+FloatArray = NDArray[np.float64]
+
+PIT_BINS = 10
+"""Bins of the histogram of probability integral transforms."""
+
+SMALLEST_GAP = 2.0
+"""A gap to close is at least this many standard deviations of χ²/dof above one."""
+
+_ENOUGH_TRIALS = 5  # from which the scatter between trials alone gives the standard error
+_PARTS = 16  # of a record, for the error within a trial
+_REMAINS = 0.01  # p-value below which something is said to remain
+
+
+def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
+    """Return the scores of a set whose trials are all fitted, or all held out.
+
+    Parameters
+    ----------
+    residuals : ResidualSet
+        One or more trials.
+    seed : int
+        Of the draw that restores what the fit absorbed, for whiteness.
+
+    Raises
+    ------
+    FitError
+        If fitted and held-out trials are mixed, or no sample is used.
+    """
+    if len({item.trial.held_out for item in residuals.trials}) > 1:
+        raise FitError("Scores need fitted or held-out trials, but the set mixes them: score each by itself.")
+    transforms = [item.residual / item.predictive_deviation for item in residuals.trials]
+    used = [item.used for item in residuals.trials]
+    z = np.concatenate([values[use] for values, use in zip(transforms, used, strict=True)])
+    if z.size == 0:
+        raise FitError("Scores need at least one used sample, but there is none.")
+    density = np.concatenate(
+        [log_density(item)[use] for item, use in zip(residuals.trials, used, strict=True)]
+    )
+    square, deviation = chi_square_per_dof(residuals)
+    uniform = stats.norm.cdf(z)
+    counts = np.histogram(uniform, bins=PIT_BINS, range=(0.0, 1.0))[0]
+    return Scores(
+        rms=_rms(residuals),
+        chi_square_per_dof=square,
+        log_score=float(density.mean()),
+        coverage_50=float(np.mean(np.abs(z) <= stats.norm.ppf(0.75))),
+        coverage_90=float(np.mean(np.abs(z) <= stats.norm.ppf(0.95))),
+        whiteness=_whiteness(residuals, seed),
+        sample_count=int(z.size),
+        chi_square_deviation=deviation,
+        pit=tuple(float(value) for value in counts / z.size),
+        pit_p_value=_uniformity(transforms, used, counts),
+    )
+
+
+def log_density(item: FittedTrial) -> FloatArray:
+    """Return the predictive log density of each sample in units of its noise deviation, (N, C).
+
+    ln N(residual; 0, predictive_deviation^2) + ln s0; a perfect model with exact parameters has
+    -(1 + ln 2 pi) / 2 = -1.419 on average.
+    """
+    z = item.residual / item.predictive_deviation
+    spread = item.predictive_deviation / item.noise_deviation
+    return np.asarray(-0.5 * np.log(2.0 * np.pi) - np.log(spread) - 0.5 * z**2)
+
+
+def chi_square_per_dof(residuals: ResidualSet) -> tuple[float, float]:
+    """Return χ²/dof against the noise records, and its standard deviation if the model is right.
+
+    Channels without a noise record do not count; nan if none has one. Degrees of freedom are the expected
+    sum of squares: samples less what the fit absorbs, or plus what its uncertainty adds to held-out trials.
+    """
+    names = list(dict.fromkeys(n for item in residuals.trials for n in item.trial.channels))
+    known = [name for name in names if residuals.degrees_of_freedom(name) > 0.0]
+    if not known:
+        return nan, nan
+    square, freedom = mean_square(residuals, known)
+    if freedom <= 0.0:
+        return nan, nan
+    # Channels may share their record or not; the worst case, that all share the poorest one, is assumed.
+    noise = min(residuals.degrees_of_freedom(name) for name in known)
+    return square, sqrt(2.0 / freedom + 2.0 / noise)
+
+
+def _rms(residuals: ResidualSet) -> dict[str, float]:
+    sums: dict[str, list[float]] = {}
+    for item in residuals.trials:
+        for column, name in enumerate(item.trial.channels):
+            values = item.residual[item.used[:, column], column]
+            total = sums.setdefault(name, [0.0, 0.0])
+            total[0] += float(values @ values)
+            total[1] += values.size
+    return {name: sqrt(total / count) for name, (total, count) in sums.items() if count}
+
+
+def _whiteness(residuals: ResidualSet, seed: int) -> float:
+    """Return the least p-value of Ljung-Box over dynamic channels times their number."""
+    white = residuals.white(np.random.default_rng(seed))
+    found = [
+        ljung_box(values[:, column])[1]
+        for item, values in zip(residuals.trials, white, strict=True)
+        if item.trial.is_dynamic and len(values) >= SHORTEST_SERIES
+        for column in range(values.shape[1])
+        if item.used[:, column].any()
+    ]
+    return min(1.0, len(found) * min(found)) if found else nan
+
+
+def correlation_time(series: FloatArray) -> float:
+    """Return the samples that count as one, 1 + 2 sum rho_k, with Geyer's initial positive sequence.
+
+    Geyer 1992, Statistical Science 7, 473-483: sums of neighbouring pairs are added while positive. At
+    least one.
+    """
+    count = series.size
+    centred = series - series.mean()
+    power = float(centred @ centred)
+    if count < 4 or power == 0.0:
+        return 1.0
+    covariance = np.fft.irfft(np.abs(np.fft.rfft(centred, 2 * count)) ** 2)[:count]
+    rho = covariance / covariance[0]
+    pairs = rho[0 : count - 1 : 2] + rho[1:count:2]
+    ends = np.flatnonzero(pairs <= 0.0)
+    last = int(ends[0]) if ends.size else pairs.size
+    return max(1.0, 2.0 * float(pairs[:last].sum()) - 1.0)
+
+
+def _uniformity(
+    transforms: Sequence[FloatArray], used: Sequence[NDArray[np.bool_]], counts: NDArray[np.int64]
+) -> float:
+    """Return the p-value of Pearson's chi^2 over the bins, thinned by the correlation of |z|."""
+    total, effective = 0, 0.0
+    for values, use in zip(transforms, used, strict=True):
+        for column in range(values.shape[1]):
+            series = values[use[:, column], column]
+            if series.size:
+                slow = max(correlation_time(series), correlation_time(np.abs(series)))
+                total += series.size
+                effective += series.size / slow
+    if effective < PIT_BINS:
+        return nan
+    expected = total / PIT_BINS
+    statistic = float(np.sum((counts - expected) ** 2) / expected) * effective / total
+    return float(stats.chi2.sf(statistic, PIT_BINS - 1))
+
+
+def score_gain(before: ResidualSet, after: ResidualSet) -> tuple[float, float]:
+    """Return the gain of the mean predictive log density per sample, and its standard error.
+
+    Trials are the units: the error is that of a ratio over clusters. With fewer than five trials it is at
+    least the error within them, from sums over sixteenths of each record (all channels at once, so that
+    neighbouring samples may depend on each other); with one trial it is that alone.
+
+    Raises
+    ------
+    FitError
+        If the two sets are not of the same samples.
+    """
+    sums, counts, within = [], [], 0.0
+    for first, second in zip(before.trials, after.trials, strict=True):
+        use = first.used
+        gain = np.where(use, log_density(second) - log_density(first), 0.0)
+        sums.append(float(gain.sum()))
+        counts.append(int(use.sum()))
+        within += _variance_within(gain.sum(axis=1))
+    total = sum(counts)
+    if total == 0:
+        raise FitError("A gain needs at least one used sample, but there is none.")
+    mean = sum(sums) / total
+    inner = sqrt(within) / total
+    if len(sums) == 1:
+        return mean, inner
+    scatter = sum((s - mean * n) ** 2 for s, n in zip(sums, counts, strict=True))
+    outer = sqrt(len(sums) / (len(sums) - 1) * scatter) / total
+    return mean, outer if len(sums) >= _ENOUGH_TRIALS else max(outer, inner)
+
+
+def _variance_within(series: FloatArray) -> float:
+    """Return the variance of the sum of a series from differences of neighbouring sums.
+
+    Differences, because the expected gain itself changes slowly along a record, as the motion decays.
+    """
+    sums = np.array([part.sum() for part in np.array_split(series, min(_PARTS, series.size))])
+    if sums.size < 2:
+        return 0.0
+    return float(0.5 * np.sum(np.diff(sums) ** 2) * sums.size / (sums.size - 1))
+
+
+def gap_closed(before: Scores | None, after: Scores | None) -> tuple[float, str]:
+    """Return 1 - (χ²_after - 1) / (χ²_before - 1), or nan and the reason.
+
+    A χ²/dof below one after counts as one: fitting noise closes no gap.
+    """
+    if before is None or after is None:
+        return nan, "No trial was held out."
+    if not np.isfinite(before.chi_square_per_dof):
+        return nan, "No noise record: what a closed gap would be is not known."
+    gap = before.chi_square_per_dof - 1.0
+    if gap < SMALLEST_GAP * before.chi_square_deviation:
+        return nan, (
+            f"Held-out trials show no gap before: χ²/dof {before.chi_square_per_dof:.2f}, where "
+            f"1 \N{PLUS-MINUS SIGN} {before.chi_square_deviation:.2f} is expected of noise."
+        )
+    return 1.0 - max(after.chi_square_per_dof - 1.0, 0.0) / gap, ""
+
+
+def prove(
+    before: ResidualSet, after: ResidualSet, *, location: Location | None = None, seed: int = 0
+) -> Proof:
+    """Return the proof from the residuals without and with the effect.
+
+    Parameters
+    ----------
+    before, after : ResidualSet
+        The same trials and samples; noise deviations are alike.
+    location : Location, optional
+        Where the model with the effect still disagrees, for the sentence on what remains.
+    seed : int
+        As of `scores`.
+
+    Raises
+    ------
+    FitError
+        If the two sets differ in trials, used samples or noise, or no trial was fitted.
+    """
+    _check_alike(before, after)
+    if before.fitted is None or after.fitted is None:
+        raise FitError("A proof needs at least one fitted trial, but all are held out.")
+    outside = (before.held_out, after.held_out)
+    held_before = None if outside[0] is None else scores(outside[0], seed=seed)
+    held_after = None if outside[1] is None else scores(outside[1], seed=seed)
+    fitted_after = scores(after.fitted, seed=seed)
+    closed, reason = gap_closed(held_before, held_after)
+    gain, error = nan, nan
+    if outside[0] is not None and outside[1] is not None:
+        gain, error = score_gain(outside[0], outside[1])
+    target = after.fitted if outside[1] is None else outside[1]
+    return Proof(
+        held_out_before=held_before,
+        held_out_after=held_after,
+        fitted_before=scores(before.fitted, seed=seed),
+        fitted_after=fitted_after,
+        gap_closed=closed,
+        log_score_gain=gain,
+        log_score_gain_error=error,
+        remaining=_remaining(target, fitted_after if held_after is None else held_after, location),
+        gap_reason=reason,
+    )
+
+
+def _check_alike(before: ResidualSet, after: ResidualSet) -> None:
+    names = [[item.trial.name for item in one.trials] for one in (before, after)]
+    if names[0] != names[1]:
+        raise FitError(
+            f"A proof needs the same trials before and after, but they are {', '.join(names[0])} and "
+            f"{', '.join(names[1])}."
+        )
+    for first, second in zip(before.trials, after.trials, strict=True):
+        if first.trial.held_out is not second.trial.held_out or not np.array_equal(first.used, second.used):
+            raise FitError(
+                f"The trial {first.trial.name!r} has other samples or another role before than after."
+            )
+        if not np.allclose(first.noise_deviation, second.noise_deviation, rtol=1e-9):
+            raise FitError(
+                f"The trial {first.trial.name!r} has other noise deviations before than after: both must be "
+                "those of the noise records."
+            )
+
+
+def _remaining(residuals: ResidualSet, after: Scores, location: Location | None) -> str:
+    """Return a sentence on what is still not explained."""
+    where = "held-out" if residuals.trials[0].trial.held_out else "fitted"
+    size = f"χ²/dof {after.chi_square_per_dof:.2f} on {where} trials"
+    if not np.isfinite(after.chi_square_per_dof):
+        return "Without a noise record it is not known what remains."
+    names = list(dict.fromkeys(n for item in residuals.trials for n in item.trial.channels))
+    known = [name for name in names if residuals.degrees_of_freedom(name) > 0.0]
+    square, freedom = mean_square(residuals, known)
+    noise = min(residuals.degrees_of_freedom(name) for name in known)
+    too_large = variance_p_value(square, freedom, noise) < _REMAINS
+    coloured = after.whiteness < _REMAINS
+    if location is not None and location.disagreements:
+        return f"Still unexplained ({size}): {location.disagreements[0].sentence}"
+    if too_large:
+        worst = max(known, key=lambda name: mean_square(residuals, (name,))[0])
+        share = mean_square(residuals, (worst,))[0]
+        return f"Still unexplained: {size}, most on {worst} ({share:.2f})."
+    if coloured:
+        return f"The size is that of noise ({size}), but residuals are not white (p = {after.whiteness:.1g})."
+    return f"Nothing that these data can show remains ({size})."

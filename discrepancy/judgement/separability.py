@@ -1,0 +1,281 @@
+"""What a campaign can decide, before its data are looked at: detectable sizes and confusion groups.
+
+Every effect is put on the model at its prior median; the change it makes, with all nuisances projected out,
+is compared with the noise (can it be seen?) and with what every other effect can do (can it be told apart?).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import inf, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.records import Campaign, NoiseRecord, Trial
+from discrepancy.catalogue.entry import Effect, EffectParameter, Setting
+from discrepancy.errors import DiscrepancyError, ModelError
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.linearisation import PARAMETER_STEP
+from discrepancy.fits.problem import Problem
+from discrepancy.fits.screening import Change, Screen
+from discrepancy.fits.trial_data import stand_in
+from discrepancy.models.interface import Model
+
+FloatArray = NDArray[np.float64]
+
+CONFUSED = 9.0
+"""Squared distance [sigma^2] below which two effects form a confusion group."""
+DETECTED = 25.0
+"""Squared distance from the model [sigma^2] at which an effect is found: 3 nats of Bayes factor, the cost of
+its parameters and of its place in the catalogue."""
+
+
+@dataclass(frozen=True)
+class Detectability:
+    """How well a campaign sees one effect.
+
+    Attributes
+    ----------
+    effect : Effect
+        Which.
+    reason : str
+        Why it cannot be tested here; empty if it can.
+    place : str
+        Where it shows best.
+    distance : float
+        d^2 from the model without it at the prior median [sigma^2].
+    parameter : str
+        The parameter that scales it.
+    detectable : float
+        Value of that parameter from which on it is found [unit of the parameter]; infinite if never.
+    unit : str
+        Of it.
+    typical : float
+        Its prior median (for a signed parameter one prior deviation).
+    """
+
+    effect: Effect
+    reason: str
+    place: str = ""
+    distance: float = 0.0
+    parameter: str = ""
+    detectable: float = inf
+    unit: str = "1"
+    typical: float = 0.0
+
+
+@dataclass(frozen=True)
+class Separability:
+    """What a campaign can and cannot decide.
+
+    Attributes
+    ----------
+    detectability : tuple of Detectability
+        In the order of the catalogue.
+    identifiers : tuple of str
+        Of the effects that can be tested, rows and columns of `distance`.
+    distance : (E, E) ndarray
+        d^2 of the row's effect from the nearest that the column's effect can do [sigma^2]: at its median, or
+        where it is not seen there, at the size from which it is. What nobody sees is close to everything.
+    groups : tuple of tuple of str
+        Confusion groups of two or more.
+    """
+
+    detectability: tuple[Detectability, ...]
+    identifiers: tuple[str, ...]
+    distance: FloatArray
+    groups: tuple[tuple[str, ...], ...]
+
+    def group_of(self, identifier: str) -> tuple[str, ...]:
+        """Return the confusion group of an effect, itself alone if it has none."""
+        for group in self.groups:
+            if identifier in group:
+                return group
+        return (identifier,)
+
+
+def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
+    """Return the campaign with what the model predicts in the place of the data.
+
+    Such data leave no rest from which an unknown noise could be told: channels without a noise record get one
+    of a thousandth of their range.
+    """
+    problem = Problem(campaign, model, setting)
+    point = problem.start(Candidate())
+    trials: list[Trial] = []
+    predicted = {}
+    for number, data in enumerate(problem.trials):
+        response, _ = problem.response(
+            number, point.shared, point.local[number], Candidate().patch(setting, point.effect)
+        )
+        predicted[data.trial.name] = problem.prediction(number, point, response)
+    for trial in campaign.trials:
+        values = predicted.get(trial.name)
+        trials.append(trial if values is None else replace(trial, values=values))
+    ideal = replace(campaign, trials=tuple(trials))
+    channels = {
+        name: channel
+        if channel.noise is not None
+        else replace(channel, noise=NoiseRecord(stand_in(ideal, name), inf))
+        for name, channel in campaign.channels.items()
+    }
+    return replace(ideal, channels=channels)
+
+
+def separability(
+    campaign: Campaign, model: Model, setting: Setting, effects: Sequence[Effect]
+) -> Separability:
+    """Return what a campaign can decide.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Inputs, channels and noise count; the measured values do not. See `as_predicted` for unknown noise.
+    model : Model
+        The model as it is.
+    setting : Setting
+        Scales.
+    effects : sequence of Effect
+        The catalogue.
+    """
+    ideal = as_predicted(campaign, model, setting)
+    problem = Problem(ideal, model, setting)
+    none = fit(problem, Candidate(), problem.start(Candidate()), iterations=1)
+    screen = Screen(problem, none)
+    rows: list[Detectability] = []
+    changes: dict[str, list[Change]] = {}
+    for effect in effects:
+        reason = effect.unavailable(setting)
+        if reason is not None:
+            rows.append(Detectability(effect, reason))
+            continue
+        options = [
+            change for place in effect.places(setting) for change in screen.changes(Term(effect, place))
+        ]
+        central = _references(screen, effect, effect.places(setting)) or options
+        if not central:
+            rows.append(Detectability(effect, "The structure cannot carry it at any size that was tried."))
+            continue
+        best = max(central, key=_size)
+        if best.size < DETECTED:  # its median place may be where nothing is measured
+            best = max([best, *(change for change in options if _at_reference(change))], key=_size)
+        little, factor = screen.shrunk(best)
+        rows.append(_detectability(effect, best, min(best.size, little.size / factor**2)))
+        if best.size > 1e-6:
+            changes[effect.identifier] = [best, *options]
+    names = tuple(changes)
+    small = {name: [screen.shrunk(change) for change in changes[name]] for name in names}
+    distance = np.zeros((len(names), len(names)))
+    for i, one in enumerate(names):
+        target, (little, factor) = changes[one][0], small[one][0]
+        for j, other in enumerate(names):
+            if i != j:
+                first_order = _distance(screen, little, [change for change, _ in small[other]]) / factor**2
+                found = min(_distance(screen, target, changes[other]), first_order)
+                distance[i, j] = found * max(1.0, DETECTED / target.size)
+    return Separability(tuple(rows), names, distance, _groups(names, distance))
+
+
+def _references(screen: Screen, effect: Effect, places: Sequence[str]) -> list[Change]:
+    """Return the changes of an effect at its prior median, at the places where the structure can carry it."""
+    found = []
+    for place in places:
+        try:
+            found.append(_reference(screen, effect, place))
+        except ModelError:
+            continue
+    return found
+
+
+def _reference(screen: Screen, effect: Effect, place: str) -> Change:
+    """Return the change of an effect at its prior median (signed magnitudes: at one prior deviation)."""
+    term = Term(effect, place)
+    start = term.start()
+    for number, item in enumerate(term.parameters):
+        if isinstance(item, EffectParameter) and item.magnitude and item.prior.value(0.0) == 0.0:
+            start[number] = 1.0
+    return screen.change(term, start)
+
+
+def _size(change: Change) -> float:
+    return change.size
+
+
+def _at_reference(change: Change) -> bool:
+    """Whether the magnitude is that of `_reference`."""
+    return all(
+        abs(u) in (0.0, 1.0)
+        for item, u in zip(change.term.parameters, change.start, strict=True)
+        if isinstance(item, EffectParameter) and item.magnitude
+    )
+
+
+def _detectability(effect: Effect, change: Change, distance: float) -> Detectability:
+    for number, item in enumerate(change.term.parameters):
+        if isinstance(item, EffectParameter) and item.magnitude:
+            typical = abs(item.prior.value(float(change.start[number])))
+            detectable = typical * sqrt(DETECTED / distance) if distance > 0.0 else inf
+            return Detectability(
+                effect, "", change.term.place, distance, item.name, detectable, item.unit, typical
+            )
+    return Detectability(effect, "", change.term.place, distance)
+
+
+def _distance(screen: Screen, target: Change, options: list[Change]) -> float:
+    """Return d^2 of a change from what an effect can do: its nearest grid point, moved by its parameters."""
+    sign = screen.sign
+    if target.size <= 0.0:
+        return 0.0
+
+    def overlap(option: Change) -> float:
+        return (
+            abs(float(target.vector * sign @ option.vector)) / sqrt(option.size) if option.size > 0.0 else 0.0
+        )
+
+    nearest = max(options, key=overlap)
+    if nearest.size <= 0.0:
+        return target.size
+    columns = [nearest.vector]
+    for number in range(len(nearest.start)):
+        moved = nearest.start.copy()
+        moved[number] += 10.0 * PARAMETER_STEP
+        columns.append(screen.change(nearest.term, moved).vector - nearest.vector)
+    span = np.stack(columns)
+    gram = (span * sign) @ span.T
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    gram = gram / np.outer(scale, scale) + 1e-6 * np.eye(len(gram))
+    right = (span * sign) @ target.vector / scale
+    return max(target.size - float(right @ np.linalg.solve(gram, right)), 0.0)
+
+
+def _groups(names: tuple[str, ...], distance: FloatArray) -> tuple[tuple[str, ...], ...]:
+    """Return connected sets of effects that are closer than `CONFUSED` in either direction."""
+    near = np.minimum(distance, distance.T) < CONFUSED
+    left, groups = set(range(len(names))), []
+    while left:
+        found, edge = set(), {min(left)}
+        while edge:
+            found |= edge
+            edge = {j for i in edge for j in left if near[i, j]} - found
+        left -= found
+        if len(found) > 1:
+            groups.append(tuple(names[i] for i in sorted(found)))
+    return tuple(groups)
+
+
+def usable(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
+    """Return the effects that can be tested here.
+
+    Raises
+    ------
+    DiscrepancyError
+        If there is none.
+    """
+    found = tuple(effect for effect in effects if effect.unavailable(setting) is None)
+    if not found:
+        raise DiscrepancyError(
+            "No effect of the catalogue can be tested with this campaign and model: the campaign needs "
+            "static, ring-down, forced or flight trials whose channels are outputs of the model."
+        )
+    return found

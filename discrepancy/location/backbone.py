@@ -1,0 +1,313 @@
+"""Backbone of a ring-down: frequency and damping ratio of each mode against its amplitude.
+
+Viscous damping is flat; Coulomb friction has zeta ~ 1/A, quadratic damping zeta ~ A, a cubic spring a
+frequency that changes with A^2; under micro-slip the frequency falls and the damping ratio rises with A.
+
+In windows of a few periods all modes are fitted together as decaying sinusoids with an offset and a drift, by
+least squares, which is maximum likelihood under Gaussian noise. Unlike a Hilbert transform this separates
+modes, has no end effects, and has error bars from the noise.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import log, nan, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.signal import savgol_coeffs
+
+from calibration.dynamics.damped_cosine import DampedCosines, Solution
+from discrepancy.errors import FitError
+
+FloatArray = NDArray[np.float64]
+
+SMALLEST_SIGNAL = 4.0
+"""A mode counts in a window while its amplitude there is this many standard errors."""
+
+_GREATEST_CHANGE = 0.3  # of a frequency from its start value
+_FEWEST_PER_UNKNOWN = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Backbone:
+    """Frequency and damping ratio of one mode along a ring-down.
+
+    Attributes
+    ----------
+    mode : int
+        Counted from one, by start frequency.
+    time : (W,) ndarray
+        Centroid of the mode's energy in each window [s].
+    amplitude, amplitude_error : (W,) ndarray
+        At that time [signal's unit]; standard error.
+    frequency, frequency_error : (W,) ndarray
+        Natural frequency |s| / 2 pi with s = -decay + i omega_d [Hz].
+    damping_ratio, damping_ratio_error : (W,) ndarray
+        decay / |s| [1].
+    """
+
+    mode: int
+    time: FloatArray
+    amplitude: FloatArray
+    amplitude_error: FloatArray
+    frequency: FloatArray
+    frequency_error: FloatArray
+    damping_ratio: FloatArray
+    damping_ratio_error: FloatArray
+
+
+def backbones(
+    time: FloatArray,
+    signal: FloatArray,
+    frequencies: Sequence[float],
+    *,
+    noise_deviation: float | None = None,
+    averaging_width: float = 0.0,
+    periods: float = 4.0,
+    overlap: float = 0.5,
+) -> tuple[Backbone, ...]:
+    """Return the backbone of each mode.
+
+    Parameters
+    ----------
+    time, signal : (N,) ndarray
+        The record, evenly spaced [s], [any unit].
+    frequencies : sequence of float
+        Start values of the frequencies of all modes that ring [Hz].
+    noise_deviation : float, optional
+        Standard deviation of the noise; without it that of each window's own residuals is taken, which also
+        holds what the sinusoids do not describe.
+    averaging_width : float
+        Interval over which each value is an average [s]; 0 for samples.
+    periods : float
+        Length of a window in periods of the lowest frequency. Longer windows have smaller errors and smear
+        what changes with amplitude: three periods of a quadratic damping with a ratio of 0.045 give 0.043.
+    overlap : float
+        Share of a window that the next one repeats, 0 <= overlap < 1; it correlates neighbouring points.
+
+    Raises
+    ------
+    FitError
+        If there is no frequency, one is above half the sampling rate, or the record is shorter than a window.
+    """
+    interval = _check(time, signal, frequencies, overlap)
+    start = 2.0 * np.pi * np.sort(np.asarray(frequencies, dtype=float))
+    width = round(periods * 2.0 * np.pi / (start[0] * interval)) + 1
+    unknown = 4 * start.size + 2
+    if width < _FEWEST_PER_UNKNOWN * unknown or width > time.size:
+        raise FitError(
+            f"A window of {periods:g} periods has {width} samples, but at least "
+            f"{_FEWEST_PER_UNKNOWN * unknown:.0f} and at most {time.size}, the record's length, are needed: "
+            "change `periods`, or give a longer or more finely sampled record."
+        )
+    active = np.ones(start.size, dtype=bool)
+    omega, decay = start.copy(), 0.02 * start
+    rows: list[list[tuple[float, ...]]] = [[] for _ in start]
+    for first in range(0, time.size - width + 1, max(1, round(width * (1.0 - overlap)))):
+        part = slice(first, first + width)
+        window = DampedCosines(time[part], signal[part], averaging_width)
+        while active.any():
+            found = _fit(window, decay[active], omega[active])
+            solution = window.solve(found[0], found[1], frequencies_fitted=True)
+            deviation = solution.residual_deviation if noise_deviation is None else noise_deviation
+            points = _points(time[part] - time[first], found, solution, deviation)
+            numbers = np.flatnonzero(active)
+            lost = [
+                number
+                for number, point in zip(numbers.tolist(), points, strict=True)
+                if not _credible(point, start[number])
+            ]
+            if not lost:
+                for number, point, d, w in zip(numbers, points, *found, strict=True):
+                    rows[number].append((float(time[first]) + point[0], *point[1:]))
+                    decay[number], omega[number] = max(d, 1e-4 * w), w
+                break
+            # Fit again without the modes that have died away: they would spoil the errors of the others.
+            active[lost] = False
+        if not active.any():
+            break
+    return tuple(
+        Backbone(number + 1, *np.array(points, dtype=float).reshape(-1, 7).T)
+        for number, points in enumerate(rows)
+    )
+
+
+def _check(time: FloatArray, signal: FloatArray, frequencies: Sequence[float], overlap: float) -> float:
+    if time.ndim != 1 or time.shape != signal.shape or time.size < 8:
+        raise FitError(
+            f"A backbone needs time and signal as vectors of one length, at least 8, but they are "
+            f"{time.shape} and {signal.shape}."
+        )
+    if not (np.all(np.isfinite(time)) and np.all(np.isfinite(signal))):
+        raise FitError("A backbone needs finite values; leave out or mend the samples that are lost.")
+    interval = float(time[-1] - time[0]) / (time.size - 1)
+    if not frequencies or not all(0.0 < f < 0.5 / interval for f in frequencies):
+        raise FitError(
+            f"A backbone needs start frequencies between 0 and half the sampling rate, "
+            f"{0.5 / interval:.4g} Hz, but they are {', '.join(f'{f:g}' for f in frequencies) or 'none'}."
+        )
+    if not 0.0 <= overlap < 1.0:
+        raise FitError(f"The overlap of windows must be at least 0 and below 1, but is {overlap:g}.")
+    return interval
+
+
+def _fit(window: DampedCosines, decay: FloatArray, omega: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return decay rates and angular frequencies of the best fit; amplitudes are eliminated."""
+    modes = omega.size
+
+    def residual(unknown: FloatArray) -> FloatArray:
+        return window.residual(unknown[:modes] * omega, unknown[modes:] * omega)
+
+    first = np.concatenate([decay / omega, np.ones(modes)])
+    scale = np.concatenate([np.full(modes, 0.02), np.full(modes, 0.02)])
+    found = least_squares(residual, first, method="lm", x_scale=scale, xtol=1e-9, ftol=1e-12, diff_step=1e-7)
+    return found.x[:modes] * omega, found.x[modes:] * omega
+
+
+def _points(
+    time: FloatArray, found: tuple[FloatArray, FloatArray], solution: Solution, deviation: float
+) -> list[tuple[float, ...]]:
+    """Return time, amplitude, frequency and damping ratio of each mode, each with its error but the time."""
+    own = solution.residual_deviation
+    covariance = solution.covariance * ((deviation / own) ** 2 if own > 0.0 else 0.0)
+    modes = found[0].size
+    points: list[tuple[float, ...]] = []
+    for mode, (d, w) in enumerate(zip(*found, strict=True)):
+        natural = float(np.hypot(d, w))
+        weight = np.exp(-2.0 * np.clip(d * (time - time[-1] / 2.0), -50.0, 50.0))
+        centre = float(weight @ time / weight.sum())
+        amplitude = float(np.abs(solution.amplitude[mode])) * float(np.exp(-np.clip(d * centre, -50.0, 50.0)))
+        block = covariance[np.ix_([mode, modes + mode], [mode, modes + mode])]
+        # Derivatives of |s| and decay / |s| by decay and omega.
+        of_frequency = np.array([d, w]) / natural / (2.0 * np.pi)
+        of_ratio = np.array([w * w, -d * w]) / natural**3
+        effective = float(weight.sum()) ** 2 / float(weight @ weight)
+        points.append(
+            (
+                centre,
+                amplitude,
+                deviation * sqrt(2.0 / effective),
+                natural / (2.0 * np.pi),
+                sqrt(max(float(of_frequency @ block @ of_frequency), 0.0)),
+                float(d) / natural,
+                sqrt(max(float(of_ratio @ block @ of_ratio), 0.0)),
+            )
+        )
+    return points
+
+
+def _credible(point: tuple[float, ...], start: float) -> bool:
+    """Whether a mode is still there: above its error, near its start frequency, damping below critical."""
+    _, amplitude, amplitude_error, frequency, _, ratio, _ = point
+    near = abs(2.0 * np.pi * frequency / start - 1.0) < _GREATEST_CHANGE
+    return amplitude > SMALLEST_SIGNAL * amplitude_error and near and abs(ratio) < 0.5
+
+
+@dataclass(frozen=True)
+class BackboneValue:
+    """Frequency [Hz] and damping ratio [1] of a mode at one amplitude, with standard errors."""
+
+    amplitude: float
+    frequency: float
+    frequency_error: float
+    damping_ratio: float
+    damping_ratio_error: float
+    trial_count: int
+
+
+def at_amplitude(curves: Sequence[Backbone], amplitude: float, factor: float = 2.0) -> BackboneValue:
+    """Return the mean over trials of a mode's frequency and damping ratio at an amplitude.
+
+    In each trial a straight line in ln A, weighted by the errors, is laid through the points within `factor`
+    of the amplitude; overlapping windows count as independent. The error is that of the mean over trials by
+    their scatter, or of the line if there is one trial; nan where no trial has two such points.
+    """
+    values = []
+    for curve in curves:
+        x = np.log(curve.amplitude / amplitude)
+        near = np.abs(x) <= log(factor)
+        if near.sum() < 2:
+            continue
+        row = []
+        for value, error in (
+            (curve.frequency, curve.frequency_error),
+            (curve.damping_ratio, curve.damping_ratio_error),
+        ):
+            weight = 1.0 / np.clip(error[near], 1e-300, None)
+            design = np.column_stack([np.ones(int(near.sum())), x[near]]) * weight[:, np.newaxis]
+            found = np.linalg.lstsq(design, value[near] * weight, rcond=None)[0]
+            row += [float(found[0]), sqrt(float(np.linalg.pinv(design.T @ design)[0, 0]))]
+        values.append(row)
+    if not values:
+        return BackboneValue(amplitude, nan, nan, nan, nan, 0)
+    table = np.array(values)
+    if len(table) == 1:
+        f, f_error, ratio, ratio_error = table[0].tolist()
+        return BackboneValue(amplitude, f, f_error, ratio, ratio_error, 1)
+    mean, scatter = table.mean(axis=0), table.std(axis=0, ddof=1) / sqrt(len(table))
+    return BackboneValue(
+        amplitude, float(mean[0]), float(scatter[0]), float(mean[2]), float(scatter[2]), len(table)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RestoringForceSurface:
+    """Acceleration of a single-mode motion over its displacement and velocity (Masri and Caughey 1979).
+
+    Attributes
+    ----------
+    displacement, velocity, acceleration : (N,) ndarray
+        [signal's unit, per s, per s^2]; minus the acceleration is the restoring force per modal mass.
+    acceleration_error : float
+        Standard error of each acceleration from the noise; nan if that is not known.
+    """
+
+    displacement: FloatArray
+    velocity: FloatArray
+    acceleration: FloatArray
+    acceleration_error: float
+
+
+def restoring_force_surface(
+    time: FloatArray,
+    signal: FloatArray,
+    frequency: float,
+    *,
+    noise_deviation: float | None = None,
+    window: float = 0.3,
+) -> RestoringForceSurface:
+    """Return the restoring-force surface of a signal with one mode.
+
+    Derivatives are those of a polynomial of degree six fitted in a window about each sample; half a window at
+    both ends is left out, and the signal's mean over its last quarter is taken as rest.
+
+    Parameters
+    ----------
+    time, signal : (N,) ndarray
+        Evenly spaced record [s], [any unit].
+    frequency : float
+        Of the mode [Hz]; a second mode must have been taken out before.
+    noise_deviation : float, optional
+        Standard deviation of the noise [signal's unit].
+    window : float
+        Length in periods. At 0.3 the cubic term of a spring with 30 % cubic force is found within 0.2 %, at
+        0.5 within 4 %, with a third of the noise.
+
+    Raises
+    ------
+    FitError
+        If a window has fewer than nine samples or the record is shorter than two of them.
+    """
+    interval = _check(time, signal, (frequency,), 0.0)
+    width = round(window / (frequency * interval)) | 1
+    if width < 9 or time.size < 2 * width:
+        raise FitError(
+            f"The window of {window:g} periods has {width} samples, but at least 9 and at most half the "
+            f"record of {time.size} are needed: sample faster or change `window`."
+        )
+    rest = float(np.mean(signal[-max(time.size // 4, 1) :]))
+    kernels = [savgol_coeffs(width, 6, deriv=order, delta=interval) for order in range(3)]
+    x, v, a = (np.convolve(signal - rest, kernel, "valid") for kernel in kernels)
+    error = nan if noise_deviation is None else noise_deviation * float(np.linalg.norm(kernels[2]))
+    return RestoringForceSurface(x, v, a, error)

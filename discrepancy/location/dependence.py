@@ -1,0 +1,356 @@
+"""What single dependences explain of the excess variance: amplitude, time, load, temperature, harmonics.
+
+Excess variance is the sum of squares in units of the noise less what noise alone would leave after the fit.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.linalg import block_diag
+
+from discrepancy.campaign.noise_tests import periodogram
+from discrepancy.location.map import features
+from discrepancy.location.modal_motion import MotionByMode, modal_motion
+from discrepancy.location.residuals import FittedTrial, ResidualSet
+
+FloatArray = NDArray[np.float64]
+
+_HATS = 9  # knots of a dependence on time or amplitude
+_FREE_SHARE = 0.02  # of a direction's square must survive the fit
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What a dependence of the residual explains.
+
+    Attributes
+    ----------
+    trials : str
+        Kind of the trials.
+    subject : str
+        "mode 1", "channel g17", or "" for all channels alike.
+    dependence : str
+        "amplitude", "time", "load (proportional)", "x and v", "whole", ...
+    share : float
+        Of the excess variance of these trials, after subtracting one for each coefficient.
+    coefficients : int
+        Number fitted.
+    p_value : float
+        Of the explained sum of squares against chi^2.
+    """
+
+    trials: str
+    subject: str
+    dependence: str
+    share: float
+    coefficients: int
+    p_value: float
+
+
+def kinds(residuals: ResidualSet) -> dict[str, tuple[int, ...]]:
+    """Return the indices of trials by kind and channels: the groups that form one matrix each."""
+    groups: dict[tuple[str, tuple[str, ...]], list[int]] = {}
+    for number, item in enumerate(residuals.trials):
+        groups.setdefault((item.trial.kind.value, item.trial.channels), []).append(number)
+    names: dict[str, tuple[int, ...]] = {}
+    for (kind, _), members in groups.items():
+        name = "ring-down" if kind == "ringdown" else kind
+        names[name if name not in names else f"{name} ({len(names) + 1})"] = tuple(members)
+    return names
+
+
+def excess(items: Sequence[FittedTrial]) -> float:
+    """Return the excess variance of trials, in units of the noise variance."""
+    return float(
+        sum(np.sum(i.standardised[i.used] ** 2) - np.sum(i.expected_variance[i.used]) for i in items)
+    )
+
+
+def _hats(values: FloatArray, low: float, high: float, knots: int = _HATS) -> FloatArray:
+    """Return piecewise linear hat functions between `low` and `high`, (n, knots)."""
+    if high <= low:
+        return np.ones((values.size, 1))
+    centres = np.linspace(low, high, knots)
+    distance = np.abs(values[:, np.newaxis] - centres) / (centres[1] - centres[0])
+    return np.asarray(np.clip(1.0 - distance, 0.0, None))
+
+
+def explanations(
+    residuals: ResidualSet, frequencies: Sequence[float] | None = None
+) -> tuple[Explanation, ...]:
+    """Return what single dependences explain of the excess variance, by kind of trial, largest share first.
+
+    Every dependence is fitted to each channel by itself with one set of coefficients for all trials of the
+    kind, so that amplitude and time are told apart where releases differ; the strongest line has a phase of
+    its own in each trial. Modes are split at `frequencies` [Hz], by default at the peaks of the predictions'
+    spectra.
+    """
+    found = []
+    for name, members in kinds(residuals).items():
+        items = [residuals.trials[number] for number in members]
+        whole = excess(items)
+        freedom = sum(float(np.sum(i.expected_variance[i.used])) for i in items)
+        if freedom <= 0.0 or whole <= 2.0 * np.sqrt(2.0 * freedom):
+            continue  # no excess to explain
+        blocks: dict[tuple[str, str], list[_Block]] = {}
+        modes = _modes(items, frequencies)
+        line = dominant_line(items) if items[0].trial.is_dynamic else None
+        for column in range(len(items[0].trial.channels)):
+            used = [item for item in items if item.used[:, column].any()]
+            if not used:
+                continue
+            residual = np.concatenate([i.standardised[i.used[:, column], column] for i in used])
+            sensitive = None
+            if all(i.sensitivity is not None for i in used):
+                sensitive = np.vstack([_rows(i, column) for i in used])
+            bases = _bases(used, column, modes)
+            if line is not None:
+                bases["", line.name] = _line_basis(used, column, line)
+            for key, basis in bases.items():
+                if (block := _block(basis, residual, sensitive)) is not None:
+                    blocks.setdefault(key, []).append(block)
+        sums = {key: _explained(parts) for key, parts in blocks.items()}
+        for (subject, dependence), (explained, count) in sums.items():
+            share = float(np.clip((explained - count) / whole, 0.0, 1.0))
+            p = float(stats.chi2.sf(explained, count)) if count else 1.0
+            if line is not None and dependence == line.name:
+                p = min(1.0, p * line.choices)
+            found.append(Explanation(name, subject, dependence, share, count, p))
+        for column, channel in enumerate(items[0].trial.channels):
+            if len(items[0].trial.channels) > 1:
+                own = sum(
+                    float(np.sum(i.standardised[i.used[:, column], column] ** 2)
+                          - np.sum(i.expected_variance[i.used[:, column], column])) for i in items
+                )  # fmt: skip
+                count = sum(int(i.used[:, column].sum()) for i in items)
+                p = float(stats.chi2.sf(own + count, count)) if count else 1.0
+                share = float(np.clip(own / whole, 0.0, 1.0))
+                found.append(Explanation(name, f"channel {channel}", "whole", share, count, p))
+    return tuple(sorted(found, key=lambda item: -item.share))
+
+
+class SpectralLine(NamedTuple):
+    """The strongest line of residuals: frequency [Hz], decay rate [1/s], how many it was chosen from."""
+
+    frequency: float
+    decay: float
+    choices: int
+
+    @property
+    def name(self) -> str:
+        """Such as "a line at 50 Hz" or "a decaying line at 9.1 Hz"."""
+        return f"a {'decaying ' if self.decay else ''}line at {self.frequency:.3g} Hz"
+
+
+def dominant_line(items: Sequence[FittedTrial]) -> SpectralLine | None:
+    """Return the line that explains most of the residuals of dynamic trials, over all channels and trials.
+
+    Frequencies are those of a spectrum padded four times, from one period of the record upwards; decays are
+    none, and 1, 3, 10 and 30 e-folds within a record. None for records of fewer than eight samples.
+    """
+    best, choices = (0.0, 0.0, 0.0), 0
+    length = max(len(item.trial.time) for item in items)
+    interval = items[0].trial.interval
+    if length < 8:
+        return None
+    alike = [item for item in items if abs(item.trial.interval / interval - 1.0) < 1e-6]
+    at = np.fft.rfftfreq(4 * length, interval)
+    for folds in (0.0, 1.0, 3.0, 10.0, 30.0):
+        decay = folds / (length * interval)
+        power = np.zeros(at.size)
+        for item in alike:
+            weight = np.exp(-decay * interval * np.arange(len(item.trial.time)))
+            values = np.nan_to_num(item.standardised) * weight[:, np.newaxis]
+            # A cosine and a sine under this weight have about half the weight's square each.
+            power += (
+                2.0 * np.sum(np.abs(np.fft.rfft(values, 4 * length, axis=0)) ** 2, axis=1) / (weight @ weight)
+            )
+        power[:4] = 0.0
+        place = int(np.argmax(power))
+        choices += length // 2
+        # A decay must explain visibly more than the same line without it.
+        if power[place] > 1.05 * best[0]:
+            best = (float(power[place]), float(at[place]), decay)
+    return SpectralLine(best[1], best[2], choices) if best[0] > 0.0 else None
+
+
+def _line_basis(items: Sequence[FittedTrial], column: int, line: SpectralLine) -> FloatArray:
+    waves = []
+    for item in items:
+        time = item.trial.time[item.used[:, column]] - item.trial.time[0]
+        wave = np.exp((-line.decay + 2j * np.pi * line.frequency) * time)
+        waves.append(np.column_stack([wave.real, wave.imag]))
+    return np.asarray(block_diag(*waves))
+
+
+class _Block(NamedTuple):
+    """One channel of a dependence: B'B, B'r and S'B for unit columns of B."""
+
+    gram: FloatArray
+    along: FloatArray
+    absorbed: FloatArray
+
+
+def _rows(item: FittedTrial, column: int) -> FloatArray:
+    assert item.sensitivity is not None
+    return np.asarray(item.sensitivity[item.used[:, column], column])
+
+
+def _block(basis: FloatArray, residual: FloatArray, sensitive: FloatArray | None) -> _Block | None:
+    size = np.linalg.norm(basis, axis=0)
+    basis = basis[:, size > 0.0] / size[size > 0.0]
+    if not 0 < basis.shape[1] < residual.size:
+        return None  # as many coefficients as samples explain anything
+    absorbed = np.zeros((0, basis.shape[1])) if sensitive is None else sensitive.T @ basis
+    return _Block(basis.T @ basis, basis.T @ residual, absorbed)
+
+
+def _explained(blocks: Sequence[_Block]) -> tuple[float, int]:
+    """Return the sum of squares that a dependence explains, and the number of its coefficients.
+
+    B'r has the covariance G = B'(I - S S')B under the null, so that (B'r)' G^-1 (B'r) is chi^2; with a gap it
+    is what B explains of it after the fit has absorbed its share. Directions that it absorbs are left out.
+    """
+    gram = block_diag(*(block.gram for block in blocks))
+    if all(block.absorbed.shape[0] for block in blocks):
+        absorbed = np.hstack([block.absorbed for block in blocks])
+        gram = gram - absorbed.T @ absorbed
+    along = np.concatenate([block.along for block in blocks])
+    values, vectors = np.linalg.eigh(gram)
+    kept = values > _FREE_SHARE
+    return float(np.sum((vectors[:, kept].T @ along) ** 2 / values[kept])), int(kept.sum())
+
+
+def _modes(
+    items: Sequence[FittedTrial], frequencies: Sequence[float] | None
+) -> dict[int, MotionByMode] | None:
+    """Return the modal motion of each trial by its identity, None where it cannot be had."""
+    if not items[0].trial.is_dynamic:
+        return None
+    at = predicted_frequencies(items) if frequencies is None else tuple(frequencies)
+    found = {id(item): modal_motion(item.prediction, item.trial.interval, at) for item in items}
+    whole = {key: motion for key, motion in found.items() if motion is not None}
+    return whole if len(whole) == len(items) else None
+
+
+def _bases(
+    items: Sequence[FittedTrial], column: int, modes: Mapping[int, MotionByMode] | None
+) -> dict[tuple[str, str], FloatArray]:
+    """Return the functions of each subject and dependence, stacked over trials, (n, k)."""
+    named = [features(item, column) for item in items]
+    rows = [item.used[:, column] for item in items]
+
+    def stack(*names: str) -> FloatArray:
+        return np.vstack([
+            np.column_stack([f.get(name, np.zeros(int(use.sum()))) for name in names])
+            for f, use in zip(named, rows, strict=True)
+        ])  # fmt: skip
+
+    def joined(parts: Sequence[FloatArray]) -> FloatArray:
+        return np.concatenate([part[use] for part, use in zip(parts, rows, strict=True)])
+
+    bases = {("", "zero shift"): stack("mean")}
+    bases["", "zero shift of each trial"] = np.vstack([
+        np.tile(np.eye(len(items))[number], (int(use.sum()), 1)) for number, use in enumerate(rows)
+    ])  # fmt: skip
+    temperature = joined([item.trial.temperature for item in items])
+    if np.ptp(temperature) > 0.0:
+        bases["", "temperature"] = np.column_stack([temperature, temperature * stack("x")[:, 0]])
+    within = joined([item.trial.time for item in items])
+    if not items[0].trial.is_dynamic:
+        if np.ptp(within) > 0.0:
+            bases["", "time"] = np.column_stack([np.ones_like(within), within - within.mean()])
+        return bases | _load_bases(items, joined, stack)
+    drifts = []
+    for item, use in zip(items, rows, strict=True):
+        x = (item.trial.time[use] - item.trial.time[0]) / (item.trial.time[-1] - item.trial.time[0])
+        drifts.append(np.polynomial.legendre.legvander(2.0 * x - 1.0, 4))
+    bases["", "a drift of zero in each trial"] = np.asarray(block_diag(*drifts))
+    if all(item.rates is not None for item in items):
+        bases["", "x and v"] = stack("x", "v")
+        bases["", "higher harmonics"] = stack(
+            *(f"{n} {part}" for n in ("2nd harmonic", "3rd harmonic") for part in ("cos", "sin"))
+        )
+    if modes is None:
+        return bases
+    by_time = _hats(within, float(within.min()), float(within.max()))
+    for mode in range(len(next(iter(modes.values())).amplitude)):
+        parts = [modes[id(item)] for item in items]
+        motion = np.column_stack([
+            joined([part.displacement[mode, :, column] for part in parts]),
+            joined([part.velocity[mode, :, column] for part in parts]),
+        ])  # fmt: skip
+        amplitude = joined([part.amplitude[mode, :, column] for part in parts])
+        if not amplitude.any():
+            continue
+        level = np.log(np.clip(amplitude / amplitude.max(), 1e-3, None))
+        by_amplitude = _hats(level, float(level.min()), 0.0)
+        for dependence, shape in (("amplitude", by_amplitude), ("time", by_time)):
+            table = np.hstack([shape * motion[:, [0]], shape * motion[:, [1]]])
+            bases[f"mode {mode + 1}", dependence] = table
+    return bases
+
+
+def _load_bases(
+    items: Sequence[FittedTrial],
+    joined: Callable[[Sequence[FloatArray]], FloatArray],
+    stack: Callable[..., FloatArray],
+) -> dict[tuple[str, str], FloatArray]:
+    bases = {}
+    force = joined([item.trial.force for item in items])
+    load = force if np.any(force) else joined([item.trial.load_factor for item in items])
+    x = stack("x")[:, 0]
+    if np.ptp(load) > 0.0:
+        bases["", "load (proportional)"] = np.column_stack([x, load])
+        bases["", "load (not proportional)"] = np.column_stack([load, np.abs(load) * load, load**2])
+    return bases
+
+
+def mode_shares(
+    items: Sequence[FittedTrial], white: Sequence[FloatArray], frequencies: Sequence[float]
+) -> FloatArray:
+    """Return the share of the excess variance in the band of each mode, (M,), summing to at most one.
+
+    Bands end midway (geometrically) between neighbouring frequencies, the lowest begins at half the first,
+    the highest ends at `sqrt(2)` times the last.
+    """
+    modes = np.sort(np.asarray(frequencies, dtype=float))
+    edges = np.concatenate([[0.5 * modes[0]], np.sqrt(modes[1:] * modes[:-1]), [np.sqrt(2.0) * modes[-1]]])
+    sums, whole = np.zeros(modes.size), 0.0
+    for item, values in zip(items, white, strict=True):
+        for column in range(values.shape[1]):
+            surplus = 2.0 * (periodogram(values[:, column]) - 1.0)
+            at = np.arange(1, surplus.size + 1) / (len(values) * item.trial.interval)
+            place = np.searchsorted(edges, at) - 1
+            whole += float(surplus.sum())
+            for mode in range(modes.size):
+                sums[mode] += float(surplus[place == mode].sum())
+    return np.clip(sums / whole, 0.0, 1.0) if whole > 0.0 else np.zeros(modes.size)
+
+
+def predicted_frequencies(items: Sequence[FittedTrial]) -> tuple[float, ...]:
+    """Return the frequencies [Hz] of the peaks of the predictions' spectra, lowest first, at most four.
+
+    A peak is a largest ordinate within a factor 1.4 on both sides, above a thousandth of the greatest, of
+    four periods or more in the record: below, a zero or a slow decay looks like one.
+    """
+    longest = max(items, key=lambda item: len(item.trial.time))
+    power = np.zeros((len(longest.trial.time) - 1) // 2)
+    for item in items:
+        if len(item.trial.time) != len(longest.trial.time):
+            continue
+        values = item.prediction - item.prediction.mean(axis=0)
+        taper = np.hanning(2 * len(values))[len(values) :, np.newaxis]  # the start of a ring-down counts
+        table = np.abs(np.fft.rfft(values * taper, axis=0)) ** 2 / item.noise_deviation**2
+        power += table[1 : power.size + 1].sum(axis=1)
+    at = np.arange(1, power.size + 1) / (len(longest.trial.time) * longest.trial.interval)
+    peaks = []
+    for number in range(3, power.size - 1):
+        near = (at > at[number] / 1.4) & (at < at[number] * 1.4)
+        if power[number] >= power[near].max() and power[number] > 1e-3 * power.max():
+            peaks.append((float(power[number]), float(at[number])))
+    return tuple(sorted(frequency for _, frequency in sorted(peaks, reverse=True)[:4]))

@@ -1,0 +1,300 @@
+"""Locate where model and data disagree: a global verdict, a map, patterns, and one-sentence findings."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.noise_tests import holm, variance_p_value
+from discrepancy.errors import FitError
+from discrepancy.location.dependence import (
+    Explanation,
+    explanations,
+    kinds,
+    mode_shares,
+    predicted_frequencies,
+)
+from discrepancy.location.map import Cell, residual_map
+from discrepancy.location.omnibus_tests import (
+    OmnibusTest,
+    coloured_noise,
+    mean_square,
+    noise_groups,
+    serial_tests,
+    variance_test,
+)
+from discrepancy.location.patterns import SingularPattern, singular_patterns
+from discrepancy.location.residuals import FittedTrial, ResidualSet
+
+FloatArray = NDArray[np.float64]
+
+GLOBAL_LEVEL = 0.01
+"""Rate of false alarms of the global verdict."""
+
+MAP_RATE = 0.05
+"""False discovery rate of the map."""
+
+_TOO_SMALL = 1e-3  # p-value below which residuals are smaller than the noise record allows
+_FAR_OUT = 6.0  # noise deviations; 2e-9 of Gaussian samples lie beyond
+_WORTH_TELLING = 0.05  # share of the excess variance below which a dependence is not told
+_CLOSE = 0.02  # shares this close are not told apart
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """One finding.
+
+    Attributes
+    ----------
+    trials : str
+        Kind of the trials where it shows.
+    subject : str
+        "mode 1", "channel g17", "all channels", ...
+    dependence : str
+        What it goes with: "amplitude", "time", "load (not proportional)", ...
+    share : float
+        Of the excess variance of these trials.
+    p_value : float
+        Of the finding.
+    sentence : str
+        In words.
+    """
+
+    trials: str
+    subject: str
+    dependence: str
+    share: float
+    p_value: float
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where a fitted hypothesis disagrees with the data.
+
+    Attributes
+    ----------
+    disagrees : bool
+        Global verdict: Holm at `GLOBAL_LEVEL` over the omnibus tests.
+    tests : tuple of OmnibusTest
+        Variance, Ljung-Box, cumulative periodogram, Fisher g.
+    cells : tuple of Cell
+        The map; significant at the false discovery rate `MAP_RATE`.
+    patterns : tuple of SingularPattern
+        Over the channels.
+    explanations : tuple of Explanation
+        What single dependences explain, largest first.
+    disagreements : tuple of Disagreement
+        Findings in words, largest first; empty if nothing disagrees.
+    remarks : tuple of str
+        Limits: a missing noise record, noise that is not white, residuals smaller than the noise.
+    """
+
+    disagrees: bool
+    tests: tuple[OmnibusTest, ...]
+    cells: tuple[Cell, ...]
+    patterns: tuple[SingularPattern, ...]
+    explanations: tuple[Explanation, ...]
+    disagreements: tuple[Disagreement, ...]
+    remarks: tuple[str, ...]
+
+
+def locate(
+    residuals: ResidualSet,
+    *,
+    seed: int = 0,
+    frequencies: Sequence[float] | None = None,
+    shapes: Mapping[str, Mapping[str, float]] | None = None,
+) -> Location:
+    """Locate disagreement in the fitted trials of a set.
+
+    Parameters
+    ----------
+    residuals : ResidualSet
+        Residuals of one hypothesis; held-out trials are not looked at.
+    seed : int
+        Of the draw that restores what the fit absorbed, and of the null distribution of singular values.
+    frequencies : sequence of float, optional
+        Natural frequencies [Hz] that modes are counted by; default: peaks of the predictions' spectra.
+    shapes : mapping, optional
+        Mode shapes and other patterns: name -> channel -> value [channel's unit].
+
+    Returns
+    -------
+    Location
+        The same bits for the same input and seed.
+
+    Raises
+    ------
+    FitError
+        If no trial was fitted.
+    """
+    fitted = residuals.fitted
+    if fitted is None:
+        raise FitError("Nothing can be located: every trial is held out, and at least one fitted is needed.")
+    generator = np.random.default_rng(seed)
+    white = fitted.white(generator)
+    coloured = coloured_noise(fitted)
+    tests = (variance_test(fitted), *serial_tests(fitted, white, tuple(coloured)))
+    rejected = holm([test.p_value for test in tests], GLOBAL_LEVEL)
+    tests = tuple(replace(test, rejected=flag) for test, flag in zip(tests, rejected, strict=True))
+    patterns = singular_patterns(fitted, white, shapes or {}, generator)
+    explained = explanations(fitted, frequencies)
+    disagrees = any(rejected)
+    return Location(
+        disagrees=disagrees,
+        tests=tests,
+        cells=residual_map(fitted, white, MAP_RATE),
+        patterns=patterns,
+        explanations=explained,
+        disagreements=_disagreements(fitted, white, explained, patterns, frequencies) if disagrees else (),
+        remarks=(*coloured.values(), *_noise_remarks(fitted), *_outlier_remarks(fitted)),
+    )
+
+
+def _noise_remarks(residuals: ResidualSet) -> tuple[str, ...]:
+    remarks = []
+    unknown = sorted({
+        name for item in residuals.trials for name in item.trial.channels
+        if residuals.degrees_of_freedom(name) <= 0.0
+    })  # fmt: skip
+    if unknown:
+        remarks.append(
+            f"No noise record for {', '.join(unknown)}: nothing absolute can be said about the size of "
+            "these residuals; give pre-trigger samples, repeats or a standard deviation with its degrees of "
+            "freedom."
+        )
+    for names in noise_groups(residuals).values():
+        square, freedom = mean_square(residuals, names)
+        noise_freedom = residuals.degrees_of_freedom(names[0])
+        if freedom < 1.0:
+            continue
+        p = variance_p_value(square, freedom, noise_freedom, small=True)
+        if p < _TOO_SMALL:
+            remarks.append(
+                f"Residuals of {', '.join(names[:4])}{' ..' if len(names) > 4 else ''} are smaller than "
+                f"their noise record allows (mean square {square:.2g} of its expectation, p = {p:.1g}): "
+                "the stated noise is too large, or not that of these channels."
+            )
+    return tuple(remarks)
+
+
+def _outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
+    """Return a sentence on single samples far out whose neighbours are not: errors of the data."""
+    places: dict[str, int] = {}
+    for item in residuals.trials:
+        if not item.trial.is_dynamic:
+            continue
+        size = np.abs(np.nan_to_num(item.standardised))
+        beside = np.zeros_like(size)
+        beside[1:] = size[:-1]
+        beside[:-1] = np.maximum(beside[:-1], size[1:])
+        alone = (size > _FAR_OUT) & (beside < 0.5 * size)
+        for column, name in enumerate(item.trial.channels):
+            places[name] = places.get(name, 0) + int(alone[:, column].sum())
+    found = {name: count for name, count in places.items() if count}
+    if not found:
+        return ()
+    listed = ", ".join(f"{name} ({count})" for name, count in found.items())
+    return (
+        f"Single samples lie beyond {_FAR_OUT:g} noise deviations while their neighbours do not: {listed}; "
+        "outliers are errors of the data, leave them out.",
+    )
+
+
+def _probability(p: float) -> str:
+    return "p < 1e-6" if p < 1e-6 else f"p = {p:.1g}"
+
+
+def _disagreements(
+    residuals: ResidualSet,
+    white: Sequence[FloatArray],
+    explained: Sequence[Explanation],
+    patterns: Sequence[SingularPattern],
+    frequencies: Sequence[float] | None,
+) -> tuple[Disagreement, ...]:
+    found: list[Disagreement] = []
+    excess: dict[str, float] = {}
+    for name, members in kinds(residuals).items():
+        items = [residuals.trials[number] for number in members]
+        excess[name] = sum(_excess(item) for item in items)
+        rows = [row for row in explained if row.trials == name and row.dependence != "whole"]
+        told = _smallest_sufficient(rows)
+        if told is None:
+            continue
+        subject = told.subject or _subject(name, items, [white[n] for n in members], patterns, frequencies)
+        line = told.dependence.startswith("a ")
+        if line and subject.startswith("mode"):
+            subject = "all channels"  # a line of its own frequency is no matter of a mode that the model has
+        words = told.dependence if line else f"by {_dependence_words(told, rows)}"
+        found.append(
+            Disagreement(
+                name,
+                subject,
+                told.dependence,
+                told.share,
+                told.p_value,
+                f"{subject[0].upper()}{subject[1:]}, {words}, in {name} trials; explains "
+                f"{100.0 * told.share:.0f} % of the excess variance ({_probability(told.p_value)}).",
+            )
+        )
+    for pattern in patterns:
+        found.append(
+            Disagreement(
+                pattern.trials, pattern.meaning, "channels", pattern.share, pattern.p_value, pattern.sentence
+            )
+        )
+    # Shares are of one kind of trial; what explains most of the whole gap is told first.
+    return tuple(sorted(found, key=lambda item: -item.share * excess[item.trials]))
+
+
+def _excess(item: FittedTrial) -> float:
+    """Return the sum of squares of a trial's residuals beyond what noise would leave."""
+    square = float(np.nansum(item.standardised**2) - item.expected_variance[item.used].sum())
+    return max(square, 0.0)
+
+
+def _subject(
+    name: str,
+    items: Sequence[FittedTrial],
+    white: Sequence[FloatArray],
+    patterns: Sequence[SingularPattern],
+    frequencies: Sequence[float] | None,
+) -> str:
+    """Return what disagrees: a channel alone, the mode with most of the excess, or all channels."""
+    channels = items[0].trial.channels
+    if len(channels) == 1:
+        return f"channel {channels[0]}"
+    for pattern in patterns:
+        if pattern.trials == name and pattern.meaning == "sensor" and pattern.share > 0.5:
+            return f"channel {channels[int(np.argmax(np.abs(pattern.weights)))]}"
+    if items[0].trial.is_dynamic:
+        at = tuple(frequencies) if frequencies else predicted_frequencies(items)
+        shares = mode_shares(items, white, at) if at else np.zeros(1)
+        if shares.max() > 0.5:
+            return f"mode {int(np.argmax(shares)) + 1}"
+    return "all channels"
+
+
+def _smallest_sufficient(rows: Sequence[Explanation]) -> Explanation | None:
+    """Return the dependence with fewest coefficients among those within 2 % of the largest share."""
+    rows = [row for row in rows if row.share >= _WORTH_TELLING and row.p_value < 1e-3]
+    if not rows:
+        return None
+    best = max(row.share for row in rows)
+    return min(
+        (row for row in rows if row.share >= best - _CLOSE), key=lambda row: (row.coefficients, -row.share)
+    )
+
+
+def _dependence_words(told: Explanation, rows: Sequence[Explanation]) -> str:
+    """Return the dependence, and its rival where one release amplitude cannot tell the two apart."""
+    rivals = {"amplitude": "time", "time": "amplitude"}
+    if told.dependence not in rivals:
+        return told.dependence
+    wanted = (told.subject, rivals[told.dependence])
+    other = next((row for row in rows if (row.subject, row.dependence) == wanted), None)
+    if other is None or other.share < told.share - _CLOSE:
+        return told.dependence
+    return "amplitude or time (these releases do not tell the two apart)"

@@ -1,0 +1,266 @@
+"""Residuals of a fit: what the fit hands on to locating, proof, report and files.
+
+Everything is relative to the noise records. With a Gaussian posterior of the fitted parameters, linear about
+the fit, the residuals r of the fitted trials, in units of the noise, have the covariance I - S S^T, where
+S = J L / s0, J the derivatives of the predictions and L L^T the posterior covariance; residuals of held-out
+trials have I + S S^T. The diagonal of S S^T is the leverage.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.records import Channel, Trial
+from discrepancy.errors import FitError
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+def sensitivity(jacobian: FloatArray, covariance: FloatArray, noise_deviation: FloatArray) -> FloatArray:
+    """Return S = J L / s0 with L L^T the posterior covariance, so that S S^T holds the leverages.
+
+    Parameters
+    ----------
+    jacobian : (N, C, P) ndarray
+        Derivatives of the predictions of one trial by all fitted parameters [channel's unit].
+    covariance : (P, P) ndarray
+        Posterior covariance of the parameters at the scale of the noise records.
+    noise_deviation : (C,) ndarray
+        s0 [channel's unit].
+
+    Returns
+    -------
+    (N, C, P) ndarray
+        Dimensionless.
+    """
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    root = vectors * np.sqrt(np.clip(values, 0.0, None))
+    return np.asarray((jacobian @ root) / noise_deviation[:, np.newaxis])
+
+
+@dataclass(frozen=True, eq=False)
+class FittedTrial:
+    """One trial beside its prediction.
+
+    Attributes
+    ----------
+    trial : Trial
+        Measured values and inputs; `trial.held_out` says whether it took part in the fit.
+    prediction : (N, C) ndarray
+        Mean of the posterior prediction, with gains and offsets [channel's unit].
+    residual : (N, C) ndarray
+        Measured less predicted [channel's unit]; anything where `trial.used` is False.
+    noise_deviation : (C,) ndarray
+        s0 of each channel [channel's unit]; an estimate where the channel has no noise record.
+    predictive_deviation : (N, C) ndarray
+        Standard deviation of a measured value under the posterior prediction, noise included.
+    leverage : (N, C) ndarray
+        A residual has the variance s0^2 (1 - leverage) in a fitted trial, s0^2 (1 + leverage) in a held-out
+        one if the model is right. Negative in a held-out trial whose own nuisances (a release amplitude, an
+        offset) were fitted to it. The sum over the used samples of fitted trials is the effective number of
+        parameters.
+    rates : (N, C) ndarray or None
+        Time derivatives of the prediction, dynamic trials [channel's unit / s].
+    sensitivity : (N, C, P) ndarray or None
+        S of the module's text, one column for each parameter of the whole fit, alike in all its trials
+        (held-out trials: without what was fitted to themselves). With it tests allow exactly for what the fit
+        has absorbed; without it for the leverage only.
+
+    Raises
+    ------
+    FitError
+        If shapes do not agree, or a used value is not finite.
+    """
+
+    trial: Trial
+    prediction: FloatArray
+    residual: FloatArray
+    noise_deviation: FloatArray
+    predictive_deviation: FloatArray
+    leverage: FloatArray
+    rates: FloatArray | None = None
+    sensitivity: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        shape = self.trial.values.shape
+        where = f"The fit of the trial {self.trial.name!r}"
+        for name in ("prediction", "residual", "predictive_deviation", "leverage", "rates"):
+            array = getattr(self, name)
+            if array is None:
+                continue
+            if array.shape != shape:
+                raise FitError(f"{where} has {name} of the shape {array.shape}, but the data have {shape}.")
+            if not np.all(np.isfinite(array[self.trial.used])):
+                raise FitError(f"{where} has a value of {name} that is not finite at a used sample.")
+        if self.noise_deviation.shape != shape[1:] or not np.all(self.noise_deviation > 0.0):
+            raise FitError(f"{where} needs one positive noise deviation for each of {shape[1]} channels.")
+        if not np.all(self.predictive_deviation[self.trial.used] > 0.0):
+            raise FitError(f"{where} has a predictive deviation that is not positive.")
+        if self.sensitivity is not None and (
+            self.sensitivity.ndim != 3 or self.sensitivity.shape[:2] != shape
+        ):
+            raise FitError(
+                f"{where} has a sensitivity of the shape {self.sensitivity.shape}; ({shape[0]}, {shape[1]}, "
+                "P) is expected."
+            )
+        expected = self.expected_variance[self.trial.used]
+        if not np.all(expected > -1e-9):
+            raise FitError(f"{where} has a leverage above one, so that the expected variance is negative.")
+
+    @property
+    def used(self) -> BoolArray:
+        """Samples that count, (N, C)."""
+        return self.trial.used
+
+    @cached_property
+    def standardised(self) -> FloatArray:
+        """Residuals in units of the noise, (N, C); nan where not used."""
+        return np.where(self.used, self.residual / self.noise_deviation, np.nan)
+
+    @property
+    def expected_variance(self) -> FloatArray:
+        """Variance of `standardised` if the model is right, (N, C)."""
+        return np.asarray(1.0 + self.leverage if self.trial.held_out else 1.0 - self.leverage)
+
+    def column(self, channel: str) -> int:
+        """Return the column of a channel; raises ValueError if the trial lacks it."""
+        return self.trial.channels.index(channel)
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualSet:
+    """All trials of a campaign beside their predictions by one fitted hypothesis.
+
+    Attributes
+    ----------
+    channels : mapping of str to Channel
+        By name; their noise records are what residuals are compared with.
+    trials : tuple of FittedTrial
+        In the campaign's order.
+
+    Raises
+    ------
+    FitError
+        If there is no trial, a trial has an unknown channel, or sensitivities differ in their parameters.
+    """
+
+    channels: Mapping[str, Channel]
+    trials: tuple[FittedTrial, ...]
+
+    def __post_init__(self) -> None:
+        if not self.trials:
+            raise FitError("A set of residuals needs at least one trial, but there is none.")
+        for item in self.trials:
+            unknown = [name for name in item.trial.channels if name not in self.channels]
+            if unknown:
+                raise FitError(f"The trial {item.trial.name!r} has the unknown channel {unknown[0]!r}.")
+        counts = {item.sensitivity.shape[2] for item in self.trials if item.sensitivity is not None}
+        if len(counts) > 1:
+            raise FitError(
+                "Sensitivities of all trials must have the columns of the same parameters, but there are "
+                f"{' and '.join(str(count) for count in sorted(counts))}."
+            )
+
+    @property
+    def fitted(self) -> "ResidualSet | None":
+        """The trials that were fitted, or None."""
+        return self._where(held_out=False)
+
+    @property
+    def held_out(self) -> "ResidualSet | None":
+        """The trials kept for proof, or None."""
+        return self._where(held_out=True)
+
+    def _where(self, *, held_out: bool) -> "ResidualSet | None":
+        trials = tuple(item for item in self.trials if item.trial.held_out is held_out)
+        return replace(self, trials=trials) if trials else None
+
+    def degrees_of_freedom(self, channel: str) -> float:
+        """Return n0 of a channel's noise record; zero without a record."""
+        noise = self.channels[channel].noise
+        return 0.0 if noise is None else noise.degrees_of_freedom
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of fitted parameters P as far as sensitivities tell; zero without."""
+        return next((i.sensitivity.shape[2] for i in self.trials if i.sensitivity is not None), 0)
+
+    def white(self, generator: np.random.Generator) -> tuple[FloatArray, ...]:
+        """Return residuals that are white with unit variance if the model is right, (N, C) by trial.
+
+        A residual at a draw of the posterior is distributed as the noise itself (Johnson 2007, Bayesian
+        Analysis 2(4), 719-734): r + S z with z standard normal, one z for all trials, restores exactly what
+        the fit has absorbed; held-out trials lose the error of the parameters alike. Without sensitivities
+        residuals are divided by their expected deviation. Samples that are not used are drawn from the noise,
+        so that series keep their even spacing.
+        """
+        draw = generator.standard_normal(self.parameter_count)
+        outside = self._held_out_draw(draw)
+        white = []
+        for item in self.trials:
+            filler = generator.standard_normal(item.residual.shape)
+            residual = np.nan_to_num(item.standardised)
+            if item.sensitivity is None:
+                residual = residual / np.sqrt(np.clip(item.expected_variance, 1e-12, None))
+            elif item.trial.held_out:
+                residual = residual - item.sensitivity @ outside
+            else:
+                residual = residual + item.sensitivity @ draw
+            white.append(np.where(item.used, residual, filler))
+        return tuple(white)
+
+    def _held_out_draw(self, draw: FloatArray) -> FloatArray:
+        """Return a draw of the parameters' error given the held-out trials.
+
+        There r = e + S z: given r, z is Gaussian with the precision I + S^T S, and r less S times a draw of
+        it is distributed as e.
+        """
+        precision, along = np.eye(draw.size), np.zeros(draw.size)
+        for item in self.trials:
+            if item.trial.held_out and item.sensitivity is not None:
+                part = item.sensitivity[item.used]
+                precision += part.T @ part
+                along += part.T @ item.standardised[item.used]
+        root = np.linalg.cholesky(precision)
+        return np.asarray(np.linalg.solve(precision, along) + np.linalg.solve(root.T, draw))
+
+
+def quadratic_moments(
+    items: Iterable[tuple[FloatArray, FloatArray | None]], *, held_out: bool = False
+) -> tuple[float, float]:
+    """Return mean and effective degrees of freedom of a sum of squares of residuals.
+
+    Parameters
+    ----------
+    items : iterable of ((n,) ndarray, (n, P) ndarray or None)
+        Expected variance of the residuals and their sensitivities, by trial and channel.
+    held_out : bool
+        Whether they are of held-out trials, where A = I + S S^T.
+
+    Returns
+    -------
+    mean, degrees_of_freedom : float
+        With A = I - S S^T the covariance: tr A and (tr A)^2 / tr A^2 (Satterthwaite 1946), so that the sum
+        over its mean is about chi^2 over the degrees of freedom.
+    """
+    mean, square, count = 0.0, 0.0, 0
+    cross: FloatArray | None = None
+    for expected, sensitive in items:
+        mean += float(expected.sum())
+        if sensitive is None:
+            square += float(expected.sum())
+            continue
+        leverage = np.einsum("np,np->n", sensitive, sensitive)
+        square += float(np.sum(1.0 + (2.0 if held_out else -2.0) * leverage))
+        count += expected.size
+        part = sensitive.T @ sensitive
+        cross = part if cross is None else cross + part
+    if cross is not None:
+        square += float(np.sum(cross**2))
+    if mean <= 1e-9 or square <= 1e-12:
+        return max(mean, 0.0), 0.0
+    return mean, mean**2 / square

@@ -1,0 +1,169 @@
+"""What the channels of a trial would show: the response of a model, seen through the sensors of a patch."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.records import Campaign, Trial, TrialKind
+from discrepancy.errors import CatalogueError, ModelError
+from discrepancy.models.interface import Conditions, Model
+from discrepancy.models.wrapped import built_in_sensors
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch, Primitive
+from fe.runtime.sensors import (
+    SensorRecord,
+    apply_sensors,
+    check_channels,
+    clock_of,
+    needs_components,
+    uses_sensors,
+)
+
+FloatArray = NDArray[np.float64]
+
+__all__ = ["Observed", "observe", "observe_response", "record_of", "uses_sensors"]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What the channels of a trial would show without noise.
+
+    Attributes
+    ----------
+    values : (N, C) ndarray
+        By `trial.channels`, in the channels' units.
+    rates : (N, C) ndarray or None
+        Their time derivatives, for dynamic trials of models that give them.
+    """
+
+    values: FloatArray
+    rates: FloatArray | None
+
+
+def observe(
+    model: Model,
+    campaign: Campaign,
+    trial: Trial,
+    patch: ModelPatch,
+    conditions: Conditions,
+    refinement: int = 1,
+) -> Observed:
+    """Return what the channels of a trial would show; gains and zeros that are nuisances are not in it.
+
+    Parameters
+    ----------
+    model : Model
+        Gives the response under the structure, force and load primitives of the patch. Sensors that it has
+        built in act before those of the patch.
+    campaign : Campaign
+        Whose channels the trial names.
+    trial : Trial
+        Inputs and sample times.
+    patch : ModelPatch
+        Clocks are added to `conditions.clock`; other sensor primitives act on the response
+        (`fe.runtime.sensors`).
+    conditions : Conditions
+        Parameters, initial state, clock and health.
+    refinement : int
+        As of `Model.respond`.
+
+    Raises
+    ------
+    ModelError
+        If the model lacks an output or cannot carry a primitive.
+    CatalogueError
+        If a sensor primitive names a channel that does not exist or has values that no sensor can have.
+    """
+    outputs = tuple(
+        (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
+    )
+    patch = _by_channels(built_in_sensors(model), campaign) + patch
+    if not uses_sensors(patch):
+        response = model.respond(trial, outputs, patch, conditions, refinement=refinement)
+        return Observed(response.values, response.rates)
+    rate, zero = clock_of(patch)
+    if rate or zero:
+        clock = (conditions.clock[0] + rate, conditions.clock[1] + zero)
+        conditions = replace(conditions, clock=clock)
+    bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SENSORS)))
+    components = needs_components(patch)
+    response = model.respond(trial, outputs, bare, conditions, components=components, refinement=refinement)
+    if components and (response.transverse is None or response.shear is None):
+        raise ModelError(
+            f"{model.name} gives no transverse and shear strain, so a turned gauge cannot be computed: leave "
+            "gauge misalignment out for this model."
+        )
+    return observe_response(
+        campaign,
+        trial,
+        patch,
+        conditions,
+        response.values,
+        response.rates,
+        response.transverse,
+        response.shear,
+    )
+
+
+def _by_channels(sensors: ModelPatch, campaign: Campaign) -> ModelPatch:
+    """Return sensor primitives for the channels that measure the outputs which they name."""
+    found: list[Primitive] = []
+    for item in sensors:
+        output = getattr(item, "channel", EVERY_CHANNEL)
+        if output == EVERY_CHANNEL:
+            found.append(item)
+            continue
+        found += [
+            replace(item, channel=name)  # type: ignore[call-arg]
+            for name, channel in campaign.channels.items()
+            if channel.output == output
+        ]
+    return ModelPatch(tuple(found))
+
+
+def observe_response(
+    campaign: Campaign,
+    trial: Trial,
+    patch: ModelPatch,
+    conditions: Conditions,
+    values: FloatArray,
+    rates: FloatArray | None = None,
+    transverse: FloatArray | None = None,
+    shear: FloatArray | None = None,
+) -> Observed:
+    """Return what the channels show of a response that is known already; see `observe`.
+
+    For callers that keep the response of a structure and try sensors on it. The clock of the patch must be in
+    the response.
+    """
+    try:
+        check_channels(patch, [(name, channel.quantity.value) for name, channel in campaign.channels.items()])
+        shown, shown_rates = apply_sensors(
+            patch, record_of(campaign, trial, conditions), values, rates, transverse, shear
+        )
+    except InvalidPatchError as cause:
+        raise CatalogueError(str(cause)) from cause
+    return Observed(shown, shown_rates)
+
+
+def record_of(campaign: Campaign, trial: Trial, conditions: Conditions) -> SensorRecord:
+    """Return the record of a trial as `fe.runtime.sensors` wants it.
+
+    The release amplitude is the nominal one; where the motion starts from the static shape, times
+    (1 + initial[0, 0]).
+    """
+    release = 1.0
+    if trial.kind is TrialKind.RINGDOWN and trial.release is not None:
+        release = trial.release.displacement
+        if trial.release.at_rest and len(conditions.initial):
+            release *= 1.0 + float(conditions.initial[0, 0])
+    return SensorRecord(
+        channels=tuple((name, campaign.channels[name].quantity.value) for name in trial.channels),
+        kind=trial.kind.value,
+        time=trial.time,
+        start=trial.start,
+        temperature=trial.temperature,
+        run=trial.run,
+        release=release,
+    )

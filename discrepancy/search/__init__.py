@@ -1,0 +1,1 @@
+"""Which candidates, in which order."""

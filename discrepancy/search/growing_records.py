@@ -1,0 +1,170 @@
+"""Fits far from the truth: phases slip over a long record, so that its beginning is fitted first."""
+
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from itertools import product
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.errors import ModelError
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import CandidateFit, attempt, fit, objective
+from discrepancy.fits.gates import absolute_gate
+from discrepancy.fits.linearisation import Point
+from discrepancy.fits.problem import Problem
+from discrepancy.fits.screening import Change, Screen, rescaled
+from discrepancy.fits.trial_data import shortened
+from discrepancy.search_settings import SEARCH
+
+from .starting_points import starts
+
+FloatArray = NDArray[np.float64]
+
+
+class Beginnings:
+    """A problem beside itself with the beginnings of its dynamic records only.
+
+    Parameters
+    ----------
+    problem : Problem
+        With whole records.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+
+    @cached_property
+    def short(self) -> Problem:
+        """The problem with the beginnings of its dynamic records."""
+        period = 2.0 * np.pi / self.problem.setting.scales.angular_frequency
+        trials = []
+        for data in self.problem.trials:
+            trial = data.trial
+            count = len(trial.time)
+            if trial.is_dynamic:
+                count = min(
+                    count, max(SEARCH.least_samples, ceil(SEARCH.beginning * period / trial.interval))
+                )
+            trials.append(shortened(trial, count))
+        return self.problem.with_trials(tuple(trials))
+
+    def refine(self, refinement: int) -> None:
+        """Take time steps so many times smaller than the model's own."""
+        if "short" in self.__dict__:
+            self.short.refinement = refinement
+
+    def set_up(self, setting: Setting) -> None:
+        """Build effects for another setting."""
+        if "short" in self.__dict__:
+            self.short.setting = setting
+
+    def scan(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
+        """Fit effects in addition to those of `base`, beginnings first; return the most promising ones."""
+        near = self.near(base)
+        screen = Screen(self.short, near)
+        ranked = [changes for effect in effects if (changes := starts(screen, effect, SEARCH.far_starts))]
+        ranked.sort(key=lambda changes: -changes[0].gain)
+        enough = SEARCH.promising * ranked[0][0].gain if ranked else 0.0
+        first = max(SEARCH.least_promising, sum(changes[0].gain >= enough for changes in ranked))
+        found = self._from_beginnings(base, near, ranked[:first])
+        if not base.candidate.terms and not any(absolute_gate(self.problem, item).passed for item in found):
+            found += self._from_beginnings(base, near, ranked[first:])
+        return found
+
+    def _from_beginnings(
+        self, base: CandidateFit, near: CandidateFit, ranked: list[list[Change]]
+    ) -> list[CandidateFit]:
+        """Fit effects to the beginnings of the records, the best of them to whole records."""
+        begun = []
+        for changes in ranked:
+            best = None
+            for change in changes:
+                candidate = base.candidate.plus(change.term)
+                item = self.shortly(
+                    near, candidate, rescaled(change), None if best is None else best.objective
+                )
+                if item is not None and (best is None or item.objective < best.objective):
+                    best = item
+            if best is not None:
+                begun.append(best)
+        return self.whole(begun, base.objective)
+
+    def near(self, base: CandidateFit) -> CandidateFit:
+        """Fit the beginnings with the effects of a base; shared unknowns as expected before the data.
+
+        The nuisances of a wrong model are far off and make a bad start.
+        """
+        expected = Point(
+            np.zeros_like(base.point.shared),
+            tuple(np.zeros_like(u) for u in base.point.local),
+            base.point.effect,
+        )
+        return fit(self.short, base.candidate, expected, local_only=True, evidence=False)
+
+    def shortly(
+        self, near: CandidateFit, candidate: Candidate, added: FloatArray, give_up: float | None = None
+    ) -> CandidateFit | None:
+        """Fit a candidate to the beginnings, or return None where the structure cannot follow."""
+        start = Point(near.point.shared, near.point.local, np.concatenate((near.point.effect, added)))
+        return self._fitted(candidate, start, give_up)
+
+    def _fitted(
+        self, candidate: Candidate, start: Point, give_up: float | None = None
+    ) -> CandidateFit | None:
+        return attempt(
+            self.short, candidate, start, iterations=SEARCH.short_steps, evidence=False, give_up=give_up
+        )
+
+    def related(self, found: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
+        """Fit effects in place of the single one of a fit, from where that brought the nuisances.
+
+        Phases that slip keep an effect from its optimum while the nuisances are those of no effect; one that
+        does nearly the same has brought them close to where they belong.
+        """
+        (term,) = found.candidate.terms
+        begun = []
+        for effect in effects:
+            places = tuple(effect.places(self.problem.setting))
+            if term.place in places:
+                places = (term.place,)
+            best = None
+            for place in places if len(places) <= SEARCH.few_places else ():
+                candidate = Candidate((Term(effect, place),))
+                for start in self._tried(found, candidate):
+                    item = self._fitted(candidate, start)
+                    if item is not None and (best is None or item.objective < best.objective):
+                        best = item
+            if best is not None:
+                begun.append(best)
+        return self.whole(begun, found.objective)
+
+    def _tried(self, found: CandidateFit, candidate: Candidate) -> list[Point]:
+        """Return the most promising points of a grid of a candidate's parameters, nuisances as fitted."""
+        count = SEARCH.related_levels.get(candidate.size, 0)
+        levels = ndtri((np.arange(count) + 0.5) / max(count, 1))
+        tried = []
+        for effect in product(levels, repeat=candidate.size):
+            point = Point(found.point.shared, found.point.local, np.array(effect))
+            try:
+                tried.append((objective(self.short, candidate, point), point))
+            except ModelError:  # more than the structure can carry
+                continue
+        return [point for _, point in sorted(tried, key=lambda item: item[0])[: SEARCH.related_starts]]
+
+    def whole(self, begun: Sequence[CandidateFit], least: float) -> list[CandidateFit]:
+        """Fit the most promising candidates to whole records from where the beginnings led."""
+        found: list[CandidateFit] = []
+        singles = all(len(item.candidate.terms) == 1 for item in begun)
+        count = SEARCH.far_fits if singles else SEARCH.far_extensions
+        for item in sorted(begun, key=lambda start: start.objective)[:count]:
+            whole = attempt(
+                self.problem, item.candidate, item.point, iterations=SEARCH.far_steps, give_up=least
+            )
+            if whole is not None:
+                least = min(least, whole.objective + SEARCH.close)
+                found.append(whole)
+        return found

@@ -1,0 +1,93 @@
+"""The hypotheses of a search: sets of effects with their fits, prior shares and probabilities."""
+
+from dataclasses import dataclass, field
+from math import comb, exp, log
+
+from scipy.special import logsumexp
+
+from discrepancy.catalogue.entry import Effect
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.gates import SHAPE_GAIN
+from discrepancy.fits.problem import Problem
+from discrepancy.search_settings import SEARCH
+
+Key = tuple[tuple[str, str], ...]
+
+
+def key_of(candidate: Candidate) -> Key:
+    """Return what tells candidates apart: sorted (identifier, place)."""
+    return tuple(sorted((term.label, term.place) for term in candidate.terms))
+
+
+@dataclass
+class Hypotheses:
+    """All candidates fitted so far.
+
+    Attributes
+    ----------
+    problem : Problem
+        Campaign and model.
+    effects : tuple of Effect
+        Those that can act here.
+    none : CandidateFit
+        Without effect.
+    exact : dict of Key to CandidateFit
+        Fitted to convergence.
+    rough : dict of Key to CandidateFit
+        Fitted by few steps only; their evidence is approximate.
+    """
+
+    problem: Problem
+    effects: tuple[Effect, ...]
+    none: CandidateFit
+    exact: dict[Key, CandidateFit] = field(default_factory=dict)
+    rough: dict[Key, CandidateFit] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.exact[()] = self.none
+
+    def log_prior(self, candidate: Candidate) -> float:
+        """Return ln of the prior probability of a candidate at its places.
+
+        A free shape has to gain what the shape gate asks for.
+        """
+        count = len(candidate.terms)
+        if count == 0:
+            return log(SEARCH.prior_none)
+        sets = comb(len(self.effects), count)
+        places = sum(log(self._places(term.effect)) for term in candidate.terms)
+        free = sum(SHAPE_GAIN for term in candidate.terms if term.free_shape)
+        return log((1.0 - SEARCH.prior_none) * SEARCH.set_shares[count - 1] / sets) - places - free
+
+    def _places(self, effect: Effect) -> int:
+        return len(effect.places(self.problem.setting))
+
+    def score(self, found: CandidateFit) -> float:
+        """Return ln (evidence times prior), up to a constant."""
+        return found.log_evidence + self.log_prior(found.candidate)
+
+    def all(self) -> dict[Key, CandidateFit]:
+        """Return every candidate, the exact fit where there is one."""
+        return {**self.rough, **self.exact}
+
+    def best(self) -> CandidateFit:
+        """Return the most probable candidate."""
+        return max(self.exact.values(), key=self.score)
+
+    def set_probabilities(self) -> dict[tuple[str, ...], float]:
+        """Return the probability of each set of identifiers, places summed, most probable first."""
+        scores: dict[tuple[str, ...], list[float]] = {}
+        for found in self.all().values():
+            scores.setdefault(found.candidate.identifiers, []).append(self.score(found))
+        sums = {identifiers: float(logsumexp(values)) for identifiers, values in scores.items()}
+        total = float(logsumexp(list(sums.values())))
+        ordered = sorted(sums.items(), key=lambda item: -item[1])
+        return {identifiers: min(exp(value - total), 1.0) for identifiers, value in ordered}
+
+    def keep(self, found: CandidateFit, *, exact: bool) -> None:
+        """Keep a fit if it is better than what is known of the same candidate."""
+        kept = self.exact if exact else self.rough
+        key = key_of(found.candidate)
+        if key not in kept or kept[key].log_evidence < found.log_evidence:
+            kept[key] = found

@@ -1,0 +1,390 @@
+"""The search for the set of effects that explains a campaign: screen, fit, add, take away, try pairs."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.catalogue.entry import Effect
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.fitting import CandidateFit, attempt, fit
+from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate
+from discrepancy.fits.linearisation import Point
+from discrepancy.fits.other_optima import around, free_shape, is_box
+from discrepancy.fits.problem import Problem
+from discrepancy.fits.screening import Change, Screen, rescaled
+from discrepancy.search_settings import SEARCH
+from fe.runtime.patch import MicroSlip, ModelPatch
+
+from .growing_records import Beginnings
+from .hypotheses import Hypotheses, key_of
+from .starting_points import acts_within, are_related, pairs, starts
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass
+class Search(Hypotheses):
+    """Hypotheses, and the way to more of them.
+
+    Attributes
+    ----------
+    beginnings : Beginnings
+        For fits far from the truth.
+    longest : int
+        Number of effects of the longest set that was the best one.
+    """
+
+    beginnings: Beginnings = field(init=False)
+    longest: int = field(init=False, default=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.beginnings = Beginnings(self.problem)
+
+    def screened(self, base: CandidateFit, effects: Iterable[Effect]) -> dict[str, list[Change]]:
+        """Return for each effect its most promising changes, best first, at different places or values."""
+        screen = Screen(self.problem, base)
+        return {effect.identifier: starts(screen, effect) for effect in effects}
+
+    def scan(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
+        """Fit every effect roughly in addition to those of `base`; return the best of each, best first.
+
+        Close to the truth one linearisation serves all (chord steps). Far from it phases slip over a long
+        record, so that the beginnings of the records are fitted first, and the whole ones from there.
+        """
+        effects = near = tuple(effects)
+        if self._misfits(base):  # what acts on readings only turns no phases
+            near = tuple(effect for effect in effects if not acts_within(effect, self.problem.setting))
+        found = self._scan_near(base, near)
+        explained = any(absolute_gate(self.problem, item).passed for item in found)
+        if self._misfits(base) or (self._far(base) and not explained):
+            found += self.beginnings.scan(base, effects)
+        best: dict[tuple[str, ...], CandidateFit] = {}
+        for item in sorted(found, key=self.score):
+            self.keep(item, exact=False)
+            best[item.candidate.identifiers] = item
+        return sorted(best.values(), key=lambda item: -self.score(item))
+
+    def _far(self, base: CandidateFit) -> bool:
+        """Whether a fit is far from the truth: much is left, or what is shared had to leave its prior."""
+        strain = np.abs(base.point.shared[self.problem.shared.precision > 0.0])
+        return self._misfits(base) or bool(strain.max(initial=0.0) > SEARCH.strained)
+
+    def _misfits(self, base: CandidateFit) -> bool:
+        """Whether much is left by a fit."""
+        return base.chi_square > SEARCH.far * float(self.problem.counts.sum())
+
+    def _scan_near(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
+        found = []
+        least = SEARCH.worth_adding if base.candidate.terms else SEARCH.worth_fitting
+        ranked = [changes for changes in self.screened(base, effects).values() if changes]
+        ranked.sort(key=lambda changes: -max(change.gain for change in changes))
+        enough = SEARCH.promising * max((change.gain for change in ranked[0]), default=0.0) if ranked else 0.0
+        prospect = base.objective - (least if base.candidate.terms else 0.0)
+        for changes in ranked:
+            fits: list[CandidateFit] = []
+            for change in changes:
+                if change.gain < least:
+                    continue
+                candidate = base.candidate.plus(change.term)
+                rough = self.roughly(base, candidate, rescaled(change), give_up=prospect)
+                if rough is None:  # the best scale is more than the structure can carry
+                    continue
+                delivered = base.objective - rough.objective
+                reached = max((base.objective - item.objective for item in fits), default=0.0)
+                if change.gain >= enough and max(delivered, reached) < SEARCH.delivered * change.gain:
+                    rough = self._followed(rough, base, rescaled(change))
+                fits.append(rough)
+                prospect = min(prospect, rough.objective + SEARCH.out_of_reach)
+            if fits:
+                found.append(max(fits, key=self.score))
+        return found
+
+    def _followed(self, rough: CandidateFit, base: CandidateFit, added: FloatArray) -> CandidateFit:
+        """Fit anew where chord steps did not reach what the screen promised: shared unknowns move far."""
+        start = Point(base.point.shared, base.point.local, np.concatenate((base.point.effect, added)))
+        again = attempt(self.problem, rough.candidate, start, iterations=SEARCH.short_steps)
+        return rough if again is None else max(rough, again, key=self.score)
+
+    def roughly(
+        self, base: CandidateFit, candidate: Candidate, added: FloatArray, *, give_up: float | None = None
+    ) -> CandidateFit | None:
+        """Fit a candidate by chord steps from a base, None where it cannot; see `fit` for `give_up`."""
+        start = Point(base.point.shared, base.point.local, np.concatenate((base.point.effect, added)))
+        return attempt(
+            self.problem, candidate, start, base=base.base, iterations=SEARCH.chord_steps, give_up=give_up
+        )
+
+    def exactly(self, rough: CandidateFit) -> CandidateFit:
+        """Fit a candidate to convergence from a rough fit, and keep it."""
+        key = key_of(rough.candidate)
+        found = self.exact.get(key)
+        if found is None or found.log_evidence < rough.log_evidence - SEARCH.gained_again:
+            again = attempt(self.problem, rough.candidate, rough.point)
+            # chord steps may have led to where the structure cannot follow
+            self.keep(rough if again is None else again, exact=True)
+        return self.exact[key]
+
+    def refine(self, rough: Sequence[CandidateFit], floor: float) -> list[CandidateFit]:
+        """Fit exactly those that are close to the best of them and above a floor of the score."""
+        if not rough:
+            return []
+        top = self.score(rough[0])
+        # far from the truth, chord steps rank only roughly
+        margin = max(SEARCH.close, SEARCH.close_share * (top - floor))
+        chosen = [item for item in rough[: SEARCH.exact_fits] if self.score(item) > max(top - margin, floor)]
+        return sorted((self.exactly(item) for item in chosen), key=lambda item: -self.score(item))
+
+    # ---------------------------------------------------------------- the strategy
+
+    def run(self) -> None:
+        """Search by all moves of the strategy, in their order."""
+        for move in STRATEGY:
+            if move.settled:
+                self.settle()
+            if move.needed(self):
+                move.make(self)
+
+    def unexplained(self) -> bool:
+        """Whether the best candidate cannot be shown to explain the data."""
+        return not absolute_gate(self.problem, self.best()).passed
+
+    def settle(self) -> None:
+        """Compute the best candidate finely enough that its evidence is its own, not that of the steps."""
+        self._settle_joints()
+        self._settle_steps()
+
+    def singles(self) -> None:
+        """Fit each effect alone, and the best of them beside their optimum too."""
+        ranked = self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
+        for rank, item in enumerate(ranked[: SEARCH.ridges]):
+            misses = absolute_gate(self.problem, item).passed is False
+            if not self._misfits(item) and (misses or (rank == 0 and is_box(item.candidate))):
+                self.keep(around(self.problem, item), exact=True)
+
+    def far_and_failing(self) -> bool:
+        """Whether the best candidate does not fit where the nuisances of no effect are far off."""
+        return self._misfits(self.none) and absolute_gate(self.problem, self.best()).passed is False
+
+    def longer(self) -> None:
+        """Add one effect at a time to the best set while that makes a better one."""
+        current: CandidateFit | None = self.best()
+        while current is not None and current.candidate.terms:
+            self.longest = len(current.candidate.terms)
+            if self.longest > 1 and self._far(current):
+                break  # a third effect is looked for only where two nearly do
+            current = self._extended(current)
+
+    def shortened(self) -> bool:
+        """Whether a smaller set became the best one: what stood in for it hid what is beside it."""
+        return 0 < len(self.best().candidate.terms) < self.longest
+
+    def longer_again(self) -> None:
+        """Add one effect to the best set."""
+        self._extended(self.best())
+
+    def relatives(self) -> None:
+        """Fit effects that are easily taken for the best one, from where it stands."""
+        best = self.best()
+        if len(best.candidate.terms) != 1:
+            return
+        (term,) = best.candidate.terms
+        related = [effect for effect in self.effects if are_related(effect, term.effect)]
+        for item in self.beginnings.related(best, related):
+            self.keep(item, exact=False)
+            if self.score(item) > self.score(best) - SEARCH.close:
+                self.exactly(item)
+
+    def families(self) -> None:
+        """Fit the free-shape families of single effects that come close, and keep those that fit.
+
+        A law with a shape of its own is a simpler cause than two laws, so it is tried before pairs are. Where
+        the best effect fits, families compete only if others fit as well: its own is for the shape gate.
+        """
+        singles = [item for item in self.exact.values() if len(item.candidate.terms) == 1]
+        singles = sorted(singles, key=self.score, reverse=True)[: SEARCH.exact_fits]
+        fitting = [item for item in singles if absolute_gate(self.problem, item).passed is not False]
+        if fitting and fitting[0] is singles[0]:
+            close = self.score(singles[0]) - SEARCH.rivals
+            singles = [item for item in fitting if self.score(item) > close]
+            if len(singles) == 1 or absolute_gate(self.problem, self.none).passed is not False:
+                return
+        # a rival that fits is followed to its end; one that does not has to promise more than the best
+        give_up = None if fitting else self.best().objective
+        kept: dict[tuple[str, str], CandidateFit] = {}
+        for named in singles:
+            family = free_shape(self.problem, named, 0, give_up=give_up)
+            if family is None or family.log_evidence - named.log_evidence <= SHAPE_GAIN:
+                continue
+            (term,) = family.candidate.terms
+            key = (term.effect.family, term.place)  # one verdict; the member from which it is reached best
+            better = key not in kept or self.score(kept[key]) < self.score(family)
+            if better and absolute_gate(self.problem, family).passed is not False:
+                kept[key] = family
+        for family in kept.values():
+            self.keep(family, exact=True)
+
+    def _settle_steps(self) -> None:
+        """Halve the time steps while they cost the best candidate too much, and fit the best ones again."""
+        while (
+            self.problem.refinement < SEARCH.finest
+            and solver_share(self.problem, self.best()) > SEARCH.solver_share
+        ):
+            self.problem.refinement *= 2
+            self.beginnings.refine(self.problem.refinement)
+            ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))[: SEARCH.refitted]
+            self._fit_again([item for item in ranked if item.candidate.terms])
+
+    def _settle_joints(self) -> None:
+        """Divide a joint that slips more finely where the best candidate has one; fit the best ones again."""
+        setting = self.problem.setting
+        if setting.joint_elements >= SEARCH.fine_joint or not _slips(self.problem, self.best()):
+            return
+        ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))
+        self.problem.setting = replace(setting, joint_elements=SEARCH.fine_joint)
+        self.beginnings.set_up(self.problem.setting)
+        self._fit_again([item for item in ranked if _slips(self.problem, item)][: SEARCH.refitted])
+        if _slips(self.problem, self.best()):
+            self.keep(around(self.problem, self.best()), exact=True)
+
+    def _fit_again(self, rough: Sequence[CandidateFit]) -> None:
+        """Replace exact fits by those of the finer model from where they stand."""
+        for item in rough:
+            again = attempt(self.problem, item.candidate, item.point)
+            if again is not None:  # else the rough one stands
+                self.exact[key_of(item.candidate)] = again
+
+    def _extended(self, current: CandidateFit) -> CandidateFit | None:
+        """Return a better set with one more effect, or None."""
+        if len(current.candidate.terms) >= SEARCH.largest_set:
+            return None
+        before = self.score(current)
+        there = {term.effect.identifier for term in current.candidate.terms}
+        others = [effect for effect in self.effects if effect.identifier not in there]
+        fitted = self.refine(self.scan(current, others), before - SEARCH.hopeless_longer)
+        return fitted[0] if fitted and self.score(fitted[0]) > before else None
+
+    def fit_pairs(self) -> None:
+        """Fit the most promising of all pairs of effects, by their changes at the fit without effect."""
+        far = self._far(self.none)
+        near = self.beginnings.near(self.none) if far else self.none
+        screen = Screen(self.beginnings.short if far else self.problem, near)
+        changes = {effect.identifier: starts(screen, effect) for effect in self.effects}
+        ranked = sorted(pairs(changes, screen.sign), key=lambda item: item[0])[: SEARCH.pairs_fitted]
+        rough: list[CandidateFit] = []
+        for _, first, second in ranked:
+            candidate = Candidate((first.term, second.term))
+            if key_of(candidate) in self.exact:
+                continue
+            start = np.concatenate((rescaled(first), rescaled(second)))
+            if far:
+                found = self.beginnings.shortly(near, candidate, start)
+            else:
+                found = self.roughly(self.none, candidate, start)
+            if found is not None:
+                rough.append(found)
+        if far:
+            rough = self.beginnings.whole(rough, self.none.objective)
+        for item in rough:
+            self.keep(item, exact=False)
+        rough.sort(key=lambda item: -self.score(item))
+        self.refine(rough, self.score(self.best()) - SEARCH.close)
+
+    def shorter(self) -> None:
+        """Fit the best set less one effect, for each."""
+        best = self.best()
+        if len(best.candidate.terms) < 2:
+            return
+        for index in range(len(best.candidate.terms)):
+            # from here even a set that was fitted before may find a better optimum
+            less = best.candidate.without(index)
+            parts = best.candidate.parts(best.point.effect)
+            effect = np.concatenate(parts[:index] + parts[index + 1 :])
+            found = attempt(self.problem, less, Point(best.point.shared, best.point.local, effect))
+            if found is not None:
+                self.keep(found, exact=True)
+
+
+def _always(found: Search) -> bool:
+    return True
+
+
+def _open(found: Search) -> bool:
+    """Whether further effects are looked for: beside a law whose shape is free they would be anything."""
+    return not found.best().candidate.is_family
+
+
+@dataclass(frozen=True)
+class Move:
+    """One way from the hypotheses of a search to more of them.
+
+    Attributes
+    ----------
+    make : callable
+        The move.
+    needed : callable
+        When it is made.
+    settled : bool
+        Whether the best candidate has to be computed finely before.
+    """
+
+    make: Callable[[Search], None]
+    needed: Callable[[Search], bool] = _always
+    settled: bool = False
+
+
+STRATEGY = (
+    Move(Search.singles),
+    Move(Search.relatives, Search.far_and_failing),
+    Move(Search.families, settled=True),
+    # finely divided, a joint may have the shape of the name in place of one that is free
+    Move(Search.longer, _open, settled=True),
+    Move(Search.fit_pairs, lambda found: _open(found) and len(found.effects) > 1 and found.unexplained()),
+    Move(Search.shorter, _open),
+    Move(Search.longer_again, lambda found: _open(found) and found.shortened(), settled=True),
+)
+"""Simple causes before others: one effect, one law of free shape, more effects, any two; then fewer again."""
+
+
+def search(problem: Problem, effects: Sequence[Effect]) -> Search:
+    """Fit the model without effect, then search the catalogue.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    effects : sequence of Effect
+        The catalogue; what is unavailable here is left out.
+
+    Returns
+    -------
+    Search
+        All candidates with their evidence.
+    """
+    none = fit(problem, Candidate(), problem.start(Candidate()))
+    usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
+    found = Search(problem, usable, none)
+    found.run()
+    return found
+
+
+def _slips(problem: Problem, found: CandidateFit) -> bool:
+    """Whether a fit has a joint that slips."""
+    patch = found.candidate.patch(problem.setting, found.point.effect) if found.candidate.terms else ()
+    return any(isinstance(item, MicroSlip) for item in patch)
+
+
+def solver_share(problem: Problem, fit: CandidateFit) -> float:
+    """Return the largest rms change of a channel when the time steps are halved, over its noise."""
+    largest = 0.0
+    for number, data in enumerate(problem.trials):
+        if not data.trial.is_dynamic:
+            continue
+        candidate = fit.candidate if data.trial.kind in fit.candidate.acts_on else Candidate()
+        patch = candidate.patch(problem.setting, fit.point.effect) if candidate.terms else ModelPatch()
+        finer, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch, finer=2)
+        change = (finer - fit.responses[number]) / data.deviation
+        largest = max(largest, float(np.sqrt((change**2).mean(axis=0)).max()))
+    return largest

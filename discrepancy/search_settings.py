@@ -1,0 +1,150 @@
+"""What the search for effects is set to: one record, each number with its reason.
+
+Gates have levels of their own (`gates`, `consistency_gate`): they judge what the search found.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """Settings of the search; gains and log evidence in nats, sizes in prior deviations."""
+
+    # ---------------------------------------------------------------- what is probable before the data
+    prior_none: float = 0.5
+    """Probability that nothing is missing: a name has to be earned."""
+    set_shares: tuple[float, ...] = (0.97, 0.029, 0.001)
+    """How the rest is shared among sets of one, two and three effects; longer ones are not looked for."""
+
+    # ---------------------------------------------------------------- what is named
+    sure: float = 0.95
+    """Probability that a name needs."""
+    bayes_factor: float = 3.0
+    """ln Bayes factor against 'none' that a name needs."""
+    unsure: float = 0.5
+    """Probability of 'none' below which the data leave open whether something is missing."""
+    largest_group: int = 6
+    """Members of a group; more of them say nothing."""
+
+    # ---------------------------------------------------------------- screening: what is worth a fit
+    levels: Mapping[int, tuple[float, ...]] = field(
+        default_factory=lambda: MappingProxyType(
+            {1: (-1.5, -0.5, 0.5, 1.5), 2: (-1.3, 0.0, 1.3), 3: (-1.2, 0.0, 1.2)}
+        )
+    )
+    """Grid of the scaled parameters that are not a mere scale, by their number."""
+    levels_of_many: tuple[float, ...] = (-1.0, 1.0)
+    """The same from four on: the grid grows with the power of their number."""
+    largest_start: float = 2.5
+    """Fits do not begin at larger magnitudes: far off, scales mean little."""
+    linear: float = 0.05
+    """Signed magnitudes are tried at one prior deviation and at this share of it: what moves phases (clock,
+    drift) leaves the range of first order before its shared part is taken up by the nuisances."""
+    first_order: float = 25.0
+    """Squared change of all readings [sigma^2] to which effects are shrunk to see their direction."""
+    padded: int = 4
+    """Zero padding of spectra: lines lie between the frequencies of a record."""
+    peaks: int = 3
+    """Peaks of a spectrum that are tried."""
+    starts: int = 2
+    """Starts of the fit of each effect close to the truth."""
+    far_starts: int = 3
+    """The same far from it, where the screen ranks only roughly."""
+    few_places: int = 3
+    """Effects with more places than this are those of single channels, which are linear in their size."""
+    worth_fitting: float = 2.0
+    """Screened gain below which an effect is not fitted at all: it could not win a name."""
+    worth_adding: float = 4.0
+    """The same for one more effect, whose prior is smaller."""
+    pairs_fitted: int = 8
+    """Pairs that are fitted of all that are screened."""
+
+    # ---------------------------------------------------------------- rough fits by chord steps
+    chord_steps: int = 8
+    """Steps with the derivatives of the fit without effect."""
+    delivered: float = 0.7
+    """Share of the screened gain that chord steps must reach; else shared unknowns move far."""
+    out_of_reach: float = 36.0
+    """Chord steps end where they have no prospect to come within this of the best: three times `close`."""
+
+    # ---------------------------------------------------------------- exact fits
+    close: float = 12.0
+    """Candidates within this log evidence of the best are fitted exactly: chord steps err by less."""
+    close_share: float = 0.5
+    """The same as a share of what the best gained: far from the truth chord steps rank only roughly."""
+    exact_fits: int = 4
+    """Candidates of a scan that are fitted exactly at most."""
+    gained_again: float = 5.0
+    """A candidate is fitted anew if a rough fit found it better than its exact one by this."""
+    hopeless: float = 6.0
+    """Single effects this far below 'none' are not fitted exactly."""
+    hopeless_longer: float = 2.0
+    """Sets with one more effect this far below the set without it are not."""
+    rivals: float = 30.0
+    """Effects that fit within this log evidence of the best one have families that may overtake it."""
+
+    # ---------------------------------------------------------------- beside an optimum
+    ridges: int = 2
+    """Candidates that do not quite fit whose neighbourhood is searched."""
+    ridge_steps: tuple[float, ...] = (-0.8, -0.3, 0.3, 0.8)
+    """Steps along the direction that the data tell least of."""
+    place_steps: tuple[float, ...] = (-0.15, -0.05, 0.05, 0.15)
+    """Steps of parameters that are not mere sizes: a place has an optimum at each sensor that it passes."""
+    neighbour_iterations: int = 8
+    """Steps of each fit beside an optimum."""
+    neighbour_gain: float = 1.0
+    """Gain of log evidence from which a neighbour is the better optimum."""
+    rounds: int = 5
+    """How often one neighbour leads to the next."""
+    shape_iterations: int = 40
+    """Steps of a fit with a free shape, whose valleys are long."""
+
+    # ---------------------------------------------------------------- far from the truth
+    far: float = 1.5
+    """Chi-square per sample above which a fit is far from the truth."""
+    strained: float = 4.0
+    """Prior deviations beyond which a shared unknown says the same."""
+    beginning: float = 4.0
+    """Periods of the first mode that are fitted before the whole record: phases have not slipped yet."""
+    least_samples: int = 60
+    """Samples that a beginning has at least."""
+    promising: float = 0.3
+    """Effects go on whose screened gain is at least this share of the best one's."""
+    least_promising: int = 5
+    """At least so many go on; the others too if none of these fits."""
+    short_steps: int = 12
+    """Steps on the beginnings before candidates are compared."""
+    far_steps: int = 6
+    """Steps on whole records from there."""
+    far_fits: int = 6
+    """Single effects that go on from the beginnings to whole records."""
+    far_extensions: int = 4
+    """Longer sets that do."""
+    related_levels: Mapping[int, int] = field(
+        default_factory=lambda: MappingProxyType({1: 5, 2: 5, 3: 5, 4: 3})
+    )
+    """Levels of each parameter, by their number, at which relatives of a fitted effect are tried."""
+    related_starts: int = 2
+    """Of these, how many begin a fit."""
+
+    # ---------------------------------------------------------------- what is judged is computed finely
+    solver_share: float = 0.1
+    """Largest share of the noise that the time steps may cost (rms over a channel of a trial)."""
+    finest: int = 8
+    """How many times smaller than the model's own the time steps may become for it."""
+    refitted: int = 3
+    """Candidates that are fitted again with smaller steps or more elements."""
+    fine_joint: int = 96
+    """Elements of joints that slip in what is named. Fewer serve the search; but along the ridge of slip
+    force and stiffness the misfit of few elements has dents of its own, which would count as knowledge."""
+
+    @property
+    def largest_set(self) -> int:
+        """Effects of the largest set that is looked for."""
+        return len(self.set_shares)
+
+
+SEARCH = SearchSettings()
+"""The settings that verdicts are reached with; `docs/blind_test.md` measures them."""

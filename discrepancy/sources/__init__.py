@@ -1,0 +1,1 @@
+"""Campaigns from elsewhere: examples, simulations, runs, the published wing."""

@@ -1,0 +1,304 @@
+"""Small campaigns to try: simulated trials of a model, with what every test has: noise, zeros, gains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from discrepancy.campaign.noise_records import pre_trigger_record
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.writing import write_campaign
+from discrepancy.checks.model_check import prior_mean
+from discrepancy.errors import CampaignFileError, ModelError
+from discrepancy.models.interface import Conditions, Model
+from discrepancy.models.sensing import observe
+from fe.runtime.patch import ModelPatch
+
+ExampleKind = Literal["static", "ringdown", "flight", "laboratory", "complete"]
+"""What is measured: one kind of trial, static and ring-down, or all three."""
+
+_KINDS: dict[str, tuple[TrialKind, ...]] = {
+    "static": (TrialKind.STATIC,),
+    "ringdown": (TrialKind.RINGDOWN,),
+    "flight": (TrialKind.FLIGHT,),
+    "laboratory": (TrialKind.STATIC, TrialKind.RINGDOWN),
+    "complete": (TrialKind.STATIC, TrialKind.RINGDOWN, TrialKind.FLIGHT),
+}
+_AT_REST_SAMPLES = 400
+
+
+@dataclass(frozen=True)
+class ExamplePlan:
+    """What an example measures; the defaults suit the wing of Kapteyn et al. 2021.
+
+    Attributes
+    ----------
+    channels : tuple of Channel
+        Their noise records say how noisy the sensors are; ring-downs replace them by recorded samples.
+    force : float
+        Largest static force [N].
+    release : float
+        Largest release displacement [m].
+    load_factors : tuple of float
+        Of the flights [1].
+    duration, interval : float
+        Of a ring-down and its samples [s].
+    load_place : str or tuple of float
+        Where the force acts.
+    static_channels, dynamic_channels, flight_channels : tuple of str
+        Names of the channels that each kind of trial measures; empty: all.
+    """
+
+    channels: tuple[Channel, ...]
+    force: float = 10.0
+    release: float = 0.015
+    load_factors: tuple[float, ...] = (1.0, 1.5, 2.0, 2.5, 3.0)
+    duration: float = 2.0
+    interval: float = 0.002
+    load_place: str | tuple[float, float] = "tip_load"
+    static_channels: tuple[str, ...] = ()
+    dynamic_channels: tuple[str, ...] = ()
+    flight_channels: tuple[str, ...] = field(default=())
+
+    def names(self, kind: TrialKind) -> tuple[str, ...]:
+        """Return the names of the channels that a kind of trial measures."""
+        chosen = {
+            TrialKind.STATIC: self.static_channels,
+            TrialKind.FLIGHT: self.flight_channels,
+        }.get(kind, self.dynamic_channels)
+        return chosen or tuple(channel.name for channel in self.channels)
+
+
+def wing_plan(gauges: tuple[int, ...] = (1, 5, 9, 13, 18, 22)) -> ExamplePlan:
+    """Return the plan of a wing test: some gauges of 2 microstrain and the tip's displacement of 0.05 mm."""
+    strain = NoiseRecord(2e-6, 200.0)
+    channels = [
+        Channel(f"g{number}", Quantity.STRAIN, f"strain[{number}]", strain, 0.005, 2e-6) for number in gauges
+    ]
+    tip = Channel("tip", Quantity.DISPLACEMENT, "tip_displacement", NoiseRecord(5e-5, 200.0), 0.0, 1e-4)
+    names = tuple(channel.name for channel in channels)
+    return ExamplePlan((*channels, tip), flight_channels=names)
+
+
+def plan_for(model: Model, outputs: tuple[str, ...], load_place: str | tuple[float, float]) -> ExamplePlan:
+    """Return a plan for any model: loads that move it by 2 % of its length, noise of 0.1 % of what they show.
+
+    Parameters
+    ----------
+    model : Model
+        Gives its natural scales and the size of its outputs.
+    outputs : tuple of str
+        What is measured, one channel of the same name each.
+    load_place : str or tuple of float
+        Where the force acts.
+
+    Raises
+    ------
+    ModelError
+        If the model lacks an output.
+    """
+    quantities = {output: model.output_quantity(output) for output in outputs}
+    for output, quantity in quantities.items():
+        if quantity is None:
+            raise ModelError(f"{model.name} has no output {output!r}: an example cannot measure it.")
+    scales = model.scales(Campaign("", {}, (), None, {}, ""))
+    channels = tuple(
+        Channel(name, quantity, name, NoiseRecord(1.0, 200.0))
+        for name, quantity in quantities.items()
+        if quantity is not None
+    )
+    period = 2.0 * np.pi / scales.angular_frequency
+    plan = ExamplePlan(
+        channels,
+        force=0.02 * scales.length * scales.tip_stiffness,
+        release=0.02 * scales.length,
+        duration=20.0 * period,
+        interval=period / 50.0,
+        load_place=load_place,
+    )
+    trial = _blank("", TrialKind.STATIC, plan, np.array([plan.force]), start=0.0, run="")
+    bare = Campaign("", {channel.name: channel for channel in channels}, (), None, {}, "")
+    seen = np.abs(observe(model, bare, trial, ModelPatch(), prior_mean(bare, model, trial)).values[0])
+    sized = []
+    for channel, size in zip(channels, seen.tolist(), strict=True):
+        noise = 1e-3 * (size or float(seen.max()) or 1.0)
+        sized.append(
+            replace(
+                channel, noise=NoiseRecord(noise, 200.0), gain_deviation=0.005, offset_deviation=2.0 * noise
+            )
+        )
+    return replace(plan, channels=tuple(sized))
+
+
+def example_campaign(
+    model: Model,
+    kind: ExampleKind,
+    seed: int,
+    plan: ExamplePlan | None = None,
+    patch: ModelPatch | None = None,
+) -> Campaign:
+    """Return a simulated campaign; equal seeds give equal campaigns to the last bit.
+
+    Static: six load levels up and the same down, in two runs. Ring-down: releases from 1, 0.7, 0.5 and 0.3 of
+    the largest displacement, the third held out, with 400 samples at rest for the noise record. Flight:
+    steady turns at each load factor. What a test has and nobody wants is drawn for each trial: sensors'
+    noise, their zeros and gains by their prior deviations, the release by its own.
+
+    Parameters
+    ----------
+    model : Model
+        What is simulated, at its prior mean.
+    kind : str
+        "static", "ringdown", "flight", "laboratory" or "complete".
+    seed : int
+        Of the `SeedSequence`.
+    plan : ExamplePlan, optional
+        By default `wing_plan()`.
+    patch : ModelPatch, optional
+        What the structure has and the model lacks; nothing by default.
+
+    Raises
+    ------
+    CampaignFileError
+        If there is no such kind of example.
+    ModelError, CatalogueError
+        As `discrepancy.models.sensing.observe`.
+    """
+    if kind not in _KINDS:
+        raise CampaignFileError(
+            f"There is no example {kind!r}: the kinds are {', '.join(get_args(ExampleKind))}."
+        )
+    plan = wing_plan() if plan is None else plan
+    patch = ModelPatch() if patch is None else patch
+    generator = np.random.default_rng(np.random.SeedSequence(seed))
+    kinds = _KINDS[kind]
+    measured = {name for item in kinds for name in plan.names(item)}
+    channels = {channel.name: channel for channel in plan.channels if channel.name in measured}
+    gains = {
+        name: 1.0
+        + (channel.gain_deviation if np.isfinite(channel.gain_deviation) else 0.0) * generator.normal()
+        for name, channel in channels.items()
+    }
+    recorded = channels
+    if TrialKind.RINGDOWN in kinds:
+        recorded = {
+            name: replace(channel, noise=_at_rest(channel, plan.interval, generator))
+            if name in plan.names(TrialKind.RINGDOWN)
+            else channel
+            for name, channel in channels.items()
+        }
+    bare = Campaign(f"Example: {kind}", channels, (), 20.0, {}, "")
+    trials = tuple(
+        _measure(model, bare, trial, patch, gains, generator)
+        for item in kinds
+        for trial in _trials(item, plan)
+    )
+    return replace(bare, channels=recorded, trials=trials)
+
+
+def write_example(
+    model: Model,
+    folder: str | Path,
+    kind: ExampleKind,
+    seed: int,
+    plan: ExamplePlan | None = None,
+    patch: ModelPatch | None = None,
+) -> Campaign:
+    """Write `example_campaign` to a folder and return it as read from there; errors as there."""
+    return read_campaign(write_campaign(example_campaign(model, kind, seed, plan, patch), folder))
+
+
+# ---------------------------------------------------------------- parts
+
+
+def _trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
+    if kind is TrialKind.STATIC:
+        levels = plan.force * np.arange(6) / 5.0
+        return [
+            _blank("loading", kind, plan, levels, start=0.0, run="A"),
+            _blank("unloading", kind, plan, levels[::-1], start=600.0, run="A"),
+            _blank("loading again", kind, plan, levels, start=3600.0, run="B", held_out=True),
+        ]
+    if kind is TrialKind.FLIGHT:
+        factors = np.array(plan.load_factors)
+        return [
+            _blank("turns", kind, plan, factors, start=10000.0, run="flight"),
+            _blank("turns again", kind, plan, factors[1:], start=11000.0, run="flight", held_out=True),
+        ]
+    time = plan.interval * np.arange(round(plan.duration / plan.interval) + 1)
+    return [
+        _blank(
+            f"release {number}", kind, plan, time, start=5000.0 + 300.0 * number, run="A",
+            release=Release(share * plan.release, 0.02, mode_count=3), held_out=number == 3,
+        )
+        for number, share in enumerate((1.0, 0.7, 0.5, 0.3), start=1)
+    ]  # fmt: skip
+
+
+def _blank(
+    name: str,
+    kind: TrialKind,
+    plan: ExamplePlan,
+    rows: np.ndarray,
+    *,
+    start: float,
+    run: str,
+    release: Release | None = None,
+    held_out: bool = False,
+) -> Trial:
+    """Return a trial without readings; `rows` are forces, load factors or times."""
+    names, count = plan.names(kind), len(rows)
+    zeros = np.zeros(count)
+    return Trial(
+        name=name,
+        kind=kind,
+        channels=names,
+        values=np.zeros((count, len(names))),
+        used=np.ones((count, len(names)), dtype=bool),
+        time=rows if kind is TrialKind.RINGDOWN else np.full(count, start),
+        force=rows if kind is TrialKind.STATIC else zeros,
+        load_factor=rows if kind is TrialKind.FLIGHT else zeros,
+        load_place=plan.load_place,
+        temperature=zeros,
+        start=start,
+        run=run,
+        health=np.zeros((count, 2)),
+        health_deviation=np.zeros((count, 2)),
+        release=release,
+        held_out=held_out,
+    )
+
+
+def _measure(
+    model: Model,
+    campaign: Campaign,
+    trial: Trial,
+    patch: ModelPatch,
+    gains: Mapping[str, float],
+    generator: np.random.Generator,
+) -> Trial:
+    conditions = prior_mean(campaign, model, trial)
+    if trial.release is not None:
+        initial = conditions.initial.copy()
+        initial[0, 0] = trial.release.deviation * generator.normal()
+        conditions = Conditions(conditions.parameters, initial, (0.0, 0.0), trial.health)
+    values = observe(model, campaign, trial, patch, conditions).values.copy()
+    for column, name in enumerate(trial.channels):
+        channel = campaign.channels[name]
+        zero = channel.offset_deviation if np.isfinite(channel.offset_deviation) else 0.0
+        noise = 0.0 if channel.noise is None else channel.noise.standard_deviation * trial.noise_factor
+        values[:, column] = values[:, column] * gains[name] + zero * generator.normal()
+        values[:, column] += noise * generator.normal(size=len(values))
+    return replace(trial, values=values)
+
+
+def _at_rest(channel: Channel, interval: float, generator: np.random.Generator) -> NoiseRecord | None:
+    if channel.noise is None:
+        return None
+    samples = channel.noise.standard_deviation * generator.normal(size=_AT_REST_SAMPLES)
+    return pre_trigger_record(samples, interval, channel.name, "the example")

@@ -1,0 +1,316 @@
+"""The run folder of a mission as a campaign: every turn is a row of a flight, its health uncertain.
+
+`docs/run_folder.md` describes the folder; it is read by its files alone.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
+from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
+from discrepancy.models.interface import Model
+from discrepancy.models.patched import PatchedModel
+from discrepancy.models.wing import WingModel
+from fmu_asset.errors import FmuError
+from fmu_asset.packing.patch_file import load_patch
+from fmu_asset.packing.patched_runtime import output_channels
+from reporting.errors import DamagedFileError
+from reporting.folders import restore_folder
+from reporting.netcdf import read_groups
+from reporting.provenance import hash_file
+from reporting.toml_file import read_toml
+from reporting.words import counted
+
+FloatArray = NDArray[np.float64]
+
+RUN_FILE, CONFIG_FILE = "run.nc", "config.json"
+DESIGN_FILE, CALIBRATION_FILE, BINDING_FILE = (
+    "asset/design.toml",
+    "asset/calibration.nc",
+    "asset/binding.toml",
+)
+MODEL_PATCH_FILE = "asset/model_patch.json"
+STRAIN = "strain"
+TEMPERATURE = ("temperature_difference", "temperature")
+"""Names under which a run may record the temperature: less the reference [K], or itself [degC]."""
+REFERENCE_TEMPERATURE = 20.0
+HEALTH_MEAN, HEALTH_DEVIATION = 0.4, 0.25
+"""Prior of each stiffness loss in each turn, where the belief is left aside: about even from 0 to 0.8."""
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """How a run is read.
+
+    Attributes
+    ----------
+    health : {"belief", "broad"}
+        Mean of the health in a turn: the smoothed belief, or the same in all.
+    health_deviation : float
+        Least prior deviation of a stiffness loss in a turn. The belief was led astray by what is looked for,
+        and is much surer than it is right; 24 gauges tell the health of a turn anyway.
+    block : int
+        Turns of a block that is held out.
+    held_out_share : float
+        Share of the turns that is held out, in whole blocks spread over the flight.
+    noise_deviation : float or None
+        Of a strain reading [1]; by default what the scenario says of the gauges, else what its twin assumes.
+    """
+
+    health: str = "belief"
+    health_deviation: float = HEALTH_DEVIATION
+    block: int = 4
+    held_out_share: float = 0.2
+    noise_deviation: float | None = None
+
+
+def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
+    """Return the flight of a run folder as a campaign.
+
+    Parameters
+    ----------
+    folder : path
+        As `uav-twin run --out` leaves it.
+    plan : RunPlan, optional
+        How it is read.
+
+    Returns
+    -------
+    Campaign
+        Strain channels g1, g2, ...; flight trials whose rows are turns, some of them held out. The time of a
+        turn is that at its end, as the FMU has it. Health is uncertain in every turn. Of the
+        truth, only a temperature that the asset monitors and the scenario's noise of the gauges are read.
+
+    Raises
+    ------
+    CampaignFileError
+        If the folder is no run of a wing, or is not whole.
+    CampaignDataError
+        If nothing was observed, or a steady force acted beside the load factor.
+    """
+    folder, plan = Path(folder), plan or RunPlan()
+    restore_folder(folder)
+    try:
+        return _campaign(folder, plan, _config(folder)["scenario"])
+    except DiscrepancyError:
+        raise
+    except (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError) as cause:
+        reason = str(cause.args[0] if cause.args else cause).rstrip(".")
+        raise CampaignFileError(
+            f"{folder / RUN_FILE} or the {CONFIG_FILE} beside it does not have the layout of a run of this "
+            f"version ({reason}): fly the run again."
+        ) from cause
+
+
+def _campaign(folder: Path, plan: RunPlan, scenario: dict[str, Any]) -> Campaign:
+    _refuse_others(folder, scenario)
+    run = _run(folder)
+    observed, smoothed = run["observed"], run["smoothed"]
+    strain = np.asarray(observed[STRAIN].values, dtype=np.float64)
+    used = np.isfinite(strain)
+    if not used.any():
+        raise CampaignDataError(f"No strain reached the twin in {folder}: there is nothing to compare.")
+    size, gauges = strain.shape
+    names = tuple(f"g{number}" for number in np.asarray(observed["sensor"].values).tolist())
+    mean = np.asarray(smoothed["mean"].values, dtype=np.float64)
+    deviation = np.asarray(smoothed["standard_deviation"].values, dtype=np.float64)
+    if plan.health == "broad":
+        mean = np.full_like(mean, HEALTH_MEAN)
+    deviation = np.maximum(deviation, plan.health_deviation)
+    time = _step_size(folder) * (np.asarray(observed["step"].values, dtype=np.float64) + 1.0)
+    temperature, known = _temperature(run, size)
+    noise, source = _noise(scenario, plan)
+    channels = {
+        name: Channel(name, Quantity.STRAIN, f"strain[{name[1:]}]", NoiseRecord(noise, inf)) for name in names
+    }
+    whole = Trial(
+        name="turns", kind=TrialKind.FLIGHT, channels=names,
+        values=np.where(used, strain, 0.0), used=used, time=time,
+        force=np.zeros(size), load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64),
+        load_place="tip_load", temperature=temperature, start=0.0, run=str(run.attrs.get("scenario", "run")),
+        health=mean, health_deviation=deviation,
+    )  # fmt: skip
+    held = held_out_turns(size, plan.block, plan.held_out_share)
+    trials = [_rows(whole, ~held, "turns", held_out=False)]
+    if held.any():
+        trials.append(_rows(whole, held, "turns held out", held_out=True))
+    lost = int(used.size - used.sum())
+    return Campaign(
+        name=str(run.attrs.get("title", folder.name)),
+        channels=channels,
+        trials=tuple(trials),
+        reference_temperature=REFERENCE_TEMPERATURE if known else None,
+        parameters=_calibrated(run),
+        data_hash=hash_file(folder / RUN_FILE),
+        remarks=(
+            f"Flight of {counted(size, 'turn')} read from a run folder; health in each turn: "
+            f"{plan.health} with a deviation of {plan.health_deviation:g} or more.",
+            f"Noise of a gauge: {1e6 * noise:.4g} microstrain, {source}.",
+            *(
+                (f"{lost} of {size * gauges} readings {'was' if lost == 1 else 'were'} lost.",)
+                if lost
+                else ()
+            ),
+        ),
+    )
+
+
+def run_model(folder: Path | str) -> Model:
+    """Return the model that the twin of a run believed: the wing of its design or calibration, patched.
+
+    The whole patch of the twin's model is in it, sensors too: they act in
+    `discrepancy.models.sensing.observe`.
+
+    Raises
+    ------
+    CampaignFileError
+        If the twin believed no design.
+    ModelError
+        If the wing cannot be modelled.
+    """
+    folder = Path(folder)
+    _config(folder)
+    model: Model
+    if (folder / CALIBRATION_FILE).is_file():
+        model = WingModel.of_calibration(folder / CALIBRATION_FILE)
+    elif (folder / DESIGN_FILE).is_file():
+        model = WingModel.of_design(folder / DESIGN_FILE)
+    else:
+        raise CampaignFileError(
+            f"{folder} holds no design (`{DESIGN_FILE}`): its twin believed no model of a wing that could be "
+            "patched."
+        )
+    if (folder / MODEL_PATCH_FILE).is_file():
+        try:
+            effects = load_patch(folder / MODEL_PATCH_FILE).for_outputs(_outputs(folder))
+        except FmuError as cause:
+            raise CampaignFileError(f"The patch of the twin's model cannot be read: {cause}") from cause
+        for effect in effects:
+            model = PatchedModel(model, effect.patch)
+    return model
+
+
+def held_out_turns(count: int, block: int, share: float) -> NDArray[np.bool_]:
+    """Return which of `count` turns are held out (count,): whole blocks, evenly spread, never the first."""
+    held = np.zeros(count, dtype=bool)
+    blocks = count // block
+    wanted = round(share * count / block)
+    if blocks < 2 or wanted < 1:
+        return held
+    for number in np.unique(
+        np.round(np.linspace(1, blocks - 1, min(wanted, blocks - 1) + 1)[:-1]).astype(int)
+    ).tolist():
+        held[number * block : (number + 1) * block] = True
+    return held
+
+
+# ---------------------------------------------------------------- parts
+
+
+def _refuse_others(folder: Path, scenario: dict[str, Any]) -> None:
+    """Refuse the run of another asset than the wing, and one with a force beside the load factor."""
+    if scenario["observation"].get("role") != STRAIN or {item["name"] for item in scenario["state"]} != {
+        "z1",
+        "z2",
+    }:
+        raise CampaignFileError(
+            f"{folder} is the run of another asset than the wing: strains under the damage states z1 and z2 "
+            "are needed."
+        )
+    force = (scenario["asset"].get("load") or {}).get("tip_force", 0.0)
+    if force:
+        raise CampaignDataError(
+            f"A force of {force:g} N at the tip acts in all turns of {folder}; only flights without it can "
+            "be read."
+        )
+
+
+def _config(folder: Path) -> dict[str, Any]:
+    try:
+        config = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as cause:
+        raise CampaignFileError(
+            f"{folder} is no run folder: {CONFIG_FILE} cannot be read ({cause})."
+        ) from cause
+    if not isinstance(config, dict) or not isinstance(config.get("scenario"), dict):
+        raise CampaignFileError(f"{folder / CONFIG_FILE} is not that of a run: it has no `scenario`.")
+    return config
+
+
+def _run(folder: Path) -> xr.DataTree:
+    path = folder / RUN_FILE
+    try:
+        run = read_groups(path)
+    except DamagedFileError as cause:
+        raise CampaignFileError(f"{cause}: it is not a whole run, resume the run or fly it again.") from cause
+    missing = {"observed", "smoothed", "calibration"} - {*run.children}
+    if missing:
+        raise CampaignFileError(
+            f"{path} lacks the groups {', '.join(sorted(missing))}: it is no run of a twin."
+        )
+    for name in (STRAIN, "load_factor"):
+        if name not in run["observed"]:
+            raise CampaignFileError(f"{path} lacks the observed {name!r}: it is no run of a wing.")
+    return run
+
+
+def _step_size(folder: Path) -> float:
+    """Return the seconds of a turn, 1 where the run has no binding of its own."""
+    path = folder / BINDING_FILE
+    if not path.exists():
+        return 1.0
+    step = read_toml(path, CampaignFileError, what="binding").get("binding", {}).get("step_size", 1.0)
+    if isinstance(step, bool) or not isinstance(step, int | float) or not 0.0 < step < inf:
+        raise CampaignFileError(
+            f"{path}: `step_size` must be a positive number of seconds, and {step!r} came."
+        )
+    return float(step)
+
+
+def _temperature(run: xr.DataTree, size: int) -> tuple[FloatArray, bool]:
+    """Return temperatures less the reference [K], and whether they were recorded."""
+    for group in ("observed", "truth"):
+        if group not in run.children:
+            continue
+        for name in TEMPERATURE:
+            if name in run[group]:
+                values = np.asarray(run[group][name].values, dtype=np.float64)
+                return values - (REFERENCE_TEMPERATURE if name == "temperature" else 0.0), True
+    return np.zeros(size), False
+
+
+def _noise(scenario: dict[str, Any], plan: RunPlan) -> tuple[float, str]:
+    if plan.noise_deviation is not None:
+        return plan.noise_deviation, "as given"
+    stated = ((scenario.get("truth") or {}).get("noise") or {}).get("standard_deviation")
+    if stated:
+        return float(stated), "as the scenario says of the gauges"
+    return float(scenario["observation"]["standard_deviation"]), "as the twin assumes"
+
+
+def _calibrated(run: xr.DataTree) -> dict[str, tuple[float, float]]:
+    name = str(run.attrs.get("parameter", ""))
+    draws = np.asarray(run["calibration"]["draw_value"].values, dtype=np.float64)
+    spread = float(draws.std(ddof=1)) if len(draws) > 1 else 0.0
+    return {name: (float(draws.mean()), spread)} if name and spread > 0.0 else {}
+
+
+def _outputs(folder: Path) -> Sequence[tuple[str, str]]:
+    return output_channels(len(_run(folder)["observed"]["sensor"]))
+
+
+def _rows(trial: Trial, rows: NDArray[np.bool_], name: str, *, held_out: bool) -> Trial:
+    parts = ("values", "used", "time", "force", "load_factor", "temperature", "health", "health_deviation")
+    return replace(
+        trial, name=name, held_out=held_out, **{part: getattr(trial, part)[rows] for part in parts}
+    )

@@ -1,0 +1,258 @@
+"""The published measurements of the real wing as a campaign: five ring-downs, and two loading runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import helmert
+
+from calibration.dynamics.records import RingDownRecord, read_records
+from calibration.errors import CalibrationError
+from calibration.static.experiments import LoadDisplacementData, read_measurements
+from discrepancy.campaign.noise_records import pre_trigger_record
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.writing import write_campaign
+from discrepancy.errors import CampaignDataError, CampaignFileError
+from reporting.provenance import hash_record
+from reporting.words import be, counted
+
+FloatArray = NDArray[np.float64]
+
+SIGNAL, TIP = "spanwise", "tip"
+"""Names of the channels: the strain signal of the ring-downs, the displacement of the loading runs."""
+ROOT_GAUGE = "strain[16]"
+"""Where the model's strain is read for the signal; its place only sets the scale, which is unknown."""
+READING_ERROR = 33e-6 / 3.0**0.5
+"""Deviation of a value read off the plot [V]: evenly within +-33 microvolt (a pixel is 66).
+
+The plots show the same motion on the same grid, so that its error is common to the trials, and no average
+makes it less.
+"""
+TREND = 67
+"""Columns of the moving average that is the slow zero: 0.54 s, three periods of the first mode."""
+PARAMETERS = {
+    "young_modulus_factor": (1.0080, 0.0103),
+    "servo_mass": (0.1680, 0.0140),
+    "pitot_mass": (0.1360, 0.0280),
+    "damping_alpha": (1.03, 0.37),
+    "damping_beta": (7.56e-4, 1.84e-4),
+}
+"""Mean and deviation of the calibrated parameters: the joint posterior (docs/calibration.md), which allows
+for what the amplitude does to the frequency and the damping ratio that were calibrated to."""
+
+
+@dataclass(frozen=True)
+class RecordPlan:
+    """What of a ring-down record is used.
+
+    Attributes
+    ----------
+    begin, end : float
+        Window since the release [s]; before it higher modes ring that the model does not meet.
+    columns : int
+        Columns of the plot that are averaged into one sample. Four (32 ms) have a zero of their frequency
+        response at 30.8 Hz, where the second bending mode rings.
+    detrended : bool
+        Whether the slow zero that the trials share is taken off: the moving average over three periods (Hann
+        weights), averaged over the trials. It moves by a third of a millivolt and is no motion of the wing.
+        What moves slowly in one trial alone is noise and stays.
+    release : float
+        Nominal displacement of the tip at the window's begin [m]; the unknown scale of the signal makes any
+        value as good.
+    mode_count : int
+        Modes whose state at the begin is free.
+    loading_runs : bool
+        Whether the loading runs are used too, where they are.
+    held_out : tuple of int
+        Trials kept for proof, counted from 1.
+    """
+
+    begin: float = 0.8
+    end: float = inf
+    columns: int = 4
+    detrended: bool = True
+    release: float = 0.05
+    mode_count: int = 2
+    loading_runs: bool = True
+    held_out: tuple[int, ...] = (3, 5)
+
+
+def wing_campaign(data: Path | str, plan: RecordPlan | None = None) -> Campaign:
+    """Return the published measurements of the real wing as a campaign.
+
+    Parameters
+    ----------
+    data : path
+        The authors' calibration folder, with `step2` and `step3`.
+    plan : RecordPlan, optional
+        What of the ring-downs is used.
+
+    Returns
+    -------
+    Campaign
+        Two static trials of the channel `tip` [m] (if `step2` is there), and the ring-downs of the channel
+        `spanwise` [V], of unknown scale.
+
+    Raises
+    ------
+    CampaignFileError
+        If the folder holds no ring-down records.
+    CampaignDataError
+        If a record cannot be used.
+    """
+    data, plan = Path(data), plan or RecordPlan()
+    try:
+        records = read_records(data)
+        pairs = read_measurements(data) if plan.loading_runs and _has_pairs(data) else None
+    except CalibrationError as cause:
+        raise CampaignFileError(f"The measurements of the wing cannot be read: {cause}") from cause
+    if any(len(record.time) != len(records[0].time) for record in records) or len(records) < 2:
+        raise CampaignDataError(
+            f"{data} must hold two or more ring-down records of one length; it holds {len(records)}."
+        )
+    zero = _shared_zero(records) if plan.detrended else np.zeros(records[0].count)
+    windows = [_windowed(record, zero, plan) for record in records]
+    scatter = trial_scatter(windows)
+    spread = float(np.std(scatter, ddof=1))
+    noise = pre_trigger_record(
+        scatter * np.hypot(1.0, READING_ERROR / spread), _interval(windows), SIGNAL, str(data)
+    )
+    channels = {
+        SIGNAL: Channel(SIGNAL, Quantity.SIGNAL, ROOT_GAUGE, noise, inf, inf),
+    }
+    trials: list[Trial] = []
+    if pairs is not None:
+        displacement_deviation = np.hypot(
+            pairs.displacement_standard_deviation,
+            pairs.load_standard_deviation * float(np.median(pairs.displacement / pairs.load)),
+        )
+        channels[TIP] = Channel(
+            TIP,
+            Quantity.DISPLACEMENT,
+            "load_point_displacement",
+            NoiseRecord(float(displacement_deviation), inf),
+        )
+        trials += _loading_runs(pairs)
+    for number, (time, signal) in enumerate(windows, start=1):
+        trials.append(
+            replace(
+                _trial(f"release {number}", TrialKind.RINGDOWN, (SIGNAL,), signal[:, None], time),
+                release=Release(plan.release, 1.0, at_rest=False, mode_count=plan.mode_count),
+                held_out=number in plan.held_out,
+            )
+        )
+    return Campaign(
+        "The real wing of Kapteyn et al. 2021",
+        channels,
+        tuple(trials),
+        None,
+        PARAMETERS,
+        hash_record([[*trial.values.ravel().tolist()] for trial in trials]),
+        (
+            f"Ring-downs: {records[0].source} to {records[-1].source}, from {plan.begin:g} s after the "
+            f"release; {counted(plan.columns, 'column')} of the plot averaged into a sample of "
+            f"{1e3 * _interval(windows):.3g} ms.",
+            f"Noise of the signal: scatter between the trials, {1e6 * spread:.3g} microvolt, and "
+            f"the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
+        ),
+    )
+
+
+def write_wing_campaign(data: Path | str, out: Path | str, plan: RecordPlan | None = None) -> Campaign:
+    """Write `wing_campaign` as a folder and return it as read from there; errors as there and of writing."""
+    return read_campaign(write_campaign(wing_campaign(data, plan), out))
+
+
+def trial_scatter(windows: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
+    """Return noise of the signal ((R - 1) N,) [V] from what differs between R trials of N samples.
+
+    All trials are releases of one kind, so that what they share is the motion, whatever its law; what differs
+    beside amplitude, delay and zero is noise. Each trial is fitted by the mean of all, its rate, its second
+    derivative and a constant; the R - 1 orthonormal contrasts of what is left (Helmert) are independent of
+    each other and have the variance of a single trial. Four degrees of freedom of each contrast went into the
+    fit, and the variance allows for it.
+
+    Raises
+    ------
+    CampaignDataError
+        If the records are too short.
+    """
+    signals = np.array([signal for _, signal in windows])
+    count, size = signals.shape
+    mean = signals.mean(axis=0)
+    rate = np.gradient(mean)
+    known = np.stack((mean, rate, np.gradient(rate), np.ones(size)), axis=1)
+    known /= np.linalg.norm(known, axis=0)
+    left = signals.T - known @ np.linalg.lstsq(known, signals.T, rcond=None)[0]
+    noise = (left @ helmert(count).T).T
+    return np.asarray(noise.ravel() * np.sqrt(size / (size - known.shape[1])))
+
+
+def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
+    """Return the slow zero (N,) that all records share, NaN at the ends, where no average is known."""
+    weights = np.hanning(TREND + 2)[1:-1]
+    mean = np.mean([record.signal for record in records], axis=0)
+    zero = np.full(len(mean), np.nan)
+    zero[TREND // 2 : len(mean) - TREND // 2] = np.convolve(mean, weights / weights.sum(), "valid")
+    return zero
+
+
+def _windowed(record: RingDownRecord, zero: FloatArray, plan: RecordPlan) -> tuple[FloatArray, FloatArray]:
+    """Return times since the first and samples of a record in the plan's window."""
+    known = np.isfinite(zero)
+    inside = np.flatnonzero(known & (record.time >= plan.begin) & (record.time <= plan.end))
+    count = len(inside) // plan.columns
+    if count < 60:
+        raise CampaignDataError(
+            f"{record.source}: {counted(count, 'sample')} {be(count)} left between {plan.begin:g} and "
+            f"{plan.end:g} s; 60 are needed."
+        )
+    kept = inside[: count * plan.columns].reshape(count, plan.columns)
+    time = record.time[kept].mean(axis=1)
+    interval = float(time[-1] - time[0]) / (count - 1)
+    return np.asarray(interval * np.arange(count), dtype=np.float64), np.asarray(
+        (record.signal - zero)[kept].mean(axis=1)
+    )
+
+
+def _interval(windows: list[tuple[FloatArray, FloatArray]]) -> float:
+    return float(windows[0][0][1])
+
+
+def _has_pairs(data: Path) -> bool:
+    return any(
+        (data / above / "step2").is_dir() for above in (Path(), Path("datafiles"), Path("src") / "datafiles")
+    )
+
+
+def _loading_runs(pairs: LoadDisplacementData) -> list[Trial]:
+    trials = []
+    for number in np.unique(pairs.run).tolist():
+        rows = pairs.run == number
+        trial = _trial(
+            f"loading run {number + 1}",
+            TrialKind.STATIC,
+            (TIP,),
+            pairs.displacement[rows][:, None],
+            np.zeros(rows.sum()),
+        )
+        trials.append(replace(trial, force=pairs.load[rows], run=f"run {number + 1}"))
+    return trials
+
+
+def _trial(
+    name: str, kind: TrialKind, channels: tuple[str, ...], values: FloatArray, time: FloatArray
+) -> Trial:
+    size = len(values)
+    zeros = np.zeros(size)
+    return Trial(
+        name=name, kind=kind, channels=channels, values=values,
+        used=np.ones(values.shape, dtype=bool), time=time,
+        force=zeros, load_factor=zeros, load_place="tip_load", temperature=zeros, start=0.0, run="",
+        health=np.zeros((size, 2)), health_deviation=np.zeros((size, 2)),
+    )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Full operators and their solvers."""

@@ -1,0 +1,270 @@
+"""Sparse Cholesky factors by the multifrontal method, with dense LAPACK kernels.
+
+The unknowns are eliminated front by front: a front is a small dense matrix of the unknowns that a leaf or
+separator of a nested dissection holds (its pivots) and of those that they are coupled to later (its
+boundary). What the pivots leave on the boundary, the Schur complement, is added to a later front.
+
+References
+----------
+I. S. Duff and J. K. Reid, "The multifrontal solution of indefinite sparse symmetric linear equations", ACM
+Transactions on Mathematical Software 9 (1983).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import blas, lapack
+from threadpoolctl import ThreadpoolController
+
+from fe.runtime.errors import SolutionError
+
+from .dissection import separator_tree
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+LEAF_UNKNOWNS = 120
+"""Parts of the mesh with up to so many unknowns are eliminated as one dense front."""
+_STRIP = 96  # rows that are added at once; only their part right of the diagonal is touched
+
+
+@dataclass(frozen=True)
+class Front:
+    """Unknowns that are eliminated together, by their places in the order of elimination.
+
+    Attributes
+    ----------
+    start, end : int
+        The pivots are the places start to end - 1.
+    boundary : (b,)
+        Later places that the pivots are coupled to, rising.
+    parent : int
+        Number of the front that takes the Schur complement, -1 where the boundary is empty.
+    """
+
+    start: int
+    end: int
+    boundary: IntArray
+    parent: int
+
+
+@dataclass(frozen=True)
+class Elimination:
+    """Order of elimination of a sparse symmetric matrix.
+
+    Attributes
+    ----------
+    order : (n,)
+        Unknown at each place of the order.
+    fronts : tuple of Front
+        In the order of elimination.
+    """
+
+    order: IntArray
+    fronts: tuple[Front, ...]
+
+
+def analyse(matrix: sparse.csr_array) -> Elimination:
+    """Find an order of elimination by nested dissection, and the fronts that follow from it.
+
+    Parameters
+    ----------
+    matrix : csr (n, n)
+        Symmetric pattern with a full diagonal; the values do not count.
+    """
+    first, group = _twins(matrix)
+    graph = matrix[first][:, first]
+    size = np.bincount(group)
+    tree = separator_tree(graph, size.astype(np.float64), LEAF_UNKNOWNS)
+    rank = np.empty(len(tree.parent), dtype=np.int64)
+    rank[tree.postorder()] = np.arange(len(rank))
+    order = np.argsort(rank[tree.place], kind="stable")
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = np.arange(len(order))
+    starts = np.flatnonzero(np.diff(rank[tree.place[order]], prepend=-1))
+    size = size[order]
+    offset = np.concatenate(([0], np.cumsum(size)))
+    fronts = tuple(
+        Front(int(offset[start]), int(offset[end]), _expanded(boundary, size, offset), parent)
+        for start, end, boundary, parent in _boundaries(graph[order], place, starts)
+    )
+    return Elimination(np.argsort(place[group], kind="stable"), fronts)
+
+
+def _twins(matrix: sparse.csr_array) -> tuple[IntArray, IntArray]:
+    """Group unknowns that are coupled to the same ones: first of each group (g,), group of each (n,).
+
+    Rows are told apart by the sum of random 64-bit keys of their columns; should two different rows ever
+    have the same sum, the order of elimination is still one, only a poorer one.
+    """
+    keys = np.random.default_rng(1973).integers(2**63, size=matrix.shape[0], dtype=np.int64)
+    sums = np.add.reduceat(keys[matrix.indices], matrix.indptr[:-1])
+    _, first, group = np.unique(sums, return_index=True, return_inverse=True)
+    return first.astype(np.int64), group.astype(np.int64)
+
+
+def _boundaries(
+    graph: sparse.csr_array, place: IntArray, starts: IntArray
+) -> Iterator[tuple[int, int, IntArray, int]]:
+    """Yield start, end, boundary and parent of each front, in places of the groups of unknowns."""
+    ends = np.append(starts[1:], graph.shape[0])
+    owner = np.repeat(np.arange(len(starts)), ends - starts)
+    coupled = place[graph.indices]
+    inherited: list[list[IntArray]] = [[] for _ in starts]
+    for start, end, passed_on in zip(starts.tolist(), ends.tolist(), inherited, strict=True):
+        near = coupled[graph.indptr[start] : graph.indptr[end]]
+        later = np.unique(np.concatenate((near, *passed_on)))
+        boundary = later[np.searchsorted(later, end) :]
+        parent = int(owner[boundary[0]]) if len(boundary) else -1
+        if parent >= 0:
+            inherited[parent].append(boundary)
+        yield start, end, boundary, parent
+
+
+def _expanded(groups: IntArray, size: IntArray, offset: IntArray) -> IntArray:
+    """Places of the unknowns of groups of unknowns (g,), given by their sizes and first places."""
+    count = size[groups]
+    before = np.cumsum(count) - count
+    return np.asarray(np.repeat(offset[groups] - before, count) + np.arange(count.sum()))
+
+
+class _Pattern:
+    """Places of the entries of a matrix, to know it again: equal where the places are."""
+
+    def __init__(self, matrix: sparse.csr_array) -> None:
+        self.starts, self.columns = matrix.indptr.copy(), matrix.indices.copy()
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, _Pattern)
+            and np.array_equal(self.starts, other.starts)
+            and np.array_equal(self.columns, other.columns)
+        )
+
+    def __hash__(self) -> int:
+        return hash((len(self.starts), len(self.columns)))
+
+
+@lru_cache(maxsize=2)
+def _analysed(pattern: _Pattern) -> Elimination:
+    """Analyse a pattern; a matrix of the same unknowns with other values, as after damage, asks again."""
+    size = len(pattern.starts) - 1
+    values = np.ones(len(pattern.columns), dtype=np.int8)
+    return analyse(sparse.csr_array((values, pattern.columns, pattern.starts), shape=(size, size)))
+
+
+@cache
+def _threads() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+class Cholesky:
+    """Cholesky factors of a sparse symmetric positive definite matrix.
+
+    They are computed, and applied, in one thread: sums over several threads depend on their number, and the
+    fronts are too small to gain from them.
+
+    Parameters
+    ----------
+    matrix : csr (n, n)
+        The matrix; only one half of it is read.
+
+    Raises
+    ------
+    SolutionError
+        If it is not positive definite.
+    """
+
+    def __init__(self, matrix: sparse.csr_array) -> None:
+        if not np.all(matrix.diagonal() > 0.0):
+            raise SolutionError(
+                f"A matrix of {matrix.shape[0]} unknowns is not positive definite: it has a diagonal entry "
+                "that is not positive."
+            )
+        elimination = _analysed(_Pattern(matrix))
+        self._order, self._fronts = elimination.order, elimination.fronts
+        self._factors: list[tuple[FloatArray, FloatArray]] = []
+        with _threads().limit(limits=1):
+            self._eliminate(matrix)
+
+    def _eliminate(self, matrix: sparse.csr_array) -> None:
+        size = matrix.shape[0]
+        place = np.empty(size, dtype=np.int64)
+        place[self._order] = np.arange(size)
+        rows = matrix[self._order]
+        columns = place[rows.indices]
+        local = np.empty(size, dtype=np.int64)
+        waiting: list[list[tuple[IntArray, FloatArray]]] = [[] for _ in self._fronts]
+        for front, contributions in zip(self._fronts, waiting, strict=True):
+            pivots, held = front.end - front.start, len(front.boundary)
+            local[front.start : front.end] = np.arange(pivots)
+            local[front.boundary] = pivots + np.arange(held)
+            # Right of the diagonal only; transposed, that is the lower half of LAPACK.
+            top, rest = np.zeros((pivots, pivots + held)), np.zeros((held, held))
+            inside = slice(rows.indptr[front.start], rows.indptr[front.end])
+            row = np.repeat(np.arange(pivots), np.diff(rows.indptr[front.start : front.end + 1]))
+            later = columns[inside] >= front.start
+            top[row[later], local[columns[inside][later]]] = rows.data[inside][later]
+            while contributions:
+                _extend_add(top, rest, *contributions.pop(), local)
+            diagonal, side = np.ascontiguousarray(top[:, :pivots]), np.ascontiguousarray(top[:, pivots:])
+            lower, failed = lapack.dpotrf(diagonal.T, lower=1, overwrite_a=1, clean=0)
+            if failed:
+                raise SolutionError(
+                    f"A matrix of {size} unknowns is not positive definite: unknown "
+                    f"{self._order[front.start + failed - 1]} is left without a positive pivot."
+                )
+            if held:
+                below = blas.dtrsm(1.0, lower, side.T, side=1, lower=1, trans_a=1, overwrite_b=1)
+                left = blas.dsyrk(-1.0, below, beta=1.0, c=rest.T, lower=1, overwrite_c=1)
+                waiting[front.parent].append((front.boundary, left.T))
+            else:
+                below = side.T
+            self._factors.append((lower, below))
+
+    def solve(self, right_hand_side: FloatArray) -> FloatArray:
+        """Solution (n,) or (n, k)."""
+        found = np.array(right_hand_side[self._order], dtype=np.float64, order="C")
+        values = found.reshape(len(found), -1)
+        with _threads().limit(limits=1):
+            for front, (lower, below) in zip(self._fronts, self._factors, strict=True):
+                own = _substitute(lower, values[front.start : front.end], transposed=False)
+                if len(front.boundary):
+                    values[front.boundary] -= below @ own
+            for front, (lower, below) in zip(self._fronts[::-1], self._factors[::-1], strict=True):
+                own = values[front.start : front.end]
+                if len(front.boundary):
+                    own -= below.T @ values[front.boundary]
+                _substitute(lower, own, transposed=True)
+        solution = np.empty_like(found)
+        solution[self._order] = found
+        return solution
+
+
+def _substitute(lower: FloatArray, values: FloatArray, *, transposed: bool) -> FloatArray:
+    """Solve L x = v or L' x = v in place, values (m, k) contiguous."""
+    if values.shape[1] == 1:
+        values[:, 0] = blas.dtrsv(lower, values[:, 0], lower=1, trans=int(transposed))
+    else:
+        # The transpose of C-ordered values is what BLAS takes without a copy: x' L' = v'.
+        values[:] = blas.dtrsm(1.0, lower, values.T, side=1, lower=1, trans_a=int(not transposed)).T
+    return values
+
+
+def _extend_add(
+    top: FloatArray, rest: FloatArray, boundary: IntArray, complement: FloatArray, local: IntArray
+) -> None:
+    """Add a Schur complement, right of its diagonal, to the pivot rows and to the rest of a front."""
+    index, pivots = local[boundary], len(top)
+    mine = int(np.searchsorted(index, pivots))
+    # One index into the flat array is gathered and scattered twice as fast as a pair of indices.
+    for target, first, start, end in ((top, 0, 0, mine), (rest, pivots, mine, len(index))):
+        flat, width = target.reshape(-1), target.shape[1]
+        for low in range(start, end, _STRIP):
+            high = min(low + _STRIP, end)
+            column = index[low:] - first
+            flat[column[: high - low, None] * width + column] += complement[low:high, low:]

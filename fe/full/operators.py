@@ -1,0 +1,344 @@
+"""Affine operators of the wing: the full finite element model as a few matrices.
+
+K(e, z) = e K_skin + (1 - z1) K_1 + (1 - z2) K_2 + K_0 and M(m) = M_0 + m_servo M_s + m_pitot M_p, where
+K_skin is the skin without the two defect regions: in the published model the factor e does not scale them.
+The root is a rigid rib on three springs; its held motions are eliminated, so that all matrices act on the
+free unknowns: those of the nodes outside the root section, then root heave [m], flap [rad] and yaw [rad].
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from fe.wing.design import WingDesign
+from fe.wing.mesh import DEFECT_1, DEFECT_2, SKIN, SurfacePoint, WingMesh, build_mesh
+from fe.wing.parts import PointMassPlace
+
+from .assembly import (
+    Discretisation,
+    cell_axes,
+    gauss_points,
+    isotropic_elasticity,
+    orthotropic_elasticity,
+    positions,
+    rotate_elasticity,
+)
+from .gauges import gauge_output
+from .turn_load import inertia_relief, lift_load
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+STIFFNESS_TERM_NAMES: tuple[str, ...] = ("skin", "defect_1", "defect_2", "base")
+MASS_TERM_NAMES: tuple[str, ...] = ("base", "servo", "pitot")
+ROOT_UNKNOWNS = 3
+
+
+@dataclass(frozen=True)
+class AffineOperators:
+    """Affine finite element model of the wing on its n free unknowns (held motions are eliminated).
+
+    Attributes
+    ----------
+    stiffness_terms : tuple of csr (n, n)
+        Skin without defects, defect 1, defect 2, and the rest with the root springs [N/m].
+    mass_terms : tuple of csr (n, n)
+        Structure [kg]; 1 kg in each servo; 1 kg in the pitot [1].
+    load_lift : (n,) N
+        Load of a turn at load factor 1.
+    load_tip : (n,) 1
+        Upward load of 1 N at the place of the static test.
+    gauge_output : csr (gauges, n) 1/m
+        Strain of each gauge, positive in compression (upper skin under positive lift), dimensionless.
+    displacement_output : (n,) 1
+        Upward displacement at the place of the static test; equal to `load_tip`.
+    tip_displacement_output : (n,) 1
+        Upward displacement at the tip, on the chord line of the static test.
+    expansion : csr (full, n)
+        Free unknowns to the displacements of all nodes of `discretisation` (3 node + component).
+    discretisation : Discretisation
+        Nodes and cells of the full mesh.
+    wing_mesh : WingMesh
+        Mesh with its named regions.
+    design_hash : str
+        Hash of the design.
+    """
+
+    stiffness_terms: tuple[sparse.csr_array, ...]
+    mass_terms: tuple[sparse.csr_array, ...]
+    load_lift: FloatArray
+    load_tip: FloatArray
+    gauge_output: sparse.csr_array
+    displacement_output: FloatArray
+    tip_displacement_output: FloatArray
+    expansion: sparse.csr_array
+    discretisation: Discretisation
+    wing_mesh: WingMesh
+    design_hash: str
+
+    @property
+    def unknowns(self) -> int:
+        """Number n of free unknowns."""
+        return len(self.load_lift)
+
+    @staticmethod
+    def theta(young_modulus_factor: float, stiffness_loss: tuple[float, float]) -> FloatArray:
+        """Coefficients (4,) of the stiffness terms at e and (z1, z2)."""
+        return np.array([young_modulus_factor, 1.0 - stiffness_loss[0], 1.0 - stiffness_loss[1], 1.0])
+
+    @staticmethod
+    def mass_theta(servo_mass: float, pitot_mass: float) -> FloatArray:
+        """Coefficients (3,) of the mass terms at masses [kg] of one servo and of the pitot."""
+        return np.array([1.0, servo_mass, pitot_mass])
+
+    def stiffness(
+        self, young_modulus_factor: float = 1.0, stiffness_loss: tuple[float, float] = (0.0, 0.0)
+    ) -> sparse.csr_array:
+        """Stiffness (n, n) [N/m] at e and (z1, z2)."""
+        return _combined(self.theta(young_modulus_factor, stiffness_loss), self.stiffness_terms)
+
+    def mass(self, servo_mass: float, pitot_mass: float) -> sparse.csr_array:
+        """Mass (n, n) [kg] at the masses [kg] of one servo and of the pitot."""
+        return _combined(self.mass_theta(servo_mass, pitot_mass), self.mass_terms)
+
+    def load(self, load_factor: float, tip_force: float = 0.0) -> FloatArray:
+        """Load (n,) [N] at a load factor and an upward tip force [N]."""
+        return load_factor * self.load_lift + tip_force * self.load_tip
+
+    def full_displacement(self, free: FloatArray) -> FloatArray:
+        """Displacements (nodes, 3) of all nodes from free unknowns (n,)."""
+        return np.asarray(self.expansion @ free).reshape(-1, 3)
+
+
+def _combined(theta: FloatArray, terms: tuple[sparse.csr_array, ...]) -> sparse.csr_array:
+    total = theta[0] * terms[0]
+    for factor, term in zip(theta[1:], terms[1:], strict=True):
+        total = total + factor * term
+    return total.tocsr()
+
+
+def cell_elasticity(mesh: WingMesh) -> FloatArray:
+    """Elasticity (nc, 6, 6) [Pa] in space of every cell, at e = 1 and without damage."""
+    design, skin = mesh.design, mesh.design.skin
+    local = np.empty((len(mesh.cells), 6, 6))
+    unit = orthotropic_elasticity(
+        1.0,
+        skin.poisson_ratio,
+        skin.transverse_shear_ratio,
+        skin.transverse_shear_ratio,
+        skin.in_plane_shear_ratio,
+    )
+    wall = orthotropic_elasticity(
+        1.0,
+        skin.poisson_ratio,
+        skin.in_plane_shear_ratio,
+        skin.transverse_shear_ratio,
+        skin.transverse_shear_ratio,
+    )
+    station = mesh.centres[:, 1] / design.planform.semi_span
+    modulus = skin.young_modulus(station)
+    shell = (mesh.web < 0) & (mesh.rib < 0)
+    local[shell] = np.where(mesh.leading_edge[shell, None, None], wall, unit) * modulus[shell, None, None]
+    for index, web in enumerate(design.webs):
+        shear = web.shear_modulus
+        local[mesh.web == index] = orthotropic_elasticity(
+            web.young_modulus, web.poisson_ratio, shear, shear, shear
+        )
+    for index, rib in enumerate(design.ribs):
+        local[mesh.rib == index] = isotropic_elasticity(rib.young_modulus, rib.poisson_ratio)
+    for rod in design.rods:
+        inside = (mesh.web == rod.web) & (station < rod.reach)
+        second_moment = design.webs[rod.web].thickness * _web_height(mesh)[inside] ** 3 / 12.0
+        local[inside, 1, 1] += rod.bending_stiffness / second_moment
+    return rotate_elasticity(local, cell_axes(mesh.corners))
+
+
+def modulus_variation(mesh: WingMesh) -> FloatArray:
+    """Young's modulus (nc, 27) at the points of `gauss_points(3)` over that at the centre of the cell.
+
+    It differs from one where the skin's modulus is given at stations and therefore changes inside a cell.
+    """
+    factor = np.ones((len(mesh.cells), 27))
+    if mesh.design.skin.stations:
+        shell = np.flatnonzero((mesh.web < 0) & (mesh.rib < 0))
+        local, _ = gauss_points(3)
+        span, skin = mesh.design.planform.semi_span, mesh.design.skin
+        place = positions(mesh.corners[shell], local)[..., 1] / span
+        centre = skin.young_modulus(mesh.centres[shell, 1] / span)
+        factor[shell] = skin.young_modulus(place) / centre[:, None]
+    return factor
+
+
+def _web_height(mesh: WingMesh) -> FloatArray:
+    """Height (nc,) [m] between the skins at each cell between them."""
+    height = np.ptp(mesh.corners[:, :, 2], axis=1)
+    return np.asarray(height * mesh.height_cells)
+
+
+def cell_density(mesh: WingMesh) -> FloatArray:
+    """Density (nc,) [kg/m^3] of every cell."""
+    design = mesh.design
+    density = np.full(len(mesh.cells), design.skin.density)
+    station = mesh.centres[:, 1] / design.planform.semi_span
+    for index, web in enumerate(design.webs):
+        density[mesh.web == index] = web.density
+    for index, rib in enumerate(design.ribs):
+        density[mesh.rib == index] = rib.density
+    for added in design.added_density:
+        density[(station > added.start) & (station < added.end)] += added.density
+    for rod in design.rods:
+        inside = (mesh.web == rod.web) & (station < rod.reach)
+        density[inside] += rod.mass_per_length / (design.webs[rod.web].thickness * _web_height(mesh)[inside])
+    return density
+
+
+def root_expansion(design: WingDesign, discretisation: Discretisation) -> sparse.csr_array:
+    """Free unknowns to all unknowns, csr (full, n): the root section moves as a rigid rib.
+
+    The rib may heave along z, flap about x and yaw about z, both about the straight chord line; its three
+    unknowns come last. Its other motions are held.
+    """
+    points = discretisation.node_points
+    on_root = np.abs(points[:, 1]) < 1e-9 * design.planform.semi_span
+    held = np.repeat(on_root, 3)
+    free = np.flatnonzero(~held)
+    root = np.flatnonzero(on_root)
+    first = len(free)
+    rows = [free, 3 * root + 2, 3 * root + 1, 3 * root + 1]
+    columns = [np.arange(first), *(np.full(len(root), first + number) for number in range(ROOT_UNKNOWNS))]
+    values = [np.ones(first), np.ones(len(root)), -points[root, 2], points[root, 0]]
+    return sparse.coo_array(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
+        shape=(discretisation.unknowns, first + ROOT_UNKNOWNS),
+    ).tocsr()
+
+
+def _through_thickness(
+    mesh: WingMesh, distance: float, chord_fraction: float
+) -> tuple[SurfacePoint, SurfacePoint]:
+    behind = chord_fraction * mesh.design.planform.chord(distance / mesh.design.planform.semi_span)
+    return mesh.skin_point(distance, behind, upper=True), mesh.skin_point(distance, behind, upper=False)
+
+
+def section_displacement(
+    mesh: WingMesh, discretisation: Discretisation, distance: float, chord_fraction: float
+) -> FloatArray:
+    """Weights (nodes,) of the mean displacement of the upper and lower skin at a place.
+
+    Parameters
+    ----------
+    mesh : WingMesh
+        The mesh.
+    discretisation : Discretisation
+        Its degrees of freedom.
+    distance : float
+        Distance from the root [m].
+    chord_fraction : float
+        Place along the local chord.
+    """
+    weights = np.zeros(discretisation.unknowns // 3)
+    for point in _through_thickness(mesh, distance, chord_fraction):
+        nodes, values = discretisation.point_values(point.cell, point.local)
+        weights[nodes] += 0.5 * values
+    return weights
+
+
+def _upward(weights: FloatArray) -> FloatArray:
+    full = np.zeros(3 * len(weights))
+    full[2::3] = weights
+    return full
+
+
+def point_mass_weights(mesh: WingMesh, discretisation: Discretisation, place: PointMassPlace) -> FloatArray:
+    """Weights (nodes,) of the displacement of a point mass: half on each skin."""
+    distance = place.station * mesh.design.planform.semi_span
+    return section_displacement(mesh, discretisation, distance, place.chord)
+
+
+def _point_mass(weights: FloatArray) -> sparse.csr_array:
+    nodes = np.flatnonzero(weights)
+    vector = weights[nodes]
+    block = np.outer(vector, vector)
+    rows = np.repeat(nodes, len(nodes))
+    columns = np.tile(nodes, len(nodes))
+    full = 3 * len(weights)
+    return sum(
+        (
+            sparse.coo_array((block.ravel(), (3 * rows + c, 3 * columns + c)), shape=(full, full)).tocsr()
+            for c in range(3)
+        ),
+        start=sparse.csr_array((full, full)),
+    )
+
+
+def assemble(design: WingDesign) -> AffineOperators:
+    """Mesh a design and assemble its affine operators.
+
+    Raises
+    ------
+    MeshError
+        If the mesh cannot hold what the design asks for.
+    """
+    mesh = build_mesh(design)
+    discretisation = Discretisation(mesh.skfem_mesh)
+    expansion = root_expansion(design, discretisation)
+    restriction = expansion.T.tocsr()
+
+    def reduced(matrix: sparse.csr_array) -> sparse.csr_array:
+        return (restriction @ (matrix @ expansion)).tocsr()
+
+    elasticity, density, variation = cell_elasticity(mesh), cell_density(mesh), modulus_variation(mesh)
+    terms = []
+    for regions in ((SKIN,), (DEFECT_1,), (DEFECT_2,)):
+        cells = np.flatnonzero(np.isin(mesh.region, regions))
+        terms.append(reduced(discretisation.stiffness(cells, elasticity[cells], variation[cells])))
+    cells = np.flatnonzero(mesh.region > DEFECT_2)
+    springs = np.zeros(expansion.shape[1])
+    root = design.root
+    springs[-ROOT_UNKNOWNS:] = root.transverse_spring, root.flap_spring, root.yaw_spring
+    terms.append(
+        (
+            reduced(discretisation.stiffness(cells, elasticity[cells], variation[cells]))
+            + sparse.diags_array(springs)
+        ).tocsr()
+    )
+
+    weights = tuple(
+        tuple(
+            point_mass_weights(mesh, discretisation, place)
+            for place in design.point_masses
+            if place.kind == kind
+        )
+        for kind in ("servo", "pitot")
+    )
+    masses = [discretisation.mass(np.arange(len(mesh.cells)), density)]
+    for places in weights:
+        matrix = sparse.csr_array(masses[0].shape)
+        for place in places:
+            matrix = matrix + _point_mass(place)
+        masses.append(matrix)
+
+    load_place = design.planform.semi_span - design.tip_load.distance_from_tip
+    at_load = _upward(section_displacement(mesh, discretisation, load_place, design.tip_load.chord))
+    at_tip = _upward(
+        section_displacement(mesh, discretisation, design.planform.semi_span, design.tip_load.chord)
+    )
+    at_load_free = np.asarray(restriction @ at_load)
+    lift = lift_load(mesh, discretisation)
+    if design.lift.inertia_relief:
+        lift = lift + inertia_relief(design, discretisation, density, weights, lift)
+    return AffineOperators(
+        stiffness_terms=tuple(terms),
+        mass_terms=tuple(reduced(mass) for mass in masses),
+        load_lift=np.asarray(restriction @ lift),
+        load_tip=at_load_free,
+        gauge_output=(gauge_output(mesh, discretisation) @ expansion).tocsr(),
+        displacement_output=at_load_free.copy(),
+        tip_displacement_output=np.asarray(restriction @ at_tip),
+        expansion=expansion,
+        discretisation=discretisation,
+        wing_mesh=mesh,
+        design_hash=design.hash,
+    )

@@ -1,0 +1,1 @@
+"""From the full model to the reduced one: certified, kept on disk."""

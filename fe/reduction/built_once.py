@@ -1,0 +1,79 @@
+"""What is built once and kept between runs in files: of several processes one builds, the others wait."""
+
+import fcntl
+import logging
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from fe.runtime.errors import ReducedModelFileError
+
+_logger = logging.getLogger(__name__)
+
+_Kept = TypeVar("_Kept")
+
+
+def cache_folder() -> Path:
+    """Return the folder of what is kept: `$XDG_CACHE_HOME/uav-twin`, or `~/.cache/uav-twin`."""
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if base else Path.home() / ".cache") / "uav-twin"
+
+
+def kept(load: Callable[[], _Kept]) -> _Kept | None:
+    """Return what `load` reads, or nothing if it is not there or not usable."""
+    try:
+        return load()
+    except OSError:  # not there, or not readable
+        return None
+    except ReducedModelFileError as error:
+        _logger.warning("A kept model is not usable and is built anew: %s", error)
+        return None
+
+
+def built_once(
+    path: Path, load: Callable[[], _Kept], build: Callable[[], _Kept], keep: Callable[[_Kept], None]
+) -> _Kept:
+    """Build and keep something; of several builders one builds, and the others wait for it and load it.
+
+    Parameters
+    ----------
+    path : Path
+        Its file; the lock lies beside it.
+    load : callable
+        Reads it; raises `OSError` or `ReducedModelFileError` where it is not there or not usable.
+    build : callable
+        Makes it.
+    keep : callable
+        Writes it; where that raises `OSError` it is used all the same, with a warning.
+    """
+    with _locked(path.with_suffix(".lock")):
+        try:
+            return load()  # another process may have been faster
+        except (OSError, ReducedModelFileError):
+            pass
+        built = build()
+        try:
+            keep(built)
+        except OSError as error:
+            _logger.warning(
+                "The model could not be kept in %s and will be built again: %s", path.parent, error
+            )
+    return built
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold a lock file while building; without a writable folder there is nothing to guard."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError:
+        yield
+        return
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)

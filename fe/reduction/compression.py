@@ -1,0 +1,89 @@
+"""Offline: fewer static basis vectors for the same certified bound."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from fe.runtime.reduced import ReducedModel
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def compressed(model: ReducedModel, directions: FloatArray) -> ReducedModel:
+    """Return the model on fewer static basis vectors, its residuals on as few as they then need.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        A model with N static basis vectors.
+    directions : (N, K) ndarray
+        Orthonormal combinations of them.
+
+    Returns
+    -------
+    ReducedModel
+        The Galerkin model on the combinations; its bound is as certified as before.
+    """
+    stiffness = directions.T @ model.static_stiffness @ directions
+    residual = np.concatenate(
+        (model.residual_load, (model.residual_stiffness @ directions).reshape(len(model.residual_load), -1)),
+        axis=1,
+    )
+    orthonormal, factor = np.linalg.qr(residual)
+    return replace(
+        model,
+        static_stiffness=0.5 * (stiffness + stiffness.transpose(0, 2, 1)),
+        static_load=model.static_load @ directions,
+        static_output=model.static_output @ directions,
+        residual_load=np.ascontiguousarray(factor[:, :2]),
+        residual_stiffness=np.ascontiguousarray(factor[:, 2:].reshape(len(factor), 4, -1)),
+        dual_correction=model.dual_correction @ orthonormal,
+        cross_mass=model.cross_mass @ directions,
+    )
+
+
+def fewest_directions(
+    model: ReducedModel, states: list[tuple[float, float, float]], tolerance: float
+) -> FloatArray:
+    """Return the fewest singular directions of the reduced solutions that keep the bound below a tolerance.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        The model that the greedy search made.
+    states : list of tuple
+        States (e, z1, z2) to look at.
+    tolerance : float
+        Relative bound wanted.
+
+    Returns
+    -------
+    (N, K) ndarray
+        Orthonormal combinations of its static basis vectors; all of them if fewer do not suffice.
+    """
+    solutions = []
+    for e, z1, z2 in states:
+        for load in ((1.0, 0.0), (0.0, 1.0)):
+            coordinates = model.static_response(e, (z1, z2), *load).coordinates
+            solutions.append(coordinates / np.linalg.norm(coordinates))
+    directions = np.linalg.svd(np.array(solutions).T)[0]
+    low, high = 2, directions.shape[1]
+    while low < high:
+        middle = (low + high) // 2
+        smaller = compressed(model, directions[:, :middle])
+        if max(relative_bound(smaller, state) for state in states) <= tolerance:
+            high = middle
+        else:
+            low = middle + 1
+    return np.asarray(directions[:, :low])
+
+
+def relative_bound(model: ReducedModel, parameters: tuple[float, float, float]) -> float:
+    """Return the larger certified strain error bound of the two loads, relative to the largest strain."""
+    e, z1, z2 = parameters
+    worst = 0.0
+    for load in ((1.0, 0.0), (0.0, 1.0)):
+        response = model.static_response(e, (z1, z2), *load)
+        worst = max(worst, response.strain_error_bound / float(np.abs(response.strain).max()))
+    return worst

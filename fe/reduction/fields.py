@@ -1,0 +1,320 @@
+"""Fields on the whole wing from the reduced model, and VTU files of them for ParaView.
+
+No equation of the full model is solved here: the reduced solution is spread over the mesh with the static
+basis, which takes milliseconds.
+"""
+
+import tempfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fe.runtime.archive import arrays_from_bytes, arrays_to_bytes
+from fe.runtime.errors import ReducedModelFileError
+from fe.runtime.reduced import ReducedModel
+
+if TYPE_CHECKING:
+    from fe.full.operators import AffineOperators
+
+    from .reduced_basis import Reduction
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+# Places of the nodes of a 20-node hexahedron in VTK's order: corners below, corners above, edges below,
+# edges above, upright edges.
+_VTK_CORNERS = np.array(
+    [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], dtype=np.float64
+)
+_VTK_EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
+_VTK_NODES = np.concatenate(
+    (_VTK_CORNERS, [0.5 * (_VTK_CORNERS[a] + _VTK_CORNERS[b]) for a, b in _VTK_EDGES])
+)
+
+
+def _order(wanted: FloatArray, given: FloatArray) -> list[int]:
+    """Return where each of the `wanted` places (20, 3) is among the `given` ones."""
+    return [int(np.flatnonzero(np.all(np.equal(given, place), axis=1))[0]) for place in wanted]
+
+
+# Node k of a cell seen in a mirror is node _MIRRORED[k] of the cell.
+_MIRRORED = _order(_VTK_NODES * [1.0, 1.0, -1.0] + [0.0, 0.0, 1.0], _VTK_NODES)
+
+
+@dataclass(frozen=True)
+class FieldBasis:
+    """The bases of a reduced model on the nodes and cells of the mesh.
+
+    Attributes
+    ----------
+    design_hash : str
+        Hash of the design.
+    points : (P, 3) ndarray
+        Nodes [m].
+    cells : (C, 20) ndarray
+        Nodes of the cells in VTK's order, with positive Jacobians.
+    region : (C,) ndarray
+        0 skin, 1 first and 2 second defect region, 3 webs, 4 ribs.
+    static_displacement : (P, 3, N) ndarray
+        Static basis vectors [m per unit coordinate].
+    static_strain : (C, 6, N) ndarray
+        Their strains at the centres of the cells: xx, yy, zz, yz, xz, xy; shear as engineering strain.
+    modal_displacement : (P, 3, Nm) ndarray
+        Modal basis vectors.
+    """
+
+    design_hash: str
+    points: FloatArray
+    cells: IntArray
+    region: IntArray
+    static_displacement: FloatArray
+    static_strain: FloatArray
+    modal_displacement: FloatArray
+
+    def __post_init__(self) -> None:
+        points, cells = self.points.shape[:1], self.cells.shape[:1]
+        static, modal = self.static_displacement.shape[2:3], self.modal_displacement.shape[2:3]
+        expected = {
+            "points": (*points, 3),
+            "cells": (*cells, 20),
+            "region": cells,
+            "static_displacement": (*points, 3, *static),
+            "static_strain": (*cells, 6, *static),
+            "modal_displacement": (*points, 3, *modal),
+        }
+        for name, shape in expected.items():
+            array = getattr(self, name)
+            kind = "i" if name in ("cells", "region") else "f"
+            if array.shape != shape or array.dtype.kind != kind or not array.size:
+                raise ReducedModelFileError(
+                    f"The array {name} of a field basis has the shape {array.shape} and the type "
+                    f"{array.dtype}, which does not fit the others; build the basis anew."
+                )
+        if self.cells.min() < 0 or self.cells.max() >= len(self.points):
+            raise ReducedModelFileError(
+                "The cells of a field basis have nodes that are not there; build the basis anew."
+            )
+
+    def to_bytes(self) -> bytes:
+        """Return the basis as the bytes of an `.npz` file; equal bases give equal bytes."""
+        return arrays_to_bytes({item.name: np.array(getattr(self, item.name)) for item in fields(self)})
+
+    @classmethod
+    def from_bytes(cls, content: bytes, where: str) -> "FieldBasis":
+        """Return the basis that `to_bytes` packed.
+
+        Parameters
+        ----------
+        content : bytes
+            An `.npz` archive.
+        where : str
+            What is being read, for the error message.
+
+        Returns
+        -------
+        FieldBasis
+            The basis.
+
+        Raises
+        ------
+        ReducedModelFileError
+            If the archive is damaged or incomplete.
+        """
+        names = [item.name for item in fields(cls)]
+        arrays = arrays_from_bytes(content, where, names)
+        values: dict[str, Any] = {name: arrays[name] for name in names}
+        return cls(**{**values, "design_hash": str(arrays["design_hash"])})
+
+
+@dataclass(frozen=True)
+class WingFields:
+    """A reduced model with its field basis; `fe.reduction.model_cache.wing_fields` gives it.
+
+    Attributes
+    ----------
+    model : ReducedModel
+        The reduced model.
+    basis : FieldBasis
+        Its bases on the mesh.
+    """
+
+    model: ReducedModel
+    basis: FieldBasis
+
+    def __post_init__(self) -> None:
+        sizes = (self.basis.static_displacement.shape[-1], self.basis.modal_displacement.shape[-1])
+        wanted = (self.model.static_stiffness.shape[-1], self.model.modal_stiffness.shape[-1])
+        if sizes != wanted or self.basis.design_hash != self.model.design_hash:
+            raise ReducedModelFileError(
+                f"The field basis, for {sizes} basis vectors, does not belong to the reduced model, which "
+                f"has {wanted}; build both anew."
+            )
+
+
+def field_basis(operators: "AffineOperators", reduction: "Reduction") -> FieldBasis:
+    """Spread the bases of a reduction over the mesh.
+
+    Parameters
+    ----------
+    operators : AffineOperators
+        The full model.
+    reduction : Reduction
+        What was made of it.
+
+    Returns
+    -------
+    FieldBasis
+        The bases on nodes and cells.
+    """
+    from skfem import ElementHexS2
+
+    from fe.full.assembly import global_gradients, strain_matrix
+
+    discretisation = operators.discretisation
+    cells = discretisation.cell_nodes[:, _order(_VTK_NODES, ElementHexS2().doflocs)]
+    gradients, determinant = global_gradients(discretisation.corners, np.full((1, 3), 0.5))
+    cells = np.where(determinant < 0.0, cells[:, _MIRRORED], cells)
+    strain = strain_matrix(gradients[:, 0])
+
+    def spread(vectors: FloatArray) -> FloatArray:
+        return np.asarray(operators.expansion @ vectors)
+
+    static = spread(reduction.static_basis)
+    modal = spread(reduction.modal_basis)
+    return FieldBasis(
+        design_hash=operators.design_hash,
+        points=discretisation.node_points,
+        cells=cells.astype(np.int64),
+        region=operators.wing_mesh.region.astype(np.int64),
+        static_displacement=static.reshape(-1, 3, static.shape[1]),
+        static_strain=strain @ static[discretisation.cell_dofs],
+        modal_displacement=modal.reshape(-1, 3, modal.shape[1]),
+    )
+
+
+def write_wing_vtu(
+    path: str | Path,
+    wing: WingFields,
+    *,
+    young_modulus_factor: float,
+    stiffness_loss: tuple[float, float],
+    load_factor: float,
+    tip_force: float = 0.0,
+) -> None:
+    """Write displacement, strain and damage of the wing under one load as a VTU file.
+
+    Point data: `displacement` [m]. Cell data, at the centres of the cells: `strain` (xx, yy, zz, yz, xz, xy),
+    `spanwise_strain` (yy, positive where compressed, as the gauges), `region` (as in `FieldBasis`),
+    `stiffness_loss` (fraction).
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; an existing one is replaced.
+    wing : WingFields
+        The wing, from `fe.reduction.model_cache.wing_fields`.
+    young_modulus_factor : float
+        e [1].
+    stiffness_loss : tuple of float
+        (z1, z2), fractions.
+    load_factor : float
+        Load factor [1].
+    tip_force : float
+        Tip force [N].
+
+    Raises
+    ------
+    OutsideModelError
+        If a value lies outside the validity box of the model.
+    OSError
+        If the file cannot be written.
+    """
+    coordinates = wing.model.static_response(
+        young_modulus_factor, stiffness_loss, load_factor, tip_force
+    ).coordinates
+    basis = wing.basis
+    strain = basis.static_strain @ coordinates
+    loss = np.zeros(len(basis.region))
+    for number, value in enumerate(stiffness_loss, start=1):
+        loss[basis.region == number] = value
+    _write(
+        Path(path),
+        basis,
+        {"displacement": basis.static_displacement @ coordinates},
+        {
+            "strain": strain,
+            "spanwise_strain": -strain[:, 1],
+            "region": basis.region,
+            "stiffness_loss": loss,
+        },
+    )
+
+
+def write_modes_vtu(
+    path: str | Path,
+    wing: WingFields,
+    *,
+    young_modulus_factor: float,
+    stiffness_loss: tuple[float, float],
+    servo_mass: float,
+    pitot_mass: float,
+) -> None:
+    """Write the mode shapes of the wing as a VTU file.
+
+    Point data: `mode_1_5.632Hz` and so on, mass-normalised displacements [kg^-1/2]. Cell data: `region`.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; an existing one is replaced.
+    wing : WingFields
+        The wing, from `fe.reduction.model_cache.wing_fields`.
+    young_modulus_factor : float
+        e [1].
+    stiffness_loss : tuple of float
+        (z1, z2), fractions.
+    servo_mass, pitot_mass : float
+        Masses [kg].
+
+    Raises
+    ------
+    OutsideModelError
+        If a value lies outside the validity box of the model.
+    OSError
+        If the file cannot be written.
+    """
+    modes = wing.model.modes(young_modulus_factor, stiffness_loss, servo_mass, pitot_mass)
+    shapes = wing.basis.modal_displacement @ modes.shape
+    _write(
+        Path(path),
+        wing.basis,
+        {
+            f"mode_{number + 1}_{frequency:.3f}Hz": np.ascontiguousarray(shapes[:, :, number])
+            for number, frequency in enumerate(modes.frequency)
+        },
+        {"region": wing.basis.region},
+    )
+
+
+def _write(
+    path: Path, basis: FieldBasis, point_data: dict[str, FloatArray], cell_data: dict[str, npt.NDArray[Any]]
+) -> None:
+    """Write a VTU file, whole or not at all."""
+    import meshio
+
+    mesh = meshio.Mesh(
+        basis.points,
+        [("hexahedron20", basis.cells)],
+        point_data=point_data,
+        cell_data={name: [values] for name, values in cell_data.items()},
+    )
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+            temporary = Path(folder) / "wing.vtu"
+            meshio.write(temporary, mesh, file_format="vtu")
+            temporary.replace(path)
+    except OSError as error:  # with the name that was asked for, not that of the temporary file
+        raise OSError(error.errno, error.strerror, str(path)) from error

@@ -1,0 +1,257 @@
+"""Offline: a small basis in which the first eigenmodes are accurate for every stiffness and mass.
+
+First a working basis is grown by Davidson corrections until the modes of sampled states have small residuals
+in it; then the modes of many states, computed in the working basis, are compressed by singular values.
+"""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import eigh
+
+from fe.full.subspace import AffineSystem, Norm, OrthonormalBasis, affine_sum
+from fe.runtime.errors import ReductionError
+
+FloatArray = npt.NDArray[np.float64]
+
+START_ITERATIONS = 4
+
+
+@dataclass(frozen=True)
+class ModalSettings:
+    """How many modes are kept and how well.
+
+    Attributes
+    ----------
+    mode_count : int
+        Modes that the reduced model returns.
+    residual_tolerance : float
+        Relative residual of the sampled modes in the working basis; frequencies err by about its square.
+    frequency_tolerance : float
+        Relative error of any frequency that compression may add.
+    most_corrections : int
+        Limit of Davidson corrections for one state.
+    """
+
+    mode_count: int = 6
+    residual_tolerance: float = 3e-3
+    frequency_tolerance: float = 1e-5
+    most_corrections: int = 12
+
+
+@dataclass(frozen=True)
+class ModalData:
+    """Modal part of a reduced model: `basis` (n, Nm) and the dense arrays of `ReducedModel`."""
+
+    basis: FloatArray
+    stiffness: FloatArray
+    mass: FloatArray
+    flapwise_reference: FloatArray
+    mode_count: int
+
+
+class _WorkingBasis:
+    """Basis orthonormal in the reference norm, with the projected terms."""
+
+    def __init__(self, system: AffineSystem, norm: Norm) -> None:
+        self.system, self.norm = system, norm
+        self.basis = OrthonormalBasis(len(system.load_lift), norm, drop=1e-6)
+        self.stiffness = np.empty((4, 0, 0))
+        self.mass = np.empty((3, 0, 0))
+
+    def extend(self, vectors: FloatArray) -> None:
+        """Add vectors (n, k) and project the terms on them."""
+        before = self.basis.size
+        self.basis.extend(vectors, self.norm.product(vectors))
+        new = self.basis.vectors[:, before:]
+        for name, terms in (("stiffness", self.system.stiffness_terms), ("mass", self.system.mass_terms)):
+            old = getattr(self, name)
+            grown = np.empty((len(terms), self.basis.size, self.basis.size))
+            grown[:, :before, :before] = old
+            for row, term in zip(grown, terms, strict=True):
+                row[:, before:] = self.basis.vectors.T @ (term @ new)
+                row[before:, :] = row[:, before:].T
+            setattr(self, name, grown)
+
+    def modes(self, theta: FloatArray, mass_theta: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return squared angular frequencies (count,) and coefficients (k, count) of the first modes."""
+        return eigenmodes(self.stiffness, self.mass, theta, mass_theta, count)
+
+
+def eigenmodes(
+    stiffness: FloatArray, mass: FloatArray, theta: FloatArray, mass_theta: FloatArray, count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the first modes of projected terms: squared angular frequencies and mass-normalised shapes."""
+    values, vectors = eigh(
+        np.tensordot(theta, stiffness, 1), np.tensordot(mass_theta, mass, 1), subset_by_index=[0, count - 1]
+    )
+    return np.asarray(values), np.asarray(vectors)
+
+
+def sampled_states(box: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the states at which the working basis is refined: the corners of z, with e and masses mixed in.
+
+    Each entry holds the coefficients of the stiffness terms (4,) and of the mass terms (3,).
+    """
+    (e, z1, z2), (servo, pitot) = box[:3], box[5:7]
+    states = []
+    for number, (i, j) in enumerate(itertools.product((0, 1), (0, 1))):
+        for flip in (0, 1):
+            corner = (number + flip) % 2
+            states.append(
+                (
+                    np.array((e[(i + j + flip) % 2], 1.0 - z1[i], 1.0 - z2[j], 1.0)),
+                    np.array((1.0, servo[corner], pitot[(corner + number // 2 + flip) % 2])),
+                )
+            )
+    middle = np.array((e.mean(), 1.0 - z1.mean(), 1.0 - z2.mean(), 1.0))
+    states.append((middle, np.array((1.0, servo.mean(), pitot.mean()))))
+    return states
+
+
+def compression_states(box: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the states whose modes are compressed together: a grid over the whole box."""
+    (e, z1, z2), (servo, pitot) = box[:3], box[5:7]
+    return [
+        (np.array((a, 1.0 - b, 1.0 - c, 1.0)), np.array((1.0, s, p)))
+        for a in e
+        for b in (z1[0], z1.mean(), z1[1])
+        for c in (z2[0], z2.mean(), z2[1])
+        for s in servo
+        for p in (pitot[0], pitot.mean(), pitot[1])
+    ]
+
+
+def reduce_modes(
+    system: AffineSystem,
+    norm: Norm,
+    reference: FloatArray,
+    box: FloatArray,
+    nominal_masses: tuple[float, float],
+    settings: ModalSettings,
+    advance: Callable[[], object],
+) -> ModalData:
+    """Make the modal basis.
+
+    Parameters
+    ----------
+    system : AffineSystem
+        The full model.
+    norm : Norm
+        Energy norm at `reference`.
+    reference : (3,) ndarray
+        (e, 1 - z1, 1 - z2) of the norm.
+    box : (7, 2) ndarray
+        Validity box, `fe.runtime.reduced_arrays.PARAMETER_NAMES`.
+    nominal_masses : tuple of float
+        Servo and pitot mass at which the flapwise modes are named, at e = 1 and no loss [kg].
+    settings : ModalSettings
+        Accuracy.
+    advance : callable
+        Called after each sampled state.
+
+    Returns
+    -------
+    ModalData
+        Basis and projected terms.
+
+    Raises
+    ------
+    ReductionError
+        If the modes of a sampled state do not converge, or there are too few unknowns for the modes.
+    """
+    unknowns = len(system.load_lift)
+    count = settings.mode_count + 2  # two more, because modes change places
+    if unknowns <= 2 * count:
+        raise ReductionError(
+            f"{settings.mode_count} modes cannot be had from {unknowns} unknowns; ask for fewer or refine."
+        )
+    working = _WorkingBasis(system, norm)
+    matrix = affine_sum((1.0, *np.mean(box[5:7], axis=1)), system.mass_terms)
+    # inverse iteration on a block; what it leaves is refined below
+    vectors = np.random.default_rng(1).normal(size=(unknowns, count + 4))
+    for _ in range(START_ITERATIONS):
+        vectors = np.linalg.qr(norm.riesz(np.asarray(matrix @ vectors)))[0]
+    working.extend(vectors)
+    for theta, mass_theta in sampled_states(box):
+        _refine(working, theta, mass_theta, count, settings)
+        advance()
+    basis = _compress(working, compression_states(box), count, settings)
+    stiffness, mass = (
+        # What rounding made of the symmetry of large entries is averaged out.
+        0.5 * (terms + terms.transpose(0, 2, 1))
+        for terms in (basis.T @ working.stiffness @ basis, basis.T @ working.mass @ basis)
+    )
+    data = ModalData(working.basis.vectors @ basis, stiffness, mass, np.empty((2, 0)), settings.mode_count)
+    shapes = _flapwise(data, system, nominal_masses)
+    return ModalData(data.basis, stiffness, mass, shapes, settings.mode_count)
+
+
+def _refine(
+    working: _WorkingBasis, theta: FloatArray, mass_theta: FloatArray, count: int, settings: ModalSettings
+) -> None:
+    """Add Davidson corrections X^-1 (K - omega^2 M) phi until the modes of one state have small residuals."""
+    stiffness = affine_sum(theta, working.system.stiffness_terms)
+    mass = affine_sum(mass_theta, working.system.mass_terms)
+    sizes = np.full(count, np.inf)
+    for _ in range(settings.most_corrections):
+        square, coefficients = working.modes(theta, mass_theta, count)
+        shape = working.basis.vectors @ coefficients
+        residual = stiffness @ shape - (mass @ shape) * square
+        correction = working.norm.riesz(residual)
+        # (r, X^-1 r) / (phi, K phi); phi is mass-normalised
+        sizes = np.sqrt(np.einsum("ik,ik->k", residual, correction) / square)
+        open_modes = np.flatnonzero(sizes > settings.residual_tolerance)
+        if not open_modes.size:
+            return
+        working.extend(correction[:, open_modes])
+    raise ReductionError(
+        f"The modes of a sampled state reached a residual of {sizes.max():.2g} only, "
+        f"{settings.residual_tolerance:.2g} was asked for; allow more corrections."
+    )
+
+
+def _compress(
+    working: _WorkingBasis, states: list[tuple[FloatArray, FloatArray]], count: int, settings: ModalSettings
+) -> FloatArray:
+    """Return the fewest singular directions (k, Nm) of many states' modes that keep every frequency."""
+    modes = [working.modes(*state, count) for state in states]
+    kept = settings.mode_count
+    snapshots = np.concatenate(
+        [shape[:, :kept] / np.linalg.norm(shape[:, :kept], axis=0) for _, shape in modes], axis=1
+    )
+    directions, singular, _ = np.linalg.svd(snapshots, full_matrices=False)
+    most = int(np.sum(singular > 1e-7 * singular[0]))
+
+    def added_error(size: int) -> float:
+        basis = directions[:, :size]
+        stiffness, mass = basis.T @ working.stiffness @ basis, basis.T @ working.mass @ basis
+        return max(
+            float(np.max(eigenmodes(stiffness, mass, *state, kept)[0] / square[:kept]))
+            for state, (square, _) in zip(states, modes, strict=True)
+        )
+
+    low, high = kept, most  # the error falls with size, because the bases are nested
+    while low < high:
+        middle = (low + high) // 2
+        if 0.5 * (added_error(middle) - 1.0) <= settings.frequency_tolerance:
+            high = middle
+        else:
+            low = middle + 1
+    return np.asarray(directions[:, :low])
+
+
+def _flapwise(data: ModalData, system: AffineSystem, nominal_masses: tuple[float, float]) -> FloatArray:
+    """Return the shapes (2, Nm) of the first and second flapwise bending of the healthy wing.
+
+    They are the two modes that contribute most to the compliance under the tip force.
+    """
+    square, shapes = eigenmodes(
+        data.stiffness, data.mass, np.ones(4), np.array((1.0, *nominal_masses)), data.mode_count
+    )
+    contribution = (system.load_tip @ data.basis @ shapes) ** 2 / square
+    chosen = np.sort(np.argsort(contribution)[-2:])
+    return np.asarray(shapes[:, chosen].T)

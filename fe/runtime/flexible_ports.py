@@ -1,0 +1,167 @@
+"""Laws at ports that lie on flexibility R which the modes of a motion leave out.
+
+x = p . q - R D + e, where D is the force of the laws there after a lag, beta D' + D = F (the lag of damping
+in proportion to the stiffness; backward Euler), and e what loads add. The force of a law is that at the
+step's end, where it obeys the law at its own position: a monotone equation in one unknown. Dry friction is
+then an elasto-plastic element of stiffness 1/R.
+
+Written in the subset of Python that numba compiles too. NumPy and relative imports only: this file is copied
+into the FMU.
+"""
+
+from .laws import advance, dry, force, pull, settle
+from .motion_arrays import FIRST_PARTS, Acting, Course, IntArray, Ports, State
+
+
+def begin_flexible(ports: Ports, acting: Acting, state: State, course: Course) -> None:
+    """Take the laws on flexible ports to the first sample; without a known memory they follow at once."""
+    count = len(ports.numbers)
+    at_once = 1.0 if ports.relaxation == 0.0 or not course.known else 0.0
+    for port in range(count):
+        if acting.leader[port] != port:  # one law for each flexible port
+            continue
+        y = ports.feed[0, port] * course.load[0] + ports.feed[1, port] + state.memory[port, 3]
+        for m in range(len(state.q)):
+            y += ports.rows[port, m] * state.q[m]
+        springs = -1
+        for j in range(count):
+            acting.springs[j] = -1
+            if acting.leader[j] != port:
+                continue
+            damped = ports.of_speed[j] == 1
+            y -= ports.flexibility[port] * state.memory[j, 2] * (1.0 if damped else 1.0 - at_once)
+            if not damped:
+                springs = j if springs < 0 else springs
+                acting.springs[j] = springs
+        x = y
+        if springs >= 0:
+            r = at_once * ports.flexibility[port]
+            x = settle_port(springs, acting.springs, ports, state, y, r, course.h, FIRST_PARTS)
+        for j in range(count):
+            if acting.leader[j] != port:
+                continue
+            if ports.of_speed[j] == 0:
+                arrive(ports, state, j, x, FIRST_PARTS)
+                if at_once == 1.0:
+                    state.memory[j, 2] = state.current[j]
+            elif not course.known:
+                state.memory[j, 1] = x
+
+
+def arrive(ports: Ports, state: State, j: int, x: float, least: int) -> None:
+    """Carry the memory of a law of position to `x`, and take its force there."""
+    advance(ports.numbers[j], ports.values[j], ports.elements[j], state.memory[j], x, least)
+    state.memory[j, 1] = x
+    state.current[j] = force(ports.numbers[j], ports.values[j], state.memory[j], x)
+
+
+def carry_lone(ports: Ports, state: State, load: float, h: float) -> None:
+    """Carry the only law to the step's end, and give the modes the second half of its impulse."""
+    keep = ports.relaxation / (ports.relaxation + h)
+    ease = 1.0 - keep
+    state.memory[0, 3] *= keep
+    y = ports.feed[0, 0] * load + ports.feed[1, 0] + state.memory[0, 3]
+    y -= ports.flexibility[0] * keep * state.memory[0, 2]
+    for m in range(len(state.q)):
+        y += ports.rows[0, m] * state.q[m]
+    r = ease * ports.flexibility[0]
+    state.current[0] = settle(
+        ports.numbers[0], ports.values[0], ports.elements[0], state.memory[0], y, r, h, state.current[0]
+    )
+    state.memory[0, 2] = keep * state.memory[0, 2] + ease * state.current[0]
+    for m in range(len(state.q)):
+        state.v[m] -= ports.rows[0, m] * state.current[0] * (0.5 * h)
+
+
+def carry_flexible(ports: Ports, acting: Acting, state: State, load: float, h: float) -> None:
+    """Carry the laws on flexible ports to the step's end, and give the second half of their impulse."""
+    count = len(ports.numbers)
+    keep = ports.relaxation / (ports.relaxation + h)
+    ease = 1.0 - keep
+    for port in range(count):
+        if acting.leader[port] != port:
+            continue
+        y = ports.feed[0, port] * load + ports.feed[1, port] + keep * state.memory[port, 3]
+        for m in range(len(state.q)):
+            y += ports.rows[port, m] * state.q[m]
+        for j in range(count):
+            if acting.leader[j] == port:
+                y -= ports.flexibility[port] * keep * state.memory[j, 2]
+        x = settle_port(port, acting.leader, ports, state, y, ease * ports.flexibility[port], h, 1)
+        for j in range(count):
+            if acting.leader[j] != port:
+                continue
+            if ports.of_speed[j] == 1:
+                state.memory[j, 1] = x
+                state.memory[j, 4] = state.current[j]
+            else:
+                arrive(ports, state, j, x, 1)
+            state.memory[j, 2] = keep * state.memory[j, 2] + ease * state.current[j]
+            state.memory[j, 3] *= keep
+            for m in range(len(state.q)):
+                state.v[m] -= ports.rows[j, m] * state.current[j] * (0.5 * h)
+
+
+def pull_of(ports: Ports, state: State, j: int, x: float, h: float, least: int) -> tuple[float, float]:
+    """Return force and slope of a law at `x`, its memory left as it is."""
+    return pull(ports.numbers[j], ports.values[j], ports.elements[j], state.memory[j], x, h, least)  # type: ignore[no-any-return]
+
+
+def settle_port(
+    port: int, leader: IntArray, ports: Ports, state: State, y: float, r: float, h: float, least: int
+) -> float:
+    """Return the position x of a port with laws, x + r sum F(x) = y; their forces go to `state.current`.
+
+    The laws are those whose `leader` is `port`.
+
+    Dry friction first: where it can hold the port, it does. The memories are left as they are.
+    """
+    count = len(ports.numbers)
+    last = state.memory[port, 1]
+    start, level = 0.0, 0.0
+    for j in range(count):
+        if leader[j] != port:
+            continue
+        own, _ = pull_of(ports, state, j, last, h, least)
+        if dry(ports.numbers[j], ports.values[j]):
+            level += own
+        else:
+            state.current[j] = own
+            start += own
+    push = y - last - r * start
+    if level > 0.0 and abs(push) <= r * level:
+        for j in range(count):
+            if leader[j] == port and dry(ports.numbers[j], ports.values[j]):
+                own, _ = pull_of(ports, state, j, last, h, least)
+                state.current[j] = push / r * own / level
+        return float(last)
+    sign = 1.0 if push > 0.0 else -1.0
+    # the root lies that way from the last position, if the structure is stable
+    low, high = last, last + sign * 1e300
+    x = last + sign * max(abs(push) - r * level, 0.0)
+    for _ in range(80):
+        total, slope = 0.0, 1.0
+        for j in range(count):
+            if leader[j] != port:
+                continue
+            own, change = pull_of(ports, state, j, x, h, least)
+            if dry(ports.numbers[j], ports.values[j]):
+                own, change = sign * own, sign * change
+            state.current[j] = own
+            total += own
+            slope += r * change
+        rest = x + r * total - y
+        if abs(rest) <= 1e-12 * (abs(x) + abs(y)) or abs(high - low) <= 1e-15 * abs(x):
+            break
+        if sign * rest > 0.0:
+            high = x
+        else:
+            low = x
+        step = x - rest / slope if slope > 1e-6 else high
+        if sign * (step - low) > 0.0 and sign * (high - step) > 0.0:
+            x = step
+        elif abs(high) < 1e299:
+            x = 0.5 * (low + high)
+        else:
+            x += sign * abs(rest)
+    return float(x)

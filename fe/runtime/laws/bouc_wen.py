@@ -1,0 +1,123 @@
+"""Hysteresis of Bouc and Wen: F = k (z - x), z' = v (1 - (1 + sgn(v z)) / 2 |z / z_y|^n).
+
+Parameters: k, z_y, n. Memory: z. NumPy and relative imports only: this file is copied into the FMU.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from .interface import HEAD, FloatArray, PortForce, power
+
+
+@dataclass(frozen=True, slots=True)
+class BoucWen(PortForce):
+    """Bouc-Wen hysteresis: F = stiffness (z - x), z' = v (1 - (1 + sgn(v z)) / 2 |z / z_y|^order).
+
+    z_y is `yield_displacement` [m or rad].
+
+    `stiffness` is the part of the port's stiffness that is hysteretic ((1 - alpha) k); below yield F is zero.
+    """
+
+    kind: ClassVar[str] = "bouc_wen"
+    hysteretic: ClassVar[bool] = True
+    proportional: ClassVar[tuple[str, ...]] = ("stiffness",)
+    units: ClassVar[dict[str, str]] = {
+        "stiffness": "N/m or N m/rad", "yield_displacement": "m or rad", "order": "1"
+    }  # fmt: skip
+    stiffness: float
+    yield_displacement: float
+    order: float
+
+    @property
+    def row(self) -> tuple[float, ...]:
+        """k, z_y, n."""
+        return self.stiffness, self.yield_displacement, self.order
+
+    @property
+    def magnitude(self) -> float:
+        """Stiffness that yields."""
+        return self.stiffness
+
+    def check(self) -> None:
+        """Raise `InvalidPatchError` where a number cannot be."""
+        self.require(
+            positive={"yield_displacement": self.yield_displacement, "order": self.order}, least_zero={}
+        )
+
+
+def force(law: FloatArray, memory: FloatArray, x: float) -> float:
+    """Return the hysteretic force at `x` less that of the spring."""
+    return float(law[0] * (memory[HEAD] - x))
+
+
+def slope(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float) -> float:
+    """Return the derivative of the force on the way that led to x."""
+    z = memory[HEAD] / law[1]
+    loading = z * (x - memory[1]) >= 0.0
+    return float(-law[0] * power(min(abs(z), 1.0), law[2])) if loading else 0.0
+
+
+def advance(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, least: int) -> None:
+    """Follow z to `x`."""
+    change = x - memory[1]
+    memory[1] = x
+    memory[HEAD] = _path(law, memory[HEAD], change, least)
+
+
+def parts(law: FloatArray, way: float) -> int:
+    """Return how many parts hold the path at rest: the more, the sharper the yield."""
+    return int(min(way / law[1] * law[2] * 20.0, 2000.0)) + 4
+
+
+def pull(
+    law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, h: float, least: int
+) -> tuple[float, float]:
+    """Return force and slope at `x`."""
+    z = _path(law, memory[HEAD], x - memory[1], least)
+    loading = z * (x - memory[1]) > 0.0
+    gradient = -law[0] * power(min(abs(z) / law[1], 1.0), law[2]) if loading else 0.0
+    return law[0] * (z - x), gradient
+
+
+def settle(
+    law: FloatArray, elements: FloatArray, memory: FloatArray, y: float, r: float, h: float, about: float
+) -> float:
+    """Return F of x + r F(x) = y by Newton's method."""
+    last, part = memory[1], r * law[0]
+    x = y - r * about
+    for turn in range(24):
+        z = _path(law, memory[HEAD], x - last, 1)
+        rest = x + part * (z - x) - y
+        if abs(rest) <= 1e-11 * (abs(x) + law[1]):
+            break
+        gradient = 1.0
+        if z * (x - last) > 0.0:
+            gradient -= part * power(min(abs(z) / law[1], 1.0), law[2])
+        x -= rest / (gradient if gradient > 1e-6 and turn < 12 else 1.0)
+    if r * law[0] > 0.01:  # the solution holds force and memory
+        found = (y - x) / r
+        memory[HEAD] = x + found / law[0]
+        memory[1] = x
+        return found
+    advance(law, elements, memory, x, 1)
+    return force(law, memory, x)
+
+
+def _path(law: FloatArray, begin: float, change: float, least: int) -> float:
+    """Return z after a way from its value at the begin, in `least` parts or more."""
+    width, order = law[1], law[2]
+    z, rest = begin / width, change / width
+    if z * rest < 0.0:  # unloading: dz = dx until z is zero
+        part = rest if abs(rest) <= abs(z) else -z
+        z += part
+        rest -= part
+    if rest != 0.0:  # loading: dz/dx = 1 - |z|^order, by the midpoint rule
+        way = min(abs(rest), 2.0 + 40.0 / order)  # by then it yields to the last bit
+        count = max(int(way * order / 0.2) + 1, least)
+        h = way / count
+        size = abs(z)
+        for _ in range(count):
+            middle = min(size + 0.5 * h * (1.0 - power(size, order)), 1.0)
+            size = min(size + h * (1.0 - power(middle, order)), 1.0)
+        z = size if rest > 0.0 else -size
+    return float(z * width)

@@ -1,0 +1,143 @@
+"""Micro-slip of a joint (Iwan 1966, Segalman 2005): F = k (mean z_i - x), dz_i = dx while |z_i| < d_i.
+
+Parameters: k, count n of Jenkins elements in parallel; slip displacements d_i of the elements. Memory: their
+stretches z_i. NumPy and relative imports only: this file is copied into the FMU.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from .interface import HEAD, FloatArray, PortForce
+
+
+@dataclass(frozen=True, slots=True)
+class MicroSlip(PortForce):
+    """Iwan's joint: `element_count` Jenkins elements in parallel in place of a spring of `stiffness`.
+
+    At rest the elements carry their share of the stiffness that the linear model already has, so F is the
+    hysteretic force less `stiffness` x: what slip takes away. The slip forces of the elements are those of a
+    density of slip displacements phi ~ d^`chi` on 0 < d <= `slip_force` (2 + chi) / ((1 + chi) stiffness)
+    (Segalman 2005 without the macro-slip impulse), -1 < chi <= 0; chi = 0 is the uniform Iwan joint, and a
+    single Jenkins element has `element_count` 1 and slips at `slip_force`.
+    """
+
+    kind: ClassVar[str] = "micro_slip"
+    hysteretic: ClassVar[bool] = True
+    proportional: ClassVar[tuple[str, ...]] = ("slip_force", "stiffness")
+    units: ClassVar[dict[str, str]] = {
+        "slip_force": "N or N m", "stiffness": "N/m or N m/rad", "chi": "1"
+    }  # fmt: skip
+    slip_force: float
+    stiffness: float
+    chi: float
+    element_count: int = 12
+
+    @property
+    def row(self) -> tuple[float, ...]:
+        """k, n."""
+        return self.stiffness, float(self.element_count)
+
+    @property
+    def magnitude(self) -> float:
+        """Stiffness that slips."""
+        return self.stiffness
+
+    def elements(self) -> FloatArray:
+        """Return the slip displacements (n,) of the elements."""
+        return slip_displacements(self)
+
+    def check(self) -> None:
+        """Raise `InvalidPatchError` where a number cannot be."""
+        self.require(
+            positive={
+                "slip_force": self.slip_force,
+                "element_count": self.element_count,
+                "1 + chi": 1 + self.chi,
+            },
+            least_zero={"stiffness": self.stiffness, "-chi": -self.chi},
+        )
+
+
+def slip_displacements(joint: MicroSlip) -> FloatArray:
+    """Return the slip displacements (n,) of a joint's elements.
+
+    Quantile midpoints of phi ~ d^chi (Segalman 2005, without the macro-slip impulse), scaled so that the
+    joint as a whole slips at `slip_force` exactly.
+    """
+    part = (np.arange(joint.element_count) + 0.5) / joint.element_count
+    slips = part ** (1.0 / (1.0 + joint.chi))
+    return np.asarray(slips * (joint.slip_force / joint.stiffness / slips.mean()))
+
+
+def force(law: FloatArray, memory: FloatArray, x: float) -> float:
+    """Return the force of the elements at `x` less that of the spring."""
+    count = int(law[1])
+    total = 0.0
+    for i in range(count):
+        total += memory[HEAD + i]
+    return float(law[0] * (total / count - x))
+
+
+def slope(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float) -> float:
+    """Return the derivative of the force: that of the elements that slip."""
+    count = int(law[1])
+    free = 0
+    for i in range(count):
+        if abs(memory[HEAD + i]) >= elements[i]:
+            free += 1
+    return float(-law[0] * free / count)
+
+
+def advance(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, least: int) -> None:
+    """Stretch the elements to `x`, each up to its slip."""
+    change = x - memory[1]
+    memory[1] = x
+    for i in range(int(law[1])):
+        stretch = memory[HEAD + i] + change
+        memory[HEAD + i] = min(max(stretch, -elements[i]), elements[i])
+
+
+def pull(
+    law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, h: float, least: int
+) -> tuple[float, float]:
+    """Return force and slope at `x`."""
+    count = int(law[1])
+    total = 0.0
+    moving = 0
+    for i in range(count):
+        stretch = memory[HEAD + i] + x - memory[1]
+        total += min(max(stretch, -elements[i]), elements[i])
+        if abs(stretch) >= elements[i]:
+            moving += 1
+    return law[0] * (total / count - x), -law[0] * moving / count
+
+
+def settle(
+    law: FloatArray, elements: FloatArray, memory: FloatArray, y: float, r: float, h: float, about: float
+) -> float:
+    """Return F of x + r F(x) = y; F is linear between the positions where elements slip."""
+    count = int(law[1])
+    last, part = memory[1], r * law[0] / law[1]
+    gradient = 1.0
+    x = y - r * about
+    for turn in range(24):
+        total = 0.0
+        moving = 0
+        change = x - last
+        for i in range(count):
+            stretch = memory[HEAD + i] + change
+            total += min(max(stretch, -elements[i]), elements[i])
+            if abs(stretch) >= elements[i]:
+                moving += 1
+        rest = x + part * (total - count * x) - y
+        if abs(rest) <= 1e-12 * (abs(x) + elements[0]):
+            break
+        gradient = 1.0 - part * moving
+        # the largest gradient never goes too far
+        x -= rest / (gradient if gradient > 1e-6 and turn < 12 else 1.0)
+    advance(law, elements, memory, x, 1)
+    if r * law[0] > 0.01:
+        return (y - x) / r
+    return force(law, memory, x)

@@ -1,0 +1,358 @@
+"""Motion of a structure in few modes with internal forces: laws from a patch, steps, static solution.
+
+`fe.runtime.motion_kernel` has the equation and the method. NumPy and relative imports only: this file is
+copied into the FMU. The loops run as plain Python here; `discrepancy.models.compiled_motion` has the same
+functions compiled, to be given as `kernel`.
+"""
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from .errors import InvalidPatchError, SolutionError
+from .laws import LAWS
+from .laws.interface import HEAD, PARAMETERS, PortForce
+from .modal_system import ModalSystem, linear_step
+from .motion_arrays import Course, Linear, Ports, Samples, State
+from .motion_kernel import integrate
+from .patch import ModelPatch, StiffnessDrift
+from .planform_forces import place_of
+from .static_path import static_path
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+class Kernel(NamedTuple):
+    """The loops `motion_kernel.integrate` and `static_path.static_path`, plain or compiled."""
+
+    integrate: Callable[..., None]
+    static_path: Callable[..., int]
+
+
+PLAIN = Kernel(integrate, static_path)
+
+SLOWEST_PHASE, FASTEST_PHASE = 0.05, 0.4
+"""Longest substep with laws: radians of the slowest and of the fastest mode that it may span."""
+
+
+@dataclass(frozen=True)
+class Laws:
+    """Internal forces as arrays for the kernel.
+
+    Attributes
+    ----------
+    ports : tuple of str
+        Port of each law, J of them.
+    numbers : (J,) ndarray of int
+        Which of `fe.runtime.laws.LAWS` each is.
+    values : (J, 5) ndarray
+        Parameters.
+    elements : (J, E) ndarray
+        Parameters of hysteretic elements.
+    rate : float
+        Stiffness drift of the whole structure [1/s].
+    """
+
+    ports: tuple[str, ...]
+    numbers: IntArray
+    values: FloatArray
+    elements: FloatArray
+    rate: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.ports)
+
+    @property
+    def linear(self) -> bool:
+        """Whether there is nothing to do."""
+        return not self.ports and self.rate == 0.0
+
+    def rows(self, ports: Mapping[str, FloatArray], width: int) -> FloatArray:
+        """Return the port row of each law, (J, width)."""
+        return np.array([ports[name] for name in self.ports], dtype=np.float64).reshape(len(self), width)
+
+    @cached_property
+    def of_speed(self) -> IntArray:
+        """1 for each law (J,) of speed."""
+        return np.array([LAWS[number].of_speed for number in self.numbers], dtype=np.int64)
+
+    def memory(self) -> FloatArray:
+        """Return the memory (J, 5 + E) of laws that have never been loaded."""
+        return np.zeros((len(self), HEAD + self.elements.shape[1]))
+
+    def at(self, rows: FloatArray, flexibility: FloatArray, relaxation: float, feed: FloatArray) -> Ports:
+        """Return the laws at ports, for the loops; what is given is that of `Ports`."""
+        return Ports(
+            rows,
+            self.numbers,
+            self.of_speed,
+            self.values,
+            self.elements,
+            flexibility,
+            float(relaxation),
+            feed,
+        )
+
+
+NO_LAWS = Laws((), np.zeros(0, dtype=np.int64), np.zeros((0, PARAMETERS)), np.zeros((0, 1)))
+"""The linear structure."""
+
+
+def laws_of(patch: ModelPatch, ports: Collection[str]) -> Laws:
+    """Return the internal forces of a patch; laws without magnitude and other primitives are left out.
+
+    Parameters
+    ----------
+    patch : ModelPatch
+        Changes.
+    ports : collection of str
+        Ports that the model has.
+
+    Returns
+    -------
+    Laws
+        For `simulate`.
+
+    Raises
+    ------
+    InvalidPatchError
+        If a law acts on a port that the model does not have, or a value cannot be (a scale that is not
+        positive).
+    """
+    names, numbers, values, elements = [], [], [], []
+    for item in patch:
+        if not isinstance(item, PortForce):
+            continue
+        if item.port not in ports:
+            known = f"it has {', '.join(ports)}" if ports else "it has none"
+            raise InvalidPatchError(
+                f"The primitive {item.kind!r} acts on the port {item.port!r}, which this model "
+                f"does not have; "
+                f"{known}."
+            )
+        if item.magnitude == 0.0:
+            continue
+        item.check()
+        names.append(item.port)
+        numbers.append(LAWS.index(type(item)))
+        values.append(np.pad(item.row, (0, PARAMETERS - len(item.row))))
+        elements.append(item.elements())
+    rate = sum((item.rate for item in patch if isinstance(item, StiffnessDrift)), 0.0)
+    if not names:
+        return NO_LAWS if rate == 0.0 else replace(NO_LAWS, rate=rate)
+    width = max(1, *(len(item) for item in elements))
+    return Laws(
+        tuple(names),
+        np.array(numbers, dtype=np.int64),
+        np.array(values, dtype=np.float64),
+        np.array([np.pad(item, (0, width - len(item))) for item in elements]),
+        rate,
+    )
+
+
+LEAST_FLEXIBLE = 0.1
+"""Share of a port's flexibility that modes must leave out for damping there to act through it."""
+
+
+def port_flexibility(system: ModalSystem, laws: Laws) -> FloatArray:
+    """Return R (J,) of the laws' ports; what forces at other ports add is left out.
+
+    Zero for damping at ports where the modes hold nearly all of the flexibility: friction there acts on the
+    modes themselves, which takes no small steps.
+    """
+    result = np.zeros(len(laws))
+    if system.flexibility is None or not len(laws):
+        return result
+    names = list(system.ports)
+    index = [names.index(name) for name in laws.ports]
+    own = system.flexibility[index]
+    rows = laws.rows(system.ports, len(system.angular_frequency))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        held = np.nansum(rows**2 / system.angular_frequency**2, axis=1)
+    stiff = (laws.of_speed == 1) & (own < LEAST_FLEXIBLE * (own + held))
+    return np.where(stiff | (own <= 0.0), 0.0, own)
+
+
+def substeps_for(angular_frequency: FloatArray, laws: Laws, interval: float) -> int:
+    """Return how many steps an interval [s] is divided into; one without laws, where the step is exact."""
+    if laws.linear or interval <= 0.0:
+        return 1
+    moving = angular_frequency[angular_frequency > 0.0]
+    if not len(moving):
+        return 8
+    phase = max(float(moving.min()) / SLOWEST_PHASE, float(moving.max()) / FASTEST_PHASE) * interval
+    return max(1, int(np.ceil(phase)))
+
+
+class ModalMotion(NamedTuple):
+    """Motion at samples: `q`, `v` (N, M), `port_forces` (N, J) of the laws, their `memory` at the end.
+
+    `lagged` (N, J) are the forces as what the modes leave out follows them.
+    """
+
+    q: FloatArray
+    v: FloatArray
+    port_forces: FloatArray
+    memory: FloatArray
+    lagged: FloatArray
+
+
+def simulate(
+    system: ModalSystem,
+    laws: Laws,
+    *,
+    q: FloatArray,
+    v: FloatArray,
+    force: FloatArray,
+    interval: float,
+    shape: FloatArray | None = None,
+    constant: FloatArray | None = None,
+    memory: FloatArray | None = None,
+    feed: FloatArray | None = None,
+    start: float = 0.0,
+    refinement: int = 1,
+    substeps: int | None = None,
+    kernel: Kernel | None = None,
+) -> ModalMotion:
+    """Return the motion from a given state.
+
+    Parameters
+    ----------
+    system : ModalSystem
+        The linear structure.
+    laws : Laws
+        Its internal forces.
+    q, v : (M,) ndarray
+        State at the first sample.
+    force : (N,) ndarray
+        Applied force at the samples [N]; linear between them.
+    interval : float
+        Between samples [s].
+    shape, constant : (M,) ndarray, optional
+        Modal shape of the force, and a constant modal force; zero if left out.
+    memory : (J, 5 + E) ndarray, optional
+        Of the laws, as `static_solution` or an earlier call returned it. Left out: each law has been loaded
+        from zero to its first position without turning back.
+    feed : (2, J) ndarray, optional
+        What the modes leave out of the positions of the laws' ports by a force of 1 N, and by the constant
+        force; zero if left out.
+    start : float
+        Time of the first sample since the beginning of the record, for stiffness drift [s].
+    refinement : int
+        Steps are this many times smaller than usual.
+    substeps : int, optional
+        For each interval; by default from `substeps_for`.
+    kernel : mapping, optional
+        Compiled functions, see `discrepancy.models.compiled_motion`.
+
+    Returns
+    -------
+    ModalMotion
+        At the samples, the first included.
+    """
+    modes = len(system.angular_frequency)
+    shape = np.zeros(modes) if shape is None else np.ascontiguousarray(shape, dtype=np.float64)
+    constant = np.zeros(modes) if constant is None else np.ascontiguousarray(constant, dtype=np.float64)
+    if substeps is None:
+        substeps = substeps_for(system.angular_frequency, laws, interval)
+    substeps *= refinement
+    h = interval / substeps
+    step = linear_step(system, shape, constant, h)
+    count = len(force)
+    result = ModalMotion(
+        np.empty((count, modes)),
+        np.empty((count, modes)),
+        np.empty((count, len(laws))),
+        laws.memory() if memory is None else memory.copy(),
+        np.empty((count, len(laws))),
+    )
+    linear = Linear(
+        *step,
+        system.coupled,
+        system.stiffness,
+        np.ascontiguousarray(system.damping),
+        shape,
+        constant,
+        laws.rate,
+    )
+    fed = np.zeros((2, len(laws))) if feed is None else np.ascontiguousarray(feed, dtype=np.float64)
+    state = State(
+        np.array(q, dtype=np.float64), np.array(v, dtype=np.float64), result.memory, np.zeros(len(laws))
+    )
+    ports = laws.at(laws.rows(system.ports, modes), port_flexibility(system, laws), system.relaxation, fed)
+    course = Course(
+        np.ascontiguousarray(force, dtype=np.float64), float(start), h, substeps, memory is not None
+    )
+    out = Samples(result.q, result.v, result.port_forces, result.lagged)
+    (kernel or PLAIN).integrate(tuple(linear), tuple(ports), tuple(course), tuple(state), tuple(out))
+    return result
+
+
+class StaticSolution(NamedTuple):
+    """Static states: `positions` and `forces` (L, J) of the laws' ports, their `memory` after the last."""
+
+    positions: FloatArray
+    forces: FloatArray
+    memory: FloatArray
+
+
+def static_solution(
+    laws: Laws,
+    linear: FloatArray,
+    compliance: FloatArray,
+    *,
+    memory: FloatArray | None = None,
+    start: FloatArray | None = None,
+    kernel: Kernel | None = None,
+) -> StaticSolution:
+    """Return the forces of the laws at rest, for load levels that follow one another from zero.
+
+    Parameters
+    ----------
+    laws : Laws
+        Internal forces; damping is taken as zero at rest.
+    linear : (L, J) ndarray
+        Position of each law's port at each level without internal forces.
+    compliance : (J, J) ndarray
+        Position of the port of each law (row) under a unit force at that of another (column).
+    memory, start : ndarray, optional
+        Memory and linear positions (J,) from which the first level is reached; by default never loaded, and
+        zero.
+    kernel : mapping, optional
+        Compiled functions.
+
+    Returns
+    -------
+    StaticSolution
+        The linear response less the response to these forces is the solution.
+
+    Raises
+    ------
+    SolutionError
+        If a level has no solution on the path (a softening law that the structure cannot hold).
+    """
+    linear = np.ascontiguousarray(linear, dtype=np.float64)
+    memory = laws.memory() if memory is None else memory.copy()
+    positions, forces = linear.copy(), np.zeros_like(linear)
+    if len(laws) and len(linear):
+        level = (kernel or PLAIN).static_path(
+            linear,
+            np.ascontiguousarray(compliance, dtype=np.float64),
+            tuple(laws.at(np.zeros((len(laws), 0)), np.zeros(len(laws)), 0.0, np.zeros((2, len(laws))))),
+            memory,
+            np.zeros(len(laws)) if start is None else np.ascontiguousarray(start, dtype=np.float64),
+            positions,
+            forces,
+        )
+        if level >= 0:
+            places = ", ".join(dict.fromkeys(map(place_of, laws.ports)))
+            raise SolutionError(
+                f"The static state at load level {level + 1} was not found: an internal force at "
+                f"{places} takes more stiffness than the structure has there."
+            )
+    return StaticSolution(positions, forces, memory)

@@ -1,0 +1,362 @@
+"""Motion of a few modes with internal forces at ports: loops over numbers, and nothing else.
+
+q'' + D q' + W^2 (1 + r t) q = b f(t) + c - sum_j p_j F_j(p_j . q, p_j . v, memory_j). The linear part is
+advanced exactly (matrix exponential, force linear between samples); internal forces are split off
+symmetrically (Strang 1968): laws of speed, laws of position, linear motion, laws of position, laws of speed.
+Laws of speed have a closed form. Where friction turns over inside a step, the impulse and its first moment
+are corrected for the moment of the turn; where it holds, the port is held in place by the impulses that this
+needs, as long as friction can give them. What a law is `fe.runtime.laws.interface` says; none is known here.
+Laws on flexibility that the modes leave out are those of `fe.runtime.flexible_ports`.
+
+Written in the subset of Python that numba compiles too. NumPy and relative imports only: this file is copied
+into the FMU. `discrepancy.models.compiled_motion` has the same compiled.
+"""
+
+import numpy as np
+
+from .flexible_ports import begin_flexible, carry_flexible, carry_lone
+from .laws import (
+    advance,
+    crossing,
+    dry,
+    force,
+    holding_limit,
+    holds,
+    kick,
+    resistance,
+    share,
+    steady,
+    strength,
+)
+from .motion_arrays import (
+    FIRST_PARTS,
+    FLEXIBLE,
+    POSITION,
+    SPEED,
+    STILL,
+    Acting,
+    Before,
+    Course,
+    FloatArray,
+    Linear,
+    Ports,
+    Samples,
+    State,
+    Unnamed,
+    at_port,
+)
+
+
+def integrate(linear: Unnamed, ports: Unnamed, course: Unnamed, state: Unnamed, out: Unnamed) -> None:
+    """Integrate over the samples of a course; the state is changed in place, `out` is filled.
+
+    Given are the fields of `Linear`, `Ports`, `Course`, `State` and `Samples` without their names: numba
+    takes three times as long for a tuple with names as for one without.
+    """
+    named_state, named_ports = State(*state), Ports(*ports)
+    modes, count = len(named_state.q), len(named_ports.numbers)
+    none, whole = np.zeros((7, count)), np.zeros((3, count), dtype=np.int64)
+    acting = Acting(
+        whole[0], whole[1], whole[2], none[0], none[1], none[2], np.zeros((count, modes)),
+        np.zeros((count, 2 * modes)),
+    )  # fmt: skip
+    before = Before(np.zeros(modes), np.zeros(modes), np.zeros(2 * modes), none[3], none[4], none[5], none[6])
+    follow(Linear(*linear), named_ports, Course(*course), named_state, acting, before, Samples(*out))
+
+
+def follow(
+    linear: Linear, ports: Ports, course: Course, state: State, acting: Acting, before: Before, out: Samples
+) -> None:
+    """Integrate with room to work in; no array is made from here on."""
+    h, substeps = course.h, course.substeps
+    find_routes(ports, acting)
+    begin_on_modes(linear, ports, acting, state, course.known)
+    begin_flexible(ports, acting, state, course)
+    lone = len(ports.numbers) == 1 and acting.route[0] == FLEXIBLE
+    driven = False
+    for sample in range(len(course.load)):
+        driven = driven or course.load[sample] != 0.0
+    for sample in range(len(course.load)):
+        for part in range(substeps if sample > 0 else 0):
+            time = course.start + ((sample - 1) * substeps + part) * h
+            first, change = course.load[sample - 1], course.load[sample] - course.load[sample - 1]
+            load_begin = first + change * (part / substeps)
+            load_end = first + change * (part + 1) / substeps
+            first_half(linear, ports, acting, state, before, time, h)
+            move(linear, state, before.room, load_begin, load_end, driven)
+            hold(ports, acting, state, before, h)
+            if lone:
+                carry_lone(ports, state, load_end, h)
+            else:
+                carry_flexible(ports, acting, state, load_end, h)
+            second_half(linear, ports, acting, state, before, time, h, load_begin, load_end)
+        time = course.start + sample * substeps * h
+        record(linear, ports, acting, state, course.load[sample], time, sample, out)
+
+
+def find_routes(ports: Ports, acting: Acting) -> None:
+    """Set how each law acts, and what its port and the modes do to each other."""
+    modes = ports.rows.shape[1]
+    for j in range(len(ports.numbers)):
+        acting.leader[j] = -1
+        moves = False
+        for m in range(modes):
+            moves = moves or ports.rows[j, m] != 0.0
+            acting.weight[j] += ports.rows[j, m] * ports.rows[j, m]
+        if acting.weight[j] == 0.0:
+            acting.route[j] = STILL
+            continue
+        for m in range(modes):
+            acting.pull[j, m] = ports.rows[j, m] / acting.weight[j]
+        if moves and ports.flexibility[j] > 0.0:
+            acting.route[j] = FLEXIBLE
+            for k in range(j, -1, -1):
+                same = acting.route[k] == FLEXIBLE
+                for m in range(modes):
+                    same = same and ports.rows[j, m] == ports.rows[k, m]
+                if same:
+                    acting.leader[j] = k
+        else:
+            acting.route[j] = SPEED if ports.of_speed[j] == 1 else POSITION
+
+
+def begin_on_modes(linear: Linear, ports: Ports, acting: Acting, state: State, known: bool) -> None:
+    """Take the laws that act on the modes, and those of speed on flexible ports, to the first sample."""
+    modes = len(state.q)
+    for j in range(len(ports.numbers)):
+        if acting.route[j] == STILL:
+            continue
+        x, speed = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
+        if acting.route[j] == FLEXIBLE:
+            if ports.of_speed[j] == 1 and known:
+                state.current[j] = state.memory[j, 4]
+            elif ports.of_speed[j] == 1:  # moving steadily
+                state.current[j] = steady(ports.numbers[j], ports.values[j], x, speed)
+                state.memory[j, 2] = state.current[j]
+        elif acting.route[j] == SPEED:
+            acting.strength[j] = strength(ports.numbers[j], ports.values[j], acting.weight[j])
+            for m in range(2 * modes):
+                for k in range(modes):
+                    acting.answer[j, m] += linear.transition[m, modes + k] * ports.rows[j, k]
+            for m in range(modes):
+                acting.give[j] += ports.rows[j, m] * acting.answer[j, m]
+            if holds(ports.numbers[j], ports.values[j]) and speed == 0.0 and acting.strength[j] > 0.0:
+                state.memory[j, 0] = 1.0
+                state.memory[j, 1] = x
+        else:
+            advance(ports.numbers[j], ports.values[j], ports.elements[j], state.memory[j], x, FIRST_PARTS)
+            state.current[j] = force(ports.numbers[j], ports.values[j], state.memory[j], x)
+
+
+def first_half(
+    linear: Linear, ports: Ports, acting: Acting, state: State, before: Before, time: float, h: float
+) -> None:
+    """Give the modes the first half of the impulse of the internal forces."""
+    half = 0.5 * h
+    modes, count = len(state.q), len(ports.numbers)
+    for j in range(count):
+        before.forces[j] = state.current[j]
+    for m in range(modes):
+        before.q[m] = state.q[m]
+        before.v[m] = state.v[m]
+    for j in range(count):
+        if acting.route[j] != SPEED:
+            continue
+        before.freed[j] = 0.0
+        before.lost[j] = 0.0
+        speed, x = at_port(ports.rows, j, state.v), at_port(ports.rows, j, state.q)
+        before.speed[j] = speed
+        if state.memory[j, 0] == 1.0:
+            continue
+        now = acting.strength[j] * share(ports.numbers[j], ports.values[j], x)
+        # dry friction is not stopped at zero: the turn is looked for after the step
+        before.lost[j] = speed - kick(ports.numbers[j], ports.values[j], speed, now, half, True)
+        for m in range(modes):
+            state.v[m] -= acting.pull[j, m] * before.lost[j]
+    for j in range(count):
+        if state.current[j] != 0.0:
+            for m in range(modes):
+                state.v[m] -= ports.rows[j, m] * state.current[j] * half
+    if linear.rate != 0.0:
+        for m in range(modes):
+            state.v[m] -= half * linear.rate * time * linear.stiffness[m] * state.q[m]
+
+
+def move(
+    linear: Linear, state: State, new: FloatArray, load_begin: float, load_end: float, driven: bool
+) -> None:
+    """Move the linear structure; exact."""
+    modes = len(state.q)
+    if linear.coupled:
+        for m in range(modes):
+            i = modes + m
+            total_q = linear.constant[m] + linear.begin[m] * load_begin + linear.end[m] * load_end
+            total_v = linear.constant[i] + linear.begin[i] * load_begin + linear.end[i] * load_end
+            for k in range(modes):
+                total_q += linear.transition[m, k] * state.q[k] + linear.transition[m, modes + k] * state.v[k]
+                total_v += linear.transition[i, k] * state.q[k] + linear.transition[i, modes + k] * state.v[k]
+            new[m] = total_q
+            new[i] = total_v
+        for m in range(modes):
+            state.q[m] = new[m]
+            state.v[m] = new[modes + m]
+    else:
+        for m in range(modes):
+            i = modes + m
+            total_q = linear.transition[m, m] * state.q[m] + linear.transition[m, i] * state.v[m]
+            total_q += linear.constant[m]
+            total_v = linear.transition[i, m] * state.q[m] + linear.transition[i, i] * state.v[m]
+            total_v += linear.constant[i]
+            if driven:
+                total_q += linear.begin[m] * load_begin + linear.end[m] * load_end
+                total_v += linear.begin[i] * load_begin + linear.end[i] * load_end
+            state.q[m] = total_q
+            state.v[m] = total_v
+
+
+def hold(ports: Ports, acting: Acting, state: State, before: Before, h: float) -> None:
+    """Keep the ports that friction holds in place, by an impulse at the begin of the step."""
+    modes = len(state.q)
+    for j in range(len(ports.numbers)):
+        if acting.route[j] != SPEED or state.memory[j, 0] != 1.0:
+            continue
+        now = acting.strength[j] * share(ports.numbers[j], ports.values[j], state.memory[j, 1])
+        limit = holding_limit(ports.numbers[j], ports.values[j], now, 0.5 * h)
+        impulse = (state.memory[j, 1] - at_port(ports.rows, j, state.q)) / acting.give[j]
+        if abs(impulse) * acting.weight[j] > limit:
+            state.memory[j, 0] = 0.0
+            before.freed[j] = 1.0
+            impulse = (limit if impulse > 0.0 else -limit) / acting.weight[j]
+        for m in range(modes):
+            state.q[m] += acting.answer[j, m] * impulse
+            state.v[m] += acting.answer[j, modes + m] * impulse
+
+
+def second_half(
+    linear: Linear, ports: Ports, acting: Acting, state: State, before: Before, time: float, h: float,
+    load_begin: float, load_end: float,
+) -> None:  # fmt: skip
+    """Give the modes the second half of the impulse; look for friction that turned over."""
+    half = 0.5 * h
+    modes, count = len(state.q), len(ports.numbers)
+    for j in range(count):
+        if acting.route[j] != POSITION:
+            continue
+        x = at_port(ports.rows, j, state.q)
+        advance(ports.numbers[j], ports.values[j], ports.elements[j], state.memory[j], x, 1)
+        state.current[j] = force(ports.numbers[j], ports.values[j], state.memory[j], x)
+        for m in range(modes):
+            state.v[m] -= ports.rows[j, m] * state.current[j] * half
+    if linear.rate != 0.0:
+        for m in range(modes):
+            state.v[m] -= half * linear.rate * (time + h) * linear.stiffness[m] * state.q[m]
+    for j in range(count - 1, -1, -1):
+        if acting.route[j] != SPEED:
+            continue
+        x, speed = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
+        if state.memory[j, 0] == 1.0:
+            now = acting.strength[j] * share(ports.numbers[j], ports.values[j], state.memory[j, 1])
+            limit = holding_limit(ports.numbers[j], ports.values[j], now, half)
+            taken = speed
+            if abs(speed) > limit:
+                taken = limit if speed > 0.0 else -limit
+                state.memory[j, 0] = 0.0
+            for m in range(modes):
+                state.v[m] -= acting.pull[j, m] * taken
+            continue
+        now = acting.strength[j] * share(ports.numbers[j], ports.values[j], x)
+        end = speed - before.lost[j]
+        can_hold = holds(ports.numbers[j], ports.values[j])
+        if can_hold and before.freed[j] == 0.0 and before.speed[j] != 0.0 and before.speed[j] * end <= 0.0:
+            slopes = slopes_at_port(linear, ports, state, before, j, time, h, load_begin, load_end)
+            turn_over(ports, acting, state, before, j, now, slopes, h)
+        else:
+            after = kick(ports.numbers[j], ports.values[j], speed, now, half, False)
+            if after == 0.0 and can_hold and now > 0.0:
+                state.memory[j, 0] = 1.0
+                state.memory[j, 1] = x
+            for m in range(modes):
+                state.v[m] -= acting.pull[j, m] * (speed - after)
+
+
+def slopes_at_port(
+    linear: Linear, ports: Ports, state: State, before: Before, j: int, time: float, h: float,
+    load_begin: float, load_end: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Return the acceleration of a port at both ends of a step, as friction of the first sign has it."""
+    modes, count = len(state.q), len(ports.numbers)
+    at_begin = -2.0 * before.lost[j] / h
+    at_end = -2.0 * before.lost[j] / h
+    for m in range(modes):
+        first = linear.shape[m] * load_begin + linear.load[m]
+        last = linear.shape[m] * load_end + linear.load[m]
+        first -= linear.stiffness[m] * (1.0 + linear.rate * time) * before.q[m]
+        last -= linear.stiffness[m] * (1.0 + linear.rate * (time + h)) * state.q[m]
+        for k in range(modes):
+            first -= linear.damping[m, k] * before.v[k]
+            last -= linear.damping[m, k] * state.v[k]
+        for k in range(count):
+            first -= ports.rows[k, m] * before.forces[k]
+            last -= ports.rows[k, m] * state.current[k]
+        at_begin += ports.rows[j, m] * first
+        at_end += ports.rows[j, m] * last
+    return at_begin, at_end
+
+
+def turn_over(
+    ports: Ports, acting: Acting, state: State, before: Before, j: int, now: float,
+    slopes: tuple[float, float], h: float,
+) -> None:  # fmt: skip
+    """Correct speed and position of a port whose friction turned over within a step."""
+    speed = at_port(ports.rows, j, state.v)
+    change, way, held = crossing(
+        ports.numbers[j], ports.values[j], before.speed[j], speed - before.lost[j], slopes, before.lost[j],
+        now, h,
+    )  # fmt: skip
+    if held == 1.0:
+        change = -speed
+        x = at_port(ports.rows, j, state.q)
+        way -= x
+        for m in range(len(state.q)):
+            way += ports.rows[j, m] * before.q[m]
+        state.memory[j, 0] = 1.0
+        state.memory[j, 1] = x + way
+    for m in range(len(state.q)):
+        state.q[m] += acting.pull[j, m] * way
+        state.v[m] += acting.pull[j, m] * change
+
+
+def record(
+    linear: Linear, ports: Ports, acting: Acting, state: State, load: float, time: float, sample: int,
+    out: Samples,
+) -> None:  # fmt: skip
+    """Write state and forces at a sample."""
+    modes, count = len(state.q), len(ports.numbers)
+    for m in range(modes):
+        out.q[sample, m] = state.q[m]
+        out.v[sample, m] = state.v[m]
+    for j in range(count):
+        out.forces[sample, j] = state.current[j]
+        out.lagged[sample, j] = state.memory[j, 2] if acting.route[j] == FLEXIBLE else state.current[j]
+        if acting.route[j] != SPEED:
+            continue
+        x, speed = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
+        most = acting.strength[j] * share(ports.numbers[j], ports.values[j], x) / acting.weight[j]
+        if state.memory[j, 0] == 1.0:  # what it takes to hold the port
+            need = 0.0
+            for m in range(modes):
+                push = linear.shape[m] * load + linear.load[m]
+                push -= linear.stiffness[m] * (1.0 + linear.rate * time) * state.q[m]
+                for k in range(modes):
+                    push -= linear.damping[m, k] * state.v[k]
+                for k in range(count):
+                    if acting.route[k] != SPEED:
+                        push -= ports.rows[k, m] * state.current[k]
+                need += ports.rows[j, m] * push / acting.weight[j]
+            out.forces[sample, j] = (
+                min(max(need, -most), most) if dry(ports.numbers[j], ports.values[j]) else need
+            )
+        elif speed != 0.0:
+            size = resistance(ports.numbers[j], ports.values[j], most, speed)
+            out.forces[sample, j] = size if speed > 0.0 else -size
+        out.lagged[sample, j] = out.forces[sample, j]

@@ -1,0 +1,352 @@
+"""Primitive changes of a model: what a missing effect is made of, and the patch that carries them.
+
+A patch is plain data. The reduced model, the full model, the FMU and the twin understand the same
+primitives; which physical effect a set of them stands for is not known here (`discrepancy.catalogue` knows).
+
+NumPy and relative imports only: this file is copied into the FMU.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+from .errors import InvalidPatchError
+from .laws import LAWS
+from .laws.bouc_wen import BoucWen as BoucWen
+from .laws.free_play import FreePlay as FreePlay
+from .laws.interface import PortForce as PortForce
+from .laws.micro_slip import MicroSlip as MicroSlip
+from .laws.power_damping import PowerDamping as PowerDamping
+from .laws.power_stiffness import PowerStiffness as PowerStiffness
+from .primitive import Primitive as Primitive
+
+EVERY_CHANNEL = "*"
+"""Name that stands for every channel of the primitive's quantity."""
+
+
+# ---------------------------------------------------------------- mass and stiffness
+
+
+@dataclass(frozen=True, slots=True)
+class PointMass(Primitive):
+    """A mass [kg] on the elastic line at `station` [m] from the root (lumped model: at a named place)."""
+
+    kind: ClassVar[str] = "point_mass"
+    mass: float
+    station: float
+
+
+@dataclass(frozen=True, slots=True)
+class RootCompliance(Primitive):
+    """A rotational spring in series with the root: `compliance` [rad/(N m)] about the flapping axis."""
+
+    kind: ClassVar[str] = "root_compliance"
+    compliance: float
+
+
+@dataclass(frozen=True, slots=True)
+class LocalStiffnessLoss(Primitive):
+    """The skin between `start` and `start + length` [m] from the root keeps 1 - `loss` of its stiffness."""
+
+    kind: ClassVar[str] = "local_stiffness_loss"
+    loss: float
+    start: float
+    length: float
+
+
+@dataclass(frozen=True, slots=True)
+class ModulusTemperature(Primitive):
+    """Young's modulus falls with temperature: E (1 - `coefficient` (T - T_ref)), `coefficient` [1/K]."""
+
+    kind: ClassVar[str] = "modulus_temperature"
+    coefficient: float
+
+
+@dataclass(frozen=True, slots=True)
+class StiffnessDrift(Primitive):
+    """The whole stiffness changes with time within a record: K (1 + `rate` t), `rate` [1/s]."""
+
+    kind: ClassVar[str] = "stiffness_drift"
+    rate: float
+
+
+# ---------------------------------------------------------------- internal forces
+#
+# The laws of `fe.runtime.laws` act against the motion x of a port (displacement [m] or rotation [rad]): -F on
+# x, F in N or N m. Ports of the wing: "root" (flapping rotation of the root), "tip" (upward displacement of
+# the tip's load point), "span" (upward displacement of all stations, weighted by the share of planform area;
+# the weights sum to one), "planform" (the law acts at every place on the place's own upward displacement,
+# with a force by the place's share of the area: `planform_forces`). A lumped model declares its own.
+
+
+# ---------------------------------------------------------------- loads
+
+
+@dataclass(frozen=True, slots=True)
+class LoadPlace(Primitive):
+    """Applied forces act `along_span` [m] further outboard, `along_chord` [m] further aft than recorded."""
+
+    kind: ClassVar[str] = "load_place"
+    along_span: float
+    along_chord: float
+
+
+@dataclass(frozen=True, slots=True)
+class LoadGain(Primitive):
+    """The force that acts is (1 + `gain`) times the recorded one plus `tare` [N], while one is applied."""
+
+    kind: ClassVar[str] = "load_gain"
+    gain: float
+    tare: float
+
+
+@dataclass(frozen=True, slots=True)
+class Washout(Primitive):
+    """Lift in flight is l (1 - `coefficient` n eta^`exponent`), eta = y / semi-span, n the load factor."""
+
+    kind: ClassVar[str] = "washout"
+    coefficient: float
+    exponent: float
+
+
+@dataclass(frozen=True, slots=True)
+class InertiaRelief(Primitive):
+    """In flight the structure's weight times n relieves the lift by this `fraction` more than modelled."""
+
+    kind: ClassVar[str] = "inertia_relief"
+    fraction: float
+
+
+# ---------------------------------------------------------------- sensors and clock
+#
+# `channel` is a channel's name, or `EVERY_CHANNEL` for all of `quantity` ("" for all quantities).
+
+
+@dataclass(frozen=True, slots=True)
+class SensorGain(Primitive):
+    """A channel shows (1 + `gain`) times what it should."""
+
+    kind: ClassVar[str] = "sensor_gain"
+    channel: str
+    gain: float
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorDrift(Primitive):
+    """A channel's zero moves by `amplitude` (t / `time`)^`exponent`, t since the campaign's start [s]."""
+
+    kind: ClassVar[str] = "sensor_drift"
+    channel: str
+    amplitude: float
+    time: float
+    exponent: float = 1.0
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorRotation(Primitive):
+    """A strain gauge is turned by `angle` [rad] in the skin, from spanwise towards the tip's rear."""
+
+    kind: ClassVar[str] = "sensor_rotation"
+    channel: str
+    angle: float
+
+
+@dataclass(frozen=True, slots=True)
+class ThermalStrain(Primitive):
+    """Strain channels show `coefficient` [1/K] times (T - T_ref) more."""
+
+    kind: ClassVar[str] = "thermal_strain"
+    channel: str
+    coefficient: float
+
+
+@dataclass(frozen=True, slots=True)
+class HighPass(Primitive):
+    """Channels pass through `order` equal first-order high-pass filters s tau / (1 + s tau), tau [s].
+
+    They had settled at the value before the record's first sample.
+    """
+
+    kind: ClassVar[str] = "high_pass"
+    channel: str
+    time_constant: float
+    order: float = 1.0
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Clock(Primitive):
+    """A sample that is stamped t was taken at (1 + `rate`) t + `zero` [s]."""
+
+    kind: ClassVar[str] = "clock"
+    rate: float
+    zero: float
+
+
+@dataclass(frozen=True, slots=True)
+class Line(Primitive):
+    """A line at `frequency` [Hz] is added: cosine cos + sine sin (2 pi f t), t since the trial's start.
+
+    Amplitudes in the channel's unit. It is in the noise record too.
+    """
+
+    kind: ClassVar[str] = "line"
+    channel: str
+    frequency: float
+    cosine: float
+    sine: float
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class DecayingLine(Primitive):
+    """A mode that the model does not have, e^(-zeta w t) (cosine cos w_d t + sine sin w_d t), in ring-downs.
+
+    t since the trial's start; amplitudes in the channel's unit per unit of the trial's release amplitude.
+    """
+
+    kind: ClassVar[str] = "decaying_line"
+    channel: str
+    frequency: float
+    damping_ratio: float
+    cosine: float
+    sine: float
+    quantity: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RunOffset(Primitive):
+    """Static readings of the trials labelled `run` have this `offset` (channel's unit): seating of a run."""
+
+    kind: ClassVar[str] = "run_offset"
+    run: str
+    offset: float
+    channel: str = EVERY_CHANNEL
+    quantity: str = "displacement"
+
+
+_EVERY: tuple[type[Primitive], ...] = (
+    PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature, StiffnessDrift,
+    *LAWS,
+    LoadPlace, LoadGain, Washout, InertiaRelief,
+    SensorGain, SensorDrift, SensorRotation, ThermalStrain, HighPass, Clock, Line, DecayingLine,
+    RunOffset,
+)  # fmt: skip
+PRIMITIVES: dict[str, type[Primitive]] = {primitive.kind: primitive for primitive in _EVERY}
+"""Every primitive by its kind."""
+
+STRUCTURE = (PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature)
+"""Primitives that change the linear structure: it is solved anew."""
+INTERNAL_FORCES = (*LAWS, StiffnessDrift)
+"""Primitives that act as forces inside the structure while it moves."""
+LOADS = (LoadPlace, LoadGain, Washout, InertiaRelief)
+"""Primitives that change what acts on the structure."""
+SENSORS = (
+    SensorGain,
+    SensorDrift,
+    SensorRotation,
+    ThermalStrain,
+    HighPass,
+    Clock,
+    Line,
+    DecayingLine,
+    RunOffset,
+)
+"""Primitives that change what is read, not what happens."""
+
+
+@dataclass(frozen=True)
+class ModelPatch:
+    """A set of primitive changes; the empty patch is the model as it was, to the last bit.
+
+    Attributes
+    ----------
+    primitives : tuple of Primitive
+        The changes, applied together; sensors in the order given.
+    """
+
+    primitives: tuple[Primitive, ...] = ()
+
+    def __iter__(self) -> Iterator[Primitive]:
+        return iter(self.primitives)
+
+    def __len__(self) -> int:
+        return len(self.primitives)
+
+    def __add__(self, other: "ModelPatch") -> "ModelPatch":
+        return ModelPatch(self.primitives + other.primitives)
+
+    def of(self, *kinds: type[Primitive]) -> "ModelPatch":
+        """Return the part whose primitives are of the given classes."""
+        return ModelPatch(tuple(item for item in self.primitives if isinstance(item, kinds)))
+
+    def to_list(self) -> list[dict[str, Any]]:
+        """Return the primitives as plain data; `from_list` gives the patch back, equal to the last bit."""
+        return [primitive.to_mapping() for primitive in self.primitives]
+
+    @classmethod
+    def from_list(cls, rows: object, where: str = "The patch") -> "ModelPatch":
+        """Return the patch that `to_list` wrote.
+
+        Parameters
+        ----------
+        rows : list of mapping
+            Kind and values of each primitive.
+        where : str
+            What is being read, for the error message.
+
+        Raises
+        ------
+        InvalidPatchError
+            If a kind is unknown, a value is missing, superfluous, of the wrong type or not finite.
+        """
+        if not isinstance(rows, list):
+            raise InvalidPatchError(f"{where} must be a list of primitives, but is a {type(rows).__name__}.")
+        return cls(tuple(_primitive(row, f"{where}, primitive {n}") for n, row in enumerate(rows, start=1)))
+
+    def to_json(self) -> str:
+        """Return the patch as JSON; floats keep every bit."""
+        return json.dumps(self.to_list(), allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str, where: str = "The patch") -> "ModelPatch":
+        """Return the patch of a JSON text; raises `InvalidPatchError`."""
+        try:
+            rows = json.loads(text)
+        except json.JSONDecodeError as cause:
+            raise InvalidPatchError(f"{where} is not JSON ({cause}).") from cause
+        return cls.from_list(rows, where)
+
+
+def _primitive(row: object, where: str) -> Primitive:
+    if not isinstance(row, Mapping) or row.get("kind") not in PRIMITIVES:
+        got = row.get("kind") if isinstance(row, Mapping) else row
+        raise InvalidPatchError(f"{where} has the kind {got!r}, but known are {', '.join(PRIMITIVES)}.")
+    primitive = PRIMITIVES[str(row["kind"])]
+    types = {item.name: item.type for item in fields(primitive)}
+    values = {str(name): value for name, value in row.items() if name != "kind"}
+    for name, value in values.items():
+        wanted = types.get(name)
+        if wanted is None:
+            raise InvalidPatchError(f"{where} has no value {name!r}; it has {', '.join(types)}.")
+        fits = (
+            isinstance(value, str)
+            if wanted is str
+            else isinstance(value, int) and not isinstance(value, bool)
+            if wanted is int
+            else isinstance(value, float | int) and not isinstance(value, bool)
+        )
+        if not fits:
+            raise InvalidPatchError(
+                f"{where}: {name} must be {'text' if wanted is str else 'a number'}, but is {value!r}."
+            )
+        if wanted is float:
+            values[name] = float(value)
+    try:
+        return primitive(**values)
+    except TypeError as cause:
+        missing = [item.name for item in fields(primitive) if item.name not in values]
+        raise InvalidPatchError(f"{where} lacks {', '.join(missing)}.") from cause

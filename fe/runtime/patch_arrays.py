@@ -1,0 +1,247 @@
+"""The arrays of a wing that can be patched: what they are, their shapes, checked, and their file.
+
+NumPy and relative imports only: this file is copied into the FMU.
+"""
+
+from dataclasses import dataclass, fields
+from math import isfinite
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from .archive import arrays_from_bytes, arrays_to_bytes, write_bytes_atomically
+from .errors import ReducedModelFileError
+from .reduced_arrays import PARAMETER_NAMES
+
+FloatArray = npt.NDArray[np.float64]
+
+PATCH_FORMAT = 1
+"""Version of the array layout in the file."""
+
+SCALARS = (
+    "flap_spring",
+    "semi_span",
+    "root_chord",
+    "tip_chord",
+    "load_place",
+    "largest_loss",
+    "largest_compliance",
+    "largest_mass",
+)
+
+
+@dataclass(frozen=True, repr=False)
+class PatchArrays:
+    """Dense matrices and rows of a wing in a basis of n vectors, made for changes of `fe.runtime.patch`.
+
+    Attributes
+    ----------
+    design_hash : str
+        Hash of the design that these arrays were made of.
+    validity_box : (7, 2) ndarray
+        Least and largest value of each of `fe.runtime.reduced_arrays.PARAMETER_NAMES`, SI units.
+    largest_loss, largest_compliance, largest_mass : float
+        Stiffness loss of a strip [1], root compliance [rad/(N m)] and point mass [kg] up to which the basis
+        was made; the accuracy falls slowly beyond.
+    stiffness : (4, n, n) ndarray
+        Stiffness terms: skin, first defect, second defect, the rest.
+    mass : (3, n, n) ndarray
+        Mass terms: structure, 1 kg in each servo, 1 kg in the pitot.
+    strip_lines : (S + 1,) ndarray
+        Edges of the strips of the skin [m from the root].
+    strip_stiffness : (T, n (n + 1) / 2) ndarray of float32
+        Lower triangles, row by row, of the parts of the stiffness terms of the skin that lie in strips.
+    strip_of, term_of : (T,) ndarray of int64
+        Strip, and stiffness term, of each part.
+    flap_row : (n,) ndarray
+        Flapping rotation of the root [rad].
+    flap_spring : float
+        Spring at the root [N m/rad].
+    semi_span, root_chord, tip_chord : float
+        L and the chords [m].
+    straight_chord_line : float
+        Chord fraction of the line that runs straight along the span.
+    load_place : float
+        Distance of the static test's load from the root [m].
+    stations : (P,) ndarray
+        Sections: mesh lines and the middles between them [m from the root], P odd.
+    line_chord : (L,) ndarray
+        Chord fractions of the elastic line and of the other lines, ascending; L at least 2.
+    line_rows : (L + 2, P, n) ndarray
+        Displacement of the elastic line along x, y and z and of the other lines along z.
+    station_weights : (P,) ndarray
+        Share of the planform's area; sums to one.
+    load_tip : (n,) ndarray
+        Load of 1 N at the place of the static test; as a row, the displacement there.
+    load_lift : (n,) ndarray
+        Load of load factor 1 [N].
+    lift_rows : (P, n) ndarray
+        The same without the weight, by stations.
+    weight : (n,) ndarray
+        Weight, downwards [N].
+    strain_rows : (3, G, n) ndarray
+        Strain of the gauges along the span, across it, and engineering shear strain, positive as measured.
+    gauge_stations : (G,) ndarray
+        Middles of the gauges [m from the root].
+    gauge_length : float
+        Length along the span over which they average [m].
+    tip_row : (n,) ndarray
+        Displacement of the tip.
+    start_shapes : (n, r) ndarray
+        Modes of the wing as it was, from which the modes of a patched one are iterated.
+    """
+
+    design_hash: str
+    validity_box: FloatArray
+    largest_loss: float
+    largest_compliance: float
+    largest_mass: float
+    stiffness: FloatArray
+    mass: FloatArray
+    strip_lines: FloatArray
+    strip_stiffness: npt.NDArray[np.float32]
+    strip_of: npt.NDArray[np.int64]
+    term_of: npt.NDArray[np.int64]
+    flap_row: FloatArray
+    flap_spring: float
+    semi_span: float
+    root_chord: float
+    tip_chord: float
+    straight_chord_line: float
+    load_place: float
+    stations: FloatArray
+    line_chord: FloatArray
+    line_rows: FloatArray
+    station_weights: FloatArray
+    load_tip: FloatArray
+    load_lift: FloatArray
+    lift_rows: FloatArray
+    weight: FloatArray
+    strain_rows: FloatArray
+    gauge_stations: FloatArray
+    gauge_length: float
+    tip_row: FloatArray
+    start_shapes: FloatArray
+
+    def __post_init__(self) -> None:
+        kinds: dict[str, type[Any]] = {
+            "strip_stiffness": np.float32, "strip_of": np.int64, "term_of": np.int64
+        }  # fmt: skip
+        for name, expected in self._expected_shapes().items():
+            array = getattr(self, name)
+            kind = kinds.get(name, np.float64)
+            if array.shape != expected or array.dtype != kind or not np.isfinite(array).all():
+                raise ReducedModelFileError(
+                    f"The array {name} of a wing for patches must hold finite numbers in the shape "
+                    f"{expected}, but it has shape {array.shape} and type {array.dtype}; build it anew."
+                )
+        for name in SCALARS:
+            value = getattr(self, name)
+            if not (isfinite(value) and value > 0.0):
+                raise ReducedModelFileError(
+                    f"The {name} of a wing for patches must be positive, but is {value!r}; build it anew."
+                )
+        if not (isfinite(self.gauge_length) and self.gauge_length >= 0.0):
+            raise ReducedModelFileError(
+                f"The gauge_length of a wing for patches must not be negative, but is "
+                f"{self.gauge_length!r}; build it anew."
+            )
+        if not 0.0 <= self.straight_chord_line <= 1.0:
+            raise ReducedModelFileError(
+                f"The straight_chord_line of a wing for patches must be a fraction, but is "
+                f"{self.straight_chord_line!r}; build it anew."
+            )
+        strips = len(self.strip_lines) - 1
+        if len(self.strip_of) and not (
+            self.strip_of.min() >= 0 and self.strip_of.max() < strips and set(self.term_of) <= {0, 1, 2}
+        ):
+            raise ReducedModelFileError(
+                "The strips of a wing for patches do not fit its strip lines; build it anew."
+            )
+        if np.any(np.diff(self.stations) <= 0.0) or np.any(np.diff(self.strip_lines) <= 0.0):
+            raise ReducedModelFileError(
+                "The stations of a wing for patches must rise from the root to the tip; build it anew."
+            )
+
+    def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
+        n, p, t = self.stiffness.shape[-1], len(self.stations), len(self.strip_of)
+        return {
+            "validity_box": (len(PARAMETER_NAMES), 2),
+            "stiffness": (4, n, n),
+            "mass": (3, n, n),
+            "strip_lines": (len(self.strip_lines),),
+            "strip_stiffness": (t, n * (n + 1) // 2),
+            "strip_of": (t,),
+            "term_of": (t,),
+            "flap_row": (n,),
+            "stations": (p,),
+            "line_chord": (max(len(self.line_chord), 2),),
+            "line_rows": (len(self.line_chord) + 2, p, n),
+            "station_weights": (p,),
+            "load_tip": (n,),
+            "load_lift": (n,),
+            "lift_rows": (p, n),
+            "weight": (n,),
+            "strain_rows": (3, self.strain_rows.shape[1], n),
+            "gauge_stations": (self.strain_rows.shape[1],),
+            "tip_row": (n,),
+            "start_shapes": (n, self.start_shapes.shape[-1]),
+        }
+
+    def __repr__(self) -> str:
+        return (
+            f"PatchArrays(design_hash={self.design_hash!r}, basis={len(self.load_tip)}, "
+            f"strips={len(self.strip_lines) - 1}, gauges={self.strain_rows.shape[1]})"
+        )
+
+    def to_bytes(self) -> bytes:
+        """Return the arrays as the bytes of an `.npz` file; the same arrays give the same bytes."""
+        arrays: dict[str, npt.NDArray[Any]] = {"patch_format": np.array(PATCH_FORMAT)}
+        for item in fields(self):
+            arrays[item.name] = np.array(getattr(self, item.name))
+        return arrays_to_bytes(arrays)
+
+    @classmethod
+    def from_bytes(cls, content: bytes, where: str = "The wing for patches") -> Self:
+        """Return the arrays that `to_bytes` packed, equal to the last bit.
+
+        Parameters
+        ----------
+        content : bytes
+            An `.npz` archive.
+        where : str
+            What is being read, for the error message.
+
+        Raises
+        ------
+        ReducedModelFileError
+            If the archive is damaged, incomplete or of another format.
+        """
+        names = [item.name for item in fields(cls)]
+        arrays = arrays_from_bytes(content, where, ("patch_format", *names))
+        if arrays["patch_format"].tolist() != PATCH_FORMAT:
+            raise ReducedModelFileError(
+                f"{where} has the format {arrays['patch_format']}, but this version reads {PATCH_FORMAT}; "
+                "build it anew."
+            )
+        values: dict[str, Any] = {name: arrays[name] for name in names}
+        try:
+            values["design_hash"] = str(arrays["design_hash"])
+            for name in (*SCALARS, "straight_chord_line", "gauge_length"):
+                values[name] = float(arrays[name])
+            return cls(**values)
+        except (TypeError, ValueError, IndexError) as cause:
+            raise ReducedModelFileError(
+                f"{where} does not hold the arrays of a wing for patches ({cause}); build it anew."
+            ) from cause
+
+    def save(self, path: str | Path) -> None:
+        """Write the arrays to one `.npz` file, whole or not at all; `OSError` if that fails."""
+        write_bytes_atomically(Path(path), self.to_bytes())
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read what `save` wrote; raises `FileNotFoundError` or `ReducedModelFileError`."""
+        return cls.from_bytes(Path(path).read_bytes(), str(path))

@@ -1,0 +1,126 @@
+"""Static path of ports with laws, load level after load level: x + C F(x) = x_linear.
+
+Written in the subset of Python that numba compiles too. NumPy and relative imports only: this file is copied
+into the FMU.
+"""
+
+import numpy as np
+
+from .laws import advance, force, parts, slope
+from .motion_arrays import FloatArray, IntArray, Ports, Unnamed
+
+
+def static_forces(
+    x: FloatArray, ports: Ports, memory: FloatArray, least: IntArray, forces: FloatArray, slopes: FloatArray
+) -> FloatArray:
+    """Return the memory at positions `x` (J,) reached from `memory`; `forces` and `slopes` (J,) are filled.
+
+    `least` (J,) is the least number of parts in which a hysteretic law follows the way; laws of speed are
+    zero at rest.
+    """
+    reached = memory.copy()
+    for j in range(len(x)):
+        forces[j] = 0.0
+        slopes[j] = 0.0
+        if ports.of_speed[j] == 0:
+            number, values, elements = ports.numbers[j], ports.values[j], ports.elements[j]
+            advance(number, values, elements, reached[j], x[j], least[j])
+            forces[j] = force(number, values, reached[j], x[j])
+            reached[j, 1] = memory[j, 1]  # loading or unloading is seen from where the way began
+            slopes[j] = slope(number, values, elements, reached[j], x[j])
+        reached[j, 1] = x[j]
+        reached[j, 2] = forces[j]
+        reached[j, 3] = 0.0
+        reached[j, 4] = 0.0
+    return reached
+
+
+def static_path(
+    linear: FloatArray, compliance: FloatArray, laws: Unnamed, memory: FloatArray, start: FloatArray,
+    positions: FloatArray, forces: FloatArray,
+) -> int:  # fmt: skip
+    """Solve x + C F(x) = x_linear for load levels one after the other; `memory` is advanced in place.
+
+    Newton's method with halved steps; a level that it does not reach is approached in up to 256 parts.
+
+    Parameters
+    ----------
+    linear : (L, J) ndarray
+        Positions of the ports without internal forces.
+    compliance : (J, J) ndarray
+        C, positions of the ports under unit forces at them.
+    laws : tuple
+        The fields of `Ports`; what they do to modes is not used.
+    memory : (J, 5 + E) ndarray
+        State at the start.
+    start : (J,) ndarray
+        Linear positions at the start; zero at rest without load.
+    positions, forces : (L, J) ndarray
+        Results.
+
+    Returns
+    -------
+    int
+        -1, or the number of the level that has no solution.
+    """
+    ports = Ports(*laws)
+    levels, count = linear.shape
+    old = start.copy()
+    x = memory[:, 1].copy()
+    own, gradient = np.zeros(count), np.zeros(count)
+    trial_force, trial_slope = np.zeros(count), np.zeros(count)
+    least = np.zeros(count, dtype=np.int64)
+    for level in range(levels):
+        done, step = 0.0, 1.0
+        while done < 1.0:
+            goal = old + (linear[level] - old) * min(done + step, 1.0)
+            scale = np.max(np.abs(goal)) + np.max(np.abs(x)) + 1e-300
+            for j in range(count):  # fixed during the iteration, so that the force is a smooth function
+                least[j] = parts(ports.numbers[j], ports.values[j], abs(goal[j] - x[j]))
+            guess = x.copy()
+            reached = static_forces(guess, ports, memory, least, own, gradient)
+            residual = guess + compliance @ own - goal
+            size = np.max(np.abs(residual))
+            found = size <= 1e-12 * scale
+            for _ in range(60):
+                if found:
+                    break
+                matrix = np.eye(count) + compliance * gradient
+                for j in range(count):  # a singular matrix is moved off its zero
+                    matrix[j, j] += 1e-14
+                move = np.linalg.solve(matrix, residual)
+                fraction = 1.0
+                better = False
+                for _ in range(12):
+                    candidate = guess - fraction * move
+                    trial = static_forces(candidate, ports, memory, least, trial_force, trial_slope)
+                    trial_residual = candidate + compliance @ trial_force - goal
+                    trial_size = np.max(np.abs(trial_residual))
+                    if trial_size < size:
+                        better = True
+                        break
+                    fraction *= 0.5
+                if not better:
+                    break
+                guess, reached, residual, size = candidate, trial, trial_residual, trial_size
+                own[:] = trial_force
+                gradient[:] = trial_slope
+                found = size <= 1e-12 * scale
+            if not found and size <= 1e-9 * scale:
+                found = True  # rounding, or a kink met exactly
+            # A solution that is not stable lies on another branch, beyond a snap.
+            if found and np.linalg.det(np.eye(count) + compliance * gradient) <= -1e-9:
+                found = False
+            if found:
+                x[:] = guess
+                memory[:] = reached
+                done = min(done + step, 1.0)
+                step *= 2.0
+            else:
+                step *= 0.5
+                if step < 1.0 / 256.0:
+                    return level
+        old[:] = linear[level]
+        positions[level] = x
+        forces[level] = own
+    return -1

@@ -1,0 +1,1 @@
+"""Known answers, CalculiX, and the sandwich plate."""

@@ -1,0 +1,292 @@
+"""The wing against CalculiX on the identical mesh: statics, modes and a ring-down."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fe.full.assembly import global_gradients, strain_matrix
+from fe.full.modes import eigenmodes
+from fe.full.operators import AffineOperators
+from fe.full.statics import Factorisation, static_outputs
+from fe.runtime.errors import CalculixError
+from fe.runtime.state import DigitalState
+
+from .calculix_input import INTEGRATION_POINTS, CalculixModel
+from .calculix_job import read_frequencies, read_tables, run_calculix
+
+FloatArray = NDArray[np.float64]
+
+TEST_FORCE = 10.0
+"""Upward force of the static test and before the ring-down [N]."""
+# Rows and columns in which CalculiX prints a strain tensor.
+_PRINTED = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+
+
+@dataclass(frozen=True)
+class StaticAgreement:
+    """Differences of a static solution to CalculiX's, each relative.
+
+    Attributes
+    ----------
+    load : str
+        "tip force" or "lift".
+    load_point, tip : float
+        Displacement at the place of the static test and at the tip.
+    field : float
+        Largest difference of a nodal displacement over the largest displacement.
+    gauge : float
+        Largest difference of a gauge strain, over that strain.
+    tensor : float
+        Largest difference of a strain component at the integration points of the cells with gauges, over the
+        largest strain there. CalculiX evaluates these strains itself.
+    """
+
+    load: str
+    load_point: float
+    tip: float
+    field: float
+    gauge: float
+    tensor: float
+
+    @property
+    def displacement(self) -> float:
+        """Largest of the differences of displacement."""
+        return max(self.load_point, self.tip, self.field)
+
+
+def static_agreement(
+    operators: AffineOperators,
+    folder: Path,
+    young_modulus_factor: float = 1.0,
+    stiffness_loss: tuple[float, float] = (0.0, 0.0),
+) -> tuple[StaticAgreement, StaticAgreement]:
+    """Compare the static test and the lift of the design in one state of health.
+
+    Parameters
+    ----------
+    operators : AffineOperators
+        The model.
+    folder : Path
+        Where CalculiX works.
+    young_modulus_factor : float
+        e [1].
+    stiffness_loss : tuple of float
+        (z1, z2), fractions.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX is not there or fails.
+    """
+    model = CalculixModel(operators, young_modulus_factor, stiffness_loss)
+    turn = operators.wing_mesh.design.lift.load_factor
+    loads = {"tip force": operators.load(0.0, TEST_FORCE), "lift": operators.load(turn)}
+    tables = read_tables(run_calculix(model.static_steps(tuple(loads.values())), folder, "static"))
+    nodes, probes, strains = (
+        [table.rows for table in tables if table.set_name == name] for name in ("NALL", "NPROBES", "EGAUGES")
+    )
+    if not len(nodes) == len(probes) == len(strains) == len(loads):
+        raise CalculixError(f"CalculiX printed {len(nodes)} static solutions instead of {len(loads)}.")
+    factors = Factorisation(operators.stiffness(young_modulus_factor, stiffness_loss))
+    found = []
+    for number, (name, load) in enumerate(loads.items()):
+        ours = static_outputs(operators, factors.solve(load))
+        field = operators.full_displacement(ours.displacement)
+        theirs = probes[number][:, 1:].ravel()
+        tensor = _strain_tensors(operators, model, ours.displacement)
+        printed = strains[number][:, 2:].reshape(*tensor.shape[:2], 6)
+        found.append(
+            StaticAgreement(
+                load=name,
+                load_point=abs(theirs[0] / ours.load_point_displacement - 1.0),
+                tip=abs(theirs[1] / ours.tip_displacement - 1.0),
+                field=float(np.abs(nodes[number][:, 1:] - field).max() / np.abs(field).max()),
+                gauge=float(np.abs(theirs[2 : 2 + len(ours.strain)] / ours.strain - 1.0).max()),
+                tensor=float(np.abs(printed - tensor).max() / np.abs(tensor).max()),
+            )
+        )
+    return found[0], found[1]
+
+
+def _strain_tensors(operators: AffineOperators, model: CalculixModel, free: FloatArray) -> FloatArray:
+    """Strain tensor (cells, 27, 6) in CalculiX's order at the integration points of the gauges' cells."""
+    body, cells = operators.discretisation, model.gauge_cells
+    gradients, _ = global_gradients(body.corners[cells], INTEGRATION_POINTS)
+    displacement = operators.full_displacement(free).ravel()[body.cell_dofs[cells]]
+    voigt = np.einsum("nqij,nj->nqi", strain_matrix(gradients), displacement)
+    voigt[..., 3:] *= 0.5  # engineering to tensor shear
+    return np.asarray(voigt[..., [_VOIGT.index(place) for place in _PRINTED]])
+
+
+@dataclass(frozen=True)
+class ModalAgreement:
+    """Frequencies (m,) [Hz] of both codes."""
+
+    ours: FloatArray
+    calculix: FloatArray
+
+    @property
+    def relative(self) -> float:
+        """Largest relative difference."""
+        return float(np.abs(self.calculix / self.ours - 1.0).max())
+
+
+def modal_agreement(
+    operators: AffineOperators,
+    folder: Path,
+    state: DigitalState,
+    count: int = 6,
+) -> ModalAgreement:
+    """Compare the lowest modes in one state.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX is not there or fails.
+    """
+    model = _model(operators, state)
+    theirs = read_frequencies(run_calculix(model.frequency_step(count), folder, "modes"))
+    ours = eigenmodes(
+        operators,
+        state.young_modulus_factor,
+        state.stiffness_loss,
+        state.servo_mass,
+        state.pitot_mass,
+        count,
+    ).frequency
+    if len(theirs) < count:
+        raise CalculixError(f"CalculiX printed {len(theirs)} frequencies instead of {count}.")
+    return ModalAgreement(ours, theirs[:count])
+
+
+def _model(operators: AffineOperators, state: DigitalState) -> CalculixModel:
+    return CalculixModel(
+        operators,
+        state.young_modulus_factor,
+        state.stiffness_loss,
+        state.servo_mass,
+        state.pitot_mass,
+        state.damping_alpha,
+        state.damping_beta,
+    )
+
+
+@dataclass(frozen=True)
+class RingDownAgreement:
+    """Upward displacement [m] of the tip after its release, at the times (t,) [s], of both codes.
+
+    Attributes
+    ----------
+    time, ours, calculix : (t,)
+        Modal integration, exact in time, and direct integration by CalculiX.
+    same_rule : (t,)
+        Modal integration by the trapezoidal rule with the increment of CalculiX, which leaves out the error
+        of that rule.
+    initial : float
+        Displacement before the release [m].
+    period : float
+        Period of the first mode [s].
+    """
+
+    time: FloatArray
+    ours: FloatArray
+    calculix: FloatArray
+    same_rule: FloatArray
+    initial: float
+    period: float
+
+    @property
+    def relative(self) -> float:
+        """Largest difference over the initial displacement."""
+        return float(np.abs(self.calculix - self.ours).max() / abs(self.initial))
+
+    @property
+    def relative_same_rule(self) -> float:
+        """Largest difference over the initial displacement when both use the trapezoidal rule."""
+        return float(np.abs(self.calculix - self.same_rule).max() / abs(self.initial))
+
+
+def ring_down_agreement(
+    operators: AffineOperators,
+    folder: Path,
+    state: DigitalState,
+    periods: float = 5.0,
+    steps_per_period: int = 80,
+) -> RingDownAgreement:
+    """Release the tip from a static force: our modal integration against direct integration.
+
+    Ours is the reduced model with its few modes, exact in time; CalculiX integrates all unknowns by the
+    trapezoidal rule, whose period is too long by (omega dt)^2 / 12, so that part of the difference is its.
+
+    Parameters
+    ----------
+    operators : AffineOperators
+        The model; CalculiX takes about a second for each step at 8,000 unknowns.
+    folder : Path
+        Where CalculiX works.
+    state : DigitalState
+        Health, masses and damping.
+    periods : float
+        Length in periods of the first mode.
+    steps_per_period : int
+        Increments of the direct integration.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX is not there or fails.
+    """
+    from fe.reduction.reduced_basis import reduce_model
+    from fe.runtime.transient import ModalIntegrator
+
+    integrator = ModalIntegrator(
+        reduce_model(operators).model,
+        young_modulus_factor=state.young_modulus_factor,
+        stiffness_loss=state.stiffness_loss,
+        servo_mass=state.servo_mass,
+        pitot_mass=state.pitot_mass,
+        damping_alpha=state.damping_alpha,
+        damping_beta=state.damping_beta,
+    )
+    period = 1.0 / float(integrator.modes.frequency[0])
+    increment, steps = period / steps_per_period, round(periods * steps_per_period)
+    initial = integrator.static_response(0.0, TEST_FORCE).tip_displacement
+    current = integrator.released(initial)
+    same_rule = integrator.modes.tip_displacement @ _trapezoidal(
+        current.displacement,
+        2.0 * np.pi * integrator.modes.frequency,
+        integrator.damping_ratio,
+        increment,
+        steps,
+    )
+    ours = np.empty(steps)
+    for step in range(steps):
+        current = integrator.advance(current, increment, (0.0, 0.0))
+        ours[step] = integrator.response(current).tip_displacement
+    text = _model(operators, state).ring_down_steps(operators.load(0.0, TEST_FORCE), increment, steps)
+    tables = read_tables(run_calculix(text, folder, "ring_down"))
+    theirs = np.array([table.rows[0, 2] for table in tables if table.set_name == "NPROBES"])
+    if len(theirs) != steps:
+        raise CalculixError(f"CalculiX printed {len(theirs)} increments of the ring-down instead of {steps}.")
+    time = np.asarray(increment * np.arange(1, steps + 1), dtype=np.float64)
+    return RingDownAgreement(time, ours, theirs, same_rule, initial, period)
+
+
+def _trapezoidal(
+    start: FloatArray, omega: FloatArray, damping_ratio: FloatArray, increment: float, steps: int
+) -> FloatArray:
+    """Free response (m, steps) of modes (m,) from rest at `start` by the trapezoidal rule of Newmark."""
+    displacement, velocity, acceleration = start, np.zeros_like(start), -(omega**2) * start
+    divisor = 1.0 + damping_ratio * omega * increment + 0.25 * (omega * increment) ** 2
+    found = np.empty((len(start), steps))
+    for step in range(steps):
+        displacement = displacement + increment * velocity + 0.25 * increment**2 * acceleration
+        velocity = velocity + 0.5 * increment * acceleration
+        acceleration = -(2.0 * damping_ratio * omega * velocity + omega**2 * displacement) / divisor
+        displacement = displacement + 0.25 * increment**2 * acceleration
+        velocity = velocity + 0.5 * increment * acceleration
+        found[:, step] = displacement
+    return found

@@ -1,0 +1,313 @@
+"""The same wing as input for CalculiX; `fe.verification.calculix_job` runs it and reads the results.
+
+CalculiX (`ccx`, Debian package calculix-ccx) is an independent finite element code. It gets the identical
+mesh as C3D20 elements, local material constants with an orientation for each cell, the rigid root rib as
+equations on a reference node that sits on springs, the point masses as blocks tied to the skins, and the
+nodal loads; it integrates, assembles and solves on its own. The gauges are nodes whose displacement is the
+strain, by an equation, because the printed displacements hold seven digits only.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from skfem import ElementHexS2
+
+from fe.full.assembly import cell_axes, rotate_elasticity
+from fe.full.operators import ROOT_UNKNOWNS, AffineOperators, cell_density, cell_elasticity
+from fe.wing.mesh import DEFECT_1, DEFECT_2, SKIN
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_PER_LINE = 4
+_BLOCK = 0.01  # side of the block that stands for a point mass [m]
+
+_CORNERS = np.array(
+    [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], dtype=np.float64
+)
+_EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
+C3D20_NODES = np.concatenate((_CORNERS, [0.5 * (_CORNERS[a] + _CORNERS[b]) for a, b in _EDGES]))
+"""Local places (20, 3) in 0..1 of the nodes of a C3D20 element."""
+_LINE = 0.5 + 0.5 * np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0])
+INTEGRATION_POINTS = np.array([(x, y, z) for z in _LINE for y in _LINE for x in _LINE])
+"""Local places (27, 3) in 0..1 of the integration points of a C3D20 element, in the order of its output."""
+
+
+@dataclass(frozen=True)
+class CalculixModel:
+    """The wing in one state, as input for CalculiX.
+
+    Attributes
+    ----------
+    operators : AffineOperators
+        Mesh and free unknowns.
+    young_modulus_factor : float
+        e [1].
+    stiffness_loss : tuple of float
+        (z1, z2), fractions.
+    servo_mass, pitot_mass : float
+        Masses of one servo and of the pitot [kg].
+    damping_alpha, damping_beta : float
+        Rayleigh coefficients [1/s], [s].
+    """
+
+    operators: AffineOperators
+    young_modulus_factor: float = 1.0
+    stiffness_loss: tuple[float, float] = (0.0, 0.0)
+    servo_mass: float = 0.169
+    pitot_mass: float = 0.134
+    damping_alpha: float = 0.0
+    damping_beta: float = 0.0
+
+    @property
+    def node_count(self) -> int:
+        """Number of nodes of the mesh; the root's reference node follows them."""
+        return len(self.operators.discretisation.node_points)
+
+    @property
+    def probes(self) -> FloatArray:
+        """Outputs (2 + gauges, n): displacement at the test load, at the tip, then the gauge strains."""
+        operators = self.operators
+        return np.vstack(
+            (
+                operators.displacement_output,
+                operators.tip_displacement_output,
+                operators.gauge_output.toarray(),
+            )
+        )
+
+    @property
+    def gauge_cells(self) -> IntArray:
+        """Numbers of the cells that hold the middle of a gauge."""
+        mesh = self.operators.wing_mesh
+        plan = mesh.design.planform
+        cells = [
+            mesh.skin_point(distance, chord * plan.chord(distance / plan.semi_span)).cell
+            for distance, chord in mesh.design.gauges.positions
+        ]
+        return np.unique(cells)
+
+    def definition(self) -> Iterator[str]:
+        """Yield the lines of the model definition, before the first step."""
+        yield "*HEADING"
+        yield f"wing, design {self.operators.design_hash[:12]}"
+        yield from self._nodes_and_cells()
+        yield from self._materials()
+        yield from self._root()
+        yield from self._masses()
+        yield from self._probe_nodes()
+
+    def static_steps(self, loads: Sequence[FloatArray]) -> str:
+        """Input of one linear static step for each load (n,) of the free unknowns.
+
+        It prints the displacement of all nodes, the probes and the strain of `gauge_cells`.
+        """
+        lines = [*self.definition()]
+        for load in loads:
+            lines += ["*STEP", "*STATIC", *self._load_lines(load), "*NODE PRINT, NSET=NALL", "U"]
+            lines += ["*NODE PRINT, NSET=NPROBES", "U"]
+            lines += ["*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E", "*END STEP"]
+        return "\n".join(lines) + "\n"
+
+    def frequency_step(self, count: int) -> str:
+        """Input of the lowest undamped modes."""
+        return "\n".join([*self.definition(), "*STEP", "*FREQUENCY", str(count), "*END STEP"]) + "\n"
+
+    def ring_down_steps(self, load: FloatArray, increment: float, steps: int) -> str:
+        """Input of a static load (n,) and its sudden removal: direct integration by the trapezoidal rule.
+
+        Parameters
+        ----------
+        load : (n,) N
+            Load that is removed at time zero.
+        increment : float
+            Fixed time increment [s].
+        steps : int
+            Number of increments.
+        """
+        lines = [*self.definition(), "*STEP", "*STATIC", *self._load_lines(load)]
+        # CalculiX balances energy in a dynamic step and wants it asked for from the first step on.
+        lines += ["*EL PRINT, ELSET=E0", "ENER", "*END STEP"]
+        lines += [f"*STEP, INC={steps + 10}", "*DYNAMIC, DIRECT, ALPHA=0."]
+        lines += [f"{increment:.12E},{increment * steps:.12E}"]
+        lines += [*self._load_lines(0.0 * load), "*NODE PRINT, NSET=NPROBES, FREQUENCY=1", "U", "*END STEP"]
+        return "\n".join(lines) + "\n"
+
+    def _nodes_and_cells(self) -> Iterator[str]:
+        body = self.operators.discretisation
+        yield "*NODE, NSET=NALL"
+        for number, point in enumerate(body.node_points, start=1):
+            yield f"{number},{_numbers(point)}"
+        yield "*ELEMENT, TYPE=C3D20, ELSET=EALL"
+        given = ElementHexS2().doflocs
+        order = [int(np.flatnonzero(np.all(np.equal(given, place), axis=1))[0]) for place in C3D20_NODES]
+        for number, nodes in enumerate(body.cell_nodes[:, order] + 1, start=1):
+            text = [str(node) for node in nodes]
+            yield f"{number},{','.join(text[:12])},"
+            yield ",".join(text[12:])
+        yield "*ELSET, ELSET=EGAUGES"
+        yield from (str(cell + 1) for cell in self.gauge_cells)
+
+    def _materials(self) -> Iterator[str]:
+        mesh = self.operators.wing_mesh
+        axes = cell_axes(mesh.corners)
+        # Constants in the cell's own axes; CalculiX turns them by the orientation.
+        local = rotate_elasticity(cell_elasticity(mesh), np.swapaxes(axes, 1, 2))
+        factor = np.ones(len(mesh.cells))
+        factor[mesh.region == SKIN] = self.young_modulus_factor
+        for region, loss in zip((DEFECT_1, DEFECT_2), self.stiffness_loss, strict=True):
+            factor[mesh.region == region] = 1.0 - loss
+        constants = np.column_stack([local[:, row, column] for row, column in _ORTHOTROPIC])
+        constants *= factor[:, None]
+        density = cell_density(mesh)
+        graded = self._graded
+        if graded.any():
+            centre = mesh.design.skin.young_modulus(mesh.centres[graded, 1] / mesh.design.planform.semi_span)
+            constants[graded] /= centre[:, None]
+        stations = mesh.design.skin.stations
+        rounded = [
+            (bool(varies), *(f"{value:.10E}" for value in (*row, mass)))
+            for varies, row, mass in zip(graded, constants, density, strict=True)
+        ]
+        materials = {key: number for number, key in enumerate(dict.fromkeys(rounded))}
+        for key, number in materials.items():
+            first = rounded.index(key)
+            courses = [(place.station, place.young_modulus) for place in stations] if key[0] else [(0.0, 1.0)]
+            yield f"*MATERIAL, NAME=M{number}"
+            yield "*ELASTIC, TYPE=ORTHO"
+            for temperature, modulus in courses:
+                row = modulus * constants[first]
+                yield _numbers(row[:8])
+                yield _numbers((*row[8:], temperature))
+            yield "*DENSITY"
+            yield _numbers(density[first : first + 1])
+            if self.damping_alpha or self.damping_beta:
+                yield f"*DAMPING, ALPHA={self.damping_alpha:.12E}, BETA={self.damping_beta:.12E}"
+        if graded.any():
+            # The station of a node stands as its temperature, on which the skin's constants depend.
+            yield "*INITIAL CONDITIONS, TYPE=TEMPERATURE"
+            span = mesh.design.planform.semi_span
+            for node, place in enumerate(self.operators.discretisation.node_points[:, 1] / span, start=1):
+                yield f"{node},{place:.13E}"
+        for cell, key in enumerate(rounded):
+            yield f"*ORIENTATION, NAME=O{cell}, SYSTEM=RECTANGULAR"
+            yield _numbers(axes[cell, :2].ravel())
+            yield f"*ELSET, ELSET=E{cell}"
+            yield str(cell + 1)
+            yield f"*SOLID SECTION, ELSET=E{cell}, MATERIAL=M{materials[key]}, ORIENTATION=O{cell}"
+
+    @property
+    def _graded(self) -> NDArray[np.bool_]:
+        """Whether Young's modulus changes inside a cell (nc,)."""
+        mesh = self.operators.wing_mesh
+        return (mesh.web < 0) & (mesh.rib < 0) & bool(mesh.design.skin.stations)
+
+    def _root(self) -> Iterator[str]:
+        """Yield the reference node, whose displacements are heave, flap and yaw, its springs and the rib."""
+        points, root = self.operators.discretisation.node_points, self.operators.wing_mesh.design.root
+        reference = self.node_count + 1
+        yield "*NODE"
+        yield f"{reference},0.,0.,0."
+        springs = (root.transverse_spring, root.flap_spring, root.yaw_spring)
+        for number, spring in enumerate(springs, start=1):
+            yield f"*ELEMENT, TYPE=SPRING1, ELSET=SPRING{number}"
+            yield f"{len(self.operators.wing_mesh.cells) + number},{reference}"
+            yield f"*SPRING, ELSET=SPRING{number}"
+            yield str(number)
+            yield f"{spring:.13E}"
+        span = self.operators.wing_mesh.design.planform.semi_span
+        on_root: list[int] = np.flatnonzero(np.abs(points[:, 1]) < 1e-9 * span).tolist()
+        for node in on_root:
+            yield from _equation([(node + 1, 3, -1.0), (reference, 1, 1.0)])
+            terms = [
+                (node + 1, 2, -1.0),
+                (reference, 2, -float(points[node, 2])),
+                (reference, 3, float(points[node, 0])),
+            ]
+            yield from _equation(term for term in terms if term[2] != 0.0)
+        yield "*BOUNDARY"
+        for node in on_root:
+            yield f"{node + 1},1"
+
+    def _masses(self) -> Iterator[str]:
+        """Yield a block for each point mass, all its nodes tied to the mean of the two skins.
+
+        The block only translates, so that its elasticity does not count. CalculiX 2.20 ends with an error in
+        `add_sm_st` when an element of type MASS sits on a node that depends on others.
+        """
+        mesh, body = self.operators.wing_mesh, self.operators.discretisation
+        design = mesh.design
+        first_element = len(mesh.cells) + ROOT_UNKNOWNS + 1
+        for number, place in enumerate(design.point_masses):
+            first = self.node_count + 2 + 8 * number
+            distance = place.station * design.planform.semi_span
+            behind = place.chord * design.planform.chord(place.station)
+            weights: dict[int, float] = {}
+            for upper in (True, False):
+                point = mesh.skin_point(distance, behind, upper=upper)
+                for other, value in zip(*body.point_values(point.cell, point.local), strict=True):
+                    if value != 0.0:
+                        weights[int(other)] = weights.get(int(other), 0.0) + 0.5 * float(value)
+            mass = self.servo_mass if place.kind == "servo" else self.pitot_mass
+            if mass <= 0.0:
+                continue
+            yield "*NODE"
+            for corner, (x, y, z) in enumerate(C3D20_NODES[:8] * _BLOCK):
+                yield f"{first + corner},{_numbers((x, distance + y, z))}"
+            yield f"*ELEMENT, TYPE=C3D8, ELSET=MASS{number}"
+            yield ",".join(str(n) for n in (first_element + number, *range(first, first + 8)))
+            yield f"*MATERIAL, NAME=MASS{number}"
+            yield "*ELASTIC"
+            yield "1.E6,0."
+            yield "*DENSITY"
+            yield f"{mass / _BLOCK**3:.13E}"
+            yield f"*SOLID SECTION, ELSET=MASS{number}, MATERIAL=MASS{number}"
+            for node in range(first, first + 8):
+                for component in (1, 2, 3):
+                    yield from _equation(
+                        [(node, component, -1.0), *((n + 1, component, w) for n, w in weights.items())]
+                    )
+
+    def _probe_nodes(self) -> Iterator[str]:
+        first = self.node_count + 2 + 8 * len(self.operators.wing_mesh.design.point_masses)
+        probes = self.probes
+        nodes = range(first, first + (len(probes) + 2) // 3)
+        yield "*NODE, NSET=NPROBES"
+        for node in nodes:
+            yield f"{node},0.,0.,0."
+        for number, weights in enumerate(probes):
+            yield from _equation([(first + number // 3, number % 3 + 1, -1.0), *self._terms(weights)])
+
+    def _terms(self, free: FloatArray) -> Iterator[tuple[int, int, float]]:
+        """Yield (node, direction, value) of the values (n,) of free unknowns that are not zero."""
+        places = np.asarray(self.operators.expansion[:, :-ROOT_UNKNOWNS].tocsc().indices)
+        for unknown in np.flatnonzero(free):
+            if unknown < len(places):
+                node, component = divmod(int(places[unknown]), 3)
+                yield node + 1, component + 1, float(free[unknown])
+            else:
+                yield self.node_count + 1, int(unknown) - len(places) + 1, float(free[unknown])
+
+    def _load_lines(self, load: FloatArray) -> Iterator[str]:
+        yield "*CLOAD, OP=NEW"
+        if not load.any():
+            yield f"{self.node_count},3,0."
+        for node, direction, value in self._terms(load):
+            yield f"{node},{direction},{value:.13E}"
+
+
+_ORTHOTROPIC = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (5, 5), (4, 4), (3, 3))
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return ",".join(f"{value:.13E}" for value in values)  # at most 20 characters, as CalculiX reads
+
+
+def _equation(terms: Iterable[tuple[int, int, float]]) -> Iterator[str]:
+    text = [f"{node},{direction},{value:.13E}" for node, direction, value in terms]
+    yield "*EQUATION"
+    yield str(len(text))
+    for start in range(0, len(text), _PER_LINE):
+        yield ",".join(text[start : start + _PER_LINE])

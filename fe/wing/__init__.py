@@ -1,0 +1,1 @@
+"""The design of a wing, and its mesh."""

@@ -1,0 +1,247 @@
+"""The wing as its designer describes it: a TOML file, checked, in SI units.
+
+Lengths are in metres, moduli in pascals, densities in kg/m^3, masses in kg, forces in newtons, spring
+constants in N/m and N m/rad. Stations along the span of ribs and point masses are fractions of the
+semi-span, chordwise places are fractions of the local chord measured from the leading edge.
+"""
+
+import hashlib
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, field_validator, model_validator
+
+from fe.runtime.errors import DesignFileError, InvalidDesignError
+from fe.runtime.state import STIFFNESS_LOSS_NAMES, Geometry
+from reporting.section import checked
+from reporting.toml_file import read_toml
+
+from .airfoil import four_digit_half_thickness
+from .parts import (
+    AddedDensity,
+    Airfoil,
+    Defect,
+    Gauges,
+    Lift,
+    Masses,
+    MeshSettings,
+    Part,
+    Planform,
+    PointMassPlace,
+    Rib,
+    Rod,
+    Root,
+    Skin,
+    TipLoad,
+    Web,
+)
+
+SHIPPED_DESIGN = Path(__file__).parents[1] / "designs" / "uav_wing.toml"
+"""The design of the wing of Kapteyn et al. 2021."""
+
+
+class WingDesign(Part):
+    """A wing: everything that decides its model. Construct it with `load_design` or `parse_design`.
+
+    Raises
+    ------
+    InvalidDesignError
+        From `parse_design` and `load_design`, with one sentence that names the place in the design.
+    """
+
+    name: str = Field(min_length=1)
+    planform: Planform
+    airfoil: Airfoil
+    skin: Skin
+    webs: tuple[Web, ...] = Field(min_length=2)
+    ribs: tuple[Rib, ...] = ()
+    rods: tuple[Rod, ...] = ()
+    added_density: tuple[AddedDensity, ...] = ()
+    root: Root
+    masses: Masses
+    point_masses: tuple[PointMassPlace, ...] = ()
+    gauges: Gauges
+    defects: tuple[Defect, ...]
+    lift: Lift
+    tip_load: TipLoad
+    mesh: MeshSettings
+
+    @field_validator("defects")
+    @classmethod
+    def _one_defect_per_loss(cls, defects: tuple[Defect, ...]) -> tuple[Defect, ...]:
+        if len(defects) != len(STIFFNESS_LOSS_NAMES):
+            raise ValueError(
+                f"exactly {len(STIFFNESS_LOSS_NAMES)} defect regions are expected, for "
+                f"{' and '.join(STIFFNESS_LOSS_NAMES)}, but {len(defects)} were given"
+            )
+        return defects
+
+    @model_validator(mode="after")
+    def _parts_fit_together(self) -> "WingDesign":
+        for check in (_check_webs, _check_ribs, _check_regions, _check_gauges, _check_places):
+            check(self)
+        return self
+
+    @property
+    def geometry(self) -> Geometry:
+        """Planform as the `Geometry` of a digital state [m]."""
+        plan = self.planform
+        return Geometry(plan.semi_span, plan.root_chord, plan.tip_chord)
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of the content, 64 hexadecimal digits; comments and key order do not count."""
+        content = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(content.encode()).hexdigest()
+
+    @property
+    def front_chord(self) -> float:
+        """Chord fraction of the front of the box."""
+        return self.webs[0].chord
+
+    @property
+    def rear_chord(self) -> float:
+        """Chord fraction of the rear of the box."""
+        return self.webs[-1].chord
+
+    def changed(self, **sections: Any) -> "WingDesign":
+        """Copy with other contents, checked: `design.changed(mesh={"refinement": 2.0})`.
+
+        Parameters
+        ----------
+        **sections
+            For each top-level key a mapping whose items replace those of the section, or a new value.
+
+        Raises
+        ------
+        InvalidDesignError
+            If the changed design cannot be built.
+        """
+        content = self.model_dump(mode="python")
+        for key, value in sections.items():
+            if isinstance(value, dict) and isinstance(content.get(key), dict):
+                content[key] = {**content[key], **value}
+            else:
+                content[key] = value
+        return parse_design(content, source="the changed design")
+
+
+def _check_webs(design: WingDesign) -> None:
+    smallest = min(design.planform.root_chord, design.planform.tip_chord)
+    for index, (before, after) in enumerate(itertools.pairwise(design.webs), start=1):
+        room = (after.chord - before.chord) * smallest - before.thickness - after.thickness
+        if room <= 0.0:
+            raise ValueError(
+                f"webs[{index}] at chord {after.chord:g} must lie behind webs[{index - 1}] at chord "
+                f"{before.chord:g} with room for the thickness of both"
+            )
+    if design.front_chord <= 0.0 or design.rear_chord >= 1.0:
+        raise ValueError("webs[0] and the last web must lie inside the chord, between 0 and 1")
+    for web in design.webs:
+        half = float(four_digit_half_thickness(web.chord, design.airfoil.thickness_ratio)) * smallest
+        if half <= 1.5 * design.skin.thickness:
+            raise ValueError(
+                f"the skin of {design.skin.thickness:g} m does not fit into the section at chord "
+                f"{web.chord:g}, whose half height is {half:.2g} m at the smallest chord"
+            )
+    for index, rod in enumerate(design.rods):
+        if rod.web >= len(design.webs):
+            raise ValueError(
+                f"rods[{index}] lies in web {rod.web}, but there are only webs 0 to {len(design.webs) - 1}"
+            )
+
+
+def _check_ribs(design: WingDesign) -> None:
+    intervals = sorted((*rib_interval(design, index), index) for index in range(len(design.ribs)))
+    for (_, end, first), (start, _, second) in itertools.pairwise(intervals):
+        if start < end:
+            raise ValueError(f"ribs[{first}] and ribs[{second}] overlap at {start:.4g} m from the root")
+
+
+def _check_regions(design: WingDesign) -> None:
+    span = design.planform.semi_span
+    for index, defect in enumerate(design.defects):
+        where = f"defects[{index}]"
+        if defect.span_end <= defect.span_start or defect.chord_end <= defect.chord_start:
+            raise ValueError(f"{where} must end behind its start, along the span and along the chord")
+        if defect.span_end > span:
+            raise ValueError(f"{where} ends {defect.span_end:g} m from the root, off the wing of {span:g} m")
+        if defect.chord_start < design.front_chord or defect.chord_end > design.rear_chord:
+            raise ValueError(
+                f"{where} covers chord {defect.chord_start:g} to {defect.chord_end:g}, outside the skin of "
+                f"the box from {design.front_chord:g} to {design.rear_chord:g}"
+            )
+    one, two = design.defects
+    if min(one.span_end, two.span_end) > max(one.span_start, two.span_start) and min(
+        one.chord_end, two.chord_end
+    ) > max(one.chord_start, two.chord_start):
+        raise ValueError("defects[0] and defects[1] overlap")
+    for index, added in enumerate(design.added_density):
+        if added.end <= added.start:
+            raise ValueError(f"added_density[{index}] must end behind its start")
+
+
+def _check_gauges(design: WingDesign) -> None:
+    span = design.planform.semi_span
+    along, across = 0.5 * design.gauges.averaging_spanwise, 0.5 * design.gauges.averaging_chordwise
+    for index, (distance, chord) in enumerate(design.gauges.positions):
+        if not along <= distance <= span - along:
+            raise ValueError(
+                f"gauges.positions[{index}] is {distance:g} m from the root, with its averaging length off "
+                f"the wing of {span:g} m"
+            )
+        for end in (distance - along, distance + along):
+            local = design.planform.chord(end / span)
+            middle = chord * design.planform.chord(distance / span)
+            reach = [(middle - across) / local, (middle + across) / local]
+            if reach[0] < design.front_chord or reach[1] > design.rear_chord:
+                raise ValueError(
+                    f"gauges.positions[{index}] at chord {chord:g} does not lie, with its averaging length, "
+                    f"on the skin of the box from chord {design.front_chord:g} to {design.rear_chord:g}"
+                )
+
+
+def _check_places(design: WingDesign) -> None:
+    places = [(f"point_masses[{i}]", place.chord) for i, place in enumerate(design.point_masses)]
+    for where, chord in [*places, ("tip_load", design.tip_load.chord)]:
+        if not design.front_chord <= chord <= design.rear_chord:
+            raise ValueError(
+                f"{where} at chord {chord:g} does not lie on the box from {design.front_chord:g} to "
+                f"{design.rear_chord:g}"
+            )
+    if design.tip_load.distance_from_tip >= design.planform.semi_span:
+        raise ValueError("tip_load.distance_from_tip reaches beyond the root")
+
+
+def rib_interval(design: WingDesign, index: int) -> tuple[float, float]:
+    """Start and end [m from the root] of a rib's thickness; ribs at the ends lie inside the span."""
+    rib, span = design.ribs[index], design.planform.semi_span
+    start = min(max(rib.station * span - 0.5 * rib.thickness, 0.0), span - rib.thickness)
+    return start, start + rib.thickness
+
+
+def parse_design(content: dict[str, Any], source: str = "the design") -> WingDesign:
+    """Check the content of a design file.
+
+    Raises
+    ------
+    InvalidDesignError
+        One sentence that names `source`, the place, what came and what was expected.
+    """
+    return checked(WingDesign, content, source, InvalidDesignError, what="a wing design", first_index=0)
+
+
+def load_design(path: Path | str | None = None) -> WingDesign:
+    """Read a design file; without a path, the shipped design of the UAV wing.
+
+    Raises
+    ------
+    DesignFileError
+        If the file cannot be read or is not TOML.
+    InvalidDesignError
+        If its content is not a wing that can be built.
+    """
+    file = SHIPPED_DESIGN if path is None else Path(path)
+    return parse_design(read_toml(file, DesignFileError, what="wing design"), source=str(file))

@@ -1,0 +1,247 @@
+"""The parts of a wing design: the sections of its TOML file, in SI units, each checked on its own."""
+
+import itertools
+import math
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, model_validator
+
+from reporting.section import Section
+
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Thickness = Annotated[float, Field(gt=0.0, lt=0.1, description="m")]
+Modulus = Annotated[float, Field(ge=1e6, le=1e13, description="Pa")]
+PoissonRatio = Annotated[float, Field(ge=0.0, lt=0.5)]
+ShearRatio = Annotated[float, Field(gt=0.0, le=1.0)]
+Density = Annotated[float, Field(ge=0.0, le=3e4, description="kg/m^3")]
+Spring = Annotated[float, Field(gt=0.0, le=1e15)]
+
+
+class Part(Section):
+    """Section of a design file: unknown keys, non-finite numbers and booleans for numbers are refused."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists_as_tuples(cls, content: object) -> object:
+        return _tuples(content) if isinstance(content, dict) else content
+
+
+def _tuples(content: Any) -> Any:
+    """Return the content of a file with its lists as the tuples that a strict section takes."""
+    if isinstance(content, dict):
+        return {key: _tuples(item) for key, item in content.items()}
+    return tuple(_tuples(item) for item in content) if isinstance(content, list | tuple) else content
+
+
+class Planform(Part):
+    """Straight-tapered half-wing; the chord line `straight_chord_line` is the spanwise axis."""
+
+    semi_span: float = Field(gt=0.05, lt=60.0, description="m")
+    root_chord: float = Field(gt=0.01, lt=15.0, description="m")
+    tip_chord: float = Field(gt=0.01, lt=15.0, description="m")
+    straight_chord_line: Fraction
+
+    def chord(self, station: float) -> float:
+        """Chord [m] at a fraction of the semi-span."""
+        return self.root_chord + (self.tip_chord - self.root_chord) * station
+
+
+class Airfoil(Part):
+    """Symmetric four-digit section."""
+
+    thickness_ratio: float = Field(ge=0.02, le=0.4)
+
+
+class SkinBand(Part):
+    """Young's modulus [Pa] of the skin from the previous band's end to `end`, a fraction of the span."""
+
+    end: Fraction
+    young_modulus: Modulus
+
+
+class SkinStation(Part):
+    """Young's modulus [Pa] of the skin at a fraction of the span."""
+
+    station: Fraction
+    young_modulus: Modulus
+
+
+class Skin(Part):
+    """Shell of the wing; orthotropic with equal moduli, the shear moduli as ratios to Young's modulus.
+
+    Young's modulus along the span is given either in `bands`, each of one modulus, or at `stations`, between
+    which it runs straight.
+    """
+
+    thickness: Thickness
+    density: Density
+    poisson_ratio: PoissonRatio
+    in_plane_shear_ratio: ShearRatio
+    transverse_shear_ratio: ShearRatio
+    closed_leading_edge: bool = True
+    bands: tuple[SkinBand, ...] = ()
+    stations: tuple[SkinStation, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_course_of_the_modulus(self) -> "Skin":
+        if bool(self.bands) == bool(self.stations):
+            raise ValueError("Young's modulus must be given either in bands or at stations")
+        places = [place.station for place in self.stations]
+        if places and (
+            len(places) < 2
+            or any(after <= before for before, after in itertools.pairwise(places))
+            or (places[0], places[-1]) != (0.0, 1.0)
+        ):
+            raise ValueError(f"the stations must rise from 0 to 1, but are {places}")
+        ends = [band.end for band in self.bands]
+        if ends and (
+            any(after <= before for before, after in itertools.pairwise([0.0, *ends])) or ends[-1] != 1.0
+        ):
+            raise ValueError(f"the ends of the bands must rise from above 0 to 1, but are {ends}")
+        return self
+
+    def young_modulus(self, station: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Young's modulus (...,) [Pa] at fractions of the span (...,)."""
+        if self.stations:
+            places = [place.station for place in self.stations]
+            return np.asarray(np.interp(station, places, [place.young_modulus for place in self.stations]))
+        moduli = np.array([band.young_modulus for band in self.bands])
+        return moduli[np.searchsorted([band.end for band in self.bands], station)]
+
+
+class Web(Part):
+    """Spanwise web at a chordwise place; the first and the last close the box."""
+
+    chord: Fraction
+    thickness: Thickness
+    young_modulus: Modulus
+    shear_modulus: Modulus
+    poisson_ratio: PoissonRatio
+    density: Density
+
+
+class Rib(Part):
+    """Rib at a fraction of the span, isotropic, over the whole height and width of the box."""
+
+    station: Fraction
+    thickness: Thickness
+    young_modulus: Modulus
+    poisson_ratio: PoissonRatio
+    density: Density
+
+
+class Rod(Part):
+    """Solid round rod at mid-height of a web, from the root to `reach`, a fraction of the span.
+
+    Its flapwise bending stiffness and its mass are spread over the cells of that web.
+    """
+
+    web: int = Field(ge=0)
+    reach: float = Field(gt=0.0, le=1.0)
+    diameter: Thickness
+    young_modulus: Modulus
+    density: Density
+
+    @property
+    def bending_stiffness(self) -> float:
+        """E I [N m^2]."""
+        return self.young_modulus * math.pi * self.diameter**4 / 64.0
+
+    @property
+    def mass_per_length(self) -> float:
+        """Mass per length [kg/m]."""
+        return self.density * math.pi * self.diameter**2 / 4.0
+
+
+class AddedDensity(Part):
+    """Density [kg/m^3] added to everything between two fractions of the span (glue, paint, wiring)."""
+
+    start: Fraction
+    end: Fraction
+    density: Density
+
+
+class Root(Part):
+    """Springs that carry the rigid root rib; its other motions are held."""
+
+    transverse_spring: Spring = Field(description="N/m")
+    flap_spring: Spring = Field(description="N m/rad")
+    yaw_spring: Spring = Field(description="N m/rad")
+
+
+class PointMassPlace(Part):
+    """Where a point mass of a kind sits; its mass is `masses.<kind>` until calibrated."""
+
+    kind: Literal["servo", "pitot"]
+    station: Fraction
+    chord: Fraction
+
+
+class Masses(Part):
+    """Nominal masses [kg] of one servo and of the pitot tube."""
+
+    servo: float = Field(ge=0.0, lt=1e3)
+    pitot: float = Field(ge=0.0, lt=1e3)
+
+
+class Gauges(Part):
+    """Strain gauges on the upper skin, along the span.
+
+    Positions are (distance from the root [m], chord fraction); a gauge reads the strain averaged over a
+    patch of `averaging_chordwise` by `averaging_spanwise` [m], on the outer surface of the skin or in the
+    middle of its thickness, where the bending of the thin skin between its supports does not show.
+    """
+
+    averaging_chordwise: float = Field(ge=0.0, lt=1.0, description="m")
+    averaging_spanwise: float = Field(default=0.0, ge=0.0, lt=1.0, description="m")
+    surface: Literal["outer", "middle"] = "outer"
+    positions: tuple[tuple[float, float], ...] = Field(min_length=1)
+
+
+class Defect(Part):
+    """Region of the upper skin that may lose stiffness: distances from the root [m], chord fractions."""
+
+    span_start: float = Field(ge=0.0)
+    span_end: float = Field(gt=0.0)
+    chord_start: Fraction
+    chord_end: Fraction
+
+
+class Lift(Part):
+    """Net load of a level turn, linear in the load factor.
+
+    `force` [N] and `forward_force` [N] are the totals on the half-wing at `load_factor`. The lift is weighted
+    along the chord by (1 - xi)^`chordwise_exponent`, xi the chord fraction. With `inertia_relief` the weight
+    of the structure and of the nominal point masses, times the load factor, acts against the lift where it
+    lies; `force` stays the net total.
+    """
+
+    distribution: Literal["schrenk", "lifting_line"]
+    force: float = Field(gt=0.0, lt=1e6)
+    forward_force: float = Field(ge=0.0, lt=1e6)
+    load_factor: float = Field(gt=0.0, lt=20.0)
+    chordwise_exponent: float = Field(default=1.0, ge=0.0, le=10.0)
+    inertia_relief: bool = False
+
+
+class TipLoad(Part):
+    """Place of the static test load: distance from the tip [m] and chord fraction."""
+
+    distance_from_tip: float = Field(ge=0.0)
+    chord: Fraction
+
+
+class MeshSettings(Part):
+    """Largest cell: along the span [m] and along the chord (fraction), and beside the edges of defects [m].
+
+    All are divided by `refinement`. Without `edge_size` the cells beside the edges are like the others.
+    """
+
+    span_size: float = Field(gt=1e-3, lt=10.0)
+    chord_size: float = Field(gt=0.005, le=1.0)
+    edge_size: float | None = Field(default=None, gt=1e-3, lt=1.0)
+    refinement: float = Field(default=1.0, ge=0.25, le=8.0)

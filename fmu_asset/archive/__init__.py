@@ -1,0 +1,1 @@
+"""An FMU file from outside, checked and unpacked."""

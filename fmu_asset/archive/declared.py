@@ -1,0 +1,311 @@
+"""What an FMU declares in its model description, as plain records for all FMI versions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+from fmu_asset.errors import visible
+from fmu_asset.instances.plan import Interface
+
+NUMERIC_KINDS = frozenset(
+    {"Real", "Integer", "Enumeration", "Boolean", "Float32", "Float64"}
+    | {f"{sign}{bits}" for sign in ("Int", "UInt") for bits in (8, 16, 32, 64)}
+)
+_LARGEST_ARRAY = 10_000_000
+FLOAT_KINDS = frozenset({"Real", "Float32", "Float64"})
+
+
+@dataclass(frozen=True)
+class VariableInfo:
+    """A variable as the FMU declares it.
+
+    Attributes
+    ----------
+    name, description : str
+        As declared.
+    reference : int
+        Value reference.
+    kind : str
+        FMI base type: Real, Integer, Enumeration, Boolean, String; in FMI 3 Float64, Int32, Binary, ...
+    causality, variability : str
+        As declared.
+    unit, display_unit : str or None
+        As declared, or by the declared type.
+    minimum, maximum : float or None
+        Declared range in `unit`.
+    start : str or None
+        Declared start value; of an array, its elements.
+    shape : tuple of int
+        Of an array of FMI 3, with the start values of its structural parameters; empty for a scalar.
+    clocked : bool
+        Whether it changes with a clock of FMI 3 only.
+    """
+
+    name: str
+    reference: int
+    kind: str
+    causality: str
+    variability: str
+    description: str
+    unit: str | None
+    display_unit: str | None
+    minimum: float | None
+    maximum: float | None
+    start: str | None
+    shape: tuple[int, ...] = ()
+    clocked: bool = False
+
+    @property
+    def size(self) -> int:
+        """Number of values."""
+        return math.prod(self.shape)
+
+    @property
+    def numeric(self) -> bool:
+        """Whether its values are numbers."""
+        return self.kind in NUMERIC_KINDS
+
+
+@dataclass(frozen=True)
+class UnitInfo:
+    """A unit as the FMU defines it: SI exponents (or None), factor and offset to SI, display units."""
+
+    name: str
+    exponents: tuple[int, ...] | None
+    factor: float
+    offset: float
+    displays: tuple[tuple[str, float, float], ...]
+
+
+@dataclass(frozen=True)
+class FmuDescription:
+    """What an FMU file is and declares; plain values only, so that it can be listed or sent.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    sha256 : str
+        Hash of the file.
+    file_size : int
+        Bytes.
+    fmi_version, model_name, model_identifier, guid, description, generation_tool : str
+        As declared; the identifier is that of `interface`.
+    platforms : tuple of str
+        Folders of binaries, such as linux64.
+    can_get_and_set_state, can_serialise_state, can_vary_step : bool
+        Declared capabilities of `interface`.
+    variables : tuple of VariableInfo
+        In the order of the model description.
+    units : tuple of UnitInfo
+        The unit definitions.
+    interface : {"co-simulation", "model-exchange"}
+        How it is run.
+    interfaces : tuple of str
+        All that it offers.
+    needs_tool : bool
+        Whether it needs its authoring tool.
+    once_per_process : bool
+        Whether a process can make one instance only.
+    start_time, step_size, tolerance : float or None
+        Of the default experiment.
+    fixed_step : float or None
+        Internal step size that FMI 3 declares [s].
+    states, event_indicators : int
+        Numbers of continuous states and event indicators.
+    completed_step : bool
+        Whether model exchange wants to hear of completed integrator steps.
+    """
+
+    path: Path
+    sha256: str
+    file_size: int
+    fmi_version: str
+    model_name: str
+    model_identifier: str
+    guid: str
+    description: str
+    generation_tool: str
+    platforms: tuple[str, ...]
+    can_get_and_set_state: bool
+    can_serialise_state: bool
+    can_vary_step: bool
+    variables: tuple[VariableInfo, ...]
+    units: tuple[UnitInfo, ...]
+    interface: Interface = "co-simulation"
+    interfaces: tuple[str, ...] = ("co-simulation",)
+    needs_tool: bool = False
+    once_per_process: bool = False
+    start_time: float | None = None
+    step_size: float | None = None
+    tolerance: float | None = None
+    fixed_step: float | None = None
+    states: int = 0
+    event_indicators: int = 0
+    completed_step: bool = False
+
+    @property
+    def major_version(self) -> int:
+        """1, 2 or 3."""
+        return int(self.fmi_version[0])
+
+    @cached_property
+    def _by_name(self) -> dict[str, VariableInfo]:
+        return {variable.name: variable for variable in self.variables}
+
+    def variable(self, name: str) -> VariableInfo | None:
+        """Return the variable of that name, or None."""
+        return self._by_name.get(name)
+
+    def exchange_kind(self, variable: VariableInfo) -> str:
+        """Return the base type in which a variable is set and read: enumerations are integers."""
+        if variable.kind != "Enumeration":
+            return variable.kind
+        return "Int64" if self.major_version == 3 else "Integer"
+
+
+def read_declared(
+    declared: Any, root: Element, file: Path, archive: Mapping[str, Any], interface: Interface
+) -> FmuDescription:
+    """Return the description of an FMU from what fmpy has read.
+
+    Parameters
+    ----------
+    declared : fmpy.model_description.ModelDescription
+        As fmpy reads it.
+    root : Element
+        The XML itself, for what fmpy leaves out.
+    file : Path
+        The FMU.
+    archive : mapping
+        `sha256`, `file_size` and `platforms`.
+    interface : {"co-simulation", "model-exchange"}
+        How it is to be run; it offers that.
+    """
+    chosen = declared.coSimulation if interface == "co-simulation" else declared.modelExchange
+    experiment = declared.defaultExperiment
+    offered = {"co-simulation": declared.coSimulation, "model-exchange": declared.modelExchange}
+    # fmpy does not read the capabilities of FMI 1.
+    capabilities = root.find("Implementation//Capabilities")
+    vary = getattr(chosen, "canHandleVariableCommunicationStepSize", True)
+    if capabilities is not None:
+        vary = capabilities.get("canHandleVariableCommunicationStepSize") in ("true", "1")
+    # FMI 1 always wants it.
+    completed = bool(getattr(chosen, "needsCompletedIntegratorStep", False)) or declared.fmiVersion == "1.0"
+
+    def of_experiment(attribute: str) -> float | None:
+        value = getattr(experiment, attribute, None)
+        return None if value is None else float(value)
+
+    fixed = getattr(chosen, "fixedInternalStepSize", None)
+    return FmuDescription(
+        path=file,
+        sha256=archive["sha256"],
+        file_size=archive["file_size"],
+        fmi_version=str(declared.fmiVersion),
+        model_name=str(declared.modelName),
+        model_identifier=str(chosen.modelIdentifier),
+        guid=str(declared.guid),
+        description=str(declared.description or ""),
+        generation_tool=str(declared.generationTool or ""),
+        platforms=archive["platforms"],
+        can_get_and_set_state=bool(chosen.canGetAndSetFMUstate),
+        can_serialise_state=bool(chosen.canSerializeFMUstate),
+        can_vary_step=bool(vary),
+        variables=tuple(_variable(variable) for variable in declared.modelVariables),
+        units=tuple(_unit(unit) for unit in declared.unitDefinitions),
+        interface=interface,
+        interfaces=tuple(name for name, given in offered.items() if given is not None),
+        needs_tool=bool(chosen.needsExecutionTool)
+        or root.find("Implementation/CoSimulation_Tool") is not None,
+        once_per_process=bool(getattr(chosen, "canBeInstantiatedOnlyOncePerProcess", False)),
+        start_time=of_experiment("startTime"),
+        step_size=of_experiment("stepSize"),
+        tolerance=of_experiment("tolerance"),
+        fixed_step=None if fixed is None else float(fixed),
+        states=int(declared.numberOfContinuousStates),
+        event_indicators=int(declared.numberOfEventIndicators),
+        completed_step=completed,
+    )
+
+
+def _variable(declared: Any) -> VariableInfo:
+    declared_type = declared.declaredType
+
+    def of(attribute: str) -> Any:
+        value = getattr(declared, attribute)
+        return (
+            getattr(declared_type, attribute, None) if value is None and declared_type is not None else value
+        )
+
+    shape = tuple(declared.shape or ())
+    if any(length < 0 for length in shape) or math.prod(shape) > _LARGEST_ARRAY:
+        raise ValueError(f"{declared.name!r} is an array of {' x '.join(map(str, shape))} elements")
+    return VariableInfo(
+        name=str(declared.name),
+        reference=int(declared.valueReference),
+        kind=str(declared.type),
+        causality=str(declared.causality or "local"),
+        variability=str(declared.variability or "continuous"),
+        description=str(declared.description or ""),
+        unit=of("unit"),
+        display_unit=of("displayUnit"),
+        minimum=None if of("min") is None else float(of("min")),
+        maximum=None if of("max") is None else float(of("max")),
+        start=None if declared.start is None else str(declared.start),
+        shape=shape,
+        clocked=bool(declared.clocks),
+    )
+
+
+def _unit(declared: Any) -> UnitInfo:
+    base = declared.baseUnit
+    exponents = (
+        None
+        if base is None
+        else tuple(int(getattr(base, symbol)) for symbol in ("kg", "m", "s", "A", "K", "mol", "cd", "rad"))
+    )
+    return UnitInfo(
+        name=str(declared.name),
+        exponents=exponents,
+        factor=1.0 if base is None else float(base.factor),
+        offset=0.0 if base is None else float(base.offset),
+        displays=tuple((str(d.name), float(d.factor), float(d.offset)) for d in declared.displayUnits),
+    )
+
+
+def _visible(record: dict[str, Any]) -> dict[str, Any]:
+    return {name: visible(value) if isinstance(value, str) else value for name, value in record.items()}
+
+
+def describe_fmu(description: FmuDescription, roles: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Return an FMU's description as plain records, with the role of each variable if known.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        As `read_fmu` returns it.
+    roles : mapping of str to str, optional
+        Role by variable name.
+
+    Returns
+    -------
+    dict
+        Plain values, JSON-serialisable.
+    """
+    record: dict[str, Any] = _visible(asdict(description))
+    record["path"] = str(description.path)
+    record["platforms"] = list(description.platforms)
+    record["interfaces"] = list(description.interfaces)
+    record["units"] = [asdict(unit) for unit in description.units]
+    record["variables"] = [
+        _visible(asdict(variable)) | {"role": (roles or {}).get(variable.name, "")}
+        for variable in description.variables
+    ]
+    return record

@@ -1,0 +1,267 @@
+"""An FMU file from outside: sound, safe to extract, of a kind that can be flown, and what it declares."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import stat
+import zipfile
+import zlib
+from pathlib import Path, PurePosixPath
+from typing import Any
+from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
+
+from fmpy import platform as fmi_platform
+from fmpy import platform_tuple, read_model_description, sharedLibraryExtension
+
+from fmu_asset.errors import FmuFileError, FmuUnsupportedError
+from fmu_asset.folders import plain_folder, remove_folder
+from fmu_asset.instances.plan import Interface
+
+from .declared import FmuDescription, UnitInfo, VariableInfo, describe_fmu, read_declared
+
+__all__ = [
+    "FmuDescription",
+    "UnitInfo",
+    "VariableInfo",
+    "describe_fmu",
+    "extract_fmu",
+    "plain_folder",
+    "read_fmu",
+]
+
+# A model FMU of hundreds of megabytes exists; one that unpacks to more than this is a mistake or an attack.
+LARGEST_EXTRACTED_BYTES = 4 * 1024**3
+_LARGEST_RATIO = 200
+_SMALL_ENOUGH = 256 * 1024**2
+_MOST_ENTRIES = 100_000
+_DEEPEST = 100
+_LARGEST_DESCRIPTION = 256 * 1024**2
+
+_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -> FmuDescription:
+    """Check an FMU file and return what it declares, without extracting it.
+
+    Parameters
+    ----------
+    path : path-like
+        The FMU.
+    interface : {"co-simulation", "model-exchange"}, optional
+        How it is to be run; co-simulation where it offers that.
+
+    Returns
+    -------
+    FmuDescription
+        What it declares.
+
+    Raises
+    ------
+    FmuFileError
+        If the file is missing, no archive, damaged, unsafe, or its model description cannot be read.
+    FmuUnsupportedError
+        If it is not of FMI 1, 2 or 3, offers neither co-simulation nor model exchange (or not the one that is
+        asked for), or has no binary for this platform.
+    """
+    file = Path(path)
+    size, sha256 = _size_and_hash(file)
+    names = _check_archive(file, size)
+    if "modelDescription.xml" not in names:
+        raise FmuFileError(f"{file} is an archive without modelDescription.xml, so it is not an FMU.")
+    root = _model_description(file)
+    version = root.get("fmiVersion") or ""
+    if version not in ("1.0", "2.0") and not version.startswith("3."):
+        raise FmuUnsupportedError(
+            f"{file} is an FMU of FMI {version or '(not said)'}; FMI 1.0, 2.0 or 3.0 is needed: export it "
+            "as such."
+        )
+    try:
+        declared = read_model_description(str(file), validate=False)
+        offered = _offered(file, declared, interface)
+        platforms = tuple(
+            sorted({PurePosixPath(name).parts[1] for name in names if re.match(r"binaries/[^/]+/.+", name)})
+        )
+        archive = {"sha256": sha256, "file_size": size, "platforms": platforms}
+        description = read_declared(declared, root, file, archive, offered)
+    except FmuUnsupportedError:
+        raise
+    except Exception as error:
+        why = " ".join(str(error).split()).removesuffix(".")
+        raise FmuFileError(f"The model description of {file} cannot be read ({why}).") from error
+    if not _IDENTIFIER.fullmatch(description.model_identifier):
+        raise FmuFileError(
+            f"The model identifier of {file}, {description.model_identifier!r}, is no name of a C "
+            "function; the "
+            "FMU is damaged or unsafe."
+        )
+    here = platform_tuple if description.major_version == 3 else fmi_platform
+    binary = f"binaries/{here}/{description.model_identifier}{sharedLibraryExtension}"
+    if binary not in names:
+        there = ", ".join(platforms) or "none"
+        raise FmuUnsupportedError(
+            f"{file} has no binary for this platform ({binary} is not in it; binaries there: {there}); "
+            f"export it for {here}."
+        )
+    return description
+
+
+def _offered(file: Path, declared: Any, wanted: Interface | None) -> Interface:
+    """Return the interface to use."""
+    offered: dict[Interface, Any] = {
+        "co-simulation": declared.coSimulation, "model-exchange": declared.modelExchange
+    }  # fmt: skip
+    there: list[Interface] = [name for name, given in offered.items() if given is not None]
+    if not there:
+        raise FmuUnsupportedError(
+            f"{file} offers neither co-simulation nor model exchange (scheduled execution is not supported); "
+            "export it for co-simulation."
+        )
+    if wanted is not None and wanted not in there:
+        raise FmuUnsupportedError(
+            f"{file} offers {there[0]} only, but the binding asks for {wanted}; change `interface` there, or "
+            "export the FMU anew."
+        )
+    return wanted or there[0]
+
+
+def extract_fmu(description: FmuDescription) -> Path:
+    """Extract an FMU that `read_fmu` has checked into a new folder with a plain ASCII path.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU; the file must not have changed since it was read.
+
+    Returns
+    -------
+    Path
+        The folder; the caller removes it.
+
+    Raises
+    ------
+    FmuFileError
+        If the file has changed, cannot be extracted, or no folder with a plain path can be made.
+    """
+    if _size_and_hash(description.path)[1] != description.sha256:
+        raise FmuFileError(f"{description.path} has changed since it was checked; start again.")
+    folder = plain_folder()
+    try:
+        with zipfile.ZipFile(description.path) as archive:
+            needed = sum(entry.file_size for entry in archive.infolist())
+        free = shutil.disk_usage(folder).free
+        if needed > free:
+            raise OSError(f"it needs {needed // 1024**2} MiB, and {free // 1024**2} MiB are free")
+        with zipfile.ZipFile(description.path) as archive:
+            archive.extractall(folder)
+    except (OSError, zipfile.BadZipFile, zlib.error) as error:
+        remove_folder(folder)
+        raise FmuFileError(f"{description.path} could not be extracted to {folder} ({error}).") from error
+    return folder
+
+
+def _size_and_hash(file: Path) -> tuple[int, str]:
+    if not file.exists():
+        raise FmuFileError(f"There is no FMU {file}; check the path, or build it with `uav-twin fmu build`.")
+    if not file.is_file():
+        raise FmuFileError(f"{file} is a folder, not an FMU file.")
+    try:
+        with file.open("rb") as content:
+            return file.stat().st_size, hashlib.file_digest(content, "sha256").hexdigest()
+    except OSError as error:
+        raise FmuFileError(f"{file} cannot be read ({error.strerror}).") from error
+
+
+def _check_archive(file: Path, size: int) -> set[str]:
+    """Check structure, checksums, names and sizes of the archive; return the names of its files."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            entries = archive.infolist()
+            for entry in entries:
+                _check_entry(file, entry)
+            names = [entry.filename for entry in entries if not entry.is_dir()]
+            if len(entries) > _MOST_ENTRIES or len({*names}) < len(names):
+                raise FmuFileError(
+                    f"{file} holds {len(entries)} entries, too many or some twice; no tool exports that, "
+                    "and it "
+                    "was refused."
+                )
+            extracted = sum(entry.file_size for entry in entries)
+            if extracted > min(LARGEST_EXTRACTED_BYTES, max(_SMALL_ENOUGH, _LARGEST_RATIO * size)):
+                raise FmuFileError(
+                    f"{file} has {size / 1024**2:.3g} MiB and would extract to {extracted / 1024**2:.0f} "
+                    "MiB, "
+                    "which looks like an archive made to fill the disk; it was refused."
+                )
+            broken = archive.testzip()
+            if broken is not None:
+                raise FmuFileError(f"{file} is damaged: the checksum of {broken} is wrong; fetch it again.")
+            return {*names}
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError) as error:
+        raise FmuFileError(
+            f"{file} is not a sound FMU archive ({error}); fetch or build it again."
+        ) from error
+
+
+def _check_entry(file: Path, entry: zipfile.ZipInfo) -> None:
+    name = entry.orig_filename
+    parts = PurePosixPath(name).parts
+    mode = entry.external_attr >> 16
+    if (
+        not name
+        or "\\" in name
+        or ":" in name
+        or "\0" in name
+        or name.startswith("/")
+        or ".." in parts
+        or stat.S_ISLNK(mode)
+    ):
+        raise FmuFileError(
+            f"{file} holds the entry {name!r}, which would be extracted outside its folder; it was refused."
+        )
+    if len(parts) > _DEEPEST:
+        raise FmuFileError(
+            f"{file} holds an entry {len(parts)} folders deep; no tool exports that (at most {_DEEPEST} are "
+            "taken), and it was refused."
+        )
+
+
+class _DocumentTypeError(Exception):
+    pass
+
+
+class _WithoutDocumentType(TreeBuilder):
+    """Elements of a file in any encoding, up to a document type, before its entities are defined."""
+
+    def doctype(self, name: str, public: str | None, system: str | None) -> None:
+        raise _DocumentTypeError
+
+
+def _model_description(file: Path) -> Element:
+    """Return the XML of the model description, which must not define entities that grow or read files."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            if archive.getinfo("modelDescription.xml").file_size > _LARGEST_DESCRIPTION:
+                raise FmuFileError(
+                    f"The model description of {file} is larger than {_LARGEST_DESCRIPTION // 1024**2} "
+                    "MiB; it "
+                    "was refused."
+                )
+            text = archive.read("modelDescription.xml")
+        parser = XMLParser(target=_WithoutDocumentType())
+        parser.feed(text)
+        root: Element = parser.close()
+    except _DocumentTypeError:
+        raise FmuFileError(
+            f"The model description of {file} defines a document type or entities, which FMI does not "
+            "provide for and which can be made to fill the memory; it was refused."
+        ) from None
+    except (ParseError, ValueError, LookupError, zipfile.BadZipFile, OSError) as error:
+        if isinstance(error, FmuFileError):
+            raise
+        raise FmuFileError(f"The model description of {file} cannot be read ({error}).") from error
+    if root.tag != "fmiModelDescription":
+        raise FmuFileError(f"The model description of {file} begins with <{root.tag}>; it is damaged.")
+    return root

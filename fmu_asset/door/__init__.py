@@ -1,0 +1,1 @@
+"""The one door to any FMU: bindings, what is sent and read."""

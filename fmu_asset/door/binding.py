@@ -1,0 +1,435 @@
+"""Binding files: which variable of an FMU plays which role, and in which unit the caller speaks.
+
+A binding knows roles, not wings. It is TOML:
+
+```toml
+[binding]
+name = "uav_wing"
+step_size = 1.0            # s
+
+[control.load_factor]      # what a policy chooses
+variable = "load_factor"
+unit = "1"
+
+[observation.strain]       # what is measured; a list, or a pattern
+variables = "strain[{1..24}]"
+unit = "1"
+```
+
+The other roles are `health` (the state of damage), `load` (other inputs), `parameter` (set before the first
+step, optionally with a `value` here), `monitor` (further scalars to be recorded) and `port` (force,
+displacement and velocity where another FMU can be coupled). `[record]` names variables to be recorded in the
+FMU's own units, and `[limits]` says what the FMU's worker may take.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from fmu_asset.errors import BindingError
+from fmu_asset.instances.plan import Interface
+from reporting.toml_file import read_toml
+
+from .unit_symbols import same_dimension
+
+INPUT_ROLES = ("control", "health", "load")
+"""Roles whose variables are sent at every step, in the order in which they are sent; ports follow."""
+
+PORT_QUANTITIES = {"force": ("N", "N.m"), "displacement": ("m", "rad"), "velocity": ("m/s", "rad/s")}
+"""What a mechanical port consists of, with its units where it is one of translation or of rotation."""
+
+_RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
+_LARGEST_PATTERN = 100_000
+
+_Text = Annotated[str, Field(min_length=1)]
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class Scalar(_Record):
+    """One variable: its name in the FMU and the unit in which the caller gives or takes it.
+
+    The name is that of a scalar, of one element of an FMI 3 array (`p[3]`, `a[2,1]`; from 1), or of a whole
+    array, which takes as many values.
+    """
+
+    variable: _Text
+    unit: _Text
+
+
+class Input(Scalar):
+    """An input with a range of its own, in `unit`, within that of the FMU."""
+
+    minimum: _Number | None = None
+    maximum: _Number | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Input:
+        if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
+            raise ValueError(f"minimum {self.minimum:g} is larger than maximum {self.maximum:g}")
+        return self
+
+
+class Parameter(Input):
+    """A parameter; `value`, in `unit`, is set at every reset unless the caller gives another."""
+
+    value: _Number | None = None
+
+
+class Vector(_Record):
+    """Several variables in order; a text with `{a..b}` stands for all numbers from a to b.
+
+    `unit` is one for all variables, or one for each.
+    """
+
+    variables: tuple[_Text, ...]
+    unit: _Text | tuple[_Text, ...]
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each variable."""
+        return (self.unit,) * len(self.variables) if isinstance(self.unit, str) else self.unit
+
+    @field_validator("unit", mode="before")
+    @classmethod
+    def _listed(cls, given: object) -> object:
+        return tuple(given) if isinstance(given, list) else given
+
+    @model_validator(mode="after")
+    def _one_or_each(self) -> Self:
+        if len(self.units) != len(self.variables):
+            raise ValueError(
+                f"`unit` must be one text, or one for each of the {len(self.variables)} variables, and "
+                f"{len(self.units)} came"
+            )
+        return self
+
+    @field_validator("variables", mode="before")
+    @classmethod
+    def _expand(cls, given: object) -> object:
+        return _expanded(given)
+
+    @field_validator("variables")
+    @classmethod
+    def _not_empty(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if not names:
+            raise ValueError("at least one variable is needed")
+        return names
+
+
+class Port(_Record):
+    """A mechanical port: where another FMU can be coupled.
+
+    Force goes one way and motion the other: an FMU takes the force and gives displacement or velocity, or the
+    other way round. Inputs are given to `FmiAsset.step` as `port={"<name>.force": ...}`, outputs are in
+    `Observation.extra` under the same names.
+    """
+
+    force: Vector
+    displacement: Vector | None = None
+    velocity: Vector | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> Port:
+        if self.displacement is None and self.velocity is None:
+            raise ValueError("a port needs a displacement or a velocity beside its force")
+        for name, vector in self.quantities.items():
+            if not isinstance(vector.unit, str):
+                raise ValueError(f"{name} must have one unit, and {len(vector.unit)} came")
+            allowed = [same_dimension(vector.unit, unit) for unit in PORT_QUANTITIES[name]]
+            if allowed == [False, False]:
+                raise ValueError(
+                    f"{name} is in {vector.unit!r}, but must be in {' or '.join(PORT_QUANTITIES[name])}"
+                )
+        return self
+
+    @property
+    def quantities(self) -> dict[str, Vector]:
+        """What the port has, in the order of `PORT_QUANTITIES`."""
+        given = {name: getattr(self, name) for name in PORT_QUANTITIES}
+        return {name: vector for name, vector in given.items() if vector is not None}
+
+
+class Record(_Record):
+    """The table `[record]`: further variables to be recorded, in the FMU's own units."""
+
+    variables: tuple[_Text, ...] = ()
+
+    @field_validator("variables", mode="before")
+    @classmethod
+    def _expand(cls, given: object) -> object:
+        return _expanded(given)
+
+
+class WorkerLimits(_Record):
+    """The table `[limits]`: what the FMU's worker may take; what is not said is the default.
+
+    Attributes
+    ----------
+    step_time, load_time : float or None
+        Wall clock for one step, and for loading and initialisation [s].
+    memory : float or None
+        Resident memory [MiB].
+    """
+
+    step_time: _Positive | None = None
+    load_time: _Positive | None = None
+    memory: _Positive | None = None
+
+
+class Header(_Record):
+    """The table `[binding]`.
+
+    Attributes
+    ----------
+    name : str
+        Name of the binding.
+    step_size : float
+        Communication step of the FMU [s].
+    decimation : int
+        Communication steps between two observations; the inputs are held meanwhile.
+    start_time : float
+        Where the FMU begins [s].
+    fmi_version : {"1.0", "2.0", "3.0"}, optional
+        What the FMU must be; any of them if absent.
+    interface : {"co-simulation", "model-exchange"}, optional
+        How it is run; co-simulation where it offers that.
+    tolerance : float, optional
+        Relative tolerance of the FMU's solver, and of ours in model exchange; if absent, what the FMU
+        declares for its default experiment (ours is never looser than 1e-6 then).
+    state : {"auto", "serialised", "replay"}
+        How `save_state` keeps the state; auto trusts what the FMU declares.
+    description : str
+        A line for people.
+    """
+
+    name: _Text
+    step_size: _Positive
+    decimation: int = Field(default=1, ge=1, le=10_000_000)
+    start_time: _Number = 0.0
+    fmi_version: Literal["1.0", "2.0", "3.0"] | None = None
+    interface: Interface | None = None
+    tolerance: _Positive | None = None
+    state: Literal["auto", "serialised", "replay"] = "auto"
+    description: str = ""
+
+
+class Binding(_Record):
+    """A whole binding file.
+
+    Attributes
+    ----------
+    binding : Header
+        Name, FMI version, step size.
+    control, health, load : dict of str to Input
+        Inputs by role and by the caller's name.
+    observation : dict of str to Vector
+        What is measured, in order.
+    parameter : dict of str to Parameter
+        Parameters by the caller's name.
+    monitor : dict of str to Scalar
+        Further scalars to be recorded.
+    port : dict of str to Port
+        Where other FMUs can be coupled.
+    record : Record
+        Further variables to be recorded, in the FMU's units.
+    limits : WorkerLimits
+        What the worker may take.
+    """
+
+    binding: Header
+    control: dict[str, Input] = Field(default_factory=dict)
+    health: dict[str, Input] = Field(default_factory=dict)
+    load: dict[str, Input] = Field(default_factory=dict)
+    observation: dict[str, Vector] = Field(default_factory=dict)
+    parameter: dict[str, Parameter] = Field(default_factory=dict)
+    monitor: dict[str, Scalar] = Field(default_factory=dict)
+    port: dict[str, Port] = Field(default_factory=dict)
+    record: Record = Field(default_factory=Record)
+    limits: WorkerLimits = Field(default_factory=WorkerLimits)
+
+    @property
+    def name(self) -> str:
+        """Name of the binding."""
+        return self.binding.name
+
+    @property
+    def step_size(self) -> float:
+        """Communication step size [s]."""
+        return self.binding.step_size
+
+    @property
+    def interval(self) -> float:
+        """Time between two observations [s]."""
+        return self.binding.step_size * self.binding.decimation
+
+    def inputs(self, role: str) -> Mapping[str, Input]:
+        """Return the variables of one of `INPUT_ROLES` by the caller's names."""
+        table: Mapping[str, Input] = {"control": self.control, "health": self.health, "load": self.load}[role]
+        return table
+
+    @property
+    def observation_variables(self) -> tuple[str, ...]:
+        """FMU variables of all observations, in the order of `Observation.values`."""
+        return tuple(name for vector in self.observation.values() for name in vector.variables)
+
+    def observation_slice(self, name: str) -> slice:
+        """Return where the observation of that name stands in `Observation.values`.
+
+        Raises
+        ------
+        BindingError
+            If the binding has no such observation.
+        """
+        begin = 0
+        for key, vector in self.observation.items():
+            if key == name:
+                return slice(begin, begin + len(vector.variables))
+            begin += len(vector.variables)
+        raise BindingError(
+            f"The binding {self.name} has no observation {name!r}; it has {_listed(self.observation)}."
+        )
+
+    def with_arrays(self, elements: Callable[[str], Sequence[str]]) -> Binding:
+        """Return the binding with every array that is observed or recorded as its elements.
+
+        Parameters
+        ----------
+        elements : callable
+            Names of the elements of a variable; the name itself for a scalar.
+        """
+
+        def of(names: Sequence[str]) -> tuple[str, ...]:
+            return tuple(element for name in names for element in elements(name))
+
+        observation = {
+            key: vector.model_copy(
+                update={
+                    "variables": of(vector.variables),
+                    "unit": vector.unit
+                    if isinstance(vector.unit, str)
+                    else tuple(
+                        unit
+                        for name, unit in zip(vector.variables, vector.unit, strict=True)
+                        for _ in elements(name)
+                    ),
+                }
+            )
+            for key, vector in self.observation.items()
+        }
+        monitor = {}
+        for key, scalar in self.monitor.items():
+            names = of([scalar.variable])
+            for number, name in enumerate(names, 1):
+                label = key if len(names) == 1 else f"{key}[{number}]"
+                monitor[label] = scalar.model_copy(update={"variable": name})
+        port = {
+            key: item.model_copy(
+                update={
+                    quantity: vector.model_copy(update={"variables": of(vector.variables)})
+                    for quantity, vector in item.quantities.items()
+                }
+            )
+            for key, item in self.port.items()
+        }
+        record = self.record.model_copy(update={"variables": of(self.record.variables)})
+        return self.model_copy(
+            update={"observation": observation, "monitor": monitor, "port": port, "record": record}
+        )
+
+
+def _expanded(given: object) -> object:
+    """Expand the patterns of a text or of a list of texts."""
+    if isinstance(given, str):
+        return expand(given)
+    if isinstance(given, list):
+        return tuple(name for item in given for name in (expand(item) if isinstance(item, str) else (item,)))
+    return given
+
+
+def expand(pattern: str) -> tuple[str, ...]:
+    """Return the names that a pattern stands for: `a[{1..3}]` is a[1], a[2], a[3].
+
+    Raises
+    ------
+    ValueError
+        If a range is empty or too long, or there is more than one.
+    """
+    ranges = _RANGE.findall(pattern)
+    if not ranges:
+        return (pattern,)
+    if len(ranges) > 1:
+        raise ValueError(f"the pattern {pattern!r} has more than one range")
+    first, last = int(ranges[0][0]), int(ranges[0][1])
+    if not first <= last or last - first >= _LARGEST_PATTERN:
+        raise ValueError(f"the range of {pattern!r} is empty or longer than {_LARGEST_PATTERN}")
+    return tuple(_RANGE.sub(str(number), pattern) for number in range(first, last + 1))
+
+
+def load_binding(path: str | os.PathLike[str]) -> Binding:
+    """Read and check a binding file.
+
+    Parameters
+    ----------
+    path : path-like
+        The TOML file.
+
+    Returns
+    -------
+    Binding
+        The binding.
+
+    Raises
+    ------
+    BindingError
+        If the file is missing, not TOML, has an unknown or missing key or a wrong type, or maps one
+        FMU variable to two inputs.
+    """
+    content = read_toml(os.fspath(path), BindingError, what="binding file")
+    return parse_binding(content, where=str(path))
+
+
+def parse_binding(content: Mapping[str, Any], *, where: str = "the binding") -> Binding:
+    """Check a binding that was read from elsewhere; see `load_binding`."""
+    try:
+        parsed = Binding.model_validate(dict(content))
+    except ValidationError as error:
+        raise BindingError(f"In {where}, {_first_problem(error)}.") from error
+    if not parsed.observation:
+        raise BindingError(f"In {where}, there is no [observation.<name>] table; say what is measured.")
+    taken: dict[str, str] = {}
+    for role in (*INPUT_ROLES, "parameter"):
+        table: Mapping[str, Scalar] = getattr(parsed, role)
+        for key, scalar in table.items():
+            here = f"{role}.{key}"
+            if scalar.variable in taken:
+                raise BindingError(
+                    f"In {where}, the FMU variable {scalar.variable!r} is set by both "
+                    f"{taken[scalar.variable]} and {here}; keep one."
+                )
+            taken[scalar.variable] = here
+    return parsed
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    place = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        return f"the key {place!r} is unknown; remove it or correct its spelling"
+    if problem["type"] == "missing":
+        return f"the key {place!r} is missing"
+    message = problem["msg"].removeprefix("Value error, ")
+    return f"{place} is wrong: {message[:1].lower()}{message[1:]} (it is {problem['input']!r})"
+
+
+def _listed(names: Mapping[str, object]) -> str:
+    return ", ".join(names) or "none"

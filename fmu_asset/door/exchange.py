@@ -1,0 +1,413 @@
+"""A binding resolved against an FMU: what is sent and read, where it stands in the blocks, in which units."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
+from fmu_asset.errors import BindingError
+from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
+
+from .binding import INPUT_ROLES, Binding, Input
+from .layout import BlockLayout, Place, element_names, find, start_values
+from .reading import OutputTable, Selection
+from .slots import Slot, in_unit, put, value_range
+from .units import IDENTITY, conversion
+
+_LARGEST = sys.float_info.max
+
+Values = Mapping[str, float | Sequence[float]]
+"""Values by the binding's names: a number, or as many as the bound array or port has."""
+
+
+def plain_values(values: Values) -> dict[str, float | list[float]]:
+    """Return values as floats and lists of floats, which can be compared and kept as JSON."""
+    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
+    return {
+        name: array.item() if array.ndim == 0 else array.ravel().tolist() for name, array in arrays.items()
+    }
+
+
+class Exchange:
+    """What an asset exchanges with its FMU.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU.
+    binding : Binding
+        The binding.
+
+    Attributes
+    ----------
+    binding : Binding
+        The binding, with arrays that are observed or recorded as their elements.
+    plan : Plan
+        For the instance; its folder is still empty.
+    outputs : OutputTable
+        What is read of the reply block.
+
+    Raises
+    ------
+    BindingError
+        If a variable is missing, of the wrong causality or type, or in another unit, or the FMU is of another
+        version.
+    """
+
+    def __init__(self, description: FmuDescription, binding: Binding) -> None:
+        self._description = description
+        wanted = binding.binding.fmi_version
+        if wanted is not None and wanted[0] != description.fmi_version[0]:
+            raise BindingError(
+                f"The binding {binding.name} is for FMI {wanted}, but {description.path} is of FMI "
+                f"{description.fmi_version}; correct `fmi_version`, or leave it out."
+            )
+        self.binding = self._binding = binding.with_arrays(self._elements)
+        self._reads_ports = self._port_directions()
+        self._make_outputs()
+        self._make_inputs()
+        self.plan = Plan(
+            folder="",
+            fmi_version=description.major_version,
+            interface=description.interface,
+            guid=description.guid,
+            model_identifier=description.model_identifier,
+            instance_name=binding.name,
+            inputs=self._inputs.groups,
+            outputs=self._outputs.groups,
+            substeps=binding.binding.decimation,
+            tolerance=binding.binding.tolerance or description.tolerance,
+            solver_tolerance=binding.binding.tolerance or min(description.tolerance or 1.0, SOLVER_TOLERANCE),
+            states=description.states,
+            event_indicators=description.event_indicators,
+            completed_step=description.completed_step,
+        )
+
+    # ------------------------------------------------------------------ resolving
+
+    def _elements(self, name: str) -> tuple[str, ...]:
+        variable = self._description.variable(name)
+        return (name,) if variable is None else element_names(variable)
+
+    def _find(self, name: str, label: str, causality: str) -> Place:
+        return find(self._description, name, f"{label} of the binding {self._binding.name}", causality)
+
+    def _port_directions(self) -> dict[str, bool]:
+        """Return for every quantity of a port whether it is read; force and motion go opposite ways."""
+        reads = {}
+        for name, port in self._binding.port.items():
+            own = {}
+            for quantity, vector in port.quantities.items():
+                label = f"port.{name}.{quantity}"
+                if len(vector.variables) != len(port.force.variables):
+                    raise BindingError(
+                        f"{label} of the binding {self._binding.name} has {len(vector.variables)} values "
+                        "and the "
+                        f"force {len(port.force.variables)}; give as many."
+                    )
+                causalities = {self._causality(variable) == "input" for variable in vector.variables}
+                if len(causalities) > 1:
+                    raise BindingError(
+                        f"{label} of the binding {self._binding.name} mixes inputs and outputs of the FMU."
+                    )
+                own[quantity] = not causalities.pop()
+                reads[f"{name}.{quantity}"] = own[quantity]
+            if any(own[quantity] == own["force"] for quantity in own if quantity != "force"):
+                way = "outputs" if own["force"] else "inputs"
+                raise BindingError(
+                    f"In port.{name} of the binding {self._binding.name}, force and motion are both {way} "
+                    "of the "
+                    "FMU; at a port one is given for the other."
+                )
+        return reads
+
+    def _causality(self, name: str) -> str:
+        variable = self._description.variable(name) or self._description.variable(name.rpartition("[")[0])
+        return "" if variable is None else variable.causality
+
+    def _port_vectors(self, *, read: bool) -> list[tuple[str, tuple[str, ...], str]]:
+        """Return name, variables and unit of the ports' quantities that are read, or that are sent."""
+        return [
+            (f"{name}.{quantity}", vector.variables, vector.units[0])
+            for name, port in self._binding.port.items()
+            for quantity, vector in port.quantities.items()
+            if self._reads_ports[f"{name}.{quantity}"] == read
+        ]
+
+    def _make_inputs(self) -> None:
+        """Lay out the request block: time, step size, all inputs."""
+        places = {
+            (role, name): [self._find(item.variable, f"{role}.{name}", "input")]
+            for role in INPUT_ROLES
+            for name, item in self._table(role).items()
+        }
+        ports = self._port_vectors(read=False)
+        for name, variables, _ in ports:
+            places["port", name] = [self._find(item, f"port.{name}", "input") for item in variables]
+        self._inputs = BlockLayout(
+            self._description, [place.variable for found in places.values() for place in found], begin=2
+        )
+        self._slots: dict[str, dict[str, Slot]] = {role: {} for role in (*INPUT_ROLES, "port")}
+        taken: dict[int, str] = {}
+        items: dict[tuple[str, str], Input] = {
+            (role, name): item for role in INPUT_ROLES for name, item in self._table(role).items()
+        }
+        items |= {("port", name): Input(variable=variables[0], unit=unit) for name, variables, unit in ports}
+        for (role, name), found in places.items():
+            positions = [position for place in found for position in self._inputs.positions(place)]
+            if len({(place.variable.unit, place.variable.kind) for place in found}) > 1:
+                raise BindingError(
+                    f"The variables of {role}.{name} of the binding {self._binding.name} have different "
+                    "units or "
+                    "types in the FMU; make one port of each."
+                )
+            for position in positions:
+                if position in taken:
+                    raise BindingError(
+                        f"In the binding {self._binding.name}, {role}.{name} and {taken[position]} set "
+                        "the same "
+                        f"value of {found[0].variable.name!r}; keep one."
+                    )
+                taken[position] = f"{role}.{name}"
+            self._slots[role][name] = self._slot(
+                f"{role}.{name}", items[role, name], found[0].variable, positions
+            )
+        # A float within these limits is sent as it is; NaN and infinities are not within them.
+        self._direct = {
+            role: {
+                name: (slot.position, max(slot.low, -_LARGEST), min(slot.high, _LARGEST))
+                for name, slot in slots.items()
+                if slot.direct
+            }
+            for role, slots in self._slots.items()
+        }
+        # Parameters are set once, each for itself; their positions count from the variable's own values.
+        self._parameter_slots = {}
+        for name, parameter in self._binding.parameter.items():
+            place = self._find(parameter.variable, f"parameter.{name}", "parameter")
+            positions = [place.element] if place.element is not None else [*range(place.size)]
+            self._parameter_slots[name] = self._slot(
+                f"parameter.{name}", parameter, place.variable, positions
+            )
+
+    def _own_slot(self, name: str) -> Slot:
+        """Return the slot of a parameter by its name in the FMU, which the binding does not name."""
+        variable = self._description.variable(name)
+        bound = {slot.variable.name for slot in self._parameter_slots.values()}
+        if variable is None or variable.causality != "parameter" or name in bound:
+            raise BindingError(
+                f"The binding {self._binding.name} has no parameter {name!r}; "
+                f"it has {', '.join(self._parameter_slots) or 'none'}."
+            )
+        place = self._find(name, f"parameter.{name}", "parameter")
+        own = Input(variable=name, unit=variable.unit or "1")
+        return self._slot(f"parameter.{name}", own, variable, [*range(place.size)])
+
+    def _table(self, role: str) -> Mapping[str, Input]:
+        table: Mapping[str, Input] = getattr(self._binding, role)
+        return table
+
+    def _slot(self, label: str, item: Input, variable: VariableInfo, positions: Sequence[int]) -> Slot:
+        scale = conversion(item.unit, variable, self._description.units, where=label)
+        low, high = value_range(variable)
+        least, most = (
+            None if bound is None else scale.to_fmu(bound) for bound in (item.minimum, item.maximum)
+        )
+        if scale.factor < 0.0:
+            least, most = most, least
+        own_low, own_high = low if least is None else least, high if most is None else most
+        if own_low > high or own_high < low:
+            raise BindingError(
+                f"The range of {label} of the binding {self._binding.name} lies outside that of "
+                f"{variable.name!r}, {low:g} to {high:g}{in_unit(variable)}; correct minimum or maximum."
+            )
+        whole = variable.kind not in FLOAT_KINDS
+        return Slot(
+            position=positions[0],
+            positions=positions,
+            low=max(low, own_low),
+            high=min(high, own_high),
+            conversion=scale,
+            label=label,
+            whole=whole,
+            direct=scale == IDENTITY and not whole and len(positions) == 1,
+            variable=variable,
+        )
+
+    def _make_outputs(self) -> None:
+        """Lay out the reply block: observations, monitors, records, outputs of ports."""
+        binding = self._binding
+        wanted = [
+            (name, name, unit, f"observation.{key}")
+            for key, vector in binding.observation.items()
+            for name, unit in zip(vector.variables, vector.units, strict=True)
+        ]
+        count = len(wanted)
+        wanted += [
+            (name, scalar.variable, scalar.unit, f"monitor.{name}")
+            for name, scalar in binding.monitor.items()
+        ]
+        wanted += [(name, name, "", "record.variables") for name in binding.record.variables]
+        for label, variables, unit in self._port_vectors(read=True):
+            several = len(variables) > 1
+            wanted += [
+                (f"{label}[{number}]" if several else label, name, unit, f"port.{label}")
+                for number, name in enumerate(variables, 1)
+            ]
+        places = [self._find(name, where, "output") for _, name, _, where in wanted]
+        self._outputs = BlockLayout(self._description, [place.variable for place in places], begin=0)
+        self._output_names = self._outputs.names()
+        conversions = [
+            conversion(
+                unit or place.variable.unit or "1", place.variable, self._description.units, where=where
+            )
+            for (_, _, unit, where), place in zip(wanted, places, strict=True)
+        ]
+        positions = [self._outputs.positions(place)[0] for place in places]
+        # A name that stands there twice is that of its last value.
+        extra = {name: which for which, (name, *_) in enumerate(wanted[count:], count)}
+        self.outputs = OutputTable(
+            observed=Selection(positions[:count], conversions[:count]),
+            extra_names=tuple(extra),
+            extra=Selection(
+                [positions[which] for which in extra.values()],
+                [conversions[which] for which in extra.values()],
+            ),
+        )
+        self.recorded_units = {
+            name: unit or place.variable.unit or "1"
+            for (name, _, unit, _), place in zip(wanted[count:], places[count:], strict=True)
+        }
+
+    # ------------------------------------------------------------------ sending
+
+    def start_values(self) -> list[float]:
+        """Return a request block with the FMU's own start values of the inputs.
+
+        Raises
+        ------
+        FmuFileError
+            If a start value is no number.
+        """
+        values = [0.0, 0.0]
+        for variable in self._inputs.variables:
+            values += start_values(self._description, variable)
+        return values
+
+    def settings(self, parameters: Values) -> Settings:
+        """Return what is set before initialisation: the values of the binding, then the caller's.
+
+        Parameters
+        ----------
+        parameters : mapping of str to float or sequence of float
+            By the binding's names and in its units; a parameter that the binding does not name goes by its
+            name in the FMU, in the FMU's unit.
+
+        Returns
+        -------
+        Settings
+            Base type, value reference, values in the FMU's unit.
+
+        Raises
+        ------
+        BindingError
+            If a name is unknown.
+        FmuInputError
+            If a value is not finite or outside its range.
+        """
+        slots = self._parameter_slots | {
+            name: self._own_slot(name) for name in parameters if name not in self._parameter_slots
+        }
+        fixed = {
+            name: parameter.value
+            for name, parameter in self._binding.parameter.items()
+            if parameter.value is not None
+        }
+        set_values: dict[str, tuple[str, int, list[float]]] = {}
+        for name, value in {**fixed, **parameters}.items():
+            variable = slots[name].variable
+            if variable.name not in set_values:
+                kind = self._description.exchange_kind(variable)
+                start = start_values(self._description, variable) if variable.shape else [0.0]
+                set_values[variable.name] = (kind, variable.reference, start)
+            put(set_values[variable.name][2], slots[name], value)
+        return list(set_values.values())
+
+    def place(
+        self,
+        target: Any,
+        control: Values | None,
+        health: Values | None,
+        load: Values | None,
+        port: Values | None = None,
+    ) -> bool:
+        """Put inputs where they belong; return whether there were any.
+
+        Parameters
+        ----------
+        target : list of float or ctypes array
+            A request block; changed in place.
+        control, health, load, port : mapping or None
+            By the binding's names and in its units; a port's are called `<port>.<quantity>`.
+
+        Raises
+        ------
+        BindingError
+            If a name is unknown.
+        FmuInputError
+            If a value is not finite or outside its range.
+        """
+        if control:
+            self._place_role(target, "control", control)
+        if health:
+            self._place_role(target, "health", health)
+        if load:
+            self._place_role(target, "load", load)
+        if port:
+            self._place_role(target, "port", port)
+        return bool(control or health or load or port)
+
+    def _place_role(self, target: Any, role: str, values: Values) -> None:
+        direct = self._direct[role]
+        for name, value in values.items():
+            limits = direct.get(name)
+            if limits is not None and isinstance(value, float):
+                position, low, high = limits
+                if low <= value <= high:
+                    target[position] = value
+                    continue
+            put(target, self.slot(role, name), value)
+
+    def slot(self, role: str, name: str) -> Slot:
+        """Return where an input goes.
+
+        Raises
+        ------
+        BindingError
+            If the binding has no such input.
+        """
+        slot = self._slots.get(role, {}).get(name)
+        if slot is None:
+            known = ", ".join(self._slots.get(role, {})) or "none"
+            raise BindingError(f"The binding {self._binding.name} has no {role} {name!r}; it has {known}.")
+        return slot
+
+    def input_range(self, role: str, name: str) -> tuple[float, float]:
+        """Return the range of an input in the binding's unit; see `FmiAsset.input_range`."""
+        slot = self.slot(role, name)
+        low, high = sorted(slot.conversion.from_fmu(end) for end in (slot.low, slot.high))
+        return low, high
+
+    def output_name(self, position: int) -> str:
+        """Return the name of an output by its position in the reply block."""
+        return self._output_names[position]
+
+    def not_finite(self, block: npt.NDArray[np.float64]) -> list[str]:
+        """Return the names of outputs that are NaN or infinite."""
+        count = len(self._output_names)
+        return [self._output_names[index] for index in np.flatnonzero(~np.isfinite(block[:count]))]

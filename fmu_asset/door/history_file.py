@@ -1,0 +1,226 @@
+"""Files of a simulation: the input histories as CSV, the outputs as CSV or NetCDF."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fmu_asset.errors import FmuInputError
+from reporting.files import atomic_write_bytes, atomic_write_text
+
+from .binding import INPUT_ROLES, Binding
+from .session import FmiAsset
+from .simulation import ObservationHistory
+
+Roles = dict[str, dict[str, npt.NDArray[np.float64]]]
+
+_ELEMENT = re.compile(r"(.+)\[(\d+)\]", re.DOTALL)
+_TIME = "time"
+# Of the interval between two observations: what a spreadsheet loses when it rounds.
+_TIME_TOLERANCE = 1e-6
+
+
+class InputHistories(NamedTuple):
+    """The inputs of N steps.
+
+    Attributes
+    ----------
+    steps : int
+        N.
+    roles : dict of str to dict of str to ndarray
+        By role and name, (N,) or (N, n) for an array: what `FmiAsset.simulate` takes.
+    """
+
+    steps: int
+    roles: Roles
+
+
+def read_histories(path: Path, binding: Binding) -> InputHistories:
+    """Read the inputs of all steps from a CSV file.
+
+    The first line names the columns: `time` [s], which begins at the binding's start time and goes on by its
+    interval, and inputs as `control.load_factor`, or `load_factor` where no other role has that name; the
+    elements of an array are `u[1]`, `u[2]`, .... Each further line holds over the step that begins at its
+    time.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    binding : Binding
+        Whose inputs and units these are.
+
+    Returns
+    -------
+    InputHistories
+        The inputs that have columns.
+
+    Raises
+    ------
+    FmuInputError
+        If the file is missing or no CSV, a column is missing, unknown or there twice, a cell is no finite
+        number, or time is uneven.
+    """
+    table = _table(path)
+    if _TIME not in table:
+        raise FmuInputError(
+            f"{path} lacks the column `time`; its columns are {', '.join(table)}. Give the time in seconds "
+            "at which each step begins."
+        )
+    time = table.pop(_TIME)
+    _check_time(path, time, binding)
+    names = _input_names(binding)
+    columns: dict[tuple[str, str], dict[int, npt.NDArray[np.float64]]] = {}
+    for column, values in table.items():
+        key, element = names.get(column), 0
+        if key is None and (found := _ELEMENT.fullmatch(column)):
+            key, element = names.get(found[1]), int(found[2])
+        if key is None:
+            known = ", ".join(".".join(key) for key in dict.fromkeys(names.values())) or "none"
+            raise FmuInputError(
+                f"The column {column!r} of {path} is no input of the binding {binding.name}; it has {known}."
+            )
+        taken = columns.setdefault(key, {})
+        if element in taken or (taken and 0 in (element, *taken)):
+            raise FmuInputError(f"{path} gives {'.'.join(key)} in more than one column; keep one.")
+        taken[element] = values
+    roles: Roles = {}
+    for (role, name), elements in columns.items():
+        if 0 in elements:
+            roles.setdefault(role, {})[name] = elements[0]
+            continue
+        lost = [number for number in range(1, max(elements) + 1) if number not in elements]
+        if lost or min(elements) < 1:
+            raise FmuInputError(
+                f"{path} lacks the column {role}.{name}[{lost[0] if lost else 1}]; count from 1."
+            )
+        roles.setdefault(role, {})[name] = np.column_stack([elements[i] for i in sorted(elements)])
+    return InputHistories(len(time), roles)
+
+
+def write_history(path: Path, asset: FmiAsset, history: ObservationHistory) -> None:
+    """Write what came out of a simulation, whole or not at all: NetCDF if the name ends with .nc, else CSV.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    asset : FmiAsset
+        The asset that was simulated.
+    history : ObservationHistory
+        What came out: time at the end of each step, observations and extras.
+
+    Raises
+    ------
+    reporting.errors.FileNotWrittenError
+        If the file cannot be written.
+    """
+    if path.suffix == ".nc":
+        atomic_write_bytes(path, _netcdf(asset, history))
+        return
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([_TIME, *asset.binding.observation_variables, *history.extra])
+    rows = np.column_stack([history.time, history.values, *history.extra.values()])
+    writer.writerows(rows.tolist())
+    atomic_write_text(path, text.getvalue())
+
+
+def _table(path: Path) -> dict[str, npt.NDArray[np.float64]]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            lines = [
+                (number, row) for number, row in enumerate(csv.reader(stream), 1) if any(map(str.strip, row))
+            ]
+    except FileNotFoundError:
+        raise FmuInputError(f"There is no file {path}; give the CSV file of the inputs.") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise FmuInputError(f"{path} cannot be read as a CSV text file: {error}.") from error
+    if len(lines) < 2:
+        raise FmuInputError(
+            f"{path} has no steps; a line of column names and a line for each step are needed."
+        )
+    header = [name.strip() for name in lines[0][1]]
+    twice = next((name for name in header if header.count(name) > 1), None)
+    if twice is not None:
+        raise FmuInputError(f"{path} has the column {twice!r} more than once; keep one.")
+    values = np.empty((len(lines) - 1, len(header)))
+    for index, (number, row) in enumerate(lines[1:]):
+        if len(row) != len(header):
+            raise FmuInputError(
+                f"Line {number} of {path} has {len(row)} cells, but there are {len(header)} columns."
+            )
+        for column, cell in enumerate(row):
+            values[index, column] = _number(path, number, header[column], cell)
+    return dict(zip(header, np.ascontiguousarray(values.T), strict=True))
+
+
+def _number(path: Path, line: int, column: str, cell: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise FmuInputError(
+            f"Line {line} of {path}: {column} must be a finite number, but is {cell.strip()!r}."
+        )
+    return value
+
+
+def _check_time(path: Path, time: npt.NDArray[np.float64], binding: Binding) -> None:
+    wanted = binding.binding.start_time + binding.interval * np.arange(len(time))
+    wrong = np.flatnonzero(np.abs(time - wanted) > _TIME_TOLERANCE * binding.interval)
+    if wrong.size:
+        step = int(wrong[0])
+        raise FmuInputError(
+            f"{path} has the time {time[step]:.12g} s where step {step} begins at {wanted[step]:.12g} s: the "
+            f"binding {binding.name} starts at {binding.binding.start_time:g} s and goes on by "
+            f"{binding.interval:g} s. Resample the inputs, or change `step_size` or `start_time` in the "
+            "binding."
+        )
+
+
+def _input_names(binding: Binding) -> dict[str, tuple[str, str]]:
+    """Return role and name by what a column may be called."""
+    keys = [(role, name) for role in INPUT_ROLES for name in binding.inputs(role)]
+    keys += [("port", f"{name}.{item}") for name, port in binding.port.items() for item in port.quantities]
+    plain = [name for _, name in keys]
+    return {name: key for key, name in zip(keys, plain, strict=True) if plain.count(name) == 1} | {
+        ".".join(key): key for key in keys
+    }
+
+
+def _netcdf(asset: FmiAsset, history: ObservationHistory) -> bytes:
+    import xarray as xr
+
+    binding, units = asset.binding, asset.recorded_units
+    observed_units = [vector.unit for vector in binding.observation.values() for _ in vector.variables]
+
+    extra_units = [units[name] for name in history.extra]
+    extra = np.column_stack([*history.extra.values()]) if history.extra else np.empty((len(history.time), 0))
+    data = xr.Dataset(
+        {
+            "observation": (("time", "observation_name"), history.values),
+            "observation_unit": ("observation_name", np.array(observed_units, dtype=str)),
+            "extra": (("time", "extra_name"), extra),
+            "extra_unit": ("extra_name", np.array(extra_units, dtype=str)),
+        },
+        coords={
+            "time": ("time", history.time, {"units": "s", "long_name": "end of the step"}),
+            "observation_name": ("observation_name", np.array(binding.observation_variables, dtype=str)),
+            "extra_name": ("extra_name", np.array([*history.extra], dtype=str)),
+        },
+        attrs={
+            "fmu": asset.description.path.name,
+            "fmu_sha256": asset.description.sha256,
+            "binding": binding.name,
+        },
+    )
+    return bytes(data.to_netcdf(engine="h5netcdf"))

@@ -1,0 +1,325 @@
+"""The life of an asset: what it is, how it is opened, started again and closed, and what its failures say."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from types import TracebackType
+from typing import Any, Literal, NoReturn, Self
+
+import numpy as np
+
+from fmu_asset.archive.declared import FmuDescription, describe_fmu
+from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.errors import (
+    FmuCallError,
+    FmuError,
+    FmuMemoryError,
+    FmuOutputError,
+    FmuStateError,
+    FmuWorkerError,
+)
+from fmu_asset.instances.base import STATUS_NAMES
+from fmu_asset.worker.client import WorkerInstance
+
+from .binding import INPUT_ROLES, Binding, load_binding
+from .exchange import Exchange, Values, plain_values
+from .observation import Observation
+from .placement import Housing, limits_of
+from .reading import Reader
+from .restart import Instance, ResetTrial, Start
+from .saved_state import StateMethod
+
+_LOG_LENGTH = 200
+
+
+class OpenedFmu:
+    """An FMU with a binding and the instance that stands for it; `FmiAsset` adds steps and states.
+
+    Parameters and errors are those of `FmiAsset`.
+    """
+
+    def __init__(
+        self,
+        fmu_path: str | os.PathLike[str],
+        binding: Binding | str | os.PathLike[str],
+        *,
+        isolated: bool = True,
+        step_timeout: float | None = None,
+        load_timeout: float | None = None,
+        memory_limit: float | None = None,
+        parameters: Values | None = None,
+    ) -> None:
+        given = binding if isinstance(binding, Binding) else load_binding(binding)
+        self._description = read_fmu(fmu_path, given.binding.interface)
+        limits = limits_of(given, step_timeout, load_timeout, memory_limit)
+        self._exchange = Exchange(self._description, given)
+        self._housing = Housing(self._description, self._exchange.plan, limits, isolated=isolated)
+        self._binding = self._exchange.binding
+        self._settings = self._exchange.settings(parameters or {})
+        self._parameters = plain_values(parameters or {})
+        self._phase: Literal["new", "ready", "broken", "closed"] = "new"
+        self._index = 0
+        self._step_size, self._interval = self._binding.step_size, self._binding.interval
+        self._start_time = self._binding.binding.start_time
+        self._recording = self.state_method == "replay"
+        self._record: list[bytes] = []
+        self._start_inputs = b""
+        self._log: deque[tuple[str, str]] = deque(maxlen=_LOG_LENGTH)
+
+    # ------------------------------------------------------------------ what it is
+
+    @property
+    def binding(self) -> Binding:
+        """The binding, with arrays that are observed or recorded as their elements."""
+        return self._binding
+
+    @property
+    def description(self) -> FmuDescription:
+        """What the FMU declares."""
+        return self._description
+
+    @property
+    def time(self) -> float:
+        """Time of the asset [s]: start + i * interval, never accumulated."""
+        return self._start_time + self._index * self._interval
+
+    @property
+    def step_index(self) -> int:
+        """Number of steps since the last reset."""
+        return self._index
+
+    @property
+    def state_method(self) -> StateMethod:
+        """How `save_state` keeps the state: serialised by the FMU, or by replaying the recorded inputs."""
+        wanted = self._binding.binding.state
+        if wanted != "auto":
+            return wanted
+        able = self._description.can_get_and_set_state and self._description.can_serialise_state
+        # A state in model exchange would have to hold our solver as well.
+        return "serialised" if able and self._description.interface == "co-simulation" else "replay"
+
+    @property
+    def log(self) -> tuple[tuple[str, str], ...]:
+        """The last messages of the FMU, oldest first: status and text."""
+        self._collect_log()
+        return tuple(self._log)
+
+    @property
+    def reset_trial(self) -> ResetTrial:
+        """Whether the FMU's own reset works, which is seen at the first reset after a flight."""
+        return self._housing.reset_trial
+
+    @property
+    def worker_process_id(self) -> int | None:
+        """Process number of the worker; None without one."""
+        instance = self._housing.instance
+        return instance.process_id if isinstance(instance, WorkerInstance) and not instance.lost else None
+
+    @property
+    def worker_memory(self) -> int | None:
+        """Resident memory of the worker [bytes]; None without one."""
+        instance = self._housing.instance
+        return instance.memory if isinstance(instance, WorkerInstance) and not instance.lost else None
+
+    @property
+    def recorded_units(self) -> dict[str, str]:
+        """Units of `Observation.extra` by name."""
+        return dict(self._exchange.recorded_units)
+
+    def input_range(self, role: str, name: str) -> tuple[float, float]:
+        """Return the range of an input in the binding's unit: that of the FMU and of the binding together.
+
+        Raises
+        ------
+        BindingError
+            If the binding has no such input.
+        """
+        return self._exchange.input_range(role, name)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what the FMU is and how it is bound, as plain records for a listing.
+
+        Returns
+        -------
+        dict
+            `file`, `sha256`, `size`, `guid`, ... as in `FmuDescription`, `variables` as a list of
+            records with their role, and the binding's name, step size and state method.
+        """
+        roles = {
+            scalar.variable: f"{role}.{name}"
+            for role in (*INPUT_ROLES, "parameter", "monitor")
+            for name, scalar in getattr(self._binding, role).items()
+        }
+        for name, vector in self._binding.observation.items():
+            roles.update(dict.fromkeys(vector.variables, f"observation.{name}"))
+        for name, port in self._binding.port.items():
+            for quantity, vector in port.quantities.items():
+                roles.update(dict.fromkeys(vector.variables, f"port.{name}.{quantity}"))
+        return describe_fmu(self._description, roles) | {
+            "binding": self._binding.name,
+            "step_size": self._binding.step_size,
+            "decimation": self._binding.binding.decimation,
+            "state_method": self.state_method,
+        }
+
+    # ------------------------------------------------------------------ life
+
+    def __enter__(self) -> Self:
+        if self._phase != "ready":
+            self.reset()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the worker and remove its files; the asset can be opened again by `reset`."""
+        self._phase = "closed"
+        self._housing.close()
+
+    def reset(
+        self,
+        parameters: Values | None = None,
+        *,
+        control: Values | None = None,
+        health: Values | None = None,
+        load: Values | None = None,
+        port: Values | None = None,
+    ) -> None:
+        """Go back to the start.
+
+        Parameters
+        ----------
+        parameters : mapping of str to float, optional
+            Parameters in the binding's units; those of the constructor if absent. They stay for later resets.
+        control, health, load, port : mapping of str to float, optional
+            Inputs that hold already during initialisation. If none is given, the FMU's start values hold.
+
+        Raises
+        ------
+        FmuInputError
+            If a value is not finite or outside its range.
+        BindingError
+            If a name is not in the binding.
+        FmuCallError, FmuWorkerError, FmuTimeoutError
+            If the FMU or its worker fails.
+        """
+        if parameters is not None:
+            self._settings = self._exchange.settings(parameters)
+            self._parameters = plain_values(parameters)
+        start = self._exchange.start_values()
+        given = self._exchange.place(start, control, health, load, port)
+        self._begin(start, with_inputs=given)
+
+    def renew(self) -> None:
+        """Free the FMU's instance, make another one in the same process, and go back to the start.
+
+        `reset` uses the FMU's own reset; this is what a batch of runs without it costs.
+
+        Raises
+        ------
+        FmuError
+            If the FMU fails.
+        """
+        try:
+            self._housing.renew()
+        except FmuError as error:
+            self._fail(error, "making a new instance")
+        self._begin(self._exchange.start_values(), with_inputs=False, renewed=True)
+
+    def sibling(self, parameters: Values | None = None) -> Self:
+        """Return a new asset of the same FMU, binding and limits, without extracting the FMU again.
+
+        Parameters
+        ----------
+        parameters : mapping of str to float, optional
+            Parameters in the binding's units; those of this asset if absent.
+
+        Raises
+        ------
+        BindingError, FmuInputError
+            If a parameter is unknown or lies outside its range.
+        """
+        other = type(self).__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        other._housing = self._housing.sibling()
+        other._phase, other._index = "new", 0
+        other._record, other._start_inputs = [], b""
+        other._log = deque(maxlen=_LOG_LENGTH)
+        if parameters is not None:
+            other._settings = other._exchange.settings(parameters)
+            other._parameters = plain_values(parameters)
+        return other
+
+    # ------------------------------------------------------------------ inside
+
+    def _begin(self, request: list[float], *, with_inputs: bool, renewed: bool = False) -> None:
+        start = Start(self._start_time, self._step_size, self._settings, request, with_inputs)
+        try:
+            instance = self._housing.instance
+            if renewed and instance is not None:
+                start.make(instance)
+            else:
+                instance = self._housing.start(start)
+            self._request = memoryview(instance.request).cast("B").cast("d")
+            self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
+            self._reader = Reader(self._exchange.outputs, self._reply)
+        except FmuError as error:
+            self.close()
+            self._fail(error, "the start")
+        self._index = 0
+        self._record = []
+        self._start_inputs = bytes(instance.request)[16:] if with_inputs else b""
+        self._phase = "ready"
+
+    def _opened(self) -> Instance:
+        """Return the instance, which is opened by its first use but never started again unasked."""
+        if self._phase == "ready" and self._housing.instance is not None:
+            return self._housing.instance
+        if self._phase == "broken":
+            raise FmuStateError("A state could not be restored; reset the asset to go on.")
+        if self._phase == "closed":
+            raise FmuStateError("The asset is closed; reset it to start anew.")
+        if self._phase == "new":
+            self.reset()
+        instance = self._housing.instance
+        assert instance is not None
+        return instance
+
+    def _observation(self) -> Observation:
+        if self._reader.suspicious():
+            self._refuse_not_finite()
+        return self._reader.read(self._start_time + self._index * self._interval)
+
+    def _refuse_not_finite(self, which: str = "") -> None:
+        bad = self._exchange.not_finite(self._reply)
+        if bad:
+            more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+            raise FmuOutputError(
+                f"The FMU {self._description.path} gave values that are not finite at "
+                f"t = {self.time:g} s: {', '.join(bad[:5])}{more}. Its inputs or its step size are "
+                "probably beyond what it can compute; reset the asset or restore a state to go on."
+                f"{which}",
+                [text for _, text in self.log[-5:]],
+            )
+
+    def _collect_log(self) -> None:
+        instance = self._housing.instance
+        if instance is not None and instance.has_log and not instance.lost:
+            for status, text in instance.take_log():
+                name = STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
+                self._log.append((name, text))
+
+    def _fail(self, error: FmuError, what: str) -> NoReturn:
+        """Raise the error with the FMU's file and the moment, and keep its messages."""
+        self._log.extend(("Error", message) for message in error.messages)
+        if isinstance(error, FmuCallError | FmuWorkerError | FmuStateError | FmuMemoryError | TimeoutError):
+            tool = what == "the start" and self._description.needs_tool
+            hint = " It declares that it needs its authoring tool on this machine." if tool else ""
+            raise type(error)(
+                f"{self._description.path}, {what}: {error.sentence}{hint}", error.messages
+            ) from error
+        raise error

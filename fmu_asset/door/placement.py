@@ -1,0 +1,185 @@
+"""Where the instance of an asset lives: the extracted FMU, and the worker process or this one."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+
+from fmu_asset.archive.declared import FmuDescription
+from fmu_asset.archive.extraction import Extraction
+from fmu_asset.errors import FmuCallError, FmuError, FmuInputError
+from fmu_asset.folders import plain_folder, remove_folder
+from fmu_asset.instances import open_instance
+from fmu_asset.instances.base import FmuInstance, forget_modules
+from fmu_asset.instances.plan import Plan
+from fmu_asset.worker.client import Limits, WorkerInstance
+
+from .binding import Binding
+from .restart import Instance, ResetTrial, Start, outputs_of
+
+
+class Housing:
+    """The life of one instance at a time.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU.
+    plan : Plan
+        What is exchanged; its folder is still empty.
+    limits : Limits
+        What a worker may take.
+    isolated : bool
+        Whether there is a worker.
+
+    Attributes
+    ----------
+    instance : FmuInstance, WorkerInstance or None
+        The one that lives here.
+    reset_trial : ResetTrial
+        Whether the FMU's reset works.
+    """
+
+    def __init__(self, description: FmuDescription, plan: Plan, limits: Limits, *, isolated: bool) -> None:
+        self._description, self._plan, self._limits, self._isolated = description, plan, limits, isolated
+        self._extraction: Extraction | None = None
+        self._release: Callable[[], object] = lambda: None
+        self.instance: Instance | None = None
+        self.reset_trial = ResetTrial()
+
+    def sibling(self) -> Housing:
+        """Return an empty housing beside this one, which shares the extracted FMU as long as it is in use."""
+        other = Housing(self._description, self._plan, self._limits, isolated=self._isolated)
+        other._extraction, other.reset_trial = self._extraction, self.reset_trial
+        return other
+
+    def start(self, start: Start) -> Instance:
+        """Return an instance at its start; never one that a fatal error has touched.
+
+        Raises
+        ------
+        FmuError
+            If the FMU cannot be extracted, loaded, instantiated or initialised.
+        """
+        instance = self.instance
+        if instance is None or instance.lost:
+            instance = self._another()
+        else:
+            if self.reset_trial.works is None:
+                self._try_reset(instance, start)
+            instance = self._restarted()
+        start.make(instance)
+        return instance
+
+    def renew(self) -> Instance:
+        """Free the instance and return another one, in the same process.
+
+        Raises
+        ------
+        FmuError
+            If the FMU fails.
+        """
+        if isinstance(self.instance, WorkerInstance) and not self.instance.lost:
+            self.instance.renew()
+            return self.instance
+        return self._another()
+
+    def _restarted(self) -> Instance:
+        """Return an instance as after its instantiation, by a reset where that is believed."""
+        if self.instance is not None and self.reset_trial.works:
+            with suppress(FmuCallError):
+                self.instance.reset()
+                return self.instance
+        if self._isolated and not self._description.once_per_process:
+            with suppress(FmuError):  # a worker that does not survive it is replaced
+                return self.renew()
+        return self._another()
+
+    def _try_reset(self, instance: Instance, start: Start) -> None:
+        """Find out whether the reset works, from an instance that was flown."""
+        if self._description.once_per_process and not self._isolated:
+            self.reset_trial.works = True  # there is nothing to compare it with
+            return
+        try:
+            flown = outputs_of(instance)
+            try:
+                instance.reset()
+            except FmuCallError:
+                self.reset_trial.refused()
+                return
+            again = start.first_outputs(instance)
+            fresh = start.first_outputs(self._restarted())
+        except FmuError:
+            return  # what fails here tells nothing of the reset; the start itself says what is wrong
+        self.reset_trial.judge(self._description.path, flown, again, fresh)
+
+    def _another(self) -> Instance:
+        """Return an instance made from the file, in a worker of its own if there are workers."""
+        shared = self._extraction
+        # After a crash the files of the FMU are not trusted either.
+        crashed = self.instance is not None and self.instance.lost
+        if shared is not None and (crashed or not shared.usable):
+            shared = None
+        if shared is not None:
+            shared.hold()
+        self.close()
+        if shared is None:
+            shared = Extraction(self._description)
+            shared.hold()
+        try:
+            instance = self._open(replace(self._plan, folder=str(shared.folder)))
+        except BaseException:
+            shared.release()
+            raise
+        self.instance, self._extraction = instance, shared
+        # Also at the end of the interpreter, or when the asset is forgotten without being closed.
+        self._release = weakref.finalize(self, _release, instance, shared)
+        return instance
+
+    def _open(self, plan: Plan) -> Instance:
+        if not self._isolated:
+            return open_instance(plan)
+        scratch = plain_folder()
+        try:
+            return WorkerInstance(plan, scratch, limits=self._limits)
+        except BaseException:
+            remove_folder(scratch)
+            raise
+
+    def close(self) -> None:
+        """Free the instance, end the worker and remove what nobody else uses."""
+        self.instance = None
+        self._release()
+
+
+def _release(instance: Instance, extraction: Extraction) -> None:
+    instance.close()
+    if isinstance(instance, FmuInstance):
+        forget_modules(str(extraction.folder))
+    extraction.release()
+
+
+def limits_of(
+    binding: Binding, step_timeout: float | None, load_timeout: float | None, memory_limit: float | None
+) -> Limits:
+    """Return what the caller says, else what the binding says, else the defaults.
+
+    Raises
+    ------
+    FmuInputError
+        If one is not positive.
+    """
+    given = {"step_timeout": step_timeout, "load_timeout": load_timeout, "memory_limit": memory_limit}
+    for name, value in given.items():
+        if value is not None and not (math.isfinite(value) and value > 0.0):
+            unit = "MiB" if name == "memory_limit" else "seconds"
+            raise FmuInputError(f"{name} must be a positive number of {unit}, but is {value!r}.")
+    own, default = binding.limits, Limits()
+    return Limits(
+        step_time=step_timeout or own.step_time or default.step_time,
+        load_time=load_timeout or own.load_time or default.load_time,
+        memory=memory_limit or own.memory or default.memory,
+    )

@@ -1,0 +1,322 @@
+"""`FmiAsset`: the only door to an FMU. It knows FMI and roles, not wings."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import numpy as np
+
+from fmu_asset.errors import FmuCallError, FmuError, FmuStateError
+from fmu_asset.instances.series import Series
+from reporting.progress import Progress, SilentProgress, Stage
+
+from .exchange import Values, plain_values
+from .life import OpenedFmu
+from .observation import Observation
+from .restart import Instance
+from .saved_state import SavedState
+from .simulation import Histories, ObservationHistory, blocks, request_rows
+
+
+class FmiAsset(OpenedFmu):
+    """An FMU that is flown step by step through a binding.
+
+    The FMU runs in a worker process of its own unless `isolated` is False: only then are the wall-clock limit
+    and protection against crashes given. The asset is opened by the first `reset`, `step` or `with`.
+
+    Parameters
+    ----------
+    fmu_path : path-like
+        An FMU of FMI 1, 2 or 3, for co-simulation or model exchange.
+    binding : Binding or path-like
+        The binding, or its file.
+    isolated : bool
+        Whether the FMU runs in a worker process.
+    step_timeout, load_timeout : float, optional
+        Wall-clock limits of one step, and of loading and initialisation [s]; those of the binding, or 10 and
+        60.
+    memory_limit : float, optional
+        Limit of the worker's resident memory [MiB]; that of the binding, or 4096.
+    parameters : mapping of str to float, optional
+        Parameters by the binding's names and in its units; they are set at every reset that gives no others.
+
+    Raises
+    ------
+    FmuFileError, FmuUnsupportedError
+        If the FMU is missing, damaged, unsafe or of another kind.
+    BindingError
+        If the binding does not fit the FMU: a variable is missing, of the wrong causality or in another unit.
+    FmuInputError
+        If a parameter lies outside its range.
+    """
+
+    def step(
+        self,
+        control: Values | None = None,
+        health: Values | None = None,
+        load: Values | None = None,
+        port: Values | None = None,
+    ) -> Observation:
+        """Make one communication step.
+
+        Inputs are given by the binding's names and in its units; one that is not given keeps its last value.
+        If the FMU refuses the step, the asset is where it was before it.
+
+        Parameters
+        ----------
+        control, health, load, port : mapping of str to float, or to a sequence for an array
+            Inputs of this step; those of a port are called `<port>.<quantity>`.
+
+        Returns
+        -------
+        Observation
+            What was observed at the end of the step.
+
+        Raises
+        ------
+        FmuInputError
+            If a value is not finite or outside the FMU's range; nothing was sent.
+        BindingError
+            If a name is not in the binding.
+        FmuCallError
+            If the FMU refused the step (Discard) or failed.
+        FmuOutputError
+            If an output is not finite.
+        FmuWorkerError, FmuTimeoutError
+            If the worker died or took too long.
+        """
+        instance = self._opened()
+        request = self._request
+        before = request.tobytes()
+        begin = self._start_time + self._index * self._interval
+        try:
+            self._exchange.place(request, control, health, load, port)
+            request[0] = begin
+            request[1] = self._step_size
+            instance.step()
+        except FmuError as error:
+            request.cast("B")[:] = before
+            self._fail(error, f"step {self._index} from t = {begin:g} s")
+        self._index += 1
+        if self._recording:
+            self._record.append(request.tobytes()[16:])
+        return self._observation()
+
+    def simulate(
+        self,
+        control: Histories | None = None,
+        health: Histories | None = None,
+        load: Histories | None = None,
+        port: Histories | None = None,
+        *,
+        steps: int | None = None,
+        progress: Progress | None = None,
+    ) -> ObservationHistory:
+        """Make many communication steps under prescribed inputs, from where the asset is.
+
+        The result is that of as many calls of `step`, to the bit. All inputs are checked before the first
+        step. If a step fails, the steps before it are made and the asset is where it was before that one.
+
+        Parameters
+        ----------
+        control, health, load, port : mapping of str to (N,) array-like or float
+            Inputs by the binding's names and in its units: one for each step, or one for all; (N, n) or (n,)
+            for an array. One that is not given keeps its last value.
+        steps : int, optional
+            Number of steps N; that of the histories if absent.
+        progress : Progress, optional
+            Where progress is shown.
+
+        Returns
+        -------
+        ObservationHistory
+            What was observed at the end of each step.
+
+        Raises
+        ------
+        FmuInputError
+            If a value is not finite or out of range, or histories have different lengths; nothing was sent.
+        BindingError, FmuCallError, FmuOutputError, FmuWorkerError, FmuTimeoutError
+            As `step`; the message says at which step. A worker that dies or takes too long reports every 20
+            ms: the step named may be a little early.
+        """
+        instance = self._opened()
+        roles = {"control": control, "health": health, "load": load, "port": port}
+        rows = request_rows(self._exchange, np.array(self._request), roles, steps)
+        index = np.arange(self._index, self._index + len(rows) + 1)
+        moments = np.asarray(self._start_time + index * self._interval, dtype=np.float64)
+        rows[:, 0], rows[:, 1] = moments[:-1], self._step_size
+        replies = np.full((len(rows), len(self._reply)), np.nan)
+        with (progress or SilentProgress()).stage("Simulating", total=len(rows), unit="steps") as stage:
+            for series in blocks(rows, replies):
+                self._run(instance, series, stage)
+        return ObservationHistory.of(self._exchange.outputs, moments[1:], replies)
+
+    def _run(self, instance: Instance, series: Series, stage: Stage) -> None:
+        """Make a block of steps; whatever happens, the asset is where the last complete one has left it."""
+        before, begin, shown = self._request.tobytes(), self._index, 0
+        width = len(before)
+
+        def report() -> None:
+            nonlocal shown
+            stage.advance(series.done - shown)
+            shown = series.done
+
+        failure: FmuError | None = None
+        try:
+            instance.run(series, report)
+        except FmuError as error:
+            failure = error
+        finally:
+            made = bytes(series.requests[: series.done * width])
+            self._index += series.done
+            self._request.cast("B")[:] = made[-width:] or before
+            if self._recording:
+                self._record += [made[i + 16 : i + width] for i in range(0, len(made), width)]
+        if failure is not None:
+            self._fail(failure, f"step {self._index} from t = {self.time:g} s")
+        end = series.done * series.reply_size
+        self._reply[:] = np.frombuffer(series.replies[end - series.reply_size : end])
+        if self._reader.suspicious():
+            self._refuse_not_finite(f" It was step {begin + series.done - 1}.")
+        report()
+
+    def observe(self) -> Observation:
+        """Return the observation of this moment without a step, such as the initial one."""
+        instance = self._opened()
+        try:
+            instance.read()
+        except FmuError as error:
+            self._fail(error, f"reading at t = {self.time:g} s")
+        return self._observation()
+
+    # ------------------------------------------------------------------ state
+
+    def save_state(self) -> bytes:
+        """Return the state of the asset, for `restore_state` in this or another process.
+
+        If the FMU can serialise its state, that is what is kept; if not, the inputs of all steps since the
+        last reset are, and restoring replays them (see `state_method`).
+
+        Raises
+        ------
+        FmuStateError
+            If the asset is not open.
+        FmuCallError
+            If the FMU fails to save.
+        """
+        if self._phase != "ready" or self._housing.instance is None:
+            raise FmuStateError("There is no state to save before the first reset or step.")
+        if self.state_method == "serialised":
+            try:
+                body = self._housing.instance.save()
+            except FmuCallError as error:
+                hint = 'If it cannot save its state, write `state = "replay"` into [binding] of its binding.'
+                self._fail(FmuCallError(f"{error.sentence} {hint}", error.messages), "saving the state")
+            except FmuError as error:
+                self._fail(error, "saving the state")
+        else:
+            body = b"".join(self._record)
+        return SavedState(
+            method=self.state_method,
+            fmu=self._description.sha256,
+            index=self._index,
+            step_size=self._interval,
+            start_time=self._start_time,
+            parameters=self._parameters,
+            start_inputs=self._start_inputs,
+            inputs=bytes(self._housing.instance.request)[16:],
+            outputs=self._outputs_now(),
+            body=body,
+        ).to_bytes()
+
+    def restore_state(self, content: bytes) -> None:
+        """Bring the asset to a state that `save_state` returned, in this or an earlier process.
+
+        Parameters
+        ----------
+        content : bytes
+            The state.
+
+        Raises
+        ------
+        FmuStateError
+            If it is damaged, belongs to another FMU or step size, or the FMU gives other outputs than when it
+            was saved.
+        FmuCallError, FmuWorkerError, FmuTimeoutError
+            If the FMU fails.
+        """
+        saved = SavedState.from_bytes(content)
+        width = 8 * self._exchange.plan.input_count
+        saved.refuse_if_foreign(
+            path=self._description.path,
+            fmu=self._description.sha256,
+            interval=self._interval,
+            start_time=self._start_time,
+            method=self.state_method,
+            width=width,
+        )
+        replayed = saved.method == "replay"
+        ready = (
+            self._phase == "ready" and self._housing.instance is not None and not self._housing.instance.lost
+        )
+        same = (plain_values(saved.parameters), saved.start_inputs) == (self._parameters, self._start_inputs)
+        # An instance that was initialised in the same way takes the state as it is: what an ensemble needs.
+        if replayed or not (ready and same):
+            self._settings = self._exchange.settings(saved.parameters)
+            self._parameters = plain_values(saved.parameters)
+            start = self._exchange.start_values()
+            if saved.start_inputs:
+                start[2:] = np.frombuffer(saved.start_inputs).tolist()
+            self._begin(start, with_inputs=bool(saved.start_inputs))
+        instance = self._housing.instance
+        assert instance is not None
+        try:
+            if replayed:
+                for index in range(saved.index):
+                    self._replay(saved.body[index * width : (index + 1) * width])
+            else:
+                instance.restore(saved.body)
+                self._index = saved.index
+                memoryview(instance.request).cast("B")[16:] = saved.inputs
+            saved.refuse_other_outputs(self._outputs_now(), self._exchange.output_name)
+        except FmuError as error:
+            self._phase = "broken"
+            self._fail(error, "restoring the state")
+
+    def fork(self) -> Self:
+        """Return another asset of the same FMU in the same state, with a worker of its own.
+
+        The FMU is not extracted again. Each of the two goes its own way from here.
+
+        Raises
+        ------
+        FmuStateError
+            If the asset is not open.
+        FmuError
+            As `save_state` and `restore_state`.
+        """
+        state = self.save_state()
+        other = self.sibling()
+        try:
+            other.restore_state(state)
+        except BaseException:
+            other.close()
+            raise
+        return other
+
+    def _replay(self, inputs: bytes) -> None:
+        instance = self._housing.instance
+        assert instance is not None
+        instance.request[0], instance.request[1] = self.time, self._step_size
+        memoryview(instance.request).cast("B")[16:] = inputs
+        instance.step()
+        self._index += 1
+        self._record.append(inputs)
+
+    def _outputs_now(self) -> bytes:
+        """Return the outputs of this moment as the FMU gives them."""
+        instance = self._housing.instance
+        assert instance is not None
+        instance.read()
+        return bytes(instance.reply)

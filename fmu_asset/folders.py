@@ -1,0 +1,95 @@
+"""Folders for extracted FMUs and their workers: where they are made, and how they are removed."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
+from .errors import FmuFileError
+
+_tidied: set[Path] = set()
+_PLAIN_PATH = re.compile(r"[A-Za-z0-9/_.\-]+")
+
+
+def plain_folder() -> Path:
+    """Return a new private folder whose path has ASCII letters, digits and `/_.-` only.
+
+    Other characters in the path crash some FMUs (pythonfmu's decode nothing but `%20`). What a process that
+    is gone has left behind, since it and its worker were killed in the same moment, is removed on the way.
+
+    Raises
+    ------
+    FmuFileError
+        If no such folder can be made.
+    """
+    candidates = [tempfile.gettempdir(), "/tmp", "/var/tmp", "/dev/shm"]
+    for parent in candidates:
+        path = Path(parent)
+        if _PLAIN_PATH.fullmatch(str(path.absolute())) and path.is_dir() and os.access(path, os.W_OK):
+            _remove_leftovers(path)
+            return Path(tempfile.mkdtemp(prefix=f"{_prefix()}{os.getpid()}-", dir=path)).absolute()
+    raise FmuFileError(
+        f"FMUs need a writable folder for temporary files with a plain ASCII path, but none of "
+        f"{', '.join(candidates)} is one; set TMPDIR."
+    )
+
+
+def _remove_leftovers(parent: Path) -> None:
+    """Remove folders of ours whose process is gone, once for each parent."""
+    if parent in _tidied:
+        return
+    _tidied.add(parent)
+    for folder in parent.glob(f"{_prefix()}*"):
+        number = folder.name.removeprefix(_prefix()).partition("-")[0]
+        with suppress(OSError):
+            if number.isdigit() and folder.lstat().st_uid == os.getuid() and not _runs(int(number)):
+                remove_folder(folder)
+
+
+def _prefix() -> str:
+    """Return the beginning of our folders' names; two containers may share a folder, not process numbers."""
+    try:
+        return f"uav-twin-fmu-{Path('/proc/self/ns/pid').stat().st_ino}-"
+    except OSError:
+        return "uav-twin-fmu-0-"
+
+
+def _runs(number: int) -> bool:
+    try:
+        os.kill(number, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+def remove_folder(folder: str | os.PathLike[str]) -> None:
+    """Remove a folder and all that can be removed in it, however deep an FMU has nested it.
+
+    Folders inside are first moved to the top: `shutil.rmtree` calls itself for each level, and the path of a
+    deep one is longer than the system allows. Links are not followed.
+    """
+    top = os.fspath(folder)
+    waiting, number = [top], 0
+    while waiting:
+        here = waiting.pop()
+        with suppress(OSError):
+            os.chmod(here, 0o700)  # noqa: PTH101 - here and below, strings: half the time
+            for entry in list(os.scandir(here)):
+                with suppress(OSError):
+                    if entry.is_dir(follow_symlinks=False):
+                        number += 1
+                        moved = f"{top}/.removed-{os.getpid()}-{number}"
+                        os.rename(entry.path, moved)  # noqa: PTH104
+                        waiting.append(moved)
+                    else:
+                        os.unlink(entry.path)  # noqa: PTH108
+        if here != top:
+            with suppress(OSError):
+                os.rmdir(here)  # noqa: PTH106
+    with suppress(OSError):
+        os.rmdir(top)  # noqa: PTH106

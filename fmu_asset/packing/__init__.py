@@ -1,0 +1,1 @@
+"""Making our FMUs."""

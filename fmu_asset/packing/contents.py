@@ -1,0 +1,217 @@
+"""What all FMUs that are built here have in common: a hash as their name, pythonfmu's files, a fixed archive.
+
+The files of an FMU are first written with a placeholder wherever its content hash will stand (identifier,
+GUID, module names). The hash is taken over them, and then fills the places.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import io
+import os
+import zipfile
+from collections.abc import Iterable, Mapping
+from importlib.metadata import PackageNotFoundError, distribution, version
+from importlib.resources import files
+from pathlib import Path
+
+from fmu_asset.errors import FmuBuildError
+from fmu_asset.slaves.variables import FmuVariable
+
+PYTHONFMU_VERSION = "0.7.0"
+"""The only version whose wrapper these FMUs were tried with; its conventions are not a public interface."""
+
+PLACEHOLDER = "0_content_0_"
+"""Stands for the tag, the first characters of the content hash, until that is known."""
+
+_DATE = (1980, 1, 1, 0, 0, 0)
+_TEXT_SUFFIXES = (".py", ".xml", ".txt", ".html", ".json", ".c", ".h")
+# Where the GUID itself stands, between these two; elsewhere the placeholder stands for the tag.
+_GUID_PLACES = {"modelDescription.xml": 'guid="{}"', "sources/wing_variables.h": 'WING_GUID "{}"'}
+
+
+def checked_target(path: str | os.PathLike[str], *, replace: bool) -> Path:
+    """Return where an FMU may be written.
+
+    Raises
+    ------
+    FmuBuildError
+        If the suffix is wrong, or the file exists and may not be replaced.
+    """
+    target = Path(path)
+    if target.suffix != ".fmu":
+        raise FmuBuildError(f"An FMU must have the suffix .fmu, but {target} was given.")
+    if target.exists() and not replace:
+        raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
+    return target
+
+
+def check_start(table: Iterable[FmuVariable]) -> None:
+    """Refuse start values outside their ranges; raises `FmuBuildError`."""
+    for row in table:
+        if row.start is None:
+            continue
+        low = -float("inf") if row.minimum is None else row.minimum
+        high = float("inf") if row.maximum is None else row.maximum
+        if not low <= row.start <= high:
+            raise FmuBuildError(
+                f"The start value {row.start:g} of {row.name} lies outside {low:g} to {high:g}, the range of "
+                + (
+                    "that number of an effect; correct the patch."
+                    if row.variability == "tunable"
+                    else "the reduced model; give another state or build a model with a wider range."
+                )
+            )
+
+
+# ---------------------------------------------------------------- pythonfmu
+
+
+def pythonfmu_version() -> str:
+    """Return the version of pythonfmu that is installed.
+
+    Raises
+    ------
+    FmuBuildError
+        If there is none, or another one than `PYTHONFMU_VERSION`.
+    """
+    try:
+        installed = version("pythonfmu")
+    except PackageNotFoundError as error:
+        raise FmuBuildError("Building an FMU needs pythonfmu; install the project's requirements.") from error
+    if installed != PYTHONFMU_VERSION:
+        raise FmuBuildError(
+            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed} is installed."
+        )
+    return installed
+
+
+def pythonfmu_members(module: str, folder: str, roots: Iterable[str]) -> dict[str, bytes]:
+    """Return the files that pythonfmu gives to an FMU, by their places in the archive.
+
+    Parameters
+    ----------
+    module : str
+        The FMU's identifier, also the name of its binaries and of the script that they load.
+    folder : str
+        Where the Python files go.
+    roots : iterable of str
+        Python files that are needed; those that they import come along.
+
+    Raises
+    ------
+    FmuBuildError
+        If a file is missing from the installation.
+    """
+    # As installed, not as imported: an FMU in this process may have brought a pythonfmu of its own.
+    wrapper = Path(str(distribution("pythonfmu").locate_file("pythonfmu")))
+    binaries = wrapper / "resources" / "binaries"
+    return {
+        f"binaries/linux64/{module}.so": (binaries / "linux64/libpythonfmu-export.so").read_bytes(),
+        f"binaries/win64/{module}.dll": (binaries / "win64/pythonfmu-export.dll").read_bytes(),
+        "documentation/licenses/pythonfmu.txt": _licence("pythonfmu"),
+        "resources/slavemodule.txt": module.encode(),
+        **{f"{folder}/{name}": (wrapper / name).read_bytes() for name in relative_imports(wrapper, roots)},
+    }
+
+
+def room_members(room: str, folder: str) -> dict[str, bytes]:
+    """Return all Python files of a room of the project, by their places in the archive.
+
+    Parameters
+    ----------
+    room : str
+        A package that imports nothing of the project but itself, and rooms packed beside it by `..`.
+    folder : str
+        Where it goes.
+    """
+    top = Path(str(files(room)))
+    return {
+        f"{folder}/{path.relative_to(top).as_posix()}": path.read_bytes()
+        for path in sorted(top.rglob("*.py"))
+    }
+
+
+def relative_imports(folder: Path, names: Iterable[str]) -> list[str]:
+    """Return files of a package together with all files that they import relatively, sorted."""
+    found: set[str] = set()
+    pending = list(names)
+    while pending:
+        name = pending.pop()
+        if name in found:
+            continue
+        found.add(name)
+        for node in ast.walk(ast.parse((folder / name).read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.level == 1 and node.module:
+                pending.append(f"{node.module}.py")
+    return sorted(found)
+
+
+def _licence(package: str) -> bytes:
+    found = [entry for entry in distribution(package).files or () if entry.name == "LICENSE"]
+    if not found:
+        raise FmuBuildError(f"The licence of {package} is missing from its installation; install it again.")
+    return Path(str(found[0].locate())).read_bytes()
+
+
+# ---------------------------------------------------------------- content hash
+
+
+def content_hash_of(template: Mapping[str, bytes]) -> str:
+    """Return the SHA-256 over names and contents, the placeholder standing for the hash itself."""
+    digest = hashlib.sha256()
+    for name in sorted(template):
+        digest.update(f"{name}\0{len(template[name])}\0".encode())
+        digest.update(template[name])
+    return digest.hexdigest()
+
+
+def tag_of(content_hash: str) -> str:
+    """Return what stands in names: the first characters of a content hash, as many as the placeholder has."""
+    return content_hash[: len(PLACEHOLDER)]
+
+
+def guid_of(content_hash: str) -> str:
+    """Return the GUID that a content hash gives."""
+    h = content_hash
+    return f"{{{h[:8]}-{h[8:12]}-{h[12:16]}-{h[16:20]}-{h[20:32]}}}"
+
+
+def filled(template: Mapping[str, bytes], content_hash: str) -> dict[str, bytes]:
+    """Return the files with tag and GUID in the place of the placeholder, in names and texts."""
+    tag, guid = tag_of(content_hash), guid_of(content_hash)
+    return {
+        name.replace(PLACEHOLDER, tag): _exchanged(name, data, (PLACEHOLDER, guid), (PLACEHOLDER, tag))
+        for name, data in template.items()
+    }
+
+
+def emptied(members: Mapping[str, bytes], tag: str, guid: str) -> dict[str, bytes]:
+    """Return the files with the placeholder in the place of a tag and a GUID: undoes `filled`."""
+    return {
+        name.replace(tag, PLACEHOLDER): _exchanged(name, data, (guid, PLACEHOLDER), (tag, PLACEHOLDER))
+        for name, data in members.items()
+    }
+
+
+def _exchanged(name: str, data: bytes, guids: tuple[str, str], tags: tuple[str, str]) -> bytes:
+    """Return a text with the first GUID and tag replaced by the second ones; binaries as they are."""
+    if not name.endswith(_TEXT_SUFFIXES):
+        return data
+    place = _GUID_PLACES.get(name)
+    if place is not None:
+        data = data.replace(place.format(guids[0]).encode(), place.format(guids[1]).encode())
+    return data.replace(tags[0].encode(), tags[1].encode())
+
+
+def archive_bytes(members: Mapping[str, bytes]) -> bytes:
+    """Return a zip archive with fixed dates and order; stored, since compression differs between versions."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name in sorted(members, key=lambda name: (name != "modelDescription.xml", name)):
+            entry = zipfile.ZipInfo(name, date_time=_DATE)
+            entry.create_system = 3
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, members[name])
+    return buffer.getvalue()

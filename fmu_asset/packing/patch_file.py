@@ -1,0 +1,194 @@
+"""Patch files as an FMU takes them: effects with an id and primitives, channels named as outputs.
+
+The file may hold more (posterior, data hash); what is read here, in the names of `discrepancy.files.patch` or
+in shorter ones, is
+
+```json
+{"schema": "uav-twin patch 1",
+ "effects": [{"id": "gauge_zero_drift", "primitives": [{"kind": "sensor_drift", "channel": "g17", ...}]}],
+ "channels": {"g17": "strain[17]"}}
+```
+
+where `id` may also be called `identifier`, and `primitives` `patch`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.patch import EVERY_CHANNEL, Clock, HighPass, ModelPatch, Primitive, RunOffset
+from fe.runtime.sensor_stream import needs_structure
+from fe.runtime.sensors import check_channels
+from fmu_asset.errors import PatchFileError
+
+SCHEMA = "uav-twin patch 1"
+"""Value of `schema` in a patch file."""
+
+QUANTITIES = ("", "strain", "displacement")
+"""Quantities of outputs that `channel = "*"` may be restricted to."""
+
+_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_NO_MEANING = {
+    Clock: "inputs and outputs of an FMU belong to the communication points of its master, so there is no "
+    "second clock that could be wrong",
+    RunOffset: "an FMU has no runs between which its zero could have moved; a constant offset is a "
+    "sensor_drift with exponent 0",
+}
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect of a patch file: an identifier, and the changes that it stands for."""
+
+    id: str
+    patch: ModelPatch
+
+
+@dataclass(frozen=True)
+class PatchFile:
+    """What an FMU takes of a patch file.
+
+    Attributes
+    ----------
+    effects : tuple of Effect
+        In the order of the file; an id that comes again has `_2`, `_3`, ... appended.
+    channels : mapping of str to str
+        Outputs by the names of channels.
+    """
+
+    effects: tuple[Effect, ...]
+    channels: Mapping[str, str]
+
+    @property
+    def patch(self) -> ModelPatch:
+        """All effects together."""
+        return sum((effect.patch for effect in self.effects), ModelPatch())
+
+    @property
+    def needs_arrays(self) -> bool:
+        """Whether an effect changes more than what sensors show, so that the FMU needs arrays for it."""
+        return needs_structure(self.patch)
+
+    def for_outputs(self, outputs: Sequence[tuple[str, str]], where: str = "The patch") -> tuple[Effect, ...]:
+        """Return the effects with channels replaced by the outputs that they are.
+
+        Parameters
+        ----------
+        outputs : sequence of (str, str)
+            Name and quantity of the outputs that sensors may change.
+        where : str
+            What was read, for the error.
+
+        Raises
+        ------
+        PatchFileError
+            If a channel is no such output, or a primitive has no meaning in an FMU.
+        """
+        return tuple(self._with_outputs(effect, outputs, where) for effect in self.effects)
+
+    def _with_outputs(self, effect: Effect, outputs: Sequence[tuple[str, str]], where: str) -> Effect:
+        found: list[Primitive] = []
+        for item in effect.patch:
+            label = f"{where}: the effect {effect.id!r} has the primitive {item.kind!r}"
+            for kind, reason in _NO_MEANING.items():
+                if isinstance(item, kind):
+                    raise PatchFileError(f"{label}, which has no meaning inside an FMU: {reason}.")
+            if isinstance(item, HighPass) and item.order not in (1.0, 2.0, 3.0, 4.0):
+                raise PatchFileError(
+                    f"{label} of order {item.order:g}; an FMU remembers whole stages only, order 1 to 4."
+                )
+            quantity = getattr(item, "quantity", "")
+            channel = getattr(item, "channel", EVERY_CHANNEL)
+            if channel == EVERY_CHANNEL:
+                if quantity not in QUANTITIES:
+                    raise PatchFileError(
+                        f"{label} for every channel of {quantity!r}; the outputs of the FMU are strains and "
+                        "displacements."
+                    )
+                found.append(item)
+                continue
+            item = replace(item, channel=self.channels.get(channel, channel))  # type: ignore[call-arg]
+            try:
+                check_channels(ModelPatch((item,)), outputs)
+            except InvalidPatchError as cause:
+                raise PatchFileError(
+                    f"{label} for the channel {channel!r}, which is no output of the FMU that it can act on "
+                    f"({_listed(outputs)}); name an output, or map the channel to one in `channels`."
+                ) from cause
+            found.append(item)
+        return Effect(effect.id, ModelPatch(tuple(found)))
+
+
+def _listed(outputs: Sequence[tuple[str, str]]) -> str:
+    strains = [name for name, quantity in outputs if quantity == "strain"]
+    others = [name for name, quantity in outputs if quantity != "strain"]
+    return ", ".join([*([f"{strains[0]} to {strains[-1]}"] if strains else []), *others])
+
+
+def load_patch(path: str | os.PathLike[str]) -> PatchFile:
+    """Read a patch file.
+
+    Raises
+    ------
+    PatchFileError
+        If it cannot be read, is no patch file, or holds something that no patch can hold.
+    """
+    file = Path(path)
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise PatchFileError(f"The patch file {file} cannot be read: {error.strerror or error}.") from error
+    return parse_patch(content, f"The patch file {file}")
+
+
+def parse_patch(content: bytes, where: str = "The patch file") -> PatchFile:
+    """Return what the bytes of a patch file say; see `load_patch`."""
+    try:
+        record = json.loads(content.decode("utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise PatchFileError(f"{where} is not JSON ({error}).") from error
+    except RecursionError:
+        raise PatchFileError(f"{where} is nested far deeper than any patch.") from None
+    if not isinstance(record, dict) or record.get("schema") != SCHEMA:
+        came = record.get("schema") if isinstance(record, dict) else type(record).__name__
+        raise PatchFileError(f'{where} must have "schema": "{SCHEMA}", but has {came!r}.')
+    rows, channels = record.get("effects"), record.get("channels", {})
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise PatchFileError(f'{where} must have a list of tables "effects".')
+    if not rows:
+        raise PatchFileError(f"{where} names no effect, so there is nothing to add.")
+    if not isinstance(channels, dict) or not all(isinstance(name, str) for name in channels.values()):
+        raise PatchFileError(f'"channels" in {where[:1].lower() + where[1:]} must map names to outputs.')
+    return PatchFile(_effects(rows, where), channels)
+
+
+def _effects(rows: list[dict[str, Any]], where: str) -> tuple[Effect, ...]:
+    effects: list[Effect] = []
+    taken: set[str] = set()
+    for number, row in enumerate(rows, start=1):
+        name = row.get("id", row.get("identifier"))
+        if not isinstance(name, str) or not _IDENTIFIER.fullmatch(name):
+            raise PatchFileError(
+                f'{where}: the "id" of effect {number} must be letters, digits and underscores, but is '
+                f"{name!r}."
+            )
+        try:
+            patch = ModelPatch.from_list(row.get("primitives", row.get("patch")), f"{where}, effect {name}")
+        except InvalidPatchError as cause:
+            raise PatchFileError(str(cause)) from cause
+        if not len(patch):
+            raise PatchFileError(f"{where}: the effect {name!r} has no primitives.")
+        unique, count = name, 1
+        while unique in taken:
+            count += 1
+            unique = f"{name}_{count}"
+        taken.add(unique)
+        effects.append(Effect(unique, patch))
+    return tuple(effects)

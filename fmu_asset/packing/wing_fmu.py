@@ -1,0 +1,342 @@
+"""Packing a reduced model as the wing FMU: FMI 2.0 co-simulation, reproducible to the byte.
+
+What goes into the compiled kind is in `compiled`. Of the Python kind, slave base class and binaries are
+pythonfmu's; the archive is packed here and not by its builder, which stamps times, a random GUID and module
+names that two FMUs in one process would share.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Literal
+
+from fe.runtime.patch_arrays import PatchArrays
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import STIFFNESS_LOSS_NAMES, DigitalState
+from fmu_asset.compiled.package import DATA_FILE, binary_of, compiled_members
+from fmu_asset.description import documentation_page, model_description
+from fmu_asset.errors import FmuBuildError, PatchFileError
+from fmu_asset.slaves.effect_variables import effect_rows, switch_of, units_of
+from fmu_asset.slaves.variables import UNITS, FmuVariable, variable_table
+from reporting.files import atomic_write_bytes
+
+from .contents import (
+    PLACEHOLDER,
+    archive_bytes,
+    check_start,
+    checked_target,
+    content_hash_of,
+    emptied,
+    filled,
+    guid_of,
+    pythonfmu_members,
+    pythonfmu_version,
+    room_members,
+    tag_of,
+)
+from .patch_file import PatchFile
+from .patched_runtime import output_channels, patched_members, plain_effects
+
+FmuKind = Literal["python", "compiled", "source"]
+"""Run by Python, compiled for this machine, or the sources of the compiled one alone."""
+
+MODE_COUNT = 6
+"""Number of modes of which frequency and damping ratio are outputs, if the model has as many."""
+
+DESCRIPTION = (
+    "Structure of a UAV half-wing: strains, tip displacement and modes from a reduced finite element model "
+    "under load factor and tip force, with two regions that can lose stiffness."
+)
+
+_SCRIPT = '''"""Loaded by the FMI wrapper; everything is in the package beside it."""
+from uav_wing_0_content_0__runtime.entry import Fmi2Slave, WingSlave, keep_alive
+
+# The wrapper runs this file once for each instance and drops one reference to its globals too many.
+keep_alive(globals())
+
+
+class UavWing_0_content_0_(WingSlave, Fmi2Slave):
+    """The wing."""
+
+    content_tag = "0_content_0_"
+'''
+
+_ENTRY = '''"""Joins the slave, the reduced model and pythonfmu's base class."""
+import ctypes
+import json
+
+from .fe.damping import rayleigh_damping_ratio
+from .fe.reduced import ReducedModel
+from .fe.transient import ModalIntegrator, TransientState
+from .pythonfmu.fmi2slave import Fmi2Slave
+from .slaves.base import Contents
+from .slaves.behaviour import Physics, WingBehaviour
+from .slaves.variables import variable_table
+from .slaves.wing_slave import WingSlave as _WingSlave
+
+__all__ = ["Fmi2Slave", "WingSlave", "keep_alive"]
+
+_contents = []
+
+
+def keep_alive(thing):
+    """Hold one more reference for ever, also while the interpreter shuts down and clears this module."""
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(thing))
+
+
+def load_contents(resources):
+    """Read the model once in a process: this package's name is a hash of its content."""
+    if not _contents:
+        model = ReducedModel.load(resources / "reduced_model.npz")
+        setting = json.loads((resources / "start.json").read_text(encoding="utf-8"))
+        table = variable_table(
+            gauge_count=model.gauge_count,
+            mode_count=setting["mode_count"],
+            validity=model.validity,
+            start=setting["start"],
+        )
+        physics = Physics(model, ModalIntegrator, TransientState, rayleigh_damping_ratio)
+        _contents.append(Contents(table, lambda: WingBehaviour(physics, setting["mode_count"])))
+    return _contents[0]
+
+
+class WingSlave(_WingSlave):
+    """The slave with its resources."""
+
+    load_contents = staticmethod(load_contents)
+'''
+
+
+@dataclass(frozen=True)
+class FmuInfo:
+    """An FMU that was built.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    guid, content_hash, model_identifier : str
+        GUID (from the content hash), SHA-256 of the content, stem of the binary.
+    design_hash : str
+        Hash of the design that made the reduced model.
+    size : int
+        Bytes of the file.
+    """
+
+    path: Path
+    guid: str
+    content_hash: str
+    model_identifier: str
+    design_hash: str
+    size: int
+
+
+def build_fmu(
+    model: ReducedModel,
+    path: str | os.PathLike[str],
+    *,
+    state: DigitalState | None = None,
+    kind: FmuKind = "python",
+    note: str = "",
+    resources: Mapping[str, bytes] | None = None,
+    patch: PatchFile | None = None,
+    activate: bool = False,
+    arrays: PatchArrays | None = None,
+    replace: bool = False,
+) -> FmuInfo:
+    """Pack a reduced model as an FMU; equal input gives equal bytes.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        The wing.
+    path : path-like
+        Where to write, with the suffix .fmu.
+    state : DigitalState, optional
+        Start values of parameters and health; the digital state's defaults if absent.
+    kind : {"python", "compiled", "source"}
+        What evaluates the model: Python in the host, C compiled now, or C to be compiled elsewhere.
+    note : str
+        Added to the description, such as what the wing was calibrated with; XML text without control
+        characters.
+    resources : mapping of str to bytes, optional
+        Further files of the archive's folder `resources`, by name.
+    patch : PatchFile, optional
+        Missing effects that the FMU is to carry as tunable parameters.
+    activate : bool
+        Whether these are switched on from the start.
+    arrays : PatchArrays, optional
+        The wing in the basis for patches (`fe.reduction.patch_cache.patch_arrays`); needed where an effect
+        changes structure or loads, or turns a gauge.
+    replace : bool
+        Whether an existing file may be replaced.
+
+    Returns
+    -------
+    FmuInfo
+        What was built.
+
+    Raises
+    ------
+    FmuBuildError
+        If the file exists, the suffix is wrong, a start value lies outside the model's validity box, a
+        resource would take the place of another file, the wrong pythonfmu is installed, or there is no C
+        compiler for a compiled one.
+    PatchFileError
+        If the FMU cannot carry an effect of the patch.
+    """
+    target = checked_target(path, replace=replace)
+    content, content_hash = fmu_bytes(
+        model, state, kind, note=note, resources=resources, patch=patch, activate=activate, arrays=arrays
+    )
+    atomic_write_bytes(target, content)
+    return _info(model, target, content, content_hash)
+
+
+def _info(model: ReducedModel, path: Path, content: bytes, content_hash: str) -> FmuInfo:
+    return FmuInfo(
+        path=path,
+        guid=guid_of(content_hash),
+        content_hash=content_hash,
+        model_identifier=f"uav_wing_{tag_of(content_hash)}",
+        design_hash=model.design_hash,
+        size=len(content),
+    )
+
+
+def fmu_bytes(
+    model: ReducedModel,
+    state: DigitalState | None = None,
+    kind: FmuKind = "python",
+    *,
+    note: str = "",
+    resources: Mapping[str, bytes] | None = None,
+    patch: PatchFile | None = None,
+    activate: bool = False,
+    arrays: PatchArrays | None = None,
+) -> tuple[bytes, str]:
+    """Return the archive and its content hash; see `build_fmu`."""
+    start = start_values(state or DigitalState())
+    mode_count = min(MODE_COUNT, model.mode_count)
+    table = variable_table(
+        gauge_count=model.gauge_count, mode_count=mode_count, validity=model.validity, start=start
+    )
+    check_start(table)
+    effects = []
+    if patch is not None:
+        check_kind(kind)
+        effects = plain_effects(patch.for_outputs(output_channels(model.gauge_count)))
+        start |= {switch_of(effect): float(activate) for effect in effects}
+        table += effect_rows(effects, len(table), start)
+        check_start(table)
+    description = f"{DESCRIPTION} {note}".strip()
+    if kind == "python":
+        template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start}, description)
+        if effects:
+            template |= patched_members(f"resources/uav_wing_{PLACEHOLDER}_runtime", model, effects, arrays)
+    else:
+        template = compiled_members(
+            model,
+            table,
+            identifier=f"uav_wing_{PLACEHOLDER}",
+            guid=PLACEHOLDER,
+            content_tag=PLACEHOLDER,
+            description=description,
+        )
+    for name, content in (resources or {}).items():
+        if f"resources/{name}" in template or "/" in name or not name:
+            raise FmuBuildError(f"A resource of an FMU cannot have the name {name!r}; choose another one.")
+        template[f"resources/{name}"] = content
+    content_hash = content_hash_of(template)
+    members = filled(template, content_hash)
+    if kind == "compiled":
+        members |= binary_of(members, f"uav_wing_{tag_of(content_hash)}")
+    return archive_bytes(members), content_hash
+
+
+def check_kind(kind: FmuKind) -> None:
+    """Refuse a kind of FMU that cannot carry missing effects; raises `PatchFileError`."""
+    if kind != "python":
+        raise PatchFileError(
+            f"The FMU of the kind {kind!r} cannot carry missing effects: build the kind 'python' with this "
+            "patch."
+        )
+
+
+def start_values(state: DigitalState) -> dict[str, float]:
+    """Return the start values of the FMU's variables that a digital state gives, by variable name."""
+    losses = zip(STIFFNESS_LOSS_NAMES, state.stiffness_loss, strict=True)
+    return {
+        "young_modulus_factor": float(state.young_modulus_factor),
+        "damping.alpha": float(state.damping_alpha),
+        "damping.beta": float(state.damping_beta),
+        "mass.servo": float(state.servo_mass),
+        "mass.pitot": float(state.pitot_mass),
+        **{f"health.{name}": float(loss) for name, loss in losses},
+    }
+
+
+def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
+    """Return the GUID that an FMU of ours declares, and the GUID that its content has today.
+
+    The two differ when the file was changed after it was built. A compiled binary is not part of the content,
+    since every compiler makes another one of the same sources.
+
+    Parameters
+    ----------
+    path : path-like
+        A wing FMU.
+
+    Returns
+    -------
+    declared, actual : str
+        GUIDs.
+    """
+    with zipfile.ZipFile(path) as archive:
+        # Archives that other tools have packed again list their folders too.
+        members = {name: archive.read(name) for name in archive.namelist() if not name.endswith("/")}
+    root = members["modelDescription.xml"].decode("utf-8")
+    if DATA_FILE in members:
+        members = {name: data for name, data in members.items() if not name.startswith("binaries/")}
+        tag = root.split('modelIdentifier="uav_wing_', 1)[1].split('"', 1)[0]
+    else:
+        tag = members["resources/slavemodule.txt"].decode("ascii").strip().removeprefix("uav_wing_")
+    declared = root.split('guid="', 1)[1].split('"', 1)[0]
+    return declared, guid_of(content_hash_of(emptied(members, tag, declared)))
+
+
+def _members(
+    model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str, object], description: str
+) -> dict[str, bytes]:
+    """Return the files of the archive, with the placeholder wherever the content hash will stand."""
+    installed = pythonfmu_version()
+    module = f"uav_wing_{PLACEHOLDER}"
+    runtime = f"resources/{module}_runtime"
+    members = {
+        "modelDescription.xml": model_description(
+            identifier=module,
+            guid=PLACEHOLDER,
+            table=table,
+            description=description,
+            version=version("uav-twin"),
+            generation_tool=f"uav-twin with PythonFMU {installed}",
+            units=UNITS + units_of(table),
+        ),
+        "documentation/index.html": documentation_page(table, description),
+        "resources/reduced_model.npz": model,
+        "resources/start.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode(),
+        f"resources/{module}.py": _SCRIPT.encode(),
+        f"{runtime}/__init__.py": b'"""The wing FMU."""\n',
+        f"{runtime}/entry.py": _ENTRY.encode(),
+        f"{runtime}/pythonfmu/__init__.py": b'"""The base class of pythonfmu."""\n',
+    }
+    members |= room_members("fmu_asset.slaves", f"{runtime}/slaves") | room_members(
+        "fe.runtime", f"{runtime}/fe"
+    )
+    return members | pythonfmu_members(module, f"{runtime}/pythonfmu", ["fmi2slave.py"])

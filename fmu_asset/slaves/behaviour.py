@@ -1,0 +1,247 @@
+"""What the wing does in one communication step: the steady turn, or the modes integrated in time.
+
+This file is copied into the FMU. It imports nothing of `fe` at run time: what it needs of the reduced model
+is handed to it, so that the same code runs on the project's modules and on the copies inside an FMU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from .variables import TRANSIENT
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from fe.runtime.reduced import ReducedModel
+    from fe.runtime.transient import ModalIntegrator, TransientState
+
+
+class UnacceptableEffectError(ValueError):
+    """The values of missing effects are none that the wing can have; one sentence with its full stop."""
+
+
+class Physics(NamedTuple):
+    """The reduced model and the classes that come with it (from `fe`, or from their copies in the FMU)."""
+
+    model: ReducedModel
+    integrator: type[ModalIntegrator]
+    transient_state: type[TransientState]
+    rayleigh_damping_ratio: Callable[..., Any]
+
+
+@dataclass(frozen=True, slots=True)
+class WingParameters:
+    """Parameters of the wing FMU, SI units; `response` as in `variables`."""
+
+    young_modulus_factor: float
+    damping_alpha: float
+    damping_beta: float
+    servo_mass: float
+    pitot_mass: float
+    initial_tip_displacement: float
+    response: int
+
+
+class Response(NamedTuple):
+    """Outputs at the end of a step: strain (G,) dimensionless, tip displacement [m]."""
+
+    strain: npt.NDArray[np.float64]
+    tip_displacement: float
+
+
+class Moment(NamedTuple):
+    """What a step of an FMU with missing effects depends on beside inputs and duration.
+
+    Attributes
+    ----------
+    time, start : float
+        Time at the end of the step, and at the start of the simulation [s].
+    values : mapping of str to float
+        Variables of the effects by name.
+    """
+
+    time: float
+    start: float
+    values: Mapping[str, float]
+
+
+class WingBehaviour:
+    """The wing in time: what it remembers, and how a step changes it.
+
+    A step either completes or raises and leaves everything as it was. Inputs are load factor, z1, z2 and
+    tip force [N], in this order, and are held over the step.
+
+    Parameters
+    ----------
+    physics : Physics
+        The model and its classes.
+    mode_count : int
+        Number of modes whose data `modal_data` returns.
+    """
+
+    def __init__(self, physics: Physics, mode_count: int) -> None:
+        self._physics = physics
+        self._mode_count = mode_count
+        self._parameters: WingParameters | None = None
+        self._inputs: tuple[float, ...] = ()
+        self._integrator: ModalIntegrator | None = None
+        self._transient: TransientState | None = None
+        self._bound: float | None = None
+
+    def start(
+        self, parameters: WingParameters, inputs: Sequence[float], moment: Moment | None = None
+    ) -> Response:
+        """Find the initial state: equilibrium, and for the transient the tip displaced and just let go.
+
+        Parameters
+        ----------
+        parameters : WingParameters
+            The parameters, within the validity box.
+        inputs : sequence of float
+            The inputs at the start.
+        moment : Moment, optional
+            Nothing here depends on it.
+
+        Returns
+        -------
+        Response
+            The outputs at the start.
+        """
+        if parameters.response != TRANSIENT:
+            response = self._equilibrium(parameters, inputs)
+            self._integrator, self._transient = None, None
+        else:
+            integrator = self._make_integrator(parameters, inputs)
+            load_factor, _, _, tip_force = inputs
+            transient = integrator.released(parameters.initial_tip_displacement, load_factor, tip_force)
+            response = self._read(integrator, transient)
+            self._integrator, self._transient, self._bound = integrator, transient, None
+        self._parameters, self._inputs = parameters, tuple(inputs)
+        return response
+
+    def advance(self, inputs: Sequence[float], duration: float, moment: Moment | None = None) -> Response:
+        """Advance by one step with the inputs held.
+
+        Parameters
+        ----------
+        inputs : sequence of float
+            The inputs of this step, within the validity box.
+        duration : float
+            Step size [s].
+        moment : Moment, optional
+            Nothing here depends on it.
+
+        Returns
+        -------
+        Response
+            The outputs at the end of the step.
+        """
+        parameters, before = self._parameters, self._integrator
+        if parameters is None:
+            raise RuntimeError("the wing was not initialised")
+        if before is None or self._transient is None:
+            response = self._equilibrium(parameters, inputs)
+        else:
+            integrator, transient = before, self._transient
+            if tuple(inputs[1:3]) != self._inputs[1:3]:
+                integrator = self._make_integrator(parameters, inputs)
+                transient = integrator.take_over(transient, before)
+            load = (inputs[0], inputs[3])
+            transient = integrator.advance(transient, duration, load)
+            response = self._read(integrator, transient)
+            self._integrator, self._transient, self._bound = integrator, transient, None
+        self._inputs = tuple(inputs)
+        return response
+
+    def strain_error_bound(self) -> float:
+        """Return the certified bound of the static strains under the last inputs (dimensionless)."""
+        if self._bound is None:
+            if self._parameters is None:
+                raise RuntimeError("the wing was not initialised")
+            self._equilibrium(self._parameters, self._inputs)
+        return self._bound or 0.0
+
+    def load_point_displacement(self) -> float:
+        """Return the displacement of the point where the tip force acts [m]."""
+        if self._parameters is None:
+            raise RuntimeError("the wing was not initialised")
+        if self._integrator is not None and self._transient is not None:
+            return self._integrator.load_point_displacement(self._transient)
+        load_factor, z1, z2, tip_force = self._inputs
+        model = self._physics.model
+        static = model.static_response(
+            self._parameters.young_modulus_factor, (z1, z2), load_factor, tip_force
+        )
+        return float(model.static_load[1] @ static.coordinates)
+
+    def modal_data(self) -> tuple[list[float], list[float]]:
+        """Return natural frequencies [Hz] and damping ratios [1] under the last inputs."""
+        parameters = self._parameters
+        if parameters is None:
+            raise RuntimeError("the wing was not initialised")
+        if self._integrator is not None:
+            frequency, ratio = self._integrator.modes.frequency, self._integrator.damping_ratio
+        else:
+            _, z1, z2, _ = self._inputs
+            modes = self._physics.model.modes(
+                parameters.young_modulus_factor, (z1, z2), parameters.servo_mass, parameters.pitot_mass
+            )
+            frequency = modes.frequency
+            ratio = self._physics.rayleigh_damping_ratio(
+                parameters.damping_alpha, parameters.damping_beta, frequency
+            )
+        return frequency[: self._mode_count].tolist(), ratio[: self._mode_count].tolist()
+
+    def state(self) -> list[float]:
+        """Return all that is remembered as plain floats; parameters are kept by the slave."""
+        head = [float(self._parameters is not None), float(self._transient is not None)]
+        inputs = list(self._inputs) or [0.0] * 4
+        return [*head, *inputs, *([] if self._transient is None else self._transient.to_list())]
+
+    def restore(self, parameters: WingParameters, values: Sequence[float]) -> None:
+        """Take back what `state` returned.
+
+        Parameters
+        ----------
+        parameters : WingParameters
+            The parameters of that moment.
+        values : sequence of float
+            The remembered values.
+        """
+        started, moving = values[0] != 0.0, values[1] != 0.0
+        inputs = tuple(values[2:6])
+        integrator, transient = None, None
+        if moving:
+            integrator = self._make_integrator(parameters, inputs)
+            transient = self._physics.transient_state.from_list(values[6:])
+        self._parameters = parameters if started else None
+        self._inputs = inputs if started else ()
+        self._integrator, self._transient, self._bound = integrator, transient, None
+
+    def _equilibrium(self, parameters: WingParameters, inputs: Sequence[float]) -> Response:
+        load_factor, z1, z2, tip_force = inputs
+        static = self._physics.model.static_response(
+            parameters.young_modulus_factor, (z1, z2), load_factor, tip_force
+        )
+        self._bound = static.strain_error_bound
+        return Response(static.strain, static.tip_displacement)
+
+    def _make_integrator(self, parameters: WingParameters, inputs: Sequence[float]) -> ModalIntegrator:
+        return self._physics.integrator(
+            self._physics.model,
+            young_modulus_factor=parameters.young_modulus_factor,
+            stiffness_loss=(inputs[1], inputs[2]),
+            servo_mass=parameters.servo_mass,
+            pitot_mass=parameters.pitot_mass,
+            damping_alpha=parameters.damping_alpha,
+            damping_beta=parameters.damping_beta,
+        )
+
+    @staticmethod
+    def _read(integrator: ModalIntegrator, transient: TransientState) -> Response:
+        response = integrator.response(transient)
+        return Response(response.strain, response.tip_displacement)

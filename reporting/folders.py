@@ -1,0 +1,93 @@
+"""Folders that one process holds, and that take the place of another in steps that a kill cannot spoil."""
+
+from __future__ import annotations
+
+import glob
+import os
+import shutil
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
+from reporting.files import write_error
+
+_OLD, _REPLACED = "old", "replaced"
+
+
+def lock_folder(folder: Path) -> int | None:
+    """Take a folder for this process; return a file descriptor to close at the end, None if it is taken.
+
+    The lock stays with the folder when it is renamed, and goes with the process that holds it.
+    """
+    import fcntl
+
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def replace_folder(fresh: Path, folder: Path) -> None:
+    """Put a folder in the place of another, which is removed; this process holds both.
+
+    A kill on the way leaves one of the two in the place, or the old one where `restore_folder` finds it.
+
+    Raises
+    ------
+    OSError
+        The place is not writable; the old folder is there as it was.
+    """
+    old = Path(tempfile.mkdtemp(prefix=_prefix(folder, _OLD), dir=folder.parent))
+    aside = old / folder.name
+    try:
+        folder.rename(aside)
+        fresh.rename(folder)
+    except OSError:
+        if aside.is_dir():
+            aside.rename(folder)
+        old.rmdir()
+        raise
+    replaced = old.with_name(old.name.replace(f".{_OLD}-", f".{_REPLACED}-"))
+    old.rename(replaced)
+    shutil.rmtree(replaced, ignore_errors=True)
+
+
+def restore_folder(folder: Path) -> bool:
+    """Put back a folder that a killed process had moved aside; return whether there was one.
+
+    What a killed process had replaced already, and was about to remove, is removed.
+
+    Raises
+    ------
+    FileNotWrittenError
+        The place is not writable.
+    """
+    restored = False
+    for old in _asides(folder, _OLD):
+        aside = old / folder.name
+        # A folder that is held is being replaced at this moment; one whose place is taken is left alone.
+        if folder.exists() or not aside.is_dir() or (descriptor := lock_folder(aside)) is None:
+            continue
+        try:
+            aside.rename(folder)
+            restored = True
+        except OSError as error:
+            raise write_error(error, folder) from error
+        finally:
+            os.close(descriptor)
+        with suppress(OSError):
+            old.rmdir()
+    for replaced in _asides(folder, _REPLACED):
+        shutil.rmtree(replaced, ignore_errors=True)
+    return restored
+
+
+def _prefix(folder: Path, what: str) -> str:
+    return f".{folder.name}.{what}-"
+
+
+def _asides(folder: Path, what: str) -> list[Path]:
+    return sorted(folder.parent.glob(glob.escape(_prefix(folder, what)) + "*"))

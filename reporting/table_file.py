@@ -1,0 +1,269 @@
+"""The one reader of tables: text with one row of cells in a line; errors name file, line and column.
+
+A reader that guesses is worse than none: a decimal comma makes two cells of a number, and whoever takes the
+first of them is wrong without a word. So every row has as many cells as the header, no column comes twice,
+and a number is written with the digits 0 to 9 and a point.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reporting.text_file import read_text
+from reporting.words import counted
+
+FloatArray = NDArray[np.float64]
+
+
+class TableErrors(NamedTuple):
+    """What a reader raises: for a table that is laid out otherwise, and for values that none can have."""
+
+    layout: type[Exception]
+    value: type[Exception]
+
+
+def plain_number(text: str) -> float:
+    """Return the number of a text in the digits 0 to 9, or NaN or an infinity where it says so.
+
+    Raises
+    ------
+    ValueError
+        The text is no number, or one that `float` takes and no measuring programme writes: digits of another
+        script, or underscores between them.
+    """
+    if not text.isascii() or "_" in text:
+        raise ValueError(f"{text!r} is not written with the digits 0 to 9")
+    return float(text)
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table of text.
+
+    Attributes
+    ----------
+    name : str
+        Name of the file, for error messages.
+    columns : mapping of str to tuple of str
+        Cells by column, stripped.
+    lines : tuple of int
+        Line of the file that each row stands in.
+    errors : TableErrors
+        What is raised.
+    """
+
+    name: str
+    columns: Mapping[str, tuple[str, ...]]
+    lines: tuple[int, ...]
+    errors: TableErrors
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def cells(self, column: str, needed_by: str) -> tuple[str, ...]:
+        """Return the cells of a column.
+
+        Raises
+        ------
+        errors.layout
+            There is no such column; the sentence says what there is.
+        """
+        if column not in self.columns:
+            raise self.errors.layout(
+                f"{self.name} has no column {column!r}, which {needed_by} needs; its columns are "
+                f"{', '.join(self.columns)}."
+            )
+        return self.columns[column]
+
+    def numbers(
+        self,
+        column: str,
+        needed_by: str,
+        convert: Callable[[str], float] = plain_number,
+        *,
+        empty_allowed: bool = False,
+    ) -> FloatArray:
+        """Return a column as numbers; NaN stands for an empty cell where it is allowed.
+
+        Raises
+        ------
+        errors.layout
+            There is no such column, or a cell is no number.
+        errors.value
+            A cell is NaN or infinite.
+        """
+        cells = self.cells(column, needed_by)
+        return np.array(
+            [
+                np.nan if empty_allowed and not cell else self.number(column, row, convert, empty_allowed)
+                for row, cell in enumerate(cells)
+            ]
+        )
+
+    def positive_numbers(self, column: str, needed_by: str) -> FloatArray:
+        """Return a column as positive numbers; errors as `numbers`, and `errors.value` for another."""
+        return np.array(
+            [self.positive_number(column, row) for row, _ in enumerate(self.cells(column, needed_by))]
+        )
+
+    def positive_number(self, column: str, row: int) -> float:
+        """Return a cell as a positive number; rows count from 0, errors as `positive_numbers`."""
+        value = self.number(column, row)
+        if value <= 0.0:
+            raise self.errors.value(
+                f"{self._place(column, row)} holds {self.columns[column][row]}, and a positive number is "
+                "needed; leave out readings of zero."
+            )
+        return value
+
+    def number(
+        self,
+        column: str,
+        row: int,
+        convert: Callable[[str], float] = plain_number,
+        empty_allowed: bool = False,
+    ) -> float:
+        """Return a cell as a number; rows count from 0, errors as `numbers`."""
+        cell = self.columns[column][row]
+        try:
+            value = plain_number(cell)
+            if isfinite(value) and convert is not plain_number:
+                value = convert(cell)
+        except (ValueError, ArithmeticError):
+            came = repr(cell) if cell else "nothing"
+            raise self.errors.layout(
+                f"{self._place(column, row)} must hold a number, and {came} came."
+            ) from None
+        if not isfinite(value):
+            remedy = (
+                "; leave the cell of a reading empty that is to be left out"
+                if empty_allowed
+                else ", and a finite number is needed"
+            )
+            raise self.errors.value(f"{self._place(column, row)} holds {cell}{remedy}.")
+        return value
+
+    def _place(self, column: str, row: int) -> str:
+        return f"{self.name}, line {self.lines[row]}: column {column!r}"
+
+    def refuse_repeated(self, keys: Sequence[object], what: str, remedy: str) -> None:
+        """Refuse equal keys of two rows.
+
+        Parameters
+        ----------
+        keys : sequence
+            One for each row.
+        what, remedy : str
+            What the two rows share, and what to do, for the sentence of `errors.layout`.
+        """
+        first: dict[object, int] = {}
+        for key, line in zip(keys, self.lines, strict=True):
+            if first.setdefault(key, line) != line:
+                raise self.errors.layout(
+                    f"{self.name}: the lines {first[key]} and {line} hold the same {what}; {remedy}."
+                )
+
+
+def read_table(
+    path: Path | str,
+    errors: TableErrors,
+    *,
+    name: str | None = None,
+    header: Sequence[str] | None = None,
+) -> TextTable:
+    """Read a table of comma-separated text.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file; UTF-8, with or without a byte order mark.
+    errors : TableErrors
+        What is raised.
+    name : str, optional
+        What sentences about its content call it; the path if left out.
+    header : sequence of str, optional
+        Names of the columns where the file has no line for them.
+
+    Raises
+    ------
+    errors.layout
+        The file cannot be read, is not UTF-8, has no header or rows, names a column twice, or a row has
+        another number of cells than the header.
+    """
+    text = read_text(path, errors.layout)
+    return parse_table(text, str(path) if name is None else name, errors, header=header)
+
+
+def parse_table(
+    text: str,
+    name: str,
+    errors: TableErrors,
+    *,
+    header: Sequence[str] | None = None,
+    separator: str | None = ",",
+) -> TextTable:
+    """Return the table of a text, separated by commas or (None) by blanks; errors as `read_table`."""
+    # Comment lines become empty ones, so that the reader's line numbers stay those of the file.
+    kept = ["" if line.lstrip().startswith("#") else line for line in text.splitlines()]
+    if separator is None:
+        found = [(number, line.split()) for number, line in enumerate(kept, start=1) if line.strip()]
+    else:
+        found = _separated(kept, separator, name, errors)
+    if not found and header is None:
+        raise errors.layout(f"{name} is empty: it needs a header line with the names of its columns.")
+    columns = found.pop(0)[1] if header is None else [*header]
+    if len(columns) == 1 and (";" in columns[0] or "\t" in columns[0]):
+        raise errors.layout(
+            f"{name} is not separated by commas: write it with commas between cells and points in numbers."
+        )
+    twice = sorted({column for column in columns if columns.count(column) > 1})
+    if twice:
+        raise errors.layout(f"{name} has more than one column {twice[0]!r}: rename or remove one.")
+    if not found:
+        raise errors.layout(f"{name} has {'a header line but ' if header is None else ''}no rows.")
+    for line, row in found:
+        if len(row) != len(columns):
+            raise errors.layout(
+                f"{name}, line {line}: {counted(len(row), 'cell')} came, and "
+                + (
+                    f"the header has {counted(len(columns), 'column')}."
+                    if header is None
+                    else f"{counted(len(columns), 'column')} ({', '.join(columns)}) are expected."
+                )
+            )
+    cells = tuple(zip(*(row for _, row in found), strict=True))
+    return TextTable(name, dict(zip(columns, cells, strict=True)), tuple(line for line, _ in found), errors)
+
+
+def _separated(
+    kept: Sequence[str], separator: str, name: str, errors: TableErrors
+) -> list[tuple[int, list[str]]]:
+    reader = csv.reader(io.StringIO("\n".join(kept)), delimiter=separator, skipinitialspace=True)
+    found = []
+    try:
+        for row in reader:
+            if row:
+                found.append((reader.line_num, [cell.strip() for cell in row]))
+    except csv.Error as cause:
+        raise errors.layout(f"{name}, line {reader.line_num}: not comma-separated text ({cause}).") from cause
+    return found
+
+
+def table_text(header: Sequence[str], columns: Sequence[Sequence[str]], comment: str = "") -> str:
+    """Return the text of a table, which `parse_table` reads back."""
+    stream = io.StringIO()
+    if comment:
+        stream.write(f"# {comment}\n")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(zip(*columns, strict=True))
+    return stream.getvalue()

@@ -1,0 +1,155 @@
+"""What all commands have in common: `--quiet`, `--verbose`, results as text or JSON, and how they end.
+
+Results go to the output stream, progress to the error stream. A command asks here for its console and its
+progress, and takes no option for them: `with_common_options` gives every command the same two.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from reporting.progress import Progress
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+WIDTH_OF_A_PIPE = 1000
+"""Columns of what is no terminal."""
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+"""Option of the commands that answer a question."""
+NoReport = Annotated[bool, typer.Option("--no-report", help="Draw no report and no figures.")]
+"""Option of the commands that draw one."""
+
+
+@dataclass
+class Loudness:
+    """How much a command says."""
+
+    quiet: bool = False
+    verbose: bool = False
+
+
+loudness = Loudness()
+"""Of the command that runs."""
+
+
+def console(*, silent: bool = False) -> Console:
+    """Return the console for results; with `--quiet`, or where `silent`, it prints nothing.
+
+    In a pipe or a file nothing is cut or wrapped, unless COLUMNS says how wide it is.
+    """
+    from rich.console import Console
+
+    width = None if sys.stdout.isatty() or "COLUMNS" in os.environ else WIDTH_OF_A_PIPE
+    return Console(highlight=False, markup=False, width=width, quiet=silent or loudness.quiet)
+
+
+def say(text: str) -> None:
+    """Print a line of the result, unless `--quiet`."""
+    if not loudness.quiet:
+        typer.echo(text)
+
+
+def progress() -> Progress:
+    """Return where the stages of a command are shown."""
+    from reporting.progress import RichProgress, SilentProgress
+
+    return SilentProgress() if loudness.quiet else RichProgress(lines=loudness.verbose)
+
+
+def print_json(record: Mapping[str, Any]) -> None:
+    """Print a record as JSON text; a number that is not finite becomes null."""
+    typer.echo(json.dumps(_plain(record), indent=1, ensure_ascii=False, allow_nan=False, default=str))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def with_common_options(application: typer.Typer) -> Callable[..., None]:
+    """Return a command line whose commands all take `--quiet` and `--verbose`, and end alike after Ctrl-C."""
+    from typer.main import get_command
+
+    loudness.quiet = loudness.verbose = False
+    common = typer.Typer(add_completion=False)
+    common.command()(_common_options)
+    options = [option for option in get_command(common).params if option.name in ("quiet", "verbose")]
+    for option in options:
+        option.expose_value = False  # the commands ask this module instead
+    command = get_command(application)
+    _extend(command, options)
+    return command
+
+
+def _set_quiet(value: bool) -> None:
+    loudness.quiet |= value
+    _refuse_both()
+
+
+def _set_verbose(value: bool) -> None:
+    loudness.verbose |= value
+    _refuse_both()
+
+
+def _refuse_both() -> None:
+    if loudness.quiet and loudness.verbose:
+        raise typer.BadParameter("--quiet and --verbose exclude each other.")
+
+
+def _common_options(
+    quiet: Annotated[
+        bool,
+        typer.Option(
+            "--quiet", "-q", callback=_set_quiet, help="Print nothing but errors, and what --json asks for."
+        ),
+    ] = False,
+    verbose: Annotated[
+        bool,
+        typer.Option(
+            "--verbose",
+            "-v",
+            callback=_set_verbose,
+            help="Show stages as lines with their times, and the traceback of an error.",
+        ),
+    ] = False,
+) -> None:
+    """Carry the options that every command has."""
+
+
+def _extend(command: Any, options: Sequence[Any]) -> None:
+    command.params.extend(options)
+    if command.callback is not None:
+        command.callback = _interruptible(command.callback)
+    for inner in getattr(command, "commands", {}).values():
+        _extend(inner, options)
+
+
+def _interruptible(call: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(call)
+    def guarded(*arguments: Any, **options: Any) -> Any:
+        try:
+            return call(*arguments, **options)
+        except KeyboardInterrupt:
+            typer.secho("Interrupted.", fg="red", err=True)
+            raise typer.Exit(INTERRUPTED) from None
+
+    return guarded

@@ -1,0 +1,381 @@
+"""Calibration step 3: synthetic ring-downs, noise, edges, the digitised records, bad records."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from calibration.dynamics.damped_cosine import DampedCosines, natural_mode
+from calibration.dynamics.records import RingDownRecord, read_records
+from calibration.dynamics.ringdown import FIRST_PEAK, Frequencies, fit_ring_down, prepare, spectrum
+from calibration.dynamics.trials import amplitude_dependence, fit_trials
+from calibration.errors import CalibrationError, ExperimentDataError, ExperimentFileError, RingDownError
+
+REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
+
+
+def ring_down(
+    time: NDArray[np.float64],
+    frequency: tuple[float, float] = (5.65, 29.97),
+    ratio: tuple[float, float] = (0.0281, 0.0717),
+    amplitude: tuple[float, float] = (0.0115, 0.0137),
+    phase: tuple[float, float] = (0.3, -0.8),
+    drift: float = 0.0,
+) -> NDArray[np.float64]:
+    """Natural frequencies [Hz] and damping ratios of two modes to the signal [V]."""
+    signal = 1e-4 + drift * time
+    for f, z, a, p in zip(frequency, ratio, amplitude, phase, strict=True):
+        natural = 2.0 * math.pi * f
+        signal = signal + a * np.exp(-z * natural * time) * np.cos(natural * math.sqrt(1.0 - z**2) * time + p)
+    return signal
+
+
+def test_free_frequencies_are_recovered_exactly() -> None:
+    time = np.arange(0.0, 6.5, 1.0 / 500.0)
+    fit = fit_ring_down(RingDownRecord(time, ring_down(time, drift=-2e-5)), Frequencies.FITTED, start=None)
+    for mode, f, z, a, p in zip(
+        fit.modes, (5.65, 29.97), (0.0281, 0.0717), (0.0115, 0.0137), (0.3, -0.8), strict=True
+    ):
+        assert mode.frequency == pytest.approx(f, rel=1e-8)
+        assert mode.damping_ratio == pytest.approx(z, rel=1e-7)
+        assert mode.amplitude == pytest.approx(a, rel=1e-7)
+        assert mode.phase == pytest.approx(p, rel=1e-6)
+        assert mode.damped_frequency == pytest.approx(f * math.sqrt(1.0 - z**2), rel=1e-8)
+    assert fit.residual_deviation < 1e-10
+
+
+def test_a_record_of_averages_is_recovered_exactly() -> None:
+    width = 0.0081
+    fine = np.arange(0.0, 6.5, width / 400.0) + 0.5 * width / 400.0
+    columns = fine.size // 400
+    signal = ring_down(fine)[: columns * 400].reshape(columns, 400).mean(axis=1)
+    time = width * (np.arange(columns) + 0.5)
+    fit = fit_ring_down(RingDownRecord(time, signal, averaging_width=width), Frequencies.FITTED, start=None)
+    assert fit.modes[1].frequency == pytest.approx(29.97, rel=1e-6)
+    assert fit.modes[1].damping_ratio == pytest.approx(0.0717, rel=1e-5)
+    # Amplitudes refer to the first sample; without the averaging mode 2 would lack 9 %.
+    assert fit.modes[1].amplitude == pytest.approx(
+        0.0137 * math.exp(-0.0717 * 2.0 * math.pi * 29.97 * time[0]), rel=1e-4
+    )
+
+
+def test_frequencies_of_the_peaks_are_nearly_those_of_a_linear_wing() -> None:
+    time = np.arange(0.0, 6.5, 1.0 / 500.0)
+    fit = fit_ring_down(RingDownRecord(time, ring_down(time)), Frequencies.PEAKS, start=None)
+    assert fit.modes[0].frequency == pytest.approx(5.65, rel=2e-3)
+    assert fit.modes[1].frequency == pytest.approx(29.97, rel=2e-2)
+    assert fit.modes[0].damping_ratio == pytest.approx(0.0281, rel=2e-2)
+
+
+def test_a_fast_record_is_decimated_and_cropped() -> None:
+    time = np.arange(0, 400_000) / 100_000.0
+    noise = 1e-4 * np.random.default_rng(4).standard_normal(time.size)
+    record = RingDownRecord(time, ring_down(time) + noise)
+    prepared = prepare(record)
+    assert prepared.sampling_rate == pytest.approx(2000.0)
+    assert prepared.time[0] > FIRST_PEAK
+    fit = fit_ring_down(record, Frequencies.FITTED)
+    assert fit.modes[0].frequency == pytest.approx(5.65, rel=1e-4)
+    assert fit.modes[1].frequency == pytest.approx(29.97, rel=1e-3)
+    assert fit.modes[1].damping_ratio == pytest.approx(0.0717, rel=1e-2)
+
+
+def test_a_time_printed_to_few_digits_is_even_enough() -> None:
+    time = np.arange(0, 400_000) / 100_000.0
+    rounded = RingDownRecord(np.round(time, 4), ring_down(time))
+    fit = fit_ring_down(rounded, Frequencies.FITTED)
+    assert fit.modes[0].frequency == pytest.approx(5.65, rel=1e-4)
+    assert fit.modes[1].frequency == pytest.approx(29.97, rel=1e-3)
+
+
+def test_standard_errors_are_those_of_repetitions_and_scale_with_the_noise() -> None:
+    time = np.arange(0.0, 4.0, 1.0 / 250.0)
+    clean = ring_down(time)
+    generator = np.random.default_rng(7)
+    stated = {}
+    for level in (1e-4, 2e-4):
+        found, errors = [], []
+        for _ in range(60):
+            record = RingDownRecord(time, clean + level * generator.standard_normal(time.size))
+            modes = fit_ring_down(record, Frequencies.FITTED, start=None).modes
+            found.append([m.frequency for m in modes] + [m.damping_ratio for m in modes])
+            errors.append(
+                [m.frequency_standard_error for m in modes] + [m.damping_ratio_standard_error for m in modes]
+            )
+        stated[level] = np.mean(errors, axis=0)
+        # 60 repetitions know a standard deviation within 9 %, and a mean within 0.13 of it.
+        assert np.std(found, axis=0, ddof=1) == pytest.approx(stated[level], rel=0.3)
+        score = (np.mean(found, axis=0) - [5.65, 29.97, 0.0281, 0.0717]) / stated[level]
+        assert np.max(np.abs(score)) < 4.0 / math.sqrt(60.0)
+    assert stated[2e-4] == pytest.approx(2.0 * stated[1e-4], rel=0.05)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    first=st.floats(3.0, 9.0),
+    second=st.floats(20.0, 55.0),
+    ratios=st.tuples(st.floats(0.02, 0.05), st.floats(0.005, 0.04)),
+    share=st.floats(1.0, 3.0),
+    phase=st.floats(-3.1, 3.1),
+)
+def test_any_two_separate_modes_are_recovered(
+    first: float, second: float, ratios: tuple[float, float], share: float, phase: float
+) -> None:
+    time = np.arange(0.0, 6.0, 1.0 / 200.0)
+    signal = ring_down(time, (first, second), ratios, (0.01, 0.01 * share), (phase, 1.0))
+    fit = fit_ring_down(RingDownRecord(time, signal), Frequencies.FITTED, start=None)
+    assert [m.frequency for m in fit.modes] == pytest.approx([first, second], rel=1e-5)
+    assert [m.damping_ratio for m in fit.modes] == pytest.approx(ratios, rel=1e-4)
+
+
+@given(scale=st.floats(1e-6, 1e6))
+def test_the_scale_of_the_signal_changes_nothing(scale: float) -> None:
+    time = np.arange(0.0, 4.0, 1.0 / 125.0)
+    one, other = (
+        fit_ring_down(RingDownRecord(time, factor * ring_down(time)), start=None) for factor in (1.0, scale)
+    )
+    for a, b in zip(one.modes, other.modes, strict=True):
+        assert b.damping_ratio == pytest.approx(a.damping_ratio, rel=1e-6)
+        assert b.amplitude == pytest.approx(scale * a.amplitude, rel=1e-6)
+
+
+def test_covariance_against_a_jacobian_by_differences() -> None:
+    time = np.arange(0.0, 3.0, 1.0 / 125.0)
+    generator = np.random.default_rng(1)
+    signal = ring_down(time) + 1e-4 * generator.standard_normal(time.size)
+    width = 0.006
+    decay, omega = np.array([1.0, 13.0]), 2.0 * math.pi * np.array([5.65, 29.9])
+    model = DampedCosines(time, signal, width)
+    solution = model.solve(decay, omega, frequencies_fitted=True)
+    # The projected residual has the same curvature as the full problem at its minimum (up to residual terms).
+    steps = np.diag([1e-5, 1e-4, 1e-5, 1e-4])
+    columns = []
+    for step in steps:
+        above = model.residual(decay + step[:2], omega + step[2:])
+        below = model.residual(decay - step[:2], omega - step[2:])
+        columns.append((above - below) / (2.0 * step.max()))
+    jacobian = np.column_stack(columns)
+    expected = np.linalg.inv(jacobian.T @ jacobian) * solution.residual_deviation**2
+    assert np.sqrt(np.diag(solution.covariance)) == pytest.approx(np.sqrt(np.diag(expected)), rel=0.05)
+
+
+def test_errors_of_frequency_and_damping_ratio_carry_the_covariance() -> None:
+    decay, damped = 4.0, 10.0
+    covariance = np.array([[0.04, 0.045], [0.045, 0.09]])
+
+    def natural(unknown: NDArray[np.float64]) -> NDArray[np.float64]:
+        length = math.hypot(*unknown)
+        return np.array([length / (2.0 * math.pi), unknown[0] / length])
+
+    steps = 1e-5 * np.eye(2)
+    here = np.array([decay, damped])
+    jacobian = np.column_stack([(natural(here + s) - natural(here - s)) / 2e-5 for s in steps])
+    expected = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
+    mode = natural_mode(decay, damped, covariance)
+    assert mode[::2] == pytest.approx(natural(here))
+    assert mode[1::2] == pytest.approx(expected, rel=1e-8)
+    # Without the covariance the ratio's error would be a fifth too large: the bound above sees that.
+    assert natural_mode(decay, damped, np.diag(np.diag(covariance)))[3] > 1.2 * expected[1]
+
+
+def test_a_fit_hands_the_covariance_on() -> None:
+    time = np.arange(0.0, 0.5, 1.0 / 500.0)  # a record this short leaves decay rate and frequency correlated
+    signal = ring_down(time, ratio=(0.2, 0.0717)) + 1e-4 * np.random.default_rng(3).standard_normal(time.size)
+    fit = fit_ring_down(RingDownRecord(time, signal), Frequencies.FITTED, start=None)
+    decay = np.array([mode.decay_rate for mode in fit.modes])
+    damped = 2.0 * math.pi * np.array([mode.damped_frequency for mode in fit.modes])
+    found = DampedCosines(time, signal, 0.0).solve(decay, damped, frequencies_fitted=True).covariance
+    assert abs(found[0, 2]) > 0.1 * math.sqrt(found[0, 0] * found[2, 2])
+    for place, mode in enumerate(fit.modes):
+        pair = np.ix_([place, 2 + place], [place, 2 + place])
+        expected = natural_mode(decay[place], damped[place], found[pair])
+        assert mode.damping_ratio_standard_error == pytest.approx(expected.damping_ratio_standard_error)
+        assert mode.frequency_standard_error == pytest.approx(expected.frequency_standard_error)
+
+
+def test_the_spectrum_of_a_cosine() -> None:
+    time = np.arange(0.0, 8.0, 1.0 / 200.0)
+    frequency, amplitude = spectrum(RingDownRecord(time, 0.02 * np.cos(2.0 * np.pi * 10.0 * time)))
+    assert frequency[np.argmax(amplitude)] == pytest.approx(10.0, abs=0.005)
+    assert amplitude.max() == pytest.approx(0.02, rel=1e-2)
+
+
+def test_the_digitised_records() -> None:
+    if not REFERENCE.is_dir():
+        pytest.skip("the reference data are not beside the project")
+    records = read_records(REFERENCE)
+    assert len(records) == 5
+    trials = fit_trials(records)
+    assert trials.frequency(0).mean == pytest.approx(5.65, rel=0.005)
+    assert trials.frequency(1).mean == pytest.approx(29.9, rel=0.005)
+    assert trials.damping_ratio(0).mean == pytest.approx(0.028, rel=0.10)
+    # Trials repeat each other closely; mode 2 is seen by 8.1 ms columns of pixels.
+    assert trials.frequency(0).standard_deviation < 0.002
+    assert trials.frequency(1).standard_deviation < 0.1
+    # The wing is not linear: as the amplitude falls, frequency rises and damping falls.
+    points = amplitude_dependence(trials.fits[0])
+    assert points[0].frequency < 5.58
+    assert 5.70 < points[-1].frequency < 5.80
+    assert points[0].amplitude > 10.0 * points[-1].amplitude
+    assert points[0].damping_ratio > 1.2 * points[-1].damping_ratio
+    fitted = fit_trials(records, Frequencies.FITTED)
+    assert 5.57 < fitted.frequency(0).mean < 5.60
+
+
+def test_a_linear_wing_shows_no_dependence_on_amplitude() -> None:
+    time = np.arange(0.0, 6.0, 1.0 / 125.0)
+    fit = fit_ring_down(RingDownRecord(time, ring_down(time)), start=None)
+    points = amplitude_dependence(fit, first=1.0)
+    assert len(points) > 8
+    assert [p.frequency for p in points] == pytest.approx([5.65] * len(points), rel=1e-4)
+    assert [p.damping_ratio for p in points] == pytest.approx([0.0281] * len(points), rel=1e-2)
+
+
+def test_one_trial_has_the_error_of_its_fit() -> None:
+    time = np.arange(0.0, 4.0, 1.0 / 125.0)
+    trials = fit_trials([RingDownRecord(time, ring_down(time))], start=None)
+    assert math.isnan(trials.frequency(0).standard_deviation)
+    assert trials.damping_ratio(0).standard_error == trials.fits[0].modes[0].damping_ratio_standard_error
+    with pytest.raises(RingDownError, match="no ring-down record"):
+        fit_trials([])
+
+
+TIME = np.arange(0.0, 4.0, 1.0 / 200.0)
+
+
+@pytest.mark.parametrize(
+    ("signal", "words"),
+    [
+        (0.01 * np.cos(2 * np.pi * 5.65 * TIME) + 0.01 * np.cos(2 * np.pi * 30.0 * TIME), "does not decay"),
+        (ring_down(TIME)[::-1], "does not decay"),
+        (0.01 * np.exp(-TIME) * np.cos(2.0 * np.pi * 5.65 * TIME), "two spectral peaks"),
+        (0.01 * np.exp(-TIME), "oscillation"),
+        (np.random.default_rng(0).standard_normal(TIME.size), "does not decay"),
+    ],
+)
+def test_records_without_two_decaying_modes(signal: NDArray[np.float64], words: str) -> None:
+    with pytest.raises(RingDownError, match=words):
+        fit_ring_down(RingDownRecord(TIME, signal), start=None)
+
+
+def test_a_mode_that_grows_is_refused() -> None:
+    grows = ring_down(TIME, amplitude=(0.01, 3e-5), ratio=(0.05, -0.006))
+    with pytest.raises(RingDownError, match="decay"):
+        fit_ring_down(RingDownRecord(TIME, grows), start=None)
+
+
+def test_bad_records_are_told_in_one_sentence() -> None:
+    good = ring_down(TIME)
+    lost = good.copy()
+    lost[17] = math.nan
+    with pytest.raises(ExperimentDataError, match="sample 18 is nan"):
+        RingDownRecord(TIME, lost)
+    with pytest.raises(ExperimentDataError, match="clipped"):
+        RingDownRecord(TIME, np.clip(good, -0.008, 0.008))
+    with pytest.raises(ExperimentDataError, match="constant"):
+        RingDownRecord(TIME, np.zeros(TIME.size))
+    with pytest.raises(ExperimentDataError, match="at least 64"):
+        RingDownRecord(TIME[:20], good[:20])
+    uneven = TIME.copy()
+    uneven[100:] += 0.1
+    with pytest.raises(ExperimentDataError, match="after sample 100"):
+        RingDownRecord(uneven, good)
+    with pytest.raises(ExperimentDataError, match="even steps"):
+        RingDownRecord(TIME[::-1], good)
+    with pytest.raises(ExperimentDataError, match="as long as time"):
+        RingDownRecord(TIME, good[1:])
+    for scale, words in ((1e3, "shows nothing above"), (1e-6, "too short")):
+        with pytest.raises(RingDownError, match=words):
+            fit_ring_down(RingDownRecord(scale * TIME, good), start=None)
+    with pytest.raises(RingDownError, match="remain"):
+        fit_ring_down(RingDownRecord(TIME, good), start=3.5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    rates=st.tuples(st.floats(-3.0, 30.0), st.floats(-3.0, 30.0)),
+    noise=st.sampled_from([0.0, 1e-3, 0.1]),
+    procedure=st.sampled_from(list(Frequencies)),
+)
+def test_any_record_is_fitted_or_refused(
+    seed: int, rates: tuple[float, float], noise: float, procedure: Frequencies
+) -> None:
+    generator = np.random.default_rng(seed)
+    time = np.arange(0.0, 3.0, 1.0 / 125.0)
+    signal = noise * generator.standard_normal(time.size)
+    for rate, frequency in zip(rates, generator.uniform(0.5, 60.0, 2), strict=True):
+        signal = signal + np.exp(-rate * time) * np.cos(2.0 * np.pi * frequency * time)
+    try:
+        fit = fit_ring_down(RingDownRecord(time, signal), procedure, start=None)
+    except CalibrationError:
+        return
+    assert all(0.0 < mode.damping_ratio < 1.0 for mode in fit.modes)
+    assert np.all(np.isfinite(fit.fitted))
+    amplitude_dependence(fit)
+
+
+def text_of(columns: list[NDArray[np.float64]], separator: str) -> str:
+    return "\n".join(separator.join(f"{x:.9g}" for x in row) for row in zip(*columns, strict=True)) + "\n"
+
+
+def test_the_three_layouts_of_files(tmp_path: Path) -> None:
+    good = ring_down(TIME)
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "raw" / "step3").mkdir()
+    for trial in (1, 2):
+        raw = tmp_path / "raw" / "step3" / f"initialconditiondata_{trial}.DAT"
+        raw.write_text(text_of([TIME, good, 0.1 * good], "\t"), encoding="utf-8")
+    assert len(read_records(tmp_path / "raw")) == 2
+    assert len(read_records(tmp_path / "raw" / "step3")) == 2
+    named = tmp_path / "trial.csv"
+    named.write_text(
+        "chordwise (V),time (s),spanwise [V]\n" + text_of([0.1 * good, TIME, good], ","), encoding="utf-8"
+    )
+    plot = tmp_path / "plot.csv"
+    plot.write_text(
+        "# t_s,V_low,V_mid,V_high  (from a plot)\n" + text_of([TIME, good - 1e-4, good, good + 1e-4], ","),
+        encoding="utf-8",
+    )
+    for file, width in ((raw, 0.0), (named, 0.0), (plot, 0.005)):
+        (record,) = read_records(file)
+        assert record.signal == pytest.approx(good, abs=1e-9)
+        assert record.averaging_width == pytest.approx(width)
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "words"),
+    [
+        ("", ExperimentFileError, "is empty"),
+        ("time,spanwise\n", ExperimentFileError, "no rows"),
+        ("time,strain\n0,1\n1,2\n", ExperimentFileError, "lacks the column spanwise"),
+        ("t_s,V_mid\n0,1\n1,2\n", ExperimentFileError, "lacks the column V_low"),
+        ("time (ms),spanwise (V)\n0,1\n1,2\n", ExperimentDataError, "give it in s"),
+        ("seconds,spanwise\n0,1\n1,2\n", ExperimentFileError, "lacks the column time"),
+        ("0.0\n0.1\n", ExperimentFileError, "has 1 column; time"),
+        ("time,spanwise\n0,1\n1,two\n", ExperimentFileError, "line 3: column 'spanwise' must hold a number"),
+        ("0 1 2\n1 2\n", ExperimentFileError, "line 2: 2 cells came"),
+        ("time,spanwise\n0,0,1,5\n1,0,2,5\n", ExperimentFileError, "line 2: 4 cells came"),
+        ("0,0,1,5\n1,0,2,5\n", ExperimentFileError, "has 4 columns; time"),
+        ("0.0\t1,5\n0.1\t2,5\n", ExperimentFileError, "'spanwise' must hold a number, and '1,5' came"),
+        ("time,spanwise\n٠,1\n1,2\n", ExperimentFileError, "must hold a number, and '٠' came"),
+    ],
+)
+def test_bad_files(tmp_path: Path, text: str, error: type[Exception], words: str) -> None:
+    file = tmp_path / "record.csv"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(error, match=words):
+        read_records(file)
+
+
+def test_no_records(tmp_path: Path) -> None:
+    with pytest.raises(ExperimentFileError, match="holds no ring-down record"):
+        read_records(tmp_path)
+    with pytest.raises(ExperimentFileError, match="does not exist"):
+        read_records(tmp_path / "nothing")

@@ -1,0 +1,102 @@
+"""What the ring-down is made to say: a linear wing, one that softens, the published records."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calibration.dynamics.records import RingDownRecord, read_records
+from calibration.dynamics.ringdown import Frequencies
+from calibration.dynamics.trials import fit_trials
+from calibration.joint import modal_measurement, published_modal_measurement
+from calibration.joint.measurement import _mean
+
+REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
+TIME = np.arange(0.0, 6.4, 1.0 / 250.0)
+F1, F2, ZETA1, ZETA2 = 5.65, 29.0, 0.028, 0.05
+
+
+def second_mode(time: NDArray[np.float64]) -> NDArray[np.float64]:
+    omega = 2.0 * math.pi * F2
+    damped = omega * math.sqrt(1.0 - ZETA2**2)
+    return np.asarray(0.008 * np.exp(-ZETA2 * omega * time) * np.cos(damped * time))
+
+
+def trials(
+    softening: float, seed: int, noise: float = 1e-4, scatter: float = 0.0
+) -> tuple[RingDownRecord, ...]:
+    """Records whose first frequency falls by `softening` [Hz] with every factor e of the amplitude."""
+    generator = np.random.default_rng(seed)
+    records = []
+    for trial in range(5):
+        decay = 2.0 * math.pi * F1 * ZETA1
+        # f(t) = F1 + softening (ln A(0) - ln A(t)) - middle, integrated over time
+        frequency = F1 - 0.5 * softening * decay * TIME[-1] + scatter * generator.standard_normal()
+        phase = 2.0 * math.pi * (frequency * TIME + 0.5 * softening * decay * TIME**2)
+        signal = 0.012 * np.exp(-decay * TIME) * np.cos(phase) + second_mode(TIME)
+        signal += generator.normal(0.0, noise, TIME.size)
+        records.append(RingDownRecord(TIME, signal, source=f"drawn {trial + 1}"))
+    return tuple(records)
+
+
+def test_a_linear_wing_is_given_its_statistical_error_alone() -> None:
+    scores = []
+    for seed in range(3):
+        fitted = fit_trials(trials(0.0, seed), Frequencies.FITTED, start=None)
+        found = modal_measurement(fitted)
+        scores.append(
+            (
+                (found.frequency[1] - F2) / found.frequency_standard_deviation[1],
+                (found.damping_ratio[0] - ZETA1) / found.damping_ratio_standard_deviation[0],
+                (found.damping_ratio[1] - ZETA2) / found.damping_ratio_standard_deviation[1],
+            )
+        )
+        errors = [fit.modes[0].frequency_standard_error for fit in fitted.fits]
+        expected = math.sqrt(sum(error**2 for error in errors)) / 5.0
+        # Five trials in a row seldom scatter, and windows seldom slope, beyond chance.
+        assert found.frequency_standard_deviation[0] < 6.0 * expected
+        assert found.frequency_standard_deviation[0] >= 0.999 * expected
+    assert 0.4 < math.sqrt(float(np.mean(np.square(scores)))) < 1.6
+
+
+def test_a_wing_that_softens_is_given_its_spread() -> None:
+    slope = 0.07
+    found = modal_measurement(fit_trials(trials(slope, 1), Frequencies.FITTED, start=None))
+    # Windows of 0.8 s from 0.4 s on, as far as the mode stands above the noise; spread of the log amplitude.
+    decay = 2.0 * math.pi * F1 * ZETA1
+    last = min(5.6, math.log(0.012 / (4.0 * 1e-4)) / decay)
+    middles = np.arange(0.8, last + 0.4, 0.4)
+    assert found.frequency_standard_deviation[0] == pytest.approx(slope * decay * middles.std(), rel=0.25)
+
+
+def test_frequencies_of_spectral_peaks_carry_their_bias() -> None:
+    """Skirts of the first mode move the second peak: the authors' procedure is off, and says so."""
+    found = modal_measurement(fit_trials(trials(0.0, 2), Frequencies.PEAKS, start=None))
+    fitted = modal_measurement(fit_trials(trials(0.0, 2), Frequencies.FITTED, start=None))
+    bias = abs(found.frequency[1] - F2)
+    assert bias > 5.0 * fitted.frequency_standard_deviation[1]
+    assert found.frequency_standard_deviation[1] > 0.5 * bias
+    assert found.frequency_standard_deviation[1] < 2.0 * bias
+
+
+def test_mean_over_trials() -> None:
+    mean, error = _mean([1.0, 1.1, 0.9, 1.05, 0.95], [0.1] * 5)  # scatter as expected
+    assert (mean, error) == (pytest.approx(1.0), pytest.approx(0.1 / math.sqrt(5.0)))
+    _, error = _mean([1.0, 1.1, 0.9, 1.05, 0.95], [1e-3] * 5)  # scatter beyond the fits' errors
+    assert error == pytest.approx(math.sqrt(2.0) * np.std([1.0, 1.1, 0.9, 1.05, 0.95], ddof=1) / math.sqrt(5))
+    assert _mean([3.0], [0.2]) == (3.0, pytest.approx(0.2))
+    assert _mean([1.0, 2.0], [1e-3, 1e-3])[1] == pytest.approx(1.0)
+
+
+def test_the_published_records() -> None:
+    if not REFERENCE.is_dir():
+        pytest.skip("the reference data are not beside the project")
+    found = modal_measurement(fit_trials(read_records(REFERENCE)))
+    published = published_modal_measurement()
+    assert found.frequency == pytest.approx(published.frequency, rel=3e-3)
+    for name in ("frequency_standard_deviation", "damping_ratio_standard_deviation"):
+        assert getattr(found, name) == pytest.approx(getattr(published, name), rel=0.02)

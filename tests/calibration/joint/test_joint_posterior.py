@@ -1,0 +1,416 @@
+"""The joint posterior: enumeration and an independent sampler as oracles, limits, calibration, bad input."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy import stats
+
+from calibration.errors import (
+    CalibrationError,
+    ExperimentDataError,
+    MassConstraintError,
+    OutsideValidityError,
+    PosteriorError,
+)
+from calibration.joint import (
+    NAMES,
+    JointPosterior,
+    JointPrior,
+    ModalMeasurement,
+    ModelError,
+    WeighedMass,
+    WingTables,
+    joint_posterior,
+    published_modal_measurement,
+    tabulate_wing,
+)
+from calibration.joint.frequency_table import FrequencyTable
+from calibration.static.experiments import published_measurements
+from calibration.static.posterior import GaussianPrior
+from calibration.static.stiffness import exact_posterior
+from calibration.static.stiffness_curve import PUBLISHED_LINE, LinearStiffnessCurve, stiffness_curve_of
+from fe.runtime.damping import rayleigh_damping_ratio
+
+FloatArray = NDArray[np.float64]
+
+LIMITS = np.array([[0.85, 1.15], [0.05, 0.3], [0.0, 0.3]])
+CENTRE = np.array([1.0, 0.169, 0.1345])
+AT_CENTRE = np.log([5.632, 28.544])
+SLOPE = np.array([[0.41, 0.325], [-0.94, -0.69], [-0.98, -0.64]])  # of ln f1, ln f2, as of the shipped wing
+STATIC = published_measurements()
+MODAL = published_modal_measurement()
+
+
+def line_frequency(quantities: FloatArray) -> FloatArray:
+    """Frequencies (N, 2) [Hz] of a wing whose logarithms are linear."""
+    return np.exp(AT_CENTRE + (quantities - CENTRE) @ SLOPE)
+
+
+@pytest.fixture(scope="module")
+def tables() -> WingTables:
+    """The same wing as tables; the polynomial is exact."""
+    half = 0.5 * np.diff(LIMITS, axis=1)[:, 0]
+    middle = LIMITS.mean(axis=1)
+    coefficient = np.zeros((2, 2, 2, 2))
+    coefficient[0, 0, 0] = AT_CENTRE + (middle - CENTRE) @ SLOPE
+    coefficient[1, 0, 0], coefficient[0, 1, 0], coefficient[0, 0, 1] = half[:, None] * SLOPE
+    curve = LinearStiffnessCurve(575.2, 101.8, lower=0.85, upper=1.15)
+    return WingTables(FrequencyTable(LIMITS, coefficient, 0.0), curve)
+
+
+def log_posterior(unknown: FloatArray, prior: JointPrior, modal: ModalMeasurement) -> FloatArray:
+    """Log of the joint density of e, masses, alpha, beta and both model errors, written with scipy.stats."""
+    e, servo, pitot, alpha, beta, *errors = unknown.T
+    inside = np.all((unknown[:, :3] >= LIMITS[:, 0]) & (unknown[:, :3] <= LIMITS[:, 1]), axis=1)
+    inside &= (alpha >= 0.0) & (beta >= 0.0)
+    total = np.where(inside, 0.0, -np.inf)
+    for value, given_prior in zip((e, servo, pitot, alpha, beta), prior.marginals, strict=True):
+        total += stats.norm.logpdf(value, given_prior.mean, given_prior.standard_deviation)
+    total += stats.norm.logpdf(2.0 * servo + pitot, 0.472, 1e-3)
+    k = PUBLISHED_LINE.stiffness(e)
+    for load, displacement in zip(STATIC.load, STATIC.displacement, strict=True):
+        spread = np.sqrt(
+            STATIC.load_standard_deviation**2 + (k * STATIC.displacement_standard_deviation) ** 2
+        )
+        total += stats.norm.logpdf(load - k * displacement, 0.0, spread)
+    frequency = line_frequency(unknown[:, :3])
+    omega = 2.0 * math.pi * frequency
+    for mode, (error, tau) in enumerate(zip(errors, ModelError().frequency, strict=True)):
+        total += stats.norm.logpdf(error, 0.0, tau)
+        total += stats.norm.logpdf(
+            modal.frequency[mode],
+            frequency[:, mode] * (1.0 + error),
+            modal.frequency_standard_deviation[mode],
+        )
+        ratio = 0.5 * (alpha / omega[:, mode] + beta * omega[:, mode])
+        total += stats.norm.logpdf(
+            modal.damping_ratio[mode], ratio, modal.damping_ratio_standard_deviation[mode]
+        )
+    return np.asarray(total)
+
+
+def stretch_sampler(prior: JointPrior, modal: ModalMeasurement, steps: int) -> FloatArray:
+    """Sample all seven unknowns by the affine-invariant stretch move (Goodman and Weare 2010)."""
+    generator = np.random.default_rng(7)
+    half, size = 120, 7
+    walkers = np.column_stack(
+        [
+            generator.normal(1.0, 0.01, 2 * half),
+            (servo := generator.normal(0.169, 0.01, 2 * half)),
+            0.472 - 2.0 * servo + generator.normal(0.0, 1e-3, 2 * half),
+            np.abs(generator.normal(1.0, 0.3, 2 * half)),
+            np.abs(generator.normal(7e-4, 1e-4, 2 * half)),
+            generator.normal(0.0, 0.01, 2 * half),
+            generator.normal(0.0, 0.05, 2 * half),
+        ]
+    )
+    value = log_posterior(walkers, prior, modal)
+    kept = []
+    for step in range(steps):
+        for mine, others in ((slice(0, half), slice(half, None)), (slice(half, None), slice(0, half))):
+            stretch = (1.0 + generator.random(half)) ** 2 / 2.0  # density ~ 1 / sqrt(z) on [1/2, 2]
+            partner = walkers[others][generator.integers(half, size=half)]
+            proposed = partner + stretch[:, None] * (walkers[mine] - partner)
+            proposed_value = log_posterior(proposed, prior, modal)
+            gain = (size - 1) * np.log(stretch) + proposed_value - value[mine]
+            accept = np.log(generator.random(half)) < gain
+            walkers[mine] = np.where(accept[:, None], proposed, walkers[mine])
+            value[mine] = np.where(accept, proposed_value, value[mine])
+        if step >= steps // 4:
+            kept.append(walkers.copy())
+    return np.concatenate(kept)
+
+
+def test_an_independent_sampler_finds_the_same(tables: WingTables) -> None:
+    # Ratios that leave little for alpha: the cut at zero matters.
+    modal = replace(MODAL, damping_ratio=(0.02, 0.08), damping_ratio_standard_deviation=(0.004, 0.008))
+    result = joint_posterior(tables, STATIC, modal, count=8000)
+    oracle = stretch_sampler(JointPrior(), modal, 1200)[:, :5]
+    found, spread = result.diagnostics.weighted_mean, result.diagnostics.weighted_standard_deviation
+    assert np.mean(oracle[:, 3] < 0.1) > 0.03  # the cut is felt
+    np.testing.assert_allclose(found, oracle.mean(axis=0), atol=0.06 * spread.max(), rtol=0.03)
+    np.testing.assert_array_less(np.abs(found - oracle.mean(axis=0)), 0.08 * spread)
+    np.testing.assert_allclose(spread, oracle.std(axis=0), rtol=0.06)
+    np.testing.assert_allclose(result.correlation, np.corrcoef(oracle, rowvar=False), atol=0.06)
+    np.testing.assert_allclose(
+        result.interval(0.9).T, np.quantile(oracle, [0.05, 0.95], axis=0), atol=0.15 * spread.max(), rtol=0.05
+    )
+
+
+def test_enumeration_finds_mean_deviation_and_evidence(tables: WingTables) -> None:
+    # Damping priors far from zero, so that alpha and beta integrate in closed form.
+    prior = JointPrior(damping_alpha=GaussianPrior(2.0, 0.3), damping_beta=GaussianPrior(8e-4, 1e-4))
+    result = joint_posterior(tables, STATIC, MODAL, prior=prior, count=2000)
+    e = np.linspace(0.95, 1.07, 31)
+    servo = np.linspace(0.09, 0.24, 61)
+    total = np.linspace(0.466, 0.478, 25)
+    grid = np.stack(np.meshgrid(e, servo, total, indexing="ij"), axis=-1).reshape(-1, 3)
+    quantities = grid.copy()
+    quantities[:, 2] -= 2.0 * grid[:, 1]
+    inside = (quantities[:, 2] > 0.0) & (quantities[:, 2] < 0.3)
+    quantities, grid = quantities[inside], grid[inside]
+    log_density = np.zeros(len(grid))
+    for place, given_prior in enumerate(prior.marginals[:3]):
+        log_density += stats.norm.logpdf(
+            quantities[:, place], given_prior.mean, given_prior.standard_deviation
+        )
+        log_density -= math.log(
+            np.diff(stats.norm.cdf(LIMITS[place], given_prior.mean, given_prior.standard_deviation))[0]
+        )
+    log_density += stats.norm.logpdf(grid[:, 2], 0.472, 1e-3)
+    k = PUBLISHED_LINE.stiffness(quantities[:, 0])
+    spread = np.sqrt(STATIC.load_standard_deviation**2 + (k * STATIC.displacement_standard_deviation) ** 2)
+    for load, displacement in zip(STATIC.load, STATIC.displacement, strict=True):
+        log_density += stats.norm.logpdf(load - k * displacement, 0.0, spread)
+    frequency = line_frequency(quantities)
+    omega = 2.0 * math.pi * frequency
+    for mode, tau in enumerate(ModelError().frequency):
+        log_density += stats.norm.logpdf(
+            MODAL.frequency[mode],
+            frequency[:, mode],
+            np.hypot(MODAL.frequency_standard_deviation[mode], tau * frequency[:, mode]),
+        )
+    design = np.stack([0.5 / omega, 0.5 * omega], axis=2)
+    covariance = design @ np.diag([0.3**2, 1e-4**2]) @ np.swapaxes(design, 1, 2)
+    covariance += np.diag(np.square(MODAL.damping_ratio_standard_deviation))
+    residual = np.array(MODAL.damping_ratio) - design @ np.array([2.0, 8e-4])
+    solved = np.linalg.solve(covariance, residual[..., None])[..., 0]
+    log_density -= 0.5 * np.sum(residual * solved, axis=1)
+    log_density -= 0.5 * np.linalg.slogdet(2.0 * math.pi * covariance)[1]
+    weight = np.exp(log_density - log_density.max())
+    cell = (e[1] - e[0]) * (servo[1] - servo[0]) * (total[1] - total[0])
+    evidence = math.log(weight.sum() * cell) + log_density.max()
+    weight /= weight.sum()
+    mean = weight @ quantities
+    deviation = np.sqrt(weight @ (quantities - mean) ** 2)
+    diagnostics = result.diagnostics
+    assert diagnostics.log_evidence == pytest.approx(evidence, abs=0.02)
+    np.testing.assert_array_less(np.abs(diagnostics.weighted_mean[:3] - mean), 0.02 * deviation)
+    np.testing.assert_allclose(diagnostics.weighted_standard_deviation[:3], deviation, rtol=0.02)
+
+
+def test_laplace_agrees_where_nothing_is_cut_off(tables: WingTables) -> None:
+    prior = JointPrior(damping_alpha=GaussianPrior(1.0, 0.2), damping_beta=GaussianPrior(7e-4, 1e-4))
+    diagnostics = joint_posterior(tables, STATIC, MODAL, prior=prior).diagnostics
+    spread = diagnostics.weighted_standard_deviation
+    np.testing.assert_allclose(np.sqrt(np.diag(diagnostics.laplace_covariance)), spread, rtol=0.05)
+    np.testing.assert_array_less(np.abs(diagnostics.laplace_mode - diagnostics.weighted_mean), 0.15 * spread)
+    assert diagnostics.effective_sample_size > 0.7 * diagnostics.proposal_count
+
+
+def test_the_papers_posterior_is_the_limit_without_uncertainty(tables: WingTables) -> None:
+    """With f1, the ratios and the total exact, and f2 left out, masses follow e as in the paper."""
+    exact = replace(
+        MODAL,
+        frequency_standard_deviation=(1e-5, 1.0),
+        damping_ratio_standard_deviation=(1e-6, 1e-6),
+    )
+    result = joint_posterior(
+        tables,
+        STATIC,
+        exact,
+        total_mass=WeighedMass(0.472, 1e-7),
+        model_error=ModelError((0.0, 0.5)),
+        prior=JointPrior(servo_mass=GaussianPrior(0.157, 1.0), pitot_mass=GaussianPrior(0.157, 1.0)),
+    )
+    e, servo, pitot, alpha, beta = result.samples.T
+    assert result.correlation[1, 2] == pytest.approx(-1.0, abs=1e-6)
+    assert result.correlation[0, 1] == pytest.approx(-1.0, abs=1e-4)
+    np.testing.assert_allclose(2.0 * servo + pitot, 0.472, atol=1e-6)
+    # f1 is met exactly: along the weighed total its logarithm moves by (s1 - 2 s2) with the servo mass.
+    along = SLOPE[1, 0] - 2.0 * SLOPE[2, 0]
+    shift = math.log(5.6492) - AT_CENTRE[0] - SLOPE[0, 0] * (e - 1.0) - SLOPE[2, 0] * (0.472 - 0.4725)
+    np.testing.assert_allclose(servo, 0.169 + shift / along, atol=2e-5)
+    for row in range(0, 1000, 100):
+        ratio = rayleigh_damping_ratio(alpha[row], beta[row], result.frequency[row])
+        np.testing.assert_allclose(ratio, MODAL.damping_ratio, atol=1e-5)
+
+
+def test_samples_repeat_and_follow_the_seed(tables: WingTables) -> None:
+    one, two = (joint_posterior(tables, STATIC, MODAL, seed=3, count=200) for _ in range(2))
+    other = joint_posterior(tables, STATIC, MODAL, seed=4, count=200)
+    assert one.samples.tobytes() == two.samples.tobytes()
+    assert one.prior_samples.tobytes() == two.prior_samples.tobytes()
+    assert not np.array_equal(one.samples, other.samples)
+    assert one.samples.shape == one.prior_samples.shape == (200, 5)
+    assert one.names == NAMES
+    states = one.states()
+    assert len(states) == 200
+    assert states[5].pitot_mass == one.samples[5, 2]
+    assert states[5].damping_beta == one.samples[5, 4]
+    assert states[5].stiffness_loss == (0.0, 0.0)
+    assert one.settings["model_error_frequency_2"] == 0.05
+    np.testing.assert_allclose(one.frequency, line_frequency(one.samples[:, :3]), rtol=1e-10)
+    lower, upper = one.interval(0.5).T
+    assert np.mean((one.samples > lower) & (one.samples < upper), axis=0) == pytest.approx(
+        [0.5] * 5, abs=0.01
+    )
+
+
+def test_prior_samples_are_the_prior() -> None:
+    validity = dict(zip(NAMES[:3], map(tuple, LIMITS.tolist()), strict=True))
+    drawn = JointPrior().samples(validity, np.random.default_rng(1), 20_000)
+    assert drawn[:, 0].mean() == pytest.approx(1.0, abs=1e-3)
+    assert drawn[:, 0].std() == pytest.approx(0.05 / 1.96, rel=0.02)
+    assert drawn[:, 3].mean() == pytest.approx(3.0 * math.sqrt(2.0 / math.pi), rel=0.02)
+    assert np.all(drawn[:, 3:] >= 0.0)
+    assert np.all((drawn[:, :3] >= LIMITS[:, 0]) & (drawn[:, :3] <= LIMITS[:, 1]))
+
+
+def simulate(
+    generator: np.random.Generator, prior: JointPrior, model_error: ModelError
+) -> tuple[FloatArray, ModalMeasurement, WeighedMass, FloatArray]:
+    """Draw a wing from the prior and measure it with Gaussian errors; the last are its displacements [m]."""
+    validity = dict(zip(NAMES[:3], map(tuple, LIMITS.tolist()), strict=True))
+    truth = prior.samples(validity, generator, 1)[0]
+    frequency = line_frequency(truth[None, :3])[0]
+    ratio = rayleigh_damping_ratio(truth[3], truth[4], frequency)
+    wing = frequency * (1.0 + np.array(model_error.frequency) * generator.standard_normal(2))
+    deviations = (0.06, 0.3), (0.002, 0.004)
+    measured = wing + deviations[0] * generator.standard_normal(2)
+    measured_ratio = np.maximum(ratio + deviations[1] * generator.standard_normal(2), 1e-4)
+    modal = ModalMeasurement(
+        (measured[0], measured[1]), deviations[0], (measured_ratio[0], measured_ratio[1]), deviations[1], "x"
+    )
+    weighed = WeighedMass(2.0 * truth[1] + truth[2] + 1e-3 * generator.standard_normal(), 1e-3)
+    return truth, modal, weighed, STATIC.load / PUBLISHED_LINE.stiffness(truth[0])
+
+
+def test_the_truth_has_a_uniform_rank_among_the_samples(tables: WingTables) -> None:
+    """Simulation-based calibration: wings from the prior, with the assumed model error."""
+    generator = np.random.default_rng(2021)
+    prior = JointPrior(damping_alpha=GaussianPrior(1.0, 0.5), damping_beta=GaussianPrior(7e-4, 3e-4))
+    repetitions, count = 120, 99
+    ranks = np.empty((repetitions, 5), dtype=int)
+    held = np.zeros(5)
+    for repetition in range(repetitions):
+        truth, modal, weighed, displacement = simulate(generator, prior, ModelError())
+        static = replace(
+            STATIC,
+            load=STATIC.load + generator.normal(0.0, STATIC.load_standard_deviation, STATIC.count),
+            displacement=displacement
+            + generator.normal(0.0, STATIC.displacement_standard_deviation, STATIC.count),
+        )
+        result = joint_posterior(
+            tables, static, modal, prior=prior, total_mass=weighed, seed=repetition, count=count
+        )
+        ranks[repetition] = np.sum(result.samples < truth, axis=0)
+        lower, upper = result.interval(0.9).T
+        held += (lower <= truth) & (truth <= upper)
+    assert 0.85 < held.mean() / repetitions < 0.94
+    assert np.all(held / repetitions > 0.79)
+    for place in range(5):
+        counted = np.histogram(ranks[:, place], bins=np.linspace(-0.5, count + 0.5, 9))[0]
+        assert stats.chisquare(counted).pvalue > 1e-3, NAMES[place]
+
+
+def test_model_error_is_what_it_says(tables: WingTables) -> None:
+    """Without model error f2 drags the masses along; with it, f2 is left to miss by 4.5 %."""
+    sharp = replace(MODAL, frequency_standard_deviation=(0.001, 0.03))
+    allowed = joint_posterior(tables, STATIC, sharp)
+    wide = joint_posterior(tables, STATIC, sharp, model_error=ModelError((0.02, 0.05)))
+    assert wide.standard_deviation[1] > 1.4 * allowed.standard_deviation[1]
+    assert allowed.frequency[:, 1].mean() == pytest.approx(28.6, abs=0.15)
+    trusting = joint_posterior(tables, STATIC, MODAL, model_error=ModelError((0.0, 0.0)))
+    assert trusting.diagnostics.log_evidence < allowed.diagnostics.log_evidence - 0.5
+    with pytest.raises(OutsideValidityError, match=r"pressed against 1\.15, where the model ends"):
+        joint_posterior(tables, STATIC, sharp, model_error=ModelError((0.0, 0.0)))
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    first=st.floats(5.0, 6.5),
+    ratio=st.floats(4.5, 5.6),
+    zeta=st.floats(0.005, 0.1),
+    error=st.floats(1e-4, 0.2),
+    total=st.floats(0.2, 0.7),
+)
+def test_every_measurement_gives_a_posterior_or_a_clear_refusal(
+    first: float, ratio: float, zeta: float, error: float, total: float
+) -> None:
+    half = 0.5 * np.diff(LIMITS, axis=1)[:, 0]
+    coefficient = np.zeros((2, 2, 2, 2))
+    coefficient[0, 0, 0] = AT_CENTRE + (LIMITS.mean(axis=1) - CENTRE) @ SLOPE
+    coefficient[1, 0, 0], coefficient[0, 1, 0], coefficient[0, 0, 1] = half[:, None] * SLOPE
+    wing = WingTables(
+        FrequencyTable(LIMITS, coefficient, 0.0), LinearStiffnessCurve(575.2, 101.8, lower=0.85, upper=1.15)
+    )
+    modal = ModalMeasurement(
+        (first, first * ratio), (error * first, error * first * ratio), (zeta, 0.05), (0.2 * zeta, 0.01), "x"
+    )
+    try:
+        result: JointPosterior = joint_posterior(
+            wing, STATIC, modal, total_mass=WeighedMass(total, 1e-3), count=100
+        )
+    except CalibrationError as refusal:
+        known = "contradict" in str(refusal) or "negative Rayleigh" in str(refusal)
+        if not known:
+            raise
+        return
+    assert np.all(np.isfinite(result.samples))
+    assert np.all((result.samples[:, :3] >= LIMITS[:, 0]) & (result.samples[:, :3] <= LIMITS[:, 1]))
+    assert np.all(result.samples[:, 3:] >= 0.0)
+    assert abs(2.0 * result.mean[1] + result.mean[2] - total) < 5e-3
+
+
+def test_refusals(tables: WingTables) -> None:
+    with pytest.raises(PosteriorError, match="must be positive, but 0 were asked"):
+        joint_posterior(tables, STATIC, MODAL, count=0)
+    with pytest.raises(PosteriorError, match="at most 100,000 samples"):
+        joint_posterior(tables, STATIC, MODAL, count=10**40)
+    with pytest.raises(MassConstraintError, match="cannot weigh 2 kg"):
+        joint_posterior(tables, STATIC, MODAL, total_mass=WeighedMass(2.0))
+    with pytest.raises(ExperimentDataError, match="weighed total and its standard deviation"):
+        joint_posterior(tables, STATIC, MODAL, total_mass=WeighedMass(0.472, 0.0))
+    with pytest.raises(ExperimentDataError, match="relative standard deviation from 0 to below 1"):
+        joint_posterior(tables, STATIC, MODAL, model_error=ModelError((0.01, 5.0)))
+    with pytest.raises(PosteriorError, match="prior of servo_mass"):
+        joint_posterior(tables, STATIC, MODAL, prior=JointPrior(servo_mass=GaussianPrior(5.0, 0.1)))
+    with pytest.raises(OutsideValidityError, match="outside"):
+        joint_posterior(tables, replace(STATIC, displacement=STATIC.displacement * 0.7), MODAL)
+    sharp = replace(MODAL, damping_ratio=(0.01, 0.3), damping_ratio_standard_deviation=(1e-4, 1e-3))
+    with pytest.raises(ExperimentDataError, match="negative Rayleigh coefficient"):
+        joint_posterior(tables, STATIC, sharp)
+    with pytest.raises(PosteriorError, match="between 0 and 1"):
+        joint_posterior(tables, STATIC, MODAL, count=100).interval(90.0)
+    with pytest.raises(OutsideValidityError, match=r"servo_mass is 0\.4"):
+        tables.frequency.frequency([[1.0, 0.4, 0.1]])
+    for name, value in (("frequency", (5.6, math.nan)), ("damping_ratio_standard_deviation", (0.0, 0.1))):
+        with pytest.raises(ExperimentDataError, match=f"{name} must hold two positive"):
+            replace(MODAL, **{name: value})
+    with pytest.raises(ExperimentDataError, match="damping ratio of 16 lets nothing swing"):
+        replace(MODAL, damping_ratio=(0.0281, 16.0))
+    with pytest.raises(ExperimentDataError, match="must lie below the second"):
+        replace(MODAL, frequency=(30.0, 5.6))
+
+
+@pytest.mark.slow
+def test_our_wing() -> None:
+    from fe.reduction.model_cache import reduced_model
+
+    model = reduced_model()
+    wing = tabulate_wing(model)
+    assert wing.frequency.error < 1e-5
+    generator = np.random.default_rng(5)
+    points = wing.frequency.limits[:, 0] + generator.random((20, 3)) * np.diff(wing.frequency.limits)[:, 0]
+    for point, found in zip(points.tolist(), wing.frequency.frequency(points), strict=True):
+        modes = model.modes(point[0], (0.0, 0.0), point[1], point[2])
+        np.testing.assert_allclose(found, modes.frequency[list(modes.flapwise)], rtol=1e-5)
+    result = joint_posterior(model, STATIC, MODAL)
+    assert result.samples.tobytes() == joint_posterior(wing, STATIC, MODAL).samples.tobytes()
+    mean, deviation = result.diagnostics.weighted_mean, result.diagnostics.weighted_standard_deviation
+    # Within a tenth of its deviation e is what the load test alone says; the masses follow from f1 there.
+    alone = exact_posterior(STATIC, curve=stiffness_curve_of(model))
+    assert mean[0] == pytest.approx(alone.mean, abs=0.1 * alone.standard_deviation)
+    assert mean[1:3] == pytest.approx([0.1685, 0.135], abs=2e-3)
+    assert deviation[1] == pytest.approx(0.0142, abs=5e-4)
+    assert mean[3] == pytest.approx(1.033, abs=0.02)
+    assert mean[4] == pytest.approx(7.58e-4, rel=0.02)
+    assert result.diagnostics.effective_sample_size > 15_000

@@ -1,0 +1,169 @@
+"""Reading load-displacement measurements, and one clear sentence for each thing wrong with them."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.errors import ExperimentDataError, ExperimentFileError
+from calibration.static.experiments import (
+    LOAD_STANDARD_DEVIATION,
+    LoadDisplacementData,
+    published_measurements,
+    read_measurements,
+)
+
+REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
+PAIRS = np.array([[2.4525, 3.937], [4.905, 7.6962], [7.3575, 10.8712], [2.4525, 3.3528], [4.905, 7.2898]])
+
+
+def write(folder: Path, text: str) -> Path:
+    file = folder / "step2" / "load_displacement_measurements.csv"
+    file.parent.mkdir(exist_ok=True, parents=True)
+    file.write_text(text, encoding="utf-8")
+    return folder
+
+
+def table(pairs: np.ndarray, header: str = "load,displacement") -> str:
+    return "\n".join([header, *(f"{load:.10g},{displacement:.10g}" for load, displacement in pairs)]) + "\n"
+
+
+def test_published_pairs_are_those_of_the_authors_folder():
+    if not REFERENCE.is_dir():
+        pytest.skip("the authors' calibration folder is not beside the project")
+    read, published = read_measurements(REFERENCE), published_measurements()
+    assert read.sha256 == published.sha256
+    assert np.array_equal(read.run, published.run)
+
+
+def test_published_pairs():
+    data = published_measurements()
+    assert data.count == 8
+    assert data.run.tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
+    assert data.load / 9.81 == pytest.approx(np.tile([0.25, 0.5, 0.75, 1.0], 2))
+    assert data.load_standard_deviation == pytest.approx(0.0981 / 1.96)
+    assert data.displacement_standard_deviation == pytest.approx(0.5e-3 / 1.96)
+
+
+@pytest.mark.parametrize("above", ["", "datafiles", "src/datafiles"])
+def test_folder_file_and_runs(tmp_path, above):
+    write(tmp_path / above, "\ufeff" + table(PAIRS, "load , displacement").replace("\n", "\r\n"))
+    data = read_measurements(tmp_path)
+    assert data.load.tolist() == PAIRS[:, 0].tolist()
+    assert data.displacement == pytest.approx(PAIRS[:, 1] * 1e-3)
+    assert data.run.tolist() == [0, 0, 0, 1, 1]
+    file = tmp_path / above / "step2" / "load_displacement_measurements.csv"
+    assert read_measurements(file).sha256 == data.sha256
+
+
+def test_columns_in_any_order_and_more_of_them(tmp_path):
+    rows = "\n".join(f"{displacement},x,{load}" for load, displacement in PAIRS)
+    data = read_measurements(write(tmp_path, f"displacement,remark,load\n{rows}\n"))
+    assert data.load.tolist() == PAIRS[:, 0].tolist()
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "is empty"),
+        ("\n\n", "is empty"),
+        ("load,displacement\n", "has a header line but no rows"),
+        (
+            "force,displacement\n1,2\n",
+            "no column 'load', which a load test needs; its columns are force, disp",
+        ),
+        (
+            "load,displacement\n2.4525,nan\n",
+            "line 2: column 'displacement' holds nan, and a finite number is",
+        ),
+        (
+            "load,displacement\n2.4525,3.9\n4.9,\n",
+            "line 3: column 'displacement' must hold a number, and noth",
+        ),
+        ("load,displacement\n2.4525,3.9\n4.9\n", "line 3: 1 cell came, and the header has 2 columns"),
+        ("load,displacement\n2.4525,3.9\nfive,7.7\n", "column 'load' must hold a number, and 'five' came"),
+        ("load,displacement\n0,0\n2.4525,3.9\n", "leave out readings of zero"),
+        ("load,displacement\n-2.4525,3.9\n", "column 'load' holds -2.4525, and a positive number is needed"),
+        ("load,displacement\n2.4525,inf\n", "column 'displacement' holds inf"),
+        # A decimal comma makes two cells of one number; half of it is a displacement that looks sound.
+        ("load,displacement\n9.81,14,5542\n", "line 2: 3 cells came, and the header has 2 columns"),
+        ('load,displacement\n9.81,"14,5542"\n', "must hold a number, and '14,5542' came"),
+        ("load;displacement\n9,81;14,5542\n", "is not separated by commas"),
+        ("load,displacement\n٩.٨١,14.5542\n", "must hold a number, and '٩.٨١' came"),
+        ("load,displacement\n9.81,1_4.5542\n", "must hold a number, and '1_4.5542' came"),
+        ("load,displacement,load\n9.81,14.5,9.7\n", "more than one column 'load'"),
+        ("load,displacement\n4.905,7.6\n9.81,14.5\n9.810,14.5\n", "the lines 3 and 4 hold the same row"),
+    ],
+)
+def test_bad_files_get_one_sentence(tmp_path, text, sentence):
+    with pytest.raises((ExperimentFileError, ExperimentDataError), match=r"\.$") as caught:
+        read_measurements(write(tmp_path, text))
+    assert sentence in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("load_factor", "displacement_factor", "sentence"),
+    [
+        (1.0 / 9.80665, 1.0, "looks like kgf"),
+        (1000.0 / 9.80665, 1.0, "looks like grams"),
+        (1.0 / 9.80665, 1e-3, "kgf beside a displacement in m"),
+        (1.0 / 4.44822, 1.0, "looks like lbf"),
+        (1e-3, 1.0, "looks like kN"),
+        (1.0, 1e-3, "displacement looks like m"),
+        (1.0, 0.1, "displacement looks like cm"),
+        (1.0, 1.0 / 25.4, "displacement looks like inches"),
+        (3.0, 1.0, "check the columns"),
+    ],
+)
+def test_wrong_units_are_recognised(tmp_path, load_factor, displacement_factor, sentence):
+    with pytest.raises(ExperimentDataError, match="expected before calibration") as caught:
+        read_measurements(write(tmp_path, table(PAIRS * [load_factor, displacement_factor])))
+    assert sentence in str(caught.value)
+
+
+def test_equal_readings_of_two_runs_or_two_numbered_ones_are_no_repetition(tmp_path):
+    runs = "load,displacement\n4.905,7.6\n9.81,14.5\n4.905,7.6\n9.81,14.5\n"
+    assert read_measurements(write(tmp_path, runs)).run.tolist() == [0, 0, 1, 1]
+    numbered = "reading,load,displacement\n1,9.81,14.5\n2,9.81,14.5\n"
+    assert read_measurements(write(tmp_path, numbered)).count == 2
+
+
+def test_swapped_columns_are_recognised(tmp_path):
+    with pytest.raises(ExperimentDataError):
+        read_measurements(write(tmp_path, table(PAIRS[:, ::-1])))
+
+
+def test_missing_places(tmp_path):
+    with pytest.raises(ExperimentFileError, match="does not exist"):
+        read_measurements(tmp_path / "nowhere")
+    with pytest.raises(ExperimentFileError, match="does not hold"):
+        read_measurements(tmp_path)
+    binary = tmp_path / "picture.csv"
+    binary.write_bytes(bytes(range(128, 256)))
+    with pytest.raises(ExperimentFileError, match="not text in UTF-8"):
+        read_measurements(binary)
+
+
+def test_bad_records_are_refused():
+    data = published_measurements()
+    with pytest.raises(ExperimentDataError, match="one length"):
+        dataclasses.replace(data, load=data.load[:4])
+    with pytest.raises(ExperimentDataError, match="no measurement"):
+        LoadDisplacementData(np.array([]), np.array([]), np.array([]))
+    with pytest.raises(ExperimentDataError, match="not both zero"):
+        dataclasses.replace(data, load_standard_deviation=0.0, displacement_standard_deviation=0.0)
+    with pytest.raises(ExperimentDataError, match="load of pair 2 is nan"):
+        dataclasses.replace(data, load=np.where(np.arange(8) == 1, np.nan, data.load))
+    with pytest.raises(ValueError, match="read-only"):
+        data.load[0] = 1.0
+
+
+def test_the_hash_sees_figures_and_not_names():
+    data = published_measurements()
+    assert dataclasses.replace(data, source="another name").sha256 == data.sha256
+    assert dataclasses.replace(data, load=data.load + 1e-12).sha256 != data.sha256
+    assert (
+        dataclasses.replace(data, load_standard_deviation=2 * LOAD_STANDARD_DEVIATION).sha256 != data.sha256
+    )

@@ -1,0 +1,92 @@
+"""Stiffness curves: the published line, and tables of a model."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibration.errors import StiffnessCurveError
+from calibration.static.stiffness_curve import (
+    PUBLISHED_LINE,
+    TABLE_TOLERANCE,
+    LinearStiffnessCurve,
+    TabulatedStiffnessCurve,
+    stiffness_curve_of,
+)
+
+
+class Springs:
+    """A skin spring in parallel with another, both on a root spring: a smooth curve that is no line."""
+
+    validity = {"young_modulus_factor": (0.9, 1.1)}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def tip_stiffness(self, young_modulus_factor: float) -> float:
+        self.calls += 1
+        return 1.0 / (1.0 / (640.0 * young_modulus_factor + 100.0) + 1.0 / 8000.0)
+
+
+def test_published_line():
+    assert PUBLISHED_LINE.stiffness(1.0) == pytest.approx(677.0)
+    assert PUBLISHED_LINE.stiffness([0.9, 1.1]) == pytest.approx([619.48, 734.52])
+    assert PUBLISHED_LINE.young_modulus_factor(677.0) == pytest.approx(1.0)
+    assert PUBLISHED_LINE.slope([0.9, 1.1]) == pytest.approx(575.2)
+
+
+def test_a_table_meets_its_model_within_the_stated_error():
+    model = Springs()
+    curve = stiffness_curve_of(model)
+    assert (curve.lower, curve.upper) == (0.9, 1.1)
+    assert model.calls < 600
+    factor = np.linspace(0.9, 1.1, 997)
+    exact = np.array([model.tip_stiffness(value) for value in factor])
+    assert np.abs(curve.stiffness(factor) / exact - 1.0).max() < 3.0 * TABLE_TOLERANCE
+    assert curve.table_error <= TABLE_TOLERANCE
+    slope = (curve.stiffness(factor + 1e-6) - curve.stiffness(factor - 1e-6)) / 2e-6
+    assert curve.slope(factor[1:-1]) == pytest.approx(slope[1:-1], rel=1e-4)
+
+
+@given(factor=st.floats(0.3, 1.9))
+def test_the_inverse_inverts_also_beyond_the_table(factor):
+    curve = stiffness_curve_of(Springs())
+    assert float(curve.young_modulus_factor(curve.stiffness(factor))) == pytest.approx(factor, abs=1e-7)
+
+
+def test_a_curve_continues_smoothly_beyond_its_table():
+    curve = stiffness_curve_of(Springs())
+    for end in (curve.lower, curve.upper):
+        below, at, above = curve.stiffness([end - 1e-6, end, end + 1e-6])
+        assert at - below == pytest.approx(above - at, rel=1e-3)
+
+
+def test_a_range_of_ones_own():
+    curve = stiffness_curve_of(Springs(), lower=0.95, upper=1.05, name="springs")
+    assert (curve.lower, curve.upper, curve.name) == (0.95, 1.05, "springs")
+
+
+def test_bad_curves_are_refused():
+    with pytest.raises(StiffnessCurveError, match="rise with e"):
+        LinearStiffnessCurve(-1.0, 700.0)
+    with pytest.raises(StiffnessCurveError, match="positive"):
+        LinearStiffnessCurve(1.0, -5.0)
+    with pytest.raises(StiffnessCurveError, match="at least four nodes"):
+        TabulatedStiffnessCurve(np.array([0.9, 1.1]), np.array([600.0, 700.0]))
+    with pytest.raises(StiffnessCurveError, match="ascend in e"):
+        TabulatedStiffnessCurve(np.array([0.9, 1.0, 1.0, 1.1]), np.array([1.0, 2.0, 3.0, 4.0]))
+    with pytest.raises(StiffnessCurveError, match=r"from 700 to 650 N/m between e = 1 and 1.05"):
+        TabulatedStiffnessCurve(np.array([0.9, 1.0, 1.05, 1.1]), np.array([600.0, 700.0, 650.0, 710.0]))
+    with pytest.raises(StiffnessCurveError, match="range of e"):
+        stiffness_curve_of(Springs(), lower=1.1, upper=0.9)
+
+
+def test_a_model_too_rough_to_tabulate_is_refused():
+    class Stairs:
+        def tip_stiffness(self, young_modulus_factor: float) -> float:
+            return 600.0 + 100.0 * young_modulus_factor + 5.0 * math.floor(70.0 * young_modulus_factor)
+
+    with pytest.raises(StiffnessCurveError, match="too rough"):
+        stiffness_curve_of(Stairs(), name="stairs")

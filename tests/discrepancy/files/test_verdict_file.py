@@ -1,0 +1,270 @@
+"""Files of a verdict: round trips to the last bit, the shipped schemas, damaged files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+from math import inf, nan
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from discrepancy.campaign.records import NoiseRecord
+from discrepancy.document_types import PRIMITIVE_UNITS
+from discrepancy.errors import VerdictFileError
+from discrepancy.files.document import Origin, json_schema, shipped_schema
+from discrepancy.files.patch import PATCH_SCHEMA, PatchDocument, primitive_intervals, read_patch, write_patch
+from discrepancy.files.residuals import read_residuals, write_residuals
+from discrepancy.files.verdict import VERDICT_SCHEMA, VerdictDocument, read_verdict, write_verdict
+from discrepancy.judgement.proof import prove
+from discrepancy.verdict import (
+    Estimate,
+    Experiment,
+    Gate,
+    Hypothesis,
+    NamedEffect,
+    Verdict,
+    VerdictKind,
+)
+from fe.runtime.patch import PRIMITIVES, Line, ModelPatch, PointMass, PowerDamping, PowerStiffness
+from reporting.errors import FileNotWrittenError
+from reporting.provenance import collect_provenance
+
+ORIGIN = Origin(
+    "Wing in the laboratory", "wing", "ab" * 32, "cd" * 32, "uav-twin discrepancy campaign --out verdict",
+    collect_provenance(7, input_hashes={"campaign": "ab" * 32}),
+)  # fmt: skip
+FRICTION = NamedEffect(
+    "coulomb_friction", "Coulomb friction", "root", "damping |v|^p |x|^a",
+    (Estimate("friction", 0.0123456789012345678, 0.011, 0.014, "1", "Fc / (k A)"),),
+    (Estimate("velocity_exponent", 0.03, -0.1, nan, "1"),),
+    ModelPatch((PowerDamping("root", 1.0 / 3.0, 0.0, 0.0, 0.1, 5e-324),)),
+)  # fmt: skip
+MASS = NamedEffect(
+    "point_mass", "Unmodelled point mass", "", "mass", (), (),
+    ModelPatch((PointMass(0.1 + 0.2, 1.7), PowerStiffness("tip", -3.0, 3.0, -1, 0.05))),
+)  # fmt: skip
+VERDICT = Verdict(
+    kind=VerdictKind.NAMED,
+    sentence="Coulomb friction at the root (Fc/(kA) = 0.0123 ± 0.0015).",
+    probability=0.998,
+    log_bayes_factor=inf,
+    effects=(FRICTION, MASS),
+    group=("coulomb_friction",),
+    family="damping |v|^p |x|^a",
+    gates=(Gate("absolute fit", None, nan, 1.2, "No noise record."), Gate("shape", True, 0.4, 2.0, "")),
+    hypotheses=(Hypothesis((FRICTION,), -12.5, 0.99, 812.0, 800.0), Hypothesis((), -inf, 0.0, nan, 806.0)),
+    inclusion={"coulomb_friction": 0.998},
+    next_experiments=(Experiment("Release at half the amplitude", 0.6, 1.0, "Tells A from 1/A."),),
+    remarks=("Trial 3 was clipped.",),
+    resembles=("a line at 50 Hz",),
+)
+
+
+def same(first: object, second: object) -> bool:
+    """Compare records with nan equal to nan."""
+    return repr(first) == repr(second)
+
+
+def test_a_verdict_comes_back_equal(tmp_path: Path, make_bench) -> None:
+    bench = make_bench(amplitudes=(200.0, 150.0), held_out=(False, True))
+    fitted = bench.fit(np.random.default_rng(7))
+    proof = prove(fitted, fitted)
+    for number, content in enumerate((proof, None, replace(proof, held_out_before=None))):
+        path = write_verdict(tmp_path / str(number) / "verdict.json", VERDICT, content, ORIGIN)
+        back = read_verdict(path)
+        assert same(back.verdict, VERDICT)
+        assert same(back.proof, content)
+        assert back.origin == ORIGIN
+    text = path.read_text(encoding="utf-8")
+    assert json.loads(text)["schema"] == "uav-twin verdict 1"
+    assert "NaN" not in text
+    again = write_verdict(tmp_path / "again.json", VERDICT, content, ORIGIN)
+    assert again.read_bytes() == path.read_bytes()
+
+
+def test_a_patch_comes_back_identical_with_its_intervals(tmp_path: Path) -> None:
+    generator = np.random.default_rng(1)
+    draws = [
+        ModelPatch((PowerDamping("root", float(c), 0.0, 0.0, 0.1, 5e-324),))
+        for c in generator.normal(1.0 / 3.0, 0.02, 4000)
+    ]
+    path = write_patch(tmp_path / "patch.json", (FRICTION, MASS), ORIGIN, (draws, ()))
+    back = read_patch(path)
+    assert back.patch == FRICTION.patch + MASS.patch
+    assert same(back.effects, (FRICTION, MASS))
+    assert back.origin.data_hash == "ab" * 32
+    first = back.intervals[0][0]
+    assert (first.primitive, first.parameter, first.unit) == (0, "coefficient", "N or N m")
+    assert first.low == pytest.approx(1.0 / 3.0 - 1.645 * 0.02, abs=2e-3)
+    assert first.high == pytest.approx(1.0 / 3.0 + 1.645 * 0.02, abs=2e-3)
+    assert [(i.primitive, i.parameter, i.unit) for i in back.intervals[1][:3]] == [
+        (0, "mass", "kg"), (0, "station", "m"), (1, "coefficient", "N or N m"),
+    ]  # fmt: skip
+    assert np.isnan(back.intervals[1][0].low)
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_every_primitive_with_any_numbers_survives_the_file(
+    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    number = st.floats(allow_nan=False, allow_infinity=False)
+    primitives = []
+    for kind in data.draw(st.lists(st.sampled_from(sorted(PRIMITIVES)), min_size=1, max_size=4)):
+        values = {}
+        for item in fields(PRIMITIVES[kind]):
+            values[item.name] = data.draw(
+                number
+                if item.type is float
+                else st.integers(-5, 50)
+                if item.type is int
+                else st.text(max_size=5)
+            )
+        primitives.append(PRIMITIVES[kind](**values))
+    effect = replace(MASS, patch=ModelPatch(tuple(primitives)))
+    path = tmp_path_factory.mktemp("patch") / "patch.json"
+    back = read_patch(write_patch(path, (effect,), ORIGIN)).patch
+    assert back == effect.patch
+    assert same(back, effect.patch)  # tells 0.0 from -0.0
+
+
+def test_every_real_parameter_of_every_primitive_has_a_unit() -> None:
+    for kind, primitive in PRIMITIVES.items():
+        assert set(PRIMITIVE_UNITS[kind]) == {item.name for item in fields(primitive) if item.type is float}
+    assert set(PRIMITIVE_UNITS) == set(PRIMITIVES)
+
+
+@pytest.mark.parametrize(
+    ("name", "document", "schema"),
+    [("verdict", VerdictDocument, VERDICT_SCHEMA), ("patch", PatchDocument, PATCH_SCHEMA)],
+)
+def test_the_shipped_schema_is_that_of_the_records(name: str, document: type, schema: str) -> None:
+    assert shipped_schema(name) == json.loads(json_schema(document, schema))
+    with pytest.raises(VerdictFileError, match="but not for 'report'"):
+        shipped_schema("report")
+
+
+def test_every_key_is_in_the_page() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "verdict.md").read_text(encoding="utf-8")
+    for name in ("verdict", "patch"):
+        schema = shipped_schema(name)
+        tables = [schema, *schema["$defs"].values()]
+        kinds = set(PRIMITIVES)
+        for table in tables:
+            if table.get("properties", {}).get("kind", {}).get("const") in kinds:
+                continue  # parameters of primitives are those of fe.runtime.patch
+            for key in table.get("properties", {}):
+                assert f"`{key}`" in page, key
+    for kind in PRIMITIVES:
+        assert f"`{kind}`" in page, kind
+
+
+def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
+    path = write_verdict(tmp_path / "verdict.json", VERDICT, None, ORIGIN)
+    whole = path.read_text(encoding="utf-8")
+
+    def refused(text: str, words: str) -> None:
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(VerdictFileError, match=words) as caught:
+            read_verdict(path)
+        assert "\n" not in str(caught.value)
+
+    refused(whole[: len(whole) // 2], "damaged or no JSON file")
+    refused("[]", "no file of this kind")
+    refused(whole.replace("uav-twin verdict 1", "uav-twin verdict 9"), "schema 'uav-twin verdict 9'")
+    refused(whole.replace('"kind": "named"', '"kind": "guessed"'), "verdict.kind")
+    refused(whole.replace('"probability": 0.998', '"probability": "high"'), "verdict.probability")
+    refused(whole.replace('"sentence"', '"sentences"', 1), "sentence")
+    refused(whole.replace('"family": "mass",', '"family": "mass", "colour": "red",', 1), "effects.1.colour")
+    refused(whole.replace('"family": "mass",', "", 1), "effects.1.family")
+    refused(whole.replace('"passed": true', '"passed": "yes"', 1), "gates.1.passed is 'yes'")
+    refused(whole.replace('"log_bayes_factor": "Infinity"', '"log_bayes_factor": Infinity'), "bayes_factor")
+    refused(whole.replace('"remarks": [', f'"remarks": [{"[" * 3000}{"]" * 3000}, ', 1), "damaged|remarks")
+    refused(whole.replace('"kind": "point_mass"', '"kind": "planet"', 1), "planet|point_mass|kind")
+    refused(whole.replace('"mass": 0.30000000000000004', '"mass": null', 1), "mass")
+    with pytest.raises(VerdictFileError, match="There is no file"):
+        read_verdict(tmp_path / "nothing.json")
+    path.write_text(whole, encoding="utf-8")
+    with pytest.raises(VerdictFileError, match="'uav-twin verdict 1', but 'uav-twin patch 1' is needed"):
+        read_patch(path)
+
+
+def test_nothing_is_written_where_it_cannot_be(tmp_path: Path) -> None:
+    wrong = replace(VERDICT, probability="sure")  # type: ignore[arg-type]
+    with pytest.raises(VerdictFileError, match=r"verdict.json cannot be written: verdict.probability"):
+        write_verdict(tmp_path / "verdict.json", wrong, None, ORIGIN)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(FileNotWrittenError, match="is a folder"):
+        write_verdict(tmp_path, VERDICT, None, ORIGIN)
+    with pytest.raises(VerdictFileError, match="each of 2 effects"):
+        write_patch(tmp_path / "patch.json", (FRICTION, MASS), ORIGIN, ((),))
+    other = ModelPatch((Line("g1", 50.0, 1.0, 0.0),))
+    with pytest.raises(VerdictFileError, match="Draw 1 of the posterior has the primitives line"):
+        primitive_intervals(MASS.patch, (other,))
+
+
+# ---------------------------------------------------------------- residuals
+
+
+def test_residuals_come_back_to_the_last_bit(tmp_path: Path, make_bench) -> None:
+    bench = make_bench(amplitudes=(200.0, 150.0), held_out=(False, True))
+    fitted = bench.fit(np.random.default_rng(7))
+    samples = np.random.default_rng(0).standard_normal(50)
+    noise = NoiseRecord(2.0, inf, samples, 0.01, "pre-trigger")
+    channels = dict(fitted.channels)
+    channels["g2"] = replace(channels["g2"], noise=noise, station=0.4, offset_deviation=inf)
+    channels["g3"] = replace(channels["g3"], noise=None)
+    item = fitted.trials[0]
+    used = item.used.copy()
+    used[3, 1] = False
+    residual = item.residual.copy()
+    residual[3, 1] = nan
+    place = replace(item.trial, used=used, load_place=(1.0, 0.35))
+    trials = (replace(item, trial=place, residual=residual), *fitted.trials[1:])
+    fitted = replace(fitted, channels=channels, trials=trials)
+    path = write_residuals(tmp_path / "residuals.nc", fitted, {"hypothesis": "none"})
+    back = read_residuals(path)
+    assert same(back.channels["g1"], fitted.channels["g1"])
+    assert back.channels["g3"].noise is None
+    np.testing.assert_array_equal(back.channels["g2"].noise.samples, samples)
+    assert same(replace(back.channels["g2"].noise, samples=None), replace(noise, samples=None))
+    assert back.channels["g2"].offset_deviation == inf
+    for first, second in zip(fitted.trials, back.trials, strict=True):
+        for name in ("prediction", "residual", "noise_deviation", "predictive_deviation", "leverage"):
+            np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+        assert (first.rates is None) == (second.rates is None)
+        for slot in fields(first.trial):
+            one, two = getattr(first.trial, slot.name), getattr(second.trial, slot.name)
+            if isinstance(one, np.ndarray):
+                np.testing.assert_array_equal(one, two)
+                assert one.dtype == two.dtype
+            else:
+                assert one == two
+
+
+def test_residual_file_carries_units_and_refuses_damage(tmp_path: Path, make_bench) -> None:
+    import xarray as xr
+
+    path = write_residuals(tmp_path / "residuals.nc", make_bench().fit(np.random.default_rng(1)))
+    with xr.open_datatree(path, engine="h5netcdf") as tree:
+        group = tree["trial_001"].to_dataset()
+        assert group["time"].attrs["units"] == "s"
+        assert set(group["unit"].values) == {"1"}
+        assert group["residual"].dims == ("row", "channel")
+        assert group.attrs["name"] == "release 1"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(VerdictFileError, match="damaged"):
+        read_residuals(path)
+    path.write_bytes(b"")
+    with pytest.raises(VerdictFileError, match="damaged"):
+        read_residuals(path)
+    with pytest.raises(VerdictFileError, match="There is no file"):
+        read_residuals(tmp_path / "nothing.nc")
+    xr.Dataset(attrs={"schema": "other"}).to_netcdf(path, engine="h5netcdf")
+    with pytest.raises(VerdictFileError, match="'other'"):
+        read_residuals(path)

@@ -1,0 +1,202 @@
+"""Backbones: closed forms of four laws, coverage of the error bars, the five real ring-downs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from discrepancy.errors import FitError
+from discrepancy.location.backbone import Backbone, at_amplitude, backbones, restoring_force_surface
+
+REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
+TIME = 0.005 * np.arange(2000)
+OMEGA = 2.0 * np.pi * 5.0
+
+
+def _curve(signal: NDArray[np.float64], **settings: float) -> Backbone:
+    return backbones(TIME[: signal.size], signal, (5.1,), **settings)[0]
+
+
+def _viscous(zeta: float = 0.01, f: float = 5.0, size: float = 1.0) -> NDArray[np.float64]:
+    w = 2.0 * np.pi * f
+    return size * np.exp(-zeta * w * TIME) * np.cos(w * np.sqrt(1.0 - zeta**2) * TIME + 0.4)
+
+
+def test_viscous_damping_is_flat_and_exact() -> None:
+    curve = _curve(_viscous() + 0.2 - 0.01 * TIME)
+    np.testing.assert_allclose(curve.frequency, 5.0, rtol=1e-7)
+    np.testing.assert_allclose(curve.damping_ratio, 0.01, rtol=1e-5)
+    np.testing.assert_allclose(curve.amplitude, np.exp(-0.01 * OMEGA * curve.time), rtol=1e-5)
+    assert curve.time[0] < 0.5
+    assert curve.time[-1] > 9.0
+
+
+def test_two_modes_are_separated() -> None:
+    signal = _viscous() + _viscous(0.006, 7.3, 0.5)
+    first, second = backbones(TIME, signal, (4.9, 7.5))
+    np.testing.assert_allclose(first.frequency, 5.0, rtol=1e-5)
+    np.testing.assert_allclose(second.frequency, 7.3, rtol=1e-5)
+    np.testing.assert_allclose(second.damping_ratio, 0.006, rtol=1e-3)
+
+
+def test_coulomb_friction_has_a_ratio_that_falls_with_amplitude() -> None:
+    # Exact motion: half cycles of cosines about +-delta, delta = Fc / k; peaks fall by 2 delta each.
+    delta = 0.004
+    half = np.floor(TIME * OMEGA / np.pi).astype(int)
+    peak = 1.0 - 2.0 * delta * half
+    sign = np.where(half % 2 == 0, 1.0, -1.0)
+    signal = sign * ((peak - delta) * np.cos(OMEGA * TIME - half * np.pi) + delta)
+    keep = int(0.9 / (2.0 * delta) * np.pi / OMEGA / 0.005)
+    curve = _curve(signal[:keep])
+    exact = 2.0 * delta / (np.pi * curve.amplitude)  # zeta_eq = 2 Fc / (pi k A)
+    assert curve.damping_ratio[-1] > 3.0 * curve.damping_ratio[0]
+    np.testing.assert_allclose(curve.damping_ratio[:-2], exact[:-2], rtol=0.04)
+    np.testing.assert_allclose(curve.frequency[:-2], 5.0, rtol=1e-3)
+
+
+def test_quadratic_damping_has_a_ratio_proportional_to_amplitude() -> None:
+    # x'' + c |x'| x' + w^2 x = 0: zeta_eq = 4 c A / (3 pi), integrated numerically.
+    c = 0.1
+    found = solve_ivp(
+        lambda t, y: [y[1], -c * abs(y[1]) * y[1] - OMEGA**2 * y[0]],
+        (0.0, TIME[-1]), [1.0, 0.0], t_eval=TIME, rtol=1e-9, atol=1e-11,
+    )  # fmt: skip
+    curve = _curve(found.y[0], periods=3.0)
+    exact = 4.0 * c * curve.amplitude / (3.0 * np.pi)
+    assert curve.amplitude[0] > 3.0 * curve.amplitude[-1]
+    np.testing.assert_allclose(curve.damping_ratio, exact, rtol=0.03)
+    slope = np.polyfit(np.log(curve.amplitude), np.log(curve.damping_ratio), 1)[0]
+    assert slope == pytest.approx(1.0, abs=0.02)
+
+
+def test_cubic_spring_has_a_frequency_shift_with_the_square_of_amplitude() -> None:
+    # x'' + 2 zeta w x' + w^2 (x + kappa x^3) = 0: f = f0 (1 + 3 kappa A^2 / 8) to first order.
+    kappa, zeta = 0.04, 0.008
+    found = solve_ivp(
+        lambda t, y: [y[1], -2 * zeta * OMEGA * y[1] - OMEGA**2 * (y[0] + kappa * y[0] ** 3)],
+        (0.0, TIME[-1]), [1.0, 0.0], t_eval=TIME, rtol=1e-9, atol=1e-11,
+    )  # fmt: skip
+    curve = _curve(found.y[0])
+    shift = curve.frequency / 5.0 - 1.0
+    np.testing.assert_allclose(shift, 0.375 * kappa * curve.amplitude**2, atol=2e-4, rtol=0.04)
+    slope = np.polyfit(np.log(curve.amplitude[:6]), np.log(shift[:6]), 1)[0]
+    assert slope == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_error_bars_cover(known: bool) -> None:
+    generator = np.random.default_rng(21)
+    noise = 0.02
+    z_frequency, z_ratio, z_amplitude = [], [], []
+    for _ in range(60):
+        signal = (_viscous() + noise * generator.standard_normal(TIME.size))[:1200]
+        curve = _curve(signal, noise_deviation=noise if known else None)
+        z_frequency += ((curve.frequency - 5.0) / curve.frequency_error).tolist()
+        z_ratio += ((curve.damping_ratio - 0.01) / curve.damping_ratio_error).tolist()
+        exact = np.exp(-0.01 * OMEGA * curve.time)
+        z_amplitude += ((curve.amplitude - exact) / curve.amplitude_error).tolist()
+    assert len(z_frequency) > 500
+    for z in (z_frequency, z_ratio, z_amplitude):
+        assert 0.86 < np.mean(np.abs(z) < 1.645) < 0.94
+        assert abs(np.mean(z)) < 0.15
+
+
+def test_a_mode_that_dies_away_is_dropped_and_the_other_goes_on() -> None:
+    generator = np.random.default_rng(3)
+    signal = _viscous() + _viscous(0.03, 30.0) + 0.01 * generator.standard_normal(TIME.size)
+    first, second = backbones(TIME, signal, (5.0, 30.0), noise_deviation=0.01)
+    assert second.time[-1] < 3.0 < 8.0 < first.time[-1]
+    assert np.all(second.amplitude > 4.0 * second.amplitude_error)
+    np.testing.assert_allclose(second.frequency[:2], 30.0, rtol=2e-3)
+
+
+def test_pure_noise_gives_no_points() -> None:
+    signal = np.random.default_rng(1).standard_normal(600)
+    assert backbones(TIME[:600], signal, (5.0,), noise_deviation=1.0)[0].time.size == 0
+
+
+def test_value_at_an_amplitude_is_the_mean_over_trials() -> None:
+    def line(shift: float) -> Backbone:
+        amplitude = np.geomspace(1.0, 0.1, 12)
+        one = np.ones(12)
+        return Backbone(1, one, amplitude, 0.01 * one, 5.0 + shift - 0.1 * np.log(amplitude), 0.02 * one,
+                        0.01 + 0.002 * np.log(amplitude) + shift, 0.001 * one)  # fmt: skip
+
+    found = at_amplitude([line(0.01), line(-0.01), line(0.03)], 0.4)
+    assert found.frequency == pytest.approx(5.01 - 0.1 * np.log(0.4))
+    assert found.frequency_error == pytest.approx(np.std([0.01, -0.01, 0.03], ddof=1) / np.sqrt(3))
+    assert found.damping_ratio == pytest.approx(0.02 + 0.002 * np.log(0.4))
+    assert found.trial_count == 3
+    single = at_amplitude([line(0.0)], 0.4)
+    assert 0.02 / np.sqrt(12) < single.frequency_error < 0.02
+    assert at_amplitude([line(0.0)], 50.0).trial_count == 0
+
+
+def test_surface_of_a_cubic_spring() -> None:
+    kappa, zeta = 0.3, 0.01
+    time = 0.002 * np.arange(2500)
+    found = solve_ivp(
+        lambda t, y: [y[1], -2 * zeta * OMEGA * y[1] - OMEGA**2 * (y[0] + kappa * y[0] ** 3)],
+        (0.0, time[-1]), [1.0, 0.0], t_eval=time, rtol=1e-10, atol=1e-12,
+    )  # fmt: skip
+    generator = np.random.default_rng(2)
+    noisy = found.y[0] + 1e-3 * generator.standard_normal(time.size)
+    surface = restoring_force_surface(time, noisy, 5.0, noise_deviation=1e-3)
+    x, v, a = surface.displacement, surface.velocity, surface.acceleration
+    design = np.column_stack([-x, -(x**3), -v])
+    stiffness, cubic, damping = np.linalg.lstsq(design, a, rcond=None)[0]
+    assert stiffness == pytest.approx(OMEGA**2, rel=0.01)
+    assert cubic == pytest.approx(kappa * OMEGA**2, rel=0.03)
+    assert damping == pytest.approx(2 * zeta * OMEGA, rel=0.06)
+    clean = restoring_force_surface(time, found.y[0], 5.0)
+    assert np.isnan(clean.acceleration_error)
+    assert np.std(a - clean.acceleration) == pytest.approx(surface.acceleration_error, rel=0.1)
+
+
+def test_bad_input_is_refused() -> None:
+    signal = _viscous()
+    for settings, words in (
+        ({"frequencies": ()}, "but they are none"),
+        ({"frequencies": (150.0,)}, "half the sampling rate, 100 Hz"),
+        ({"frequencies": (5.0,), "overlap": 1.0}, "overlap"),
+        ({"frequencies": (5.0,), "periods": 0.1}, "at least 12"),
+        ({"frequencies": (5.0,), "periods": 500.0}, "the record's length"),
+    ):
+        with pytest.raises(FitError, match=words):
+            backbones(TIME, signal, **settings)
+    with pytest.raises(FitError, match="one length"):
+        backbones(TIME, signal[:-1], (5.0,))
+    broken = signal.copy()
+    broken[5] = np.nan
+    with pytest.raises(FitError, match="finite"):
+        backbones(TIME, broken, (5.0,))
+    with pytest.raises(FitError, match="at least 9"):
+        restoring_force_surface(TIME, signal, 50.0)
+
+
+def test_the_real_wing_stiffens_and_its_damping_falls_as_it_comes_to_rest() -> None:
+    if not REFERENCE.is_dir():
+        pytest.skip(f"the published ring-downs are not at {REFERENCE}")
+    from calibration.dynamics.records import read_records
+
+    curves = []
+    for record in read_records(REFERENCE):
+        found = backbones(
+            record.time, record.signal, (5.65, 29.97), averaging_width=record.averaging_width, periods=4.0
+        )
+        curves.append(found[0])
+    assert len(curves) == 5
+    large, small = at_amplitude(curves, 6e-3), at_amplitude(curves, 0.6e-3)
+    assert large.trial_count == small.trial_count == 5
+    assert small.frequency - large.frequency > 5.0 * np.hypot(small.frequency_error, large.frequency_error)
+    assert large.damping_ratio - small.damping_ratio > 5.0 * np.hypot(
+        small.damping_ratio_error, large.damping_ratio_error
+    )
+    for curve in curves:
+        own = [at_amplitude([curve], a) for a in (6e-3, 0.6e-3)]
+        assert own[0].frequency < own[1].frequency
+        assert own[0].damping_ratio > own[1].damping_ratio

@@ -1,0 +1,93 @@
+"""The hand-over record: leverages, restored whiteness, shapes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from discrepancy.errors import FitError
+from discrepancy.location.residuals import ResidualSet, quadratic_moments, sensitivity
+
+
+def test_sensitivity_holds_the_leverages_of_least_squares() -> None:
+    generator = np.random.default_rng(3)
+    jacobian = generator.standard_normal((30, 2, 4))
+    noise = np.array([0.5, 2.0])
+    table = (jacobian / noise[:, np.newaxis]).reshape(60, 4)
+    covariance = np.linalg.inv(table.T @ table)
+    hat = table @ covariance @ table.T
+    found = sensitivity(jacobian, covariance, noise).reshape(60, 4)
+    np.testing.assert_allclose(found @ found.T, hat, atol=1e-12)
+    assert np.sum(found**2) == pytest.approx(4.0)
+
+
+def test_moments_of_a_sum_of_squares_are_those_of_the_projection() -> None:
+    generator = np.random.default_rng(5)
+    S = np.linalg.qr(generator.standard_normal((12, 3)))[0] * np.array([1.0, 0.9, 0.4])
+    A = np.eye(12) - S @ S.T
+    expected = 1.0 - np.sum(S**2, axis=1)
+    mean, freedom = quadratic_moments([(expected[:5], S[:5]), (expected[5:], S[5:])])
+    assert mean == pytest.approx(np.trace(A))
+    assert freedom == pytest.approx(np.trace(A) ** 2 / np.trace(A @ A))
+    assert quadratic_moments([(expected, None)]) == pytest.approx((np.trace(A), np.trace(A)))
+
+
+@pytest.mark.parametrize("held_out", [False, True])
+def test_restored_residuals_are_white_with_unit_variance(make_bench, held_out: bool) -> None:
+    bench = make_bench(count=40, noise_freedom=np.inf, held_out=(False, held_out))
+    generator = np.random.default_rng(11)
+    draws = np.array([
+        np.concatenate([part.ravel() for part in bench.fit(generator).white(generator)]) for _ in range(3000)
+    ])  # fmt: skip
+    covariance = draws.T @ draws / len(draws)
+    plain = np.abs(covariance - np.eye(len(covariance)))
+    # Standard deviations of the entries are sqrt(2 / 3000) on and sqrt(1 / 3000) off the diagonal.
+    assert np.max(np.diag(plain)) < 5.0 * np.sqrt(2.0 / 3000)
+    assert np.max(plain - np.diag(np.diag(plain))) < 6.0 * np.sqrt(1.0 / 3000)
+
+
+def test_without_restoring_the_early_samples_are_too_quiet(make_bench) -> None:
+    bench = make_bench(count=40, noise_freedom=np.inf, static=False)
+    generator = np.random.default_rng(12)
+    squares = np.mean([bench.fit(generator).trials[0].standardised[:8] ** 2 for _ in range(300)], axis=0)
+    expected = bench.fit(generator).trials[0].expected_variance[:8]
+    assert expected.min() < 0.9
+    np.testing.assert_allclose(squares, expected, atol=0.35)
+    assert np.mean(squares - expected) == pytest.approx(0.0, abs=0.06)
+
+
+def test_wrong_shapes_are_refused(make_bench) -> None:
+    good = make_bench(count=40).fit(np.random.default_rng(1))
+    item = good.trials[0]
+    for change, words in (
+        ({"prediction": item.prediction[:-1]}, "prediction of the shape"),
+        ({"residual": np.full_like(item.residual, np.nan)}, "residual that is not finite"),
+        ({"noise_deviation": np.zeros(4)}, "positive noise deviation"),
+        ({"predictive_deviation": -item.predictive_deviation}, "not positive"),
+        ({"leverage": np.full_like(item.leverage, 1.5)}, "leverage above one"),
+        ({"sensitivity": np.zeros((3, 4, 2))}, "sensitivity of the shape"),
+    ):
+        with pytest.raises(FitError, match=words):
+            replace(item, **change)
+    with pytest.raises(FitError, match="at least one trial"):
+        ResidualSet(good.channels, ())
+    with pytest.raises(FitError, match="unknown channel 'g1'"):
+        ResidualSet({}, good.trials)
+    other = replace(good.trials[1], sensitivity=np.zeros((*item.residual.shape, 3)))
+    with pytest.raises(FitError, match="same parameters"):
+        ResidualSet(good.channels, (item, other))
+
+
+def test_values_that_are_not_used_may_be_anything(make_bench) -> None:
+    good = make_bench(count=40).fit(np.random.default_rng(1))
+    item = good.trials[0]
+    used = item.used.copy()
+    used[7, 2] = False
+    residual = item.residual.copy()
+    residual[7, 2] = np.nan
+    changed = replace(item, trial=replace(item.trial, used=used), residual=residual)
+    assert np.isnan(changed.standardised[7, 2])
+    white = ResidualSet(good.channels, (changed,)).white(np.random.default_rng(0))[0]
+    assert np.all(np.isfinite(white))

@@ -1,0 +1,185 @@
+"""Run folders as campaigns: what is read, what is held out, what is refused; health beside an effect."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks.study_hidden_effects import fly_mission
+from discrepancy.campaign.records import Quantity
+from discrepancy.catalogue.entry import Setting
+from discrepancy.errors import CampaignDataError, CampaignFileError
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.linearisation import Point
+from discrepancy.fits.problem import Problem
+from discrepancy.model_choice import choice_of_run
+from discrepancy.models.interface import Conditions
+from discrepancy.models.memo import MemoModel
+from discrepancy.models.sensing import observe
+from discrepancy.sources.from_run import RunPlan, held_out_turns, run_campaign, run_model
+from discrepancy.verdict import VerdictKind
+from discrepancy.workflow import investigate
+from fe.runtime.patch import ModelPatch, SensorDrift, SensorGain, SensorRotation
+
+TURNS = 24
+DRIFT = SensorDrift("strain[17]", -1.2e-3, float(TURNS))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "drifting"
+    fly_mission(folder, 7, (DRIFT,), turns=TURNS)
+    return folder
+
+
+def tree_of(folder: Path) -> xr.DataTree:
+    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
+        return tree.load()
+
+
+@pytest.mark.xdist_group("wing")
+def test_every_turn_is_in_one_trial_as_it_was_observed(run: Path) -> None:
+    campaign, tree = run_campaign(run), tree_of(run)
+    assert [trial.held_out for trial in campaign.trials] == [False, True]
+    time = np.concatenate([trial.time for trial in campaign.trials])
+    order = np.argsort(time)
+    np.testing.assert_array_equal(time[order], np.arange(1.0, TURNS + 1.0))
+    for name, field in (("strain", "values"), ("load_factor", "load_factor")):
+        rows = np.concatenate([getattr(trial, field) for trial in campaign.trials])[order]
+        np.testing.assert_array_equal(rows, tree["observed"][name].values)
+    assert all(np.all(trial.health_deviation >= 0.25) for trial in campaign.trials)
+    draws = np.asarray(tree["calibration"]["draw_value"].values)
+    assert campaign.parameters["young_modulus_factor"][0] == pytest.approx(draws.mean())
+
+
+@pytest.mark.xdist_group("wing")
+def test_the_truth_is_not_read(run: Path, tmp_path: Path) -> None:
+    bare = tmp_path / "bare"
+    shutil.copytree(run, bare)
+    tree = tree_of(run)
+    del tree["truth"]
+    (bare / "run.nc").unlink()
+    tree.to_netcdf(bare / "run.nc", engine="h5netcdf")
+    for one, other in zip(run_campaign(run).trials, run_campaign(bare).trials, strict=True):
+        np.testing.assert_array_equal(one.values, other.values)
+        np.testing.assert_array_equal(one.health, other.health)
+
+
+@pytest.mark.xdist_group("wing")
+def test_the_model_of_the_run_gives_the_strains_that_the_fmu_had(run: Path) -> None:
+    tree, model = tree_of(run), run_model(run)
+    trial = run_campaign(run, RunPlan(held_out_share=0.0)).trials[0]
+    values = [1.0073 if item.name == "young_modulus_factor" else item.mean for item in model.parameters]
+    outputs = tuple((f"strain[{number}]", Quantity.STRAIN) for number in range(1, 25))
+    conditions = Conditions(np.array(values), health=np.asarray(tree["truth"]["state"].values))
+    response = model.respond(trial, outputs, ModelPatch(), conditions).values.copy()
+    response[:, 16] += DRIFT.amplitude * trial.time / DRIFT.time
+    truth = np.asarray(tree["truth"]["strain"].values)
+    np.testing.assert_allclose(response, truth, atol=2e-4 * np.abs(truth).max())
+
+
+@pytest.mark.xdist_group("wing")
+def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path: Path) -> None:
+    known = (
+        SensorGain("strain[3]", -0.3), SensorRotation("strain[9]", 0.4),
+        SensorDrift("strain[17]", 4e-4, 1.0, exponent=0.0), SensorGain("*", 0.05, "strain"),
+    )  # fmt: skip
+    folder = tmp_path / "known"
+    fly_mission(folder, 7, known, known, turns=4)
+    tree, model = tree_of(folder), run_model(folder)
+    campaign = run_campaign(folder, RunPlan(held_out_share=0.0))
+    values = [1.0073 if item.name == "young_modulus_factor" else item.mean for item in model.parameters]
+    conditions = Conditions(np.array(values), health=np.asarray(tree["truth"]["state"].values))
+    truth = np.asarray(tree["truth"]["strain"].values)  # of the FMU, which has the effects too
+    shown = observe(model, campaign, campaign.trials[0], ModelPatch(), conditions).values
+    np.testing.assert_allclose(shown, truth, atol=2e-4 * np.abs(truth).max())
+    # those of a question come after them: a gauge that was turned back reads as the others do
+    back = ModelPatch((SensorRotation("g9", -0.4),))
+    again = observe(MemoModel(model), campaign, campaign.trials[0], back, conditions).values
+    outputs = tuple((f"strain[{number}]", Quantity.STRAIN) for number in range(1, 25))
+    plain = model.respond(campaign.trials[0], outputs, ModelPatch(), conditions).values
+    np.testing.assert_allclose(again[:, 8], 1.05 * plain[:, 8], rtol=1e-12)
+    np.testing.assert_array_equal(np.delete(again, 8, axis=1), np.delete(shown, 8, axis=1))
+    patched = choice_of_run(folder).source_hash
+    (folder / "asset" / "model_patch.json").unlink()
+    assert choice_of_run(folder).source_hash != patched
+
+
+@pytest.mark.xdist_group("wing")
+def test_derivatives_by_uncertain_health_are_in_the_order_of_the_unknowns(run: Path) -> None:
+    campaign, model = run_campaign(run), run_model(run)
+    problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
+    point = problem.start(Candidate())
+    generator = np.random.default_rng(1)
+    local = 0.3 + 0.2 * generator.random(len(point.local[0]))
+    point = Point(point.shared, (local,), point.effect)
+    parts = problem.linearise(0, point, Candidate())
+    for unknown in (0, 1, len(local) // 2, len(local) - 1):
+        moved = local.copy()
+        moved[unknown] += 1e-3
+        change = problem.response(0, point.shared, moved, ModelPatch())[0] - parts.response
+        scale = np.abs(change).max()
+        assert scale > 0.0
+        np.testing.assert_allclose(1e-3 * parts.local[unknown], change, atol=0.05 * scale)
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wing")
+def test_a_drifting_gauge_is_found_in_the_run(run: Path) -> None:
+    found = investigate(run_campaign(run), run_model(run), thorough=False)
+    assert found.verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP)
+    members = {(effect.identifier, effect.place) for effect in found.verdict.effects}
+    assert ("gauge_zero_drift", "g17") in members
+    assert found.proof is not None
+    assert found.proof.held_out_before is not None
+    assert found.proof.held_out_after is not None
+    assert found.proof.held_out_after.chi_square_per_dof < found.proof.held_out_before.chi_square_per_dof
+
+
+@given(st.integers(1, 200), st.integers(1, 12), st.floats(0.0, 0.9))
+def test_whole_blocks_are_held_out_and_never_the_first(count: int, block: int, share: float) -> None:
+    held = held_out_turns(count, block, share)
+    assert held.shape == (count,)
+    assert not held[:block].any()
+    blocks = held[: count // block * block].reshape(-1, block)
+    assert np.all(blocks.all(axis=1) == blocks.any(axis=1))
+    assert not held[len(blocks) * block :].any()
+    assert held.sum() <= share * count + block
+
+
+@pytest.mark.xdist_group("wing")
+def test_what_is_no_run_of_a_wing_is_refused_in_one_sentence(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(CampaignFileError, match="no run folder"):
+        run_campaign(tmp_path)
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    config = json.loads((copy / "config.json").read_text(encoding="utf-8"))
+    for path, value, error, words in (
+        (("observation", "role"), "flow", CampaignFileError, "another asset"),
+        (("asset", "load"), {"tip_force": 5.0}, CampaignDataError, "5 N at the tip"),
+    ):
+        changed = json.loads(json.dumps(config))
+        changed["scenario"][path[0]][path[1]] = value
+        (copy / "config.json").write_text(json.dumps(changed), encoding="utf-8")
+        with pytest.raises(error, match=words):
+            run_campaign(copy)
+    (copy / "config.json").write_text(json.dumps(config), encoding="utf-8")
+    tree = tree_of(run)
+    tree["smoothed"] = tree["smoothed"].to_dataset().drop_vars("mean")
+    (copy / "run.nc").unlink()
+    tree.to_netcdf(copy / "run.nc", engine="h5netcdf")
+    with pytest.raises(CampaignFileError, match=r"does not have the layout of a run.*mean.*fly the run"):
+        run_campaign(copy)
+    (copy / "run.nc").write_bytes((run / "run.nc").read_bytes()[:5000])
+    with pytest.raises(CampaignFileError, match="not a whole run"):
+        run_campaign(copy)
+    (copy / "asset" / "design.toml").unlink()
+    with pytest.raises(CampaignFileError, match="no design"):
+        run_model(copy)

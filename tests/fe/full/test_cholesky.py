@@ -1,0 +1,189 @@
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+from threadpoolctl import threadpool_limits
+
+from fe.full import cholesky
+from fe.full.cholesky import Cholesky, analyse
+from fe.full.dissection import separator_tree
+from fe.full.statics import Factorisation
+from fe.runtime.errors import SolutionError
+
+
+def grid(*counts: int) -> sparse.csr_array:
+    """Laplacian of a grid, one added on the diagonal."""
+    total = sparse.csr_array((1, 1))
+    for count in counts:
+        path = sparse.diags_array(
+            [-np.ones(count - 1), np.full(count, 2.0), -np.ones(count - 1)], offsets=[-1, 0, 1]
+        )
+        total = sparse.kronsum(path, total, format="csr")
+    return sparse.csr_array(total + sparse.eye_array(total.shape[0]))
+
+
+def random_matrix(seed: int, size: int, share: float, copies: int = 1) -> sparse.csr_array:
+    """Diagonally dominant matrix of a random, perhaps disconnected graph, each vertex `copies` unknowns."""
+    random = np.random.default_rng(seed)
+    half = sparse.random_array((size, size), density=share, rng=random)
+    block = random.standard_normal((copies, copies))
+    matrix = sparse.kron(half + half.T + sparse.eye_array(size), block + block.T + 10.0 * np.eye(copies))
+    return sparse.csr_array(matrix + sparse.diags_array(np.asarray(abs(matrix).sum(axis=1)) + 1e-3))
+
+
+def ancestors(parent: np.ndarray, number: int) -> set[int]:
+    found = {number}
+    while parent[number] >= 0:
+        number = int(parent[number])
+        found.add(number)
+    return found
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 999), size=st.integers(2, 120), share=st.floats(0.0, 0.1), leaf=st.integers(1, 30))
+def test_no_edge_joins_two_halves(seed, size, share, leaf):
+    graph = random_matrix(seed, size, share)
+    tree = separator_tree(graph, np.ones(size), leaf)
+    assert np.all(tree.parent < np.arange(len(tree.parent)))
+    above = [ancestors(tree.parent, number) for number in range(len(tree.parent))]
+    edges = graph.tocoo()
+    for one, other in zip(tree.place[edges.row], tree.place[edges.col], strict=True):
+        assert one in above[other] or other in above[one]
+    order = tree.postorder()
+    assert sorted(order) == list(range(len(tree.parent)))
+    position = np.argsort(order)
+    assert all(position[n] < position[p] for n, p in enumerate(tree.parent) if p >= 0)
+
+
+def test_a_slender_body_is_cut_across():
+    # 60 x 6 x 4 vertices: the first separators are sections of 24.
+    tree = separator_tree(grid(60, 6, 4), np.ones(1440), 100)
+    held = np.bincount(tree.place)
+    assert held[0] <= 30
+    assert np.bincount(tree.place)[1:3].max() <= 30
+    assert held.sum() == 1440
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 999), size=st.integers(1, 60), share=st.floats(0.0, 0.2), copies=st.integers(1, 3))
+def test_fronts_hold_the_fill_of_the_elimination(seed, size, share, copies):
+    matrix = random_matrix(seed, size, share, copies)
+    before = cholesky.LEAF_UNKNOWNS
+    cholesky.LEAF_UNKNOWNS = 12
+    try:
+        found = analyse(matrix)
+    finally:
+        cholesky.LEAF_UNKNOWNS = before
+    n = matrix.shape[0]
+    assert sorted(found.order) == list(range(n))
+    assert [front.start for front in found.fronts] == [0, *(front.end for front in found.fronts[:-1])]
+    # Oracle: eliminate one unknown after the other on sets.
+    pattern = (matrix[found.order][:, found.order] != 0).toarray()
+    fill = [set(np.flatnonzero(row[: k + 1 + n])) for k, row in enumerate(pattern)]
+    owner = np.repeat(range(len(found.fronts)), [front.end - front.start for front in found.fronts])
+    for k in range(n):
+        later = {j for j in fill[k] if j > k}
+        front = found.fronts[owner[k]]
+        assert later <= set(range(k + 1, front.end)) | set(front.boundary)
+        for i, j in itertools.permutations(later, 2):
+            fill[i].add(j)
+    for front in found.fronts:
+        rest = set(front.boundary)
+        if rest:
+            above = found.fronts[front.parent]
+            assert above.start <= min(rest) < above.end
+            assert rest <= set(range(above.start, above.end)) | set(above.boundary)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 999),
+    size=st.integers(1, 400),
+    share=st.floats(0.0, 0.03),
+    copies=st.integers(1, 3),
+    columns=st.integers(0, 4),
+)
+def test_solutions_are_those_of_a_general_solver(seed, size, share, copies, columns):
+    matrix = random_matrix(seed, size, share, copies)
+    shape = (matrix.shape[0], columns) if columns else (matrix.shape[0],)
+    right = np.random.default_rng(seed).standard_normal(shape)
+    given_side = right.copy()
+    found = Cholesky(matrix).solve(right)
+    assert np.array_equal(right, given_side)
+    assert found.shape == shape
+    expected = spsolve(matrix.tocsc(), right).reshape(shape)
+    assert found == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
+
+
+def test_a_body_of_many_fronts():
+    matrix = grid(40, 12, 9)
+    right = np.random.default_rng(5).standard_normal((matrix.shape[0], 3))
+    found = Cholesky(matrix).solve(right)
+    assert found == pytest.approx(spsolve(matrix.tocsc(), right), rel=1e-11, abs=1e-11)
+    single = Cholesky(matrix).solve(right[:, 0])
+    assert single == pytest.approx(found[:, 0], rel=1e-12, abs=1e-12)
+
+
+def test_the_wing_is_solved_as_by_a_general_solver(coarse_operators):
+    stiffness = coarse_operators.stiffness(1.0, (0.3, 0.7))
+    load = coarse_operators.load(3.0, 5.0)
+    factors = Factorisation(stiffness)
+    found, expected = factors.solve(load), spsolve(stiffness.tocsc(), load)
+    assert factors.backward_error(factors.raw_solve(load), load) < 2e-15
+    # The condition number is about 1e10.
+    assert np.abs(found - expected).max() < 1e-5 * np.abs(expected).max()
+
+
+def test_factors_are_the_same_bytes_whatever_the_number_of_threads(coarse_operators):
+    stiffness, load = coarse_operators.stiffness(), coarse_operators.load_lift
+    found = []
+    for threads in (1, 2, 2):
+        with threadpool_limits(threads):
+            factors = Cholesky(stiffness)
+            found.append((factors.solve(load).tobytes(), factors.solve(np.eye(len(load), 3)).tobytes()))
+    assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.parametrize("spoilt", [0.0, -1.0, float("nan")])
+def test_what_is_not_positive_definite_is_refused(spoilt):
+    matrix = grid(20, 5).tolil()
+    matrix[33, 33] = spoilt
+    with pytest.raises(SolutionError, match="diagonal entry that is not positive"):
+        Cholesky(sparse.csr_array(matrix.tocsr()))
+
+
+def test_an_indefinite_matrix_names_an_unknown():
+    matrix = grid(20, 5) - 1.5 * sparse.eye_array(100)
+    assert np.linalg.eigvalsh(matrix.toarray())[0] < 0.0 < matrix.diagonal().min()
+    with pytest.raises(SolutionError, match=r"unknown \d+ is left without a positive pivot"):
+        Cholesky(sparse.csr_array(matrix))
+
+
+def test_a_structure_that_is_not_held_is_refused():
+    matrix = grid(12, 4)
+    free = matrix - sparse.diags_array(np.asarray(matrix.sum(axis=1)))  # a constant calls forth no force
+    right = np.arange(48.0)
+    with pytest.raises(SolutionError, match=r"nearly singular|not held"):
+        Factorisation(sparse.csr_array(free)).solve(right)
+
+
+def test_a_pattern_met_before_is_not_analysed_again(monkeypatch):
+    calls = []
+    monkeypatch.setattr(cholesky, "analyse", lambda matrix: calls.append(1) or analyse(matrix))
+    first = grid(9, 7, 3)
+    second = first.copy()
+    second.data = second.data * np.where(second.data < 0.0, 0.5, 2.0)
+    third = grid(7, 9, 3)
+    right = np.arange(189.0)
+    for matrix in (first, second, third, first):
+        assert matrix @ Cholesky(matrix).solve(right) == pytest.approx(right, abs=1e-10)
+    assert len(calls) == 2
+    second.indices[:] = third.indices  # what is kept does not follow a matrix that is changed in place
+    second.indptr[:] = third.indptr
+    second.data[:] = third.data
+    assert second @ Cholesky(second).solve(right) == pytest.approx(right, abs=1e-10)
+    assert len(calls) == 2

@@ -1,0 +1,109 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy import sparse
+
+from fe.full.statics import Factorisation, solve_static, tip_stiffness
+from fe.runtime.errors import SolutionError
+
+LIBRARY = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_digital_twin" / "UAVconfig.json"
+LIBRARY_FACTOR = 1.0073  # the published library's mean strains belong to this e
+
+
+@pytest.fixture(scope="module")
+def library():
+    if not LIBRARY.exists():
+        pytest.skip(f"the published strain library {LIBRARY.name} is not beside the project")
+    observations = json.loads(LIBRARY.read_text())["observations"]
+
+    def strain(z1, z2):
+        return np.array(observations[str(z1)][str(z2)]["3g"]["mean"]) * 1e-6
+
+    return strain
+
+
+@pytest.fixture(scope="module")
+def shipped_strain(shipped_operators):
+    cases = [(0, 0), (40, 0), (80, 0), (0, 80)]
+    return {
+        (z1, z2): solve_static(
+            shipped_operators, LIBRARY_FACTOR, (z1 / 100, z2 / 100), load_factor=3.0
+        ).strain
+        for z1, z2 in cases
+    }
+
+
+def test_a_factorisation_solves_and_refuses_the_singular():
+    random = np.random.default_rng(2).standard_normal((30, 30))
+    matrix = sparse.csr_array(random @ random.T + 30.0 * np.eye(30))
+    right = np.arange(30.0)
+    assert matrix @ Factorisation(matrix).solve(right) == pytest.approx(right, abs=1e-10)
+    assert Factorisation(matrix).solve(np.zeros(30)) == pytest.approx(0.0)
+    with pytest.raises(SolutionError, match="cannot be factorised"):
+        Factorisation(sparse.csr_array(np.diag([1.0, 0.0, 2.0])))
+    hardly_held = random[:, :10] @ random[:, :10].T + 1e-14 * np.eye(30)
+    with pytest.raises(SolutionError, match=r"nearly singular|not positive definite"):
+        Factorisation(sparse.csr_array(hardly_held)).solve(right)
+
+
+@settings(max_examples=3, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(load_factor=st.floats(-3.0, 4.0), tip_force=st.floats(-20.0, 20.0))
+def test_the_response_is_linear_in_the_loads(coarse_operators, load_factor, tip_force):
+    turn = solve_static(coarse_operators, load_factor=1.0).strain
+    tip = solve_static(coarse_operators, load_factor=0.0, tip_force=1.0).strain
+    both = solve_static(coarse_operators, load_factor=load_factor, tip_force=tip_force).strain
+    assert both == pytest.approx(load_factor * turn + tip_force * tip, rel=1e-5, abs=1e-9)
+
+
+@settings(max_examples=3, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(factor=st.floats(0.9, 1.09), z1=st.floats(0.0, 0.7), z2=st.floats(0.0, 0.7))
+def test_the_wing_stiffens_with_e_and_softens_with_damage(coarse_operators, factor, z1, z2):
+    base = tip_stiffness(coarse_operators, factor, (z1, z2))
+    assert tip_stiffness(coarse_operators, factor + 0.01, (z1, z2)) > base
+    assert tip_stiffness(coarse_operators, factor, (z1 + 0.05, z2)) < base
+    assert tip_stiffness(coarse_operators, factor, (z1, z2 + 0.05)) < base
+
+
+def test_positive_lift_compresses_every_gauge_and_lifts_the_tip(coarse_operators):
+    solution = solve_static(coarse_operators, load_factor=3.0)
+    assert np.all(solution.strain > 0.0)
+    assert solution.tip_displacement > solution.load_point_displacement > 0.0
+
+
+def test_the_static_test_is_reciprocal(coarse_operators):
+    turn = solve_static(coarse_operators, load_factor=1.0)
+    tip = solve_static(coarse_operators, load_factor=0.0, tip_force=1.0)
+    assert turn.load_point_displacement == pytest.approx(
+        float(coarse_operators.load_lift @ tip.displacement), rel=1e-5
+    )
+
+
+def test_tip_stiffness_is_the_published_one(shipped_operators):
+    # Kapteyn et al. 2021, eq. (14): k(e) = 0.5752 e + 0.1018 N/mm.
+    for factor in (0.98, 1.02):
+        assert tip_stiffness(shipped_operators, factor) == pytest.approx(575.2 * factor + 101.8, rel=0.001)
+
+
+def test_healthy_strains_at_3g_are_those_of_the_library(shipped_strain, library):
+    ratio = shipped_strain[0, 0] / library(0, 0)
+    assert np.abs(ratio - 1.0).max() < 0.055
+    assert np.sqrt(np.mean((ratio - 1.0) ** 2)) < 0.03
+
+
+@pytest.mark.parametrize("state", [(40, 0), (80, 0), (0, 80)])
+def test_damage_raises_each_strain_as_in_the_library(shipped_strain, library, state):
+    ours = shipped_strain[state] / shipped_strain[0, 0]
+    theirs = library(*state) / library(0, 0)
+    assert np.sqrt(np.mean((ours - theirs) ** 2)) < 0.016
+    assert np.abs(ours - theirs).max() < 0.040
+
+
+@pytest.mark.parametrize("z1", [0, 40, 80])
+def test_the_gauge_that_limits_the_flight_is_that_of_the_library(shipped_strain, library, z1):
+    ours, theirs = shipped_strain[z1, 0], library(z1, 0)
+    assert ours.argmax() == theirs.argmax() == 16
+    assert ours.max() == pytest.approx(theirs.max(), rel=0.011)

@@ -1,0 +1,229 @@
+import logging
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+import fe.reduction.model_cache
+from fe.full.operators import AffineOperators
+from fe.reduction.built_once import cache_folder
+from fe.reduction.fields import WingFields, field_basis
+from fe.reduction.model_cache import MODELLING_ROOMS, cache_key, reduced_model, wing_fields
+from fe.reduction.reduced_basis import Reduction
+from fe.reduction.settings import ReductionSettings
+from fe.runtime.errors import ReducedModelFileError
+from fe.wing.design import WingDesign
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "uav-twin"
+
+
+@pytest.fixture(scope="module")
+def coarse_wing(coarse_operators: AffineOperators, coarse_reduction: Reduction) -> WingFields:
+    with threadpool_limits(1):
+        return WingFields(coarse_reduction.model, field_basis(coarse_operators, coarse_reduction))
+
+
+@pytest.fixture
+def builds(monkeypatch: pytest.MonkeyPatch, coarse_wing: WingFields) -> list[str]:
+    """Names of the designs that were built; the build itself is replaced by a finished one."""
+    built: list[str] = []
+
+    def build(design: WingDesign, *_: object) -> WingFields:
+        built.append(design.name)
+        time.sleep(0.05)
+        return WingFields(
+            replace(coarse_wing.model, design_hash=design.hash),
+            replace(coarse_wing.basis, design_hash=design.hash),
+        )
+
+    monkeypatch.setattr(fe.reduction.model_cache, "build", build)
+    return built
+
+
+def test_cache_lies_where_the_user_says(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cache_folder() == own_cache
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert cache_folder() == Path.home() / ".cache" / "uav-twin"
+
+
+def test_unchanged_design_is_built_once(builds: list[str], coarse_design: WingDesign) -> None:
+    first = reduced_model(coarse_design)
+    again = reduced_model(coarse_design.changed())
+    assert builds == [coarse_design.name]
+    assert first.to_bytes() == again.to_bytes()
+    wing = wing_fields(coarse_design)
+    assert builds == [coarse_design.name]
+    assert wing.model.to_bytes() == first.to_bytes()
+    assert wing.basis.static_displacement.shape[-1] == first.static_stiffness.shape[-1]
+
+
+def test_shipped_design_is_the_default(builds: list[str], shipped_design: WingDesign) -> None:
+    assert reduced_model().design_hash == shipped_design.hash
+
+
+def test_changed_design_is_built_anew(builds: list[str], coarse_design: WingDesign) -> None:
+    reduced_model(coarse_design)
+    changed = coarse_design.changed(skin={"thickness": 0.0007})
+    assert reduced_model(changed).design_hash == changed.hash != coarse_design.hash
+    reduced_model(coarse_design)
+    reduced_model(changed)
+    assert len(builds) == 2
+
+
+def test_changed_settings_or_code_are_built_anew(
+    builds: list[str], coarse_design: WingDesign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reduced_model(coarse_design)
+    reduced_model(coarse_design, settings=ReductionSettings(bound_tolerance=1e-3))
+    assert len(builds) == 2
+    monkeypatch.setattr(fe.reduction.model_cache, "modelling_hash", lambda: "another")
+    reduced_model(coarse_design)
+    assert len(builds) == 3
+
+
+@pytest.mark.parametrize("victim", ["model", "fields"])
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty"])
+def test_damaged_entry_is_built_anew(
+    builds: list[str],
+    coarse_design: WingDesign,
+    own_cache: Path,
+    caplog: pytest.LogCaptureFixture,
+    victim: str,
+    damage: str,
+) -> None:
+    good = reduced_model(coarse_design)
+    key = cache_key(coarse_design)
+    path = own_cache / (f"wing-{key}.npz" if victim == "model" else f"wing-{key}-fields.npz")
+    content = bytearray(path.read_bytes())
+    if damage == "flipped":
+        content[len(content) // 3] ^= 0x55
+    path.write_bytes({"cut": content[: len(content) // 2], "flipped": content, "empty": b""}[damage])
+    with caplog.at_level(logging.WARNING):
+        assert wing_fields(coarse_design).model.to_bytes() == good.to_bytes()
+    assert "built anew" in caplog.text
+    assert len(builds) == 2
+    wing_fields(coarse_design)
+    assert len(builds) == 2
+
+
+def test_entry_of_another_design_is_not_taken(
+    builds: list[str], coarse_design: WingDesign, own_cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    reduced_model(coarse_design)
+    other = coarse_design.changed(name="another wing")
+    (own_cache / f"wing-{cache_key(coarse_design)}.npz").rename(own_cache / f"wing-{cache_key(other)}.npz")
+    assert reduced_model(other).design_hash == other.hash
+    assert "another design" in caplog.text
+
+
+def test_missing_fields_are_built_anew(builds: list[str], coarse_design: WingDesign, own_cache: Path) -> None:
+    reduced_model(coarse_design)
+    (own_cache / f"wing-{cache_key(coarse_design)}-fields.npz").unlink()
+    wing_fields(coarse_design)
+    assert len(builds) == 2
+
+
+def test_many_at_once_build_once_and_agree(builds: list[str], coarse_design: WingDesign) -> None:
+    results: list[bytes] = []
+    threads = [
+        threading.Thread(target=lambda: results.append(reduced_model(coarse_design).to_bytes()))
+        for _ in range(6)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(results) == 6
+    assert len(set(results)) == 1
+    assert len(builds) == 1
+
+
+def test_failed_build_keeps_nothing_and_the_next_succeeds(
+    coarse_design: WingDesign, own_cache: Path, builds: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    working: Callable[..., WingFields] = fe.reduction.model_cache.build
+
+    def failing(*_: object) -> WingFields:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fe.reduction.model_cache, "build", failing)
+    with pytest.raises(KeyboardInterrupt):
+        reduced_model(coarse_design)
+    assert [path.suffix for path in own_cache.iterdir()] == [".lock"]
+    monkeypatch.setattr(fe.reduction.model_cache, "build", working)
+    reduced_model(coarse_design)
+    assert len(builds) == 1
+
+
+def test_without_a_place_to_keep_it_the_model_is_still_given(
+    builds: list[str],
+    coarse_design: WingDesign,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    (tmp_path / "a file").write_text("not a folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "a file"))
+    model = reduced_model(coarse_design)
+    assert model.design_hash == coarse_design.hash
+    assert "could not be kept" in caplog.text
+
+
+def test_model_and_fields_must_belong_together(coarse_wing: WingFields) -> None:
+    with pytest.raises(ReducedModelFileError, match="does not belong"):
+        WingFields(replace(coarse_wing.model, design_hash="another"), coarse_wing.basis)
+    cut = replace(
+        coarse_wing.basis,
+        static_displacement=coarse_wing.basis.static_displacement[..., :-1],
+        static_strain=coarse_wing.basis.static_strain[..., :-1],
+    )
+    with pytest.raises(ReducedModelFileError, match="does not belong"):
+        WingFields(coarse_wing.model, cut)
+
+
+def test_every_file_that_shapes_the_model_counts_for_the_key() -> None:
+    code = (
+        "import sys, fe.reduction.patch_basis; "
+        "print(*(name for name in sys.modules if name.startswith('fe.')))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    rooms = {name.split(".")[1] for name in result.stdout.split()}
+    assert rooms - {"designs"} == set(MODELLING_ROOMS)
+
+
+@pytest.mark.slow
+def test_a_build_does_not_depend_on_the_number_of_threads(
+    coarse_design: WingDesign, coarse_wing: WingFields
+) -> None:
+    with threadpool_limits(2):
+        wing = fe.reduction.model_cache.build(coarse_design)
+    assert wing.model.to_bytes() == coarse_wing.model.to_bytes()
+    assert wing.basis.to_bytes() == coarse_wing.basis.to_bytes()
+
+
+@pytest.mark.slow
+def test_real_build_of_a_coarse_wing_is_reproducible(
+    coarse_design: WingDesign, coarse_wing: WingFields, own_cache: Path
+) -> None:
+    wing = wing_fields(coarse_design)
+    assert wing.model.to_bytes() == coarse_wing.model.to_bytes()
+    assert len(list(own_cache.glob("*.npz"))) == 2
+    np.testing.assert_array_equal(
+        reduced_model(coarse_design).static_response(1.0, (0.1, 0.2), 3.0).strain,
+        wing.model.static_response(1.0, (0.1, 0.2), 3.0).strain,
+    )

@@ -1,0 +1,303 @@
+"""The offline reduction on a small affine system, against pyMOR's own reductor and direct solutions."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from pymor.algorithms.projection import project
+from pymor.models.basic import StationaryModel
+from pymor.operators.constructions import LincombOperator, VectorOperator
+from pymor.operators.numpy import NumpyMatrixOperator
+from pymor.parameters.functionals import MinThetaParameterFunctional, ProjectionParameterFunctional
+from pymor.reductors.coercive import CoerciveRBReductor
+from scipy import sparse
+
+from fe.full.operators import AffineOperators
+from fe.full.subspace import Norm, OrthonormalBasis, affine_sum, conjugate_gradients, triangular_factors
+from fe.reduction.compression import compressed, relative_bound
+from fe.reduction.modal_basis import ModalSettings
+from fe.reduction.reduced_basis import Reduction, reduce_model
+from fe.reduction.settings import ReductionSettings, loss_splits, remaining_levels, training_set
+from fe.runtime.errors import ReductionError, SolutionError
+from fe.runtime.reduced import ReducedModel
+
+
+@dataclass(frozen=True)
+class SmallSystem:
+    """An elastic chain: springs of four kinds in a row, held at one end, masses along it."""
+
+    stiffness_terms: tuple[sparse.csr_array, ...]
+    mass_terms: tuple[sparse.csr_array, ...]
+    load_lift: NDArray[np.float64]
+    load_tip: NDArray[np.float64]
+    gauge_output: sparse.csr_array
+    tip_displacement_output: NDArray[np.float64]
+    design_hash: str = "a chain"
+
+
+def chain(count: int = 60, seed: int = 0) -> SmallSystem:
+    random = np.random.default_rng(seed)
+    stretch = sparse.csr_array(np.eye(count) - np.eye(count, k=-1))
+    kind = np.zeros((4, count))
+    kind[0, ::2] = 1.0
+    kind[1, count // 10 : count // 3 : 2] = 1.0
+    kind[2, count // 2 : 4 * count // 5] = 1.0
+    kind[0] *= 1 - np.maximum(kind[1], kind[2])
+    kind[3] = 0.2 + random.uniform(0, 0.2, count)
+    terms = tuple((stretch.T @ sparse.diags_array(1e3 * row) @ stretch).tocsr() for row in kind)
+    masses = np.zeros((3, count))
+    masses[0] = 0.01
+    masses[1, [count // 2, 3 * count // 4]] = 1.0
+    masses[2, -1] = 1.0
+    tip = np.zeros(count)
+    tip[-1] = 1.0
+    # each gauge is a mean over a piece of the chain, so that no spring decides alone
+    gauges = np.array(
+        [(np.eye(count)[k + 8] - np.eye(count)[k]) / 8 for k in np.linspace(0, count - 9, 24).astype(int)]
+    )
+    return SmallSystem(
+        stiffness_terms=terms,
+        mass_terms=tuple(sparse.diags_array(row).tocsr() for row in masses),
+        load_lift=random.uniform(0.5, 1.5, count),
+        load_tip=tip,
+        gauge_output=sparse.csr_array(gauges),
+        tip_displacement_output=tip,
+    )
+
+
+SYSTEM = chain()
+SMALL_MODES = ModalSettings(mode_count=4, frequency_tolerance=1e-5)
+SETTINGS = ReductionSettings(modal=SMALL_MODES)
+
+
+@pytest.fixture(scope="module")
+def reduction() -> Reduction:
+    return reduce_model(SYSTEM, SETTINGS)
+
+
+@pytest.fixture(scope="module", params=[(1, 1), (3, 2)])
+def rough(request: pytest.FixtureRequest) -> ReducedModel:
+    """Models so small that their errors are far above rounding."""
+    model = reduce_model(SYSTEM, replace(SETTINGS, dual_anchors=request.param)).model
+    return compressed(model, np.eye(len(model.static_load.T))[:, :4])
+
+
+def full_outputs(e: float, z1: float, z2: float, load: tuple[float, float]) -> NDArray[np.float64]:
+    matrix = affine_sum((e, 1 - z1, 1 - z2, 1.0), SYSTEM.stiffness_terms).toarray()
+    solution = np.linalg.solve(matrix, load[0] * SYSTEM.load_lift + load[1] * SYSTEM.load_tip)
+    return np.append(SYSTEM.gauge_output @ solution, SYSTEM.tip_displacement_output @ solution)
+
+
+parameters = st.tuples(
+    st.sampled_from((0.9, 1.1)) | st.floats(0.9, 1.1),
+    st.sampled_from((0.0, 0.8)) | st.floats(0.0, 0.8),
+    st.sampled_from((0.0, 0.8)) | st.floats(0.0, 0.8),
+)
+
+
+def not_tiny(value: float) -> float:
+    """Loads so small that their squares underflow are no loads."""
+    return value if abs(value) > 1e-9 else 0.0
+
+
+loads = st.tuples(st.floats(-4.0, 6.0).map(not_tiny), st.floats(-100.0, 100.0).map(not_tiny))
+
+
+@settings(max_examples=200)
+@given(state=parameters, load=loads)
+def test_bound_holds_where_the_error_is_large(
+    rough: ReducedModel, state: tuple[float, float, float], load: tuple[float, float]
+) -> None:
+    e, z1, z2 = state
+    reduced = rough.static_response(e, (z1, z2), *load)
+    full = full_outputs(e, z1, z2, load)
+    assert np.abs(reduced.strain - full[:-1]).max() <= reduced.strain_error_bound
+    assert abs(reduced.tip_displacement - full[-1]) <= reduced.tip_displacement_error_bound
+
+
+def test_bound_is_not_wildly_pessimistic(rough: ReducedModel) -> None:
+    ratios = []
+    for state in training_set(SETTINGS)[::5]:
+        reduced = rough.static_response(state[0], state[1:], 1.0, 0.0)
+        error = np.abs(reduced.strain - full_outputs(*state, (1.0, 0.0))[:-1]).max()
+        ratios.append(reduced.strain_error_bound / error)
+    assert min(ratios) >= 1.0
+    assert np.median(ratios) < 30.0
+
+
+@settings(max_examples=100)
+@given(state=parameters)
+def test_asked_accuracy_is_reached(reduction: Reduction, state: tuple[float, float, float]) -> None:
+    e, z1, z2 = state
+    for load in ((1.0, 0.0), (0.0, 1.0)):
+        reduced = reduction.model.static_response(e, (z1, z2), *load)
+        full = full_outputs(e, z1, z2, load)
+        error = np.abs(reduced.strain - full[:-1]).max()
+        largest = np.abs(full[:-1]).max()
+        assert error <= reduced.strain_error_bound <= 2 * SETTINGS.bound_tolerance * largest
+
+
+def test_pymor_reduces_and_bounds_alike(reduction: Reduction) -> None:
+    """On the same basis pyMOR's coercive reductor must give the same solution and the same energy bound."""
+    model, basis = reduction.model, reduction.static_basis
+    coefficients = [ProjectionParameterFunctional("theta", 4, k) for k in range(4)]
+    operators = [NumpyMatrixOperator(term) for term in SYSTEM.stiffness_terms]
+    reference = {"theta": np.append(model.bound_reference, 1.0)}
+    product = NumpyMatrixOperator(affine_sum(reference["theta"], SYSTEM.stiffness_terms))
+    full = StationaryModel(
+        LincombOperator(operators, coefficients),
+        VectorOperator(operators[0].range.from_numpy(SYSTEM.load_lift[:, np.newaxis])),
+    )
+    reductor = CoerciveRBReductor(
+        full,
+        RB=full.solution_space.from_numpy(np.ascontiguousarray(basis)),
+        product=product,
+        coercivity_estimator=MinThetaParameterFunctional(coefficients, reference),
+    )
+    reduced = reductor.reduce()
+    for e, z1, z2 in training_set(SETTINGS)[::17]:
+        theta = np.array((e, 1 - z1, 1 - z2, 1.0))
+        mu = reduced.parameters.parse({"theta": theta})
+        ours = model.static_response(e, (z1, z2), 1.0)
+        np.testing.assert_allclose(reduced.solve(mu).to_numpy().ravel(), ours.coordinates, rtol=1e-8)
+        residual = model.residual_load[:, 0] - np.einsum(
+            "rqj,q,j->r", model.residual_stiffness, theta, ours.coordinates
+        )
+        coercivity = min(*(theta / reference["theta"]))
+        energy_bound = float(reduced.estimate_error(mu).ravel()[0])
+        assert np.linalg.norm(residual) / coercivity == pytest.approx(energy_bound, rel=1e-6)
+
+
+def test_projections_are_those_of_pymor(reduction: Reduction) -> None:
+    space = NumpyMatrixOperator(SYSTEM.stiffness_terms[0]).range
+    basis = space.from_numpy(np.ascontiguousarray(reduction.static_basis))
+    for term, dense in zip(SYSTEM.stiffness_terms, reduction.model.static_stiffness, strict=True):
+        projected = project(NumpyMatrixOperator(term), basis, basis)
+        np.testing.assert_allclose(projected.matrix, dense, atol=1e-12)
+
+
+def test_search_ends_below_the_tolerance_and_starts_high(reduction: Reduction) -> None:
+    assert reduction.bound_history[-1] <= SETTINGS.bound_tolerance < reduction.bound_history[0]
+    assert len(reduction.bound_history) == len(reduction.snapshots)
+    assert len(set(reduction.snapshots)) == len(reduction.snapshots)
+    worst = max(relative_bound(reduction.model, state) for state in training_set(SETTINGS))
+    assert worst <= SETTINGS.bound_tolerance
+
+
+def test_same_system_gives_the_same_bytes(reduction: Reduction) -> None:
+    assert reduce_model(chain(), SETTINGS).model.to_bytes() == reduction.model.to_bytes()
+
+
+def test_frequencies_of_the_chain_are_kept(reduction: Reduction) -> None:
+    model = reduction.model
+    for e, z1, z2, servo, pitot in (
+        (0.9, 0.8, 0.0, 0.05, 0.3),
+        (1.1, 0.2, 0.5, 0.3, 0.0),
+        (1.0, 0, 0, 0.2, 0.1),
+    ):
+        stiffness = affine_sum((e, 1 - z1, 1 - z2, 1.0), SYSTEM.stiffness_terms).toarray()
+        mass = affine_sum((1.0, servo, pitot), SYSTEM.mass_terms).toarray()
+        square = np.sort(np.linalg.eigvals(np.linalg.solve(mass, stiffness)).real)[: model.mode_count]
+        np.testing.assert_allclose(
+            model.modes(e, (z1, z2), servo, pitot).frequency, np.sqrt(square) / (2 * np.pi), rtol=1e-4
+        )
+
+
+def test_too_few_snapshots_are_reported() -> None:
+    with pytest.raises(ReductionError, match="After 2 full solutions the strain error bound"):
+        reduce_model(SYSTEM, replace(SETTINGS, most_snapshots=2))
+
+
+def test_too_many_modes_are_reported() -> None:
+    with pytest.raises(ReductionError, match="29 modes cannot be had from 60 unknowns"):
+        reduce_model(SYSTEM, replace(SETTINGS, modal=ModalSettings(mode_count=29)))
+
+
+def test_a_part_that_is_not_held_is_reported() -> None:
+    loose = np.zeros(60)
+    loose[-1] = 1.0
+    cut = tuple((term * np.outer(1 - loose, 1 - loose)).tocsr() for term in SYSTEM.stiffness_terms)
+    with pytest.raises(SolutionError):
+        reduce_model(replace(SYSTEM, stiffness_terms=cut), SETTINGS)
+
+
+def test_progress_is_told() -> None:
+    from contextlib import contextmanager
+
+    told: list[str] = []
+
+    class Listener:
+        @contextmanager
+        def stage(self, description: str, total: int | None = None, unit: str = ""):
+            told.append(description)
+            yield self
+
+        def advance(self, amount: int = 1, detail: str | None = None) -> None:
+            told.append(detail or "")
+
+    reduce_model(SYSTEM, SETTINGS, Listener())
+    assert "Reducing the modes" in told
+    assert "full solution 1" in told
+
+
+def test_conjugate_gradients_solve_and_give_up() -> None:
+    norm = Norm(affine_sum((1, 0.45, 0.45, 1), SYSTEM.stiffness_terms))
+    matrix = affine_sum((0.9, 1.0, 0.2, 1), SYSTEM.stiffness_terms)
+    right = np.stack((SYSTEM.load_lift, SYSTEM.load_tip, np.zeros(60)), axis=1)
+    found = conjugate_gradients(matrix, norm, right, np.zeros_like(right), tolerance=1e-12)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix.toarray(), right), rtol=1e-9, atol=1e-15)
+    with pytest.raises(SolutionError, match="Conjugate gradients reached"):
+        conjugate_gradients(matrix, norm, right, np.zeros_like(right), tolerance=1e-12, most_iterations=2)
+
+
+@pytest.mark.parametrize("functionals", [False, True])
+def test_basis_stays_orthonormal_with_nearly_dependent_vectors(functionals: bool) -> None:
+    norm = Norm(affine_sum((1, 1, 1, 1), SYSTEM.stiffness_terms))
+    random = np.random.default_rng(5)
+    basis = OrthonormalBasis(60, norm, drop=1e-9, functionals=functionals)
+    first = random.normal(size=(60, 5))
+    assert basis.extend(first, norm.product(first)) == 5
+    near = first + 1e-6 * random.normal(size=first.shape)
+    both = np.concatenate((near, first @ random.normal(size=(5, 3)), np.zeros((60, 1))), axis=1)
+    assert basis.extend(both, norm.product(both)) == 5
+    gram = basis.vectors.T @ norm.product(basis.vectors)
+    np.testing.assert_allclose(gram, np.eye(10), atol=1e-9)
+    assert 0.0 < basis.dropped_square < 1e-11
+
+
+def test_triangular_factors_give_dual_norms() -> None:
+    norm = Norm(affine_sum((1, 1, 1, 1), SYSTEM.stiffness_terms))
+    random = np.random.default_rng(6)
+    functionals = random.normal(size=(60, 3, 4))
+    functionals[:, 1, 3] = functionals[:, 1, 0]  # dependent
+    representatives = norm.riesz(functionals.reshape(60, -1)).reshape(functionals.shape)
+    factors = triangular_factors(representatives, functionals)
+    for _ in range(5):
+        c = random.normal(size=4)
+        combined = functionals @ c
+        wanted = np.sqrt(np.einsum("ng,ng->g", combined, norm.riesz(combined)))
+        np.testing.assert_allclose(np.linalg.norm(factors @ c, axis=1), wanted, rtol=1e-10)
+
+
+def test_anchors_part_the_losses_in_equal_ratios() -> None:
+    np.testing.assert_allclose(1 - loss_splits((0.0, 0.8), 2), [np.sqrt(0.2)])
+    np.testing.assert_allclose(remaining_levels((0.0, 0.8), 1), [np.sqrt(0.2)])
+    levels, splits = remaining_levels((0.0, 0.8), 3), 1 - loss_splits((0.0, 0.8), 3)
+    assert np.all(levels[:-1] > splits)
+    assert np.all(splits > levels[1:])
+
+
+def test_bound_of_the_wing_on_its_training_set(
+    coarse_reduction: Reduction, coarse_operators: AffineOperators
+) -> None:
+    standard = ReductionSettings()
+    assert coarse_reduction.model.design_hash == coarse_operators.design_hash
+    bounds = [relative_bound(coarse_reduction.model, state) for state in training_set(standard)]
+    assert max(bounds) <= standard.bound_tolerance
+    assert coarse_reduction.static_basis.shape == (
+        coarse_operators.unknowns,
+        coarse_reduction.model.static_stiffness.shape[1],
+    )

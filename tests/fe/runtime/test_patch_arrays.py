@@ -1,0 +1,98 @@
+"""The arrays of a wing for patches: file, checks, cache."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe.full.patch_operators import strip_edges
+from fe.reduction import patch_cache
+from fe.reduction.patch_basis import PatchSettings, area_shares
+from fe.runtime.errors import ReducedModelFileError
+from fe.runtime.patch_arrays import PatchArrays
+from fe.wing.design import WingDesign
+
+
+def test_a_file_gives_the_arrays_back(coarse_patch_arrays: PatchArrays, tmp_path: Path) -> None:
+    path = tmp_path / "wing.npz"
+    coarse_patch_arrays.save(path)
+    again = PatchArrays.load(path)
+    for item in fields(PatchArrays):
+        one, other = getattr(coarse_patch_arrays, item.name), getattr(again, item.name)
+        assert np.array_equal(one, other), item.name
+    assert again.to_bytes() == coarse_patch_arrays.to_bytes()
+
+
+def test_a_damaged_file_is_refused(coarse_patch_arrays: PatchArrays) -> None:
+    content = coarse_patch_arrays.to_bytes()
+    with pytest.raises(ReducedModelFileError, match="not a sound archive"):
+        PatchArrays.from_bytes(content[: len(content) // 2])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"load_tip": np.full(3, np.nan)}, "array"),
+        ({"flap_spring": 0.0}, "flap_spring"),
+        ({"straight_chord_line": 2.0}, "straight_chord_line"),
+        ({"weight": np.zeros(2)}, "weight"),
+    ],
+)
+def test_wrong_arrays_are_refused(
+    coarse_patch_arrays: PatchArrays, changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ReducedModelFileError, match=message):
+        replace(coarse_patch_arrays, **changes)  # type: ignore[arg-type]
+
+
+def test_strips_that_do_not_fit_are_refused(coarse_patch_arrays: PatchArrays) -> None:
+    wrong = coarse_patch_arrays.strip_of.copy()
+    wrong[0] = 99
+    with pytest.raises(ReducedModelFileError, match="strips"):
+        replace(coarse_patch_arrays, strip_of=wrong)
+    with pytest.raises(ReducedModelFileError, match="must rise"):
+        replace(coarse_patch_arrays, stations=coarse_patch_arrays.stations[::-1].copy())
+
+
+def test_strip_edges_are_mesh_lines_ends_included() -> None:
+    lines = np.array([0.0, 0.003, 0.1, 0.25, 0.5, 0.52, 0.8, 1.0])
+    edges = strip_edges(lines, 4)
+    assert edges.tolist() == [0.0, 0.25, 0.5, 0.8, 1.0]
+    assert strip_edges(lines, 100).tolist() == lines.tolist()
+
+
+def test_area_shares_integrate_a_parabola_on_each_cell() -> None:
+    stations = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
+    weights = area_shares(stations, 2.0, 1.0)
+    # mean of y^2 with chord 2 - y: (2/3 - 1/4) / 1.5
+    assert weights @ stations**2 == pytest.approx((2.0 / 3.0 - 0.25) / 1.5, rel=1e-12)
+
+
+def test_the_cache_builds_once(
+    coarse_design: WingDesign,
+    coarse_patch_arrays: PatchArrays,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    built = []
+
+    def build(design: WingDesign, *_: object) -> PatchArrays:
+        built.append(design.hash)
+        return coarse_patch_arrays
+
+    monkeypatch.setattr(patch_cache, "build_patch_arrays", build)
+    first = patch_cache.patch_arrays(coarse_design)
+    assert patch_cache.patch_arrays(coarse_design).to_bytes() == first.to_bytes()
+    assert built == [coarse_design.hash]
+    other = PatchSettings(vectors=30)
+    assert patch_cache.patch_cache_key(coarse_design) != patch_cache.patch_cache_key(coarse_design, other)
+    (file,) = (tmp_path / "uav-twin").glob("*-patches.npz")
+    file.write_bytes(b"rubbish")
+    patch_cache.patch_arrays(coarse_design)
+    assert len(built) == 2
+    assert "not usable" in caplog.text

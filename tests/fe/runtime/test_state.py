@@ -1,0 +1,67 @@
+import dataclasses
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fe.runtime.errors import FiniteElementError, InvalidStateError
+from fe.runtime.state import STIFFNESS_LOSS_NAMES, DigitalState, Geometry
+
+
+def test_the_default_state_is_the_healthy_wing_as_built():
+    state = DigitalState()
+    assert state.geometry == Geometry(1.828, 0.433, 0.260)
+    assert state.young_modulus_factor == 1.0
+    assert state.stiffness_loss == (0.0, 0.0)
+    assert STIFFNESS_LOSS_NAMES == ("z1", "z2")
+
+
+def test_the_default_damping_gives_the_measured_ratios():
+    state = DigitalState()
+    for frequency, ratio in ((5.6492, 0.0281), (29.9699, 0.0717)):  # Kapteyn et al. 2021, step 3
+        omega = 2.0 * math.pi * frequency
+        assert 0.5 * (state.damping_alpha / omega + state.damping_beta * omega) == pytest.approx(
+            ratio, rel=1e-3
+        )
+
+
+def test_states_are_frozen_and_comparable():
+    assert DigitalState() == DigitalState()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        DigitalState().servo_mass = 1.0  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("changes", "place"),
+    [
+        ({"young_modulus_factor": 0.0}, "young_modulus_factor"),
+        ({"young_modulus_factor": math.nan}, "young_modulus_factor"),
+        ({"servo_mass": -0.1}, "servo_mass"),
+        ({"pitot_mass": math.inf}, "pitot_mass"),
+        ({"damping_beta": -1e-9}, "damping_beta"),
+        ({"stiffness_loss": (0.2, 1.0)}, "z2"),
+        ({"stiffness_loss": (40.0, 0.0)}, "not percent"),
+        ({"stiffness_loss": (math.nan, 0.0)}, "z1"),
+        ({"stiffness_loss": (0.1,)}, "2 fractions"),
+    ],
+)
+def test_impossible_states_are_refused_with_the_place(changes, place):
+    with pytest.raises(InvalidStateError, match=place):
+        DigitalState(**changes)
+
+
+@pytest.mark.parametrize("name", ["semi_span", "root_chord", "tip_chord"])
+def test_impossible_lengths_are_refused(name):
+    with pytest.raises(InvalidStateError, match=f"geometry.{name}"):
+        Geometry(**{name: -1.0})
+
+
+def test_state_errors_are_value_errors_of_the_wing_model():
+    assert issubclass(InvalidStateError, ValueError)
+    assert issubclass(InvalidStateError, FiniteElementError)
+
+
+@given(z1=st.floats(0.0, 1.0, exclude_max=True), z2=st.floats(0.0, 1.0, exclude_max=True))
+def test_every_fraction_below_one_is_a_stiffness_loss(z1, z2):
+    assert DigitalState(stiffness_loss=(z1, z2)).stiffness_loss == (z1, z2)

@@ -1,0 +1,126 @@
+"""What the checks say of sound FMUs and of FMUs with one fault each."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from fmu_asset.check import check_fmu
+from fmu_asset.check.result import FmuCheck
+from fmu_asset.door.binding import parse_binding
+
+MODELS = ["lag1", "room2", "fixed2", "array3", "ball2", "decay1", "swing3", "hostile2"]
+
+
+def verdicts(check: FmuCheck) -> dict[str, str]:
+    return {finding.check: finding.verdict for finding in check.findings}
+
+
+def texts(check: FmuCheck, name: str) -> str:
+    return " ".join(finding.text for finding in check.findings if finding.check == name)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_sound_fmus_of_all_kinds_have_no_problem(foreign_fmu: Any, model: str) -> None:
+    check = check_fmu(foreign_fmu(model), step_size=0.01 if model == "fixed2" else 0.1)
+    assert check.passed, check.problems
+    found = verdicts(check)
+    assert found["determinism"] == "ok"
+    assert found["state"] == ("ok" if model in ("fixed2", "array3", "hostile2") else "warning")
+    # FMI 1.0 model exchange has no reset.
+    assert found["reset"] == ("warning" if model == "decay1" else "ok")
+
+
+@pytest.mark.parametrize(
+    ("what", "check", "sentence"),
+    [
+        ("STATE_HIDDEN", "state", "declares canGetAndSetFMUstate but keeps part of its state elsewhere"),
+        ("STATE_NOT_RESTORED", "state", "does not restore all of its state"),
+        ("STATE_ERROR", "state", "fmi2GetFMUstate is not implemented"),
+        ("NOT_DETERMINISTIC", "determinism", "Two flights with the same inputs differ"),
+        ("NOT_A_NUMBER", "first flight", "values that are not finite at t = 3 s"),
+        ("SEGFAULT", "first flight", "SIGSEGV"),
+        ("EXIT", "first flight", "exit status 3"),
+        ("HANG", "first flight", "longer than 1 s for the step"),
+        ("NO_INSTANCE", "first flight", "no licence"),
+        ("CRASH_AT_LOAD", "first flight", "SIGSEGV"),
+    ],
+)
+def test_one_fault_is_one_problem(foreign_fmu: Any, what: str, check: str, sentence: str) -> None:
+    result = check_fmu(foreign_fmu("hostile2", what), step_timeout=1.0)
+    assert not result.passed
+    assert verdicts(result)[check] == "problem"
+    assert sentence in texts(result, check)
+    if check == "first flight":
+        assert len(result.problems) == 1
+        assert verdicts(result)["state"] == "skipped"
+
+
+@pytest.mark.slow
+def test_two_thousand_instances_in_one_process(foreign_fmu: Any) -> None:
+    """Create, run and free: the process does not grow, and one that leaks 256 KiB each is found out."""
+    sound = check_fmu(foreign_fmu("hostile2"), cycles=2000)
+    assert verdicts(sound)["instances"] == "ok", texts(sound, "instances")
+    leaking = check_fmu(foreign_fmu("hostile2", "LEAK_IN_FREE"), cycles=100)
+    assert verdicts(leaking)["instances"] == "problem"
+    assert "it leaks" in texts(leaking, "instances")
+    crashing = check_fmu(foreign_fmu("hostile2", "CRASH_IN_FREE"), cycles=3)
+    assert "Instance 1 of 3 in one process" in texts(crashing, "instances")
+
+
+def test_a_wrong_step_size_and_a_lie_about_it(foreign_fmu: Any) -> None:
+    wrong = check_fmu(foreign_fmu("fixed2"), step_size=1.0)
+    assert "the sample time is 0.01 s" in texts(wrong, "first flight")
+    assert "It takes 0.01 s only" in texts(check_fmu(foreign_fmu("fixed2")), "step size")
+    claims = ("<CoSimulation ", '<CoSimulation canHandleVariableCommunicationStepSize="true" ')
+    lying = check_fmu(foreign_fmu.changed("fixed2", "lying", claims))
+    assert "declares that it takes any step size, but not 0.005 s" in texts(lying, "step size")
+
+
+def test_units_that_contradict_what_is_usual(foreign_fmu: Any) -> None:
+    odd = foreign_fmu.changed(
+        "ball2",
+        "units",
+        ('<Unit name="m"><BaseUnit m="1"/>', '<Unit name="m"><BaseUnit m="1" factor="0.001"/>'),
+    )
+    assert "'m' is defined with the factor 0.001 and the offset 0; usual are 1 and 0" in texts(
+        check_fmu(odd), "units"
+    )
+    odd = foreign_fmu.changed("room2", "bushel", ('unit="K/s"', 'unit="bushel"'), ('"K/s"', '"bushel"'))
+    assert "Nothing can be converted to bushel" in texts(check_fmu(odd), "units")
+
+
+def test_the_schema_and_a_binding_of_ones_own(foreign_fmu: Any) -> None:
+    broken = foreign_fmu.changed("fixed2", "schema", ('<Real start="0"/>', "<Real/>"))
+    assert any("start value" in problem for problem in check_fmu(broken).problems)
+    own = parse_binding(
+        {
+            "binding": {"name": "own", "step_size": 30.0},
+            "load": {
+                "outside": {"variable": "ambient.T", "unit": "degC", "minimum": -40.0, "maximum": 50.0},
+                "power": {"variable": "heater.u[1].P", "unit": "kW", "maximum": 3.0},
+            },
+            "observation": {"room": {"variables": "room.T", "unit": "degC"}},
+        }
+    )
+    check = check_fmu(foreign_fmu("room2"), own)
+    assert check.passed
+    assert texts(check, "binding") == "own fits."
+    assert texts(check, "range edges") == "4 ends of ranges give finite outputs."
+    wrong = own.model_copy(
+        update={"observation": {"room": own.observation["room"].model_copy(update={"unit": "m"})}}
+    )
+    problems = check_fmu(foreign_fmu("room2"), wrong).problems
+    assert problems == (
+        "observation.room is in 'm', but the FMU has 'room.T' in 'K', and there is no conversion between "
+        "the two; "
+        "state the value in 'K'.",
+    )
+
+
+def test_a_range_that_the_fmu_does_not_keep(foreign_fmu: Any) -> None:
+    check = check_fmu(foreign_fmu("hostile2", "REFUSE", "AFTER=0"))
+    assert check.passed
+    assert "1 of 4 ends of ranges fail, such as u = 10 m/s" in texts(check, "range edges")
+    assert "u is too large" in texts(check, "range edges")

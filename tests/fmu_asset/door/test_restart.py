@@ -1,0 +1,151 @@
+"""A start is a start: a reset that does nothing is not believed, and the FMU's tolerance reaches it."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fmu_asset.check import check_fmu
+from fmu_asset.coupling.asset import CoupledAsset
+from fmu_asset.coupling.structure import Component, SystemStructure
+from fmu_asset.door.binding import parse_binding
+from fmu_asset.door.session import FmiAsset
+from twin_master.library.grid import GridSampler, SamplingGrid
+
+BOTH = pytest.mark.parametrize("isolated", [True, False], ids=["worker", "in process"])
+SPRING: dict[str, Any] = {
+    "binding": {"name": "spring", "step_size": 0.1},
+    "control": {"push": {"variable": "force", "unit": "N"}},
+    "observation": {"motion": {"variables": ["position", "velocity"], "unit": ["m", "m/s"]}},
+}
+BINDING = """
+[binding]
+name = "spring"
+step_size = 0.1
+[control.push]
+variable = "force"
+unit = "N"
+[health.spring]
+variable = "stiffness"
+unit = "N/m"
+[observation.motion]
+variables = ["position"]
+unit = "m"
+"""
+
+
+def motion(pushes: list[float]) -> list[float]:
+    """Return position and velocity of the mass after steps of 0.1 s under forces."""
+    position, velocity = 1.0, 0.0
+    for push in pushes:
+        for _ in range(100):
+            velocity += (push - 4.0 * position) * 0.001
+            position += velocity * 0.001
+    return [position, velocity]
+
+
+@BOTH
+@pytest.mark.parametrize("what", [(), ("RESET_DOES_NOTHING",)], ids=["sound", "does nothing"])
+def test_every_start_is_the_same(
+    foreign_fmu: Any, isolated: bool, what: tuple[str, ...], caplog: pytest.LogCaptureFixture
+) -> None:
+    # A file of its own for each case: what is wrong with a file is said once in a process.
+    fmu = foreign_fmu("spring2", *what, f"CASE={int(isolated)}")
+    with caplog.at_level(logging.WARNING), FmiAsset(fmu, parse_binding(SPRING), isolated=isolated) as asset:
+        process = asset.worker_process_id
+        for push in (1.0, -2.0, 3.0):
+            asset.reset()
+            asset.step({"push": push})
+            np.testing.assert_allclose(asset.step().values, motion([push, push]), rtol=1e-12)
+        with asset.sibling() as other:
+            other.step({"push": 5.0})
+            other.reset()
+            np.testing.assert_allclose(other.step({"push": 1.0}).values, motion([1.0]), rtol=1e-12)
+        assert asset.worker_process_id == process
+        assert asset.reset_trial.works is (not what)
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == len(what)
+    assert all(
+        f"{fmu}: Its reset returns OK and does not bring it back to its start" in text for text in said
+    )
+
+
+def test_a_start_at_rest_shows_nothing_and_is_right_all_the_same(foreign_fmu: Any) -> None:
+    """The first flight stays where it began; the second one moves, and what follows it starts anew."""
+    lying = foreign_fmu("lag1")
+    described = parse_binding(
+        {
+            "binding": {"name": "lag", "step_size": 1.0},
+            "control": {"u": {"variable": "In1 (rad/s)", "unit": "1"}},
+            "observation": {"y": {"variables": "Out1", "unit": "1"}},
+        }
+    )
+    with FmiAsset(lying, described) as asset:
+        for u in (0.0, 0.0, 1.0):
+            asset.reset()
+            assert asset.reset_trial.works is None
+            seen = asset.step({"u": u}).values[0]
+        asset.reset()
+        assert asset.reset_trial.works is True
+        assert asset.step({"u": 1.0}).values[0] == seen != 0.0
+
+
+def test_a_library_is_sampled_from_fresh_starts(foreign_fmu: Any, tmp_path: Path) -> None:
+    """Every point is the equilibrium; without a new start the mass would stay where it was."""
+    binding = tmp_path / "spring.toml"
+    binding.write_text(BINDING)
+    fmu = foreign_fmu("spring2", "RESET_DOES_NOTHING", "STANDS_STILL_ONCE_TERMINATED", "FRICTION=4.0")
+    grid = SamplingGrid(
+        fmu=str(fmu), binding=str(binding), role="motion", parameter="", draws=(0.0,), settling_steps=200,
+        states={"spring": (4.0, 5.0, 8.0)}, controls={"weak": {"push": 2.0}, "strong": {"push": 4.0}},
+    )  # fmt: skip
+    sampler = GridSampler(grid)
+    try:
+        found = sampler.block(0, 6)[:, 0]
+    finally:
+        sampler.close()
+    np.testing.assert_allclose(found, [0.5, 1.0, 0.4, 0.8, 0.25, 0.5], rtol=1e-9)
+
+
+def test_components_of_a_coupled_asset_start_anew(foreign_fmu: Any) -> None:
+    fmu = foreign_fmu("spring2", "RESET_DOES_NOTHING")
+    structure = SystemStructure(name="one", components=(Component("spring", fmu),))
+    described = parse_binding(
+        {
+            "binding": {"name": "one", "step_size": 0.1},
+            "control": {"push": {"variable": "spring.force", "unit": "N"}},
+            "observation": {"x": {"variables": "spring.position", "unit": "m"}},
+        }
+    )
+    with CoupledAsset(structure, described) as asset:
+        for push in (1.0, 2.0):
+            asset.reset()
+            asset.step({"push": push})
+            seen = asset.step({"push": push}).values[0]
+            assert seen == pytest.approx(motion([push, push])[0], rel=1e-12)
+
+
+def test_the_check_names_it(foreign_fmu: Any) -> None:
+    found = check_fmu(foreign_fmu("spring2", "RESET_DOES_NOTHING"), step_size=0.1)
+    assert len(found.problems) == 1, found.problems
+    assert found.problems[0].startswith("Its reset returns OK and does not bring it back to its start")
+
+
+def test_negative_zero_is_no_traceback(foreign_fmu: Any) -> None:
+    found = check_fmu(foreign_fmu("hostile2", "NEGATIVE_ZERO_AFTER_RESET"))
+    assert found.passed, found.problems
+
+
+@BOTH
+def test_the_tolerance_is_that_of_the_fmu_unless_the_binding_says_otherwise(
+    foreign_fmu: Any, isolated: bool
+) -> None:
+    described = {**SPRING, "observation": {"tolerance": {"variables": "tolerance", "unit": "1"}}}
+    for header, expected in (({}, 1e-4), ({"tolerance": 1e-7}, 1e-7)):
+        chosen = parse_binding({**described, "binding": {**SPRING["binding"], **header}})
+        with FmiAsset(foreign_fmu("spring2"), chosen, isolated=isolated) as asset:
+            assert asset.observe().values[0] == expected

@@ -1,0 +1,323 @@
+"""Any FMU in a process of its own: what it does wrong is one clear sentence and nobody else's trouble."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe.runtime.reduced import ReducedModel
+from fmu_asset.door.binding import Binding
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.errors import FmuCallError, FmuOutputError, FmuStateError, FmuTimeoutError, FmuWorkerError
+from fmu_asset.packing.wing_fmu import build_fmu
+
+ROOT = Path(__file__).parents[3]
+FINE, NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD, WANDER, TALK = map(float, range(8))
+BOTH = pytest.mark.parametrize("isolated", [True, False], ids=["worker", "in process"])
+
+
+@pytest.fixture
+def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder in which this test alone makes its temporary folders, here and in subprocesses."""
+    folder = tmp_path / "scratch"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    monkeypatch.setenv("TMPDIR", str(folder))
+    return folder
+
+
+def spring(force: float, stiffness: float, steps: int) -> tuple[float, float]:
+    """Return velocity and position of the mass after steps of 0.1 s, as its FMU integrates them."""
+    position = velocity = 0.0
+    for _ in range(100 * steps):
+        velocity += (force - stiffness * position) * 0.001
+        position += velocity * 0.001
+    return velocity, position
+
+
+@BOTH
+def test_another_asset_flies_with_its_own_binding(
+    spring_mass: Path, spring_binding: Binding, isolated: bool
+) -> None:
+    with FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset:
+        asset.step({"push": 1.0}, {"spring": 2.0})
+        seen = asset.step()
+        np.testing.assert_allclose(seen.values, spring(1.0, 2.0, 2), rtol=1e-12)
+        assert seen.time == 2.0 + 2 * 0.1
+        assert seen.extra == {"steps": 2.0}
+        locked = asset.step(load={"lock": True})
+        np.testing.assert_array_equal(locked.values, seen.values)
+
+
+@BOTH
+def test_state_is_replayed_where_the_fmu_cannot_save_it(
+    spring_mass: Path, spring_binding: Binding, isolated: bool
+) -> None:
+    with FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset:
+        assert asset.state_method == "replay"
+        for push in (1.0, -2.0, 3.0):
+            asset.step({"push": push})
+        saved = asset.save_state()
+        expected = [asset.step({"push": 0.5}).values.tobytes(), asset.step().values.tobytes()]
+    with FmiAsset(spring_mass, spring_binding, isolated=isolated) as other:
+        other.restore_state(saved)
+        assert other.step_index == 3
+        assert other.save_state() == saved
+        assert [other.step({"push": 0.5}).values.tobytes(), other.step().values.tobytes()] == expected
+
+
+@BOTH
+def test_values_that_are_not_finite_are_an_error(
+    spring_mass: Path, spring_binding: Binding, isolated: bool
+) -> None:
+    with (
+        FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset,
+        pytest.raises(FmuOutputError, match=r"not finite at t = 2\.1 s: position\."),
+    ):
+        asset.step(load={"misbehaviour": NOT_A_NUMBER})
+
+
+@BOTH
+def test_discard_is_an_error_and_the_asset_can_go_on(
+    spring_mass: Path, spring_binding: Binding, isolated: bool
+) -> None:
+    with FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset:
+        before = asset.step({"push": 1.0})
+        with pytest.raises(FmuCallError, match=r"step 1 from t = 2\.1 s: fmi2DoStep returned Discard"):
+            asset.step({"push": 7.0}, load={"misbehaviour": DISCARD})
+        after = asset.step()
+        assert after.time == before.time + 0.1
+        np.testing.assert_allclose(after.values, spring(1.0, 4.0, 2), rtol=1e-12)
+
+
+@BOTH
+def test_a_fatal_error_names_its_cause_and_the_instance_is_not_used_again(
+    spring_mass: Path, spring_binding: Binding, isolated: bool
+) -> None:
+    with FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset:
+        asset.step({"push": 1.0})
+        with pytest.raises(FmuCallError, match=r"(?s)returned Fatal.*the spring broke"):
+            asset.step(load={"misbehaviour": RAISE})
+        with pytest.raises(FmuWorkerError, match="reset the asset"):
+            asset.step()
+        asset.reset()
+        assert asset.step({"push": 1.0}).extra == {"steps": 1.0}
+
+
+def test_a_crash_is_a_sentence_and_a_reset_starts_anew(spring_mass: Path, spring_binding: Binding) -> None:
+    with FmiAsset(spring_mass, spring_binding) as asset:
+        with pytest.raises(FmuWorkerError, match=r"ended by signal 6 \(SIGABRT\)"):
+            asset.step(load={"misbehaviour": DIE})
+        with pytest.raises(FmuWorkerError, match="reset the asset"):
+            asset.step()
+        asset.reset()
+        assert asset.step().extra == {"steps": 1.0}
+
+
+def test_a_killed_worker_is_a_sentence(fmu: Path, binding: Binding) -> None:
+    with FmiAsset(fmu, binding) as asset:
+        asset.step({"load_factor": 3.0})
+        saved = asset.save_state()
+        expected = asset.step({"load_factor": 2.0}).values
+        process = asset.worker_process_id
+        assert process is not None
+        os.kill(process, signal.SIGKILL)
+        with pytest.raises(FmuWorkerError, match=r"step 2 from t = 2 s.*signal 9 \(SIGKILL\)"):
+            asset.step()
+        asset.restore_state(saved)
+        np.testing.assert_array_equal(asset.step({"load_factor": 2.0}).values, expected)
+
+
+def test_a_step_that_hangs_is_stopped(spring_mass: Path, spring_binding: Binding) -> None:
+    with FmiAsset(spring_mass, spring_binding, step_timeout=0.3) as asset:
+        asset.step()
+        begin = time.monotonic()
+        with pytest.raises(FmuTimeoutError, match=r"longer than 0\.3 s for the step"):
+            asset.step(load={"misbehaviour": SLEEP})
+        assert time.monotonic() - begin < 30.0
+        with pytest.raises(FmuWorkerError, match="reset the asset"):
+            asset.step()
+
+
+def test_an_interruption_leaves_no_stale_answer(
+    spring_mass: Path, spring_binding: Binding, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with FmiAsset(spring_mass, spring_binding) as asset:
+        asset.step({"push": 1.0})
+        with monkeypatch.context() as patch:
+            patch.setattr("fmu_asset.worker.client.WorkerInstance._await", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                asset.step({"push": 2.0})
+        with pytest.raises(FmuWorkerError, match="interrupted; reset the asset"):
+            asset.step()
+        asset.reset()
+        np.testing.assert_allclose(asset.step({"push": 1.0}).values, spring(1.0, 4.0, 1), rtol=1e-12)
+
+
+def test_a_closed_asset_is_not_started_again_unasked(spring_mass: Path, spring_binding: Binding) -> None:
+    asset = FmiAsset(spring_mass, spring_binding)
+    assert asset.step().time == 2.0 + 0.1
+    asset.close()
+    with pytest.raises(FmuStateError, match="closed; reset"):
+        asset.step()
+    with pytest.raises(FmuStateError, match="no state to save"):
+        asset.save_state()
+    asset.reset()
+    assert asset.observe().time == 2.0
+    del asset
+
+
+def test_chatter_of_the_fmu_does_not_reach_the_pipes(
+    spring_mass: Path, spring_binding: Binding, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with FmiAsset(spring_mass, spring_binding) as asset:
+        asset.step(load={"misbehaviour": TALK})
+        asset.step()
+        assert asset.log[0] == ("OK", "the spring creaks")
+    assert capfd.readouterr().out == ""
+
+
+def test_the_twin_keeps_its_working_directory(spring_mass: Path, spring_binding: Binding) -> None:
+    here = Path.cwd()
+    with FmiAsset(spring_mass, spring_binding) as asset:
+        asset.step(load={"misbehaviour": WANDER})
+        asset.step(load={"misbehaviour": FINE})
+    with FmiAsset(spring_mass, spring_binding, isolated=False) as asset:
+        asset.step()
+    assert Path.cwd() == here
+
+
+def test_an_fmu_in_this_process_leaves_no_modules(
+    spring_mass: Path, spring_binding: Binding, fmu: Path, binding: Binding
+) -> None:
+    path, modules = list(sys.path), set(sys.modules)
+    with FmiAsset(fmu, binding, isolated=False) as wing:
+        with FmiAsset(spring_mass, spring_binding, isolated=False) as asset:
+            asset.step()
+            assert "SpringMass" in sys.modules
+        wing.step({"load_factor": 2.0})
+    assert sys.path == path
+    assert "SpringMass" not in sys.modules
+    assert not [name for name in set(sys.modules) - modules if name.startswith("uav_wing_")]
+
+
+def test_nothing_is_left_behind(spring_mass: Path, spring_binding: Binding, scratch: Path) -> None:
+    descriptors = len(list(Path("/proc/self/fd").iterdir()))
+    for isolated in (True, False):
+        with FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset:
+            asset.step()
+        asset.close()
+    with FmiAsset(spring_mass, spring_binding) as asset, pytest.raises(FmuWorkerError):
+        asset.step(load={"misbehaviour": DIE})
+    assert not list(scratch.iterdir())
+    assert len(list(Path("/proc/self/fd").iterdir())) == descriptors
+
+
+def test_a_worker_ends_when_the_twin_is_killed(
+    fmu: Path, binding: Binding, tmp_path: Path, scratch: Path
+) -> None:
+    (tmp_path / "binding.json").write_text(binding.model_dump_json(exclude_none=True), encoding="utf-8")
+    program = (
+        "import json, os, signal, sys\n"
+        "from pathlib import Path\n"
+        "from fmu_asset.door.binding import parse_binding\n"
+        "from fmu_asset.door.session import FmiAsset\n"
+        "binding = parse_binding(json.loads((Path(sys.argv[2]) / 'binding.json').read_text()))\n"
+        "asset = FmiAsset(sys.argv[1], binding)\n"
+        "asset.step()\n"
+        "print(asset.worker_process_id, flush=True)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, fmu, tmp_path], cwd=ROOT, check=False, capture_output=True, text=True
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    worker = Path("/proc") / done.stdout.strip()
+    deadline = time.monotonic() + 20.0
+    # The keeper removes the folders once the worker is gone.
+    while (worker.exists() or any(scratch.iterdir())) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not worker.exists()
+    assert not list(scratch.iterdir())
+
+
+def test_fifty_sessions_leak_nothing(fmu: Path, binding: Binding) -> None:
+    """Neither descriptors nor entries of sys.path, nor with fifty resets in each of several workers."""
+    path = list(sys.path)
+    for _ in range(50):
+        with FmiAsset(fmu, binding, isolated=False) as asset:
+            asset.step({"load_factor": 2.0})
+    assert sys.path == path
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for _ in range(5):
+        with FmiAsset(fmu, binding) as asset:
+            for _ in range(50):
+                asset.reset()
+                asset.step({"load_factor": 2.0})
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+def test_a_thousand_instances_in_one_process(fmu: Path) -> None:
+    """In a process of its own, since the failure that this guards against is a crash."""
+    program = (
+        "import sys, shutil\n"
+        "from fmu_asset.archive.fmu_file import extract_fmu, read_fmu\n"
+        "from fmu_asset.instances import open_instance\n"
+        "from fmu_asset.instances.plan import Group, Plan\n"
+        "fmu = read_fmu(sys.argv[1])\n"
+        "folder = extract_fmu(fmu)\n"
+        "inputs, outputs = (Group('Real', (0,), 1),), (Group('Real', (12,), 1),)\n"
+        "names = fmu.guid, fmu.model_identifier, 'wing'\n"
+        "plan = Plan(str(folder), 2, 'co-simulation', *names, inputs, outputs)\n"
+        "for _ in range(1100):\n"
+        "    instance = open_instance(plan)\n"
+        "    instance.initialise(0.0, [], with_inputs=False)\n"
+        "    instance.request[:] = [0.0, 1.0, 2.0]\n"
+        "    instance.step()\n"
+        "    instance.close()\n"
+        "shutil.rmtree(folder)\n"
+        "print(instance.reply[0])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, fmu], cwd=ROOT, check=False, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) > 0.0
+
+
+def test_two_wings_in_one_process_do_not_mix(
+    make_model: Callable[[float], ReducedModel], fmu: Path, binding: Binding, tmp_path: Path
+) -> None:
+    other = build_fmu(make_model(1.8e5), tmp_path / "stiff.fmu").path
+    with (
+        FmiAsset(fmu, binding, isolated=False) as first,
+        FmiAsset(other, binding, isolated=False) as second,
+    ):
+        for _ in range(2):
+            one, two = first.step({"load_factor": 3.0}), second.step({"load_factor": 3.0})
+            np.testing.assert_allclose(one.values, 2.0 * two.values, rtol=1e-9)
+
+
+def test_a_temporary_folder_with_odd_characters(
+    fmu: Path, binding: Binding, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    odd = tmp_path / "é # % +"
+    odd.mkdir()
+    file = odd / "wing é.fmu"
+    file.write_bytes(fmu.read_bytes())
+    monkeypatch.setattr(tempfile, "tempdir", str(odd))
+    for isolated in (True, False):
+        with FmiAsset(file, binding, isolated=isolated) as asset:
+            assert np.all(asset.step({"load_factor": 3.0}).values > 0.0)

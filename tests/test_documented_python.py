@@ -1,0 +1,235 @@
+"""The Python of README and docs runs as it is printed: the blocks of a page one after the other.
+
+Each page has a namespace and a folder of its own, which holds what the page says that the reader has by then.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from calibration.wing.result import CalibrationResult
+from calibration.wing.result_file import save_calibration
+from discrepancy.sources.examples import write_example
+from fmu_asset.packing.wing_fmu import build_fmu
+
+ROOT = Path(__file__).parents[1]
+REFERENCE = ROOT.parent / "shared" / "reference"
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """Return the fenced blocks of a page in one language."""
+    found = BLOCK.findall(page.read_text(encoding="utf-8"))
+    return [text for kind, text in found if kind == language]
+
+
+WITH_PYTHON = {str(page.relative_to(ROOT)): page for page in PAGES if blocks(page, "python")}
+
+
+def reference(name: str) -> Path:
+    """Return a folder of the authors' published data; skips where it is not at hand."""
+    folder = REFERENCE / name
+    if not folder.is_dir():
+        pytest.skip(f"the authors' published data are not at {folder}")
+    return folder
+
+
+def calibration_data(folder: Path) -> None:
+    (folder / "UAV-Experimental-Calibration").symlink_to(reference("uav_experimental_calibration"))
+
+
+def strain_library(folder: Path) -> None:
+    (folder / "path" / "to").mkdir(parents=True)
+    (folder / "path" / "to" / "UAV-Digital-Twin").symlink_to(reference("uav_digital_twin"))
+
+
+def wing_fmu(folder: Path) -> None:
+    from fe.reduction.model_cache import reduced_model
+
+    build_fmu(reduced_model(), folder / "wing.fmu")
+
+
+def checkout(folder: Path) -> None:
+    """The folder of the project, where the shipped bindings are."""
+    (folder / "scenarios").symlink_to(ROOT / "scenarios")
+
+
+def patch_file(folder: Path) -> None:
+    """The patch that the page shows."""
+    (patch,) = (text for text in blocks(ROOT / "docs" / "fmu.md", "json") if "uav-twin patch" in text)
+    (folder / "patch.json").write_text(patch, encoding="utf-8")
+
+
+def empty_rig(folder: Path) -> None:
+    (folder / "my_rig").mkdir()
+
+
+def campaign_folder(folder: Path) -> None:
+    from discrepancy.models.wing import WingModel
+
+    write_example(WingModel.shipped(), folder / "my_campaign", "static", seed=1)
+
+
+def verdict_folder(folder: Path) -> None:
+    """A verdict on a mass on a spring, its load cell with a tare."""
+    for words in (
+        ["example", "static", "campaign", "--model", "single_mass_rig", "--effect", "load_cell"],
+        ["run", "campaign", "--model", "single_mass_rig", "--out", "verdict"],
+    ):
+        command(folder, "discrepancy", *words)
+
+
+def command(folder: Path, *words: str) -> None:
+    subprocess.run([sys.executable, "-m", "uav_twin", *words], cwd=folder, check=True, capture_output=True)
+
+
+def pump_library(folder: Path) -> None:
+    command(folder, "library", "sample", "pump_wear", "--out", "pump.nc")
+
+
+def wing_with_effects(folder: Path) -> None:
+    command(folder, "fmu", "build", "--patch", "patch.json", "--out", "wing_with_effects.fmu")
+
+
+def drafted_binding(folder: Path) -> None:
+    command(folder, "fmu", "bind", "wing.fmu", "--out", "wing.toml")
+
+
+def without_the_fmu(folder: Path) -> None:
+    """The page packs it itself."""
+    (folder / "wing.fmu").unlink()
+
+
+def converted_wing(folder: Path) -> None:
+    """The first three seconds of three ring-downs: the search in all of them takes longer still."""
+    published = reference("uav_experimental_calibration") / "step3"
+    short = folder / "UAV-Experimental-Calibration" / "step3"
+    short.mkdir(parents=True)
+    for trial in (1, 2, 3):
+        name = f"ringdown_trial{trial}_digitised.csv"
+        lines = (published / name).read_text(encoding="utf-8").splitlines(keepends=True)
+        (short / name).write_text("".join(lines[:371]), encoding="utf-8")
+    command(folder, "discrepancy", "convert", "real_wing", "--data", "UAV-Experimental-Calibration")
+
+
+def fmu_rig(folder: Path) -> None:
+    """The wing's FMU as the model of a rig."""
+    wing_fmu(folder)
+    (folder / "rig.toml").write_text(RIG, encoding="utf-8")
+
+
+RIG = """
+format = 1
+kind = "fmu"
+name = "Wing as a rig"
+fmu = "wing.fmu"
+
+[inputs]
+force = { tip = "tip_force" }
+
+[[output]]
+name = "tip"
+variable = "load_point_displacement"
+
+[[parameter]]
+name = "young_modulus_factor"
+variable = "young_modulus_factor"
+mean = 1.0
+deviation = 0.02
+low = 0.9
+high = 1.1
+
+[scales]
+length = 1.8
+"""
+
+
+Prepare = Callable[[Path], None]
+
+READER_HAS: dict[str, tuple[Prepare, ...]] = {
+    "docs/another_asset.md": (pump_library,),
+    "docs/calibration.md": (calibration_data,),
+    "docs/campaign.md": (campaign_folder,),
+    "docs/fmu_models.md": (fmu_rig,),
+    "docs/fmu.md": (checkout, patch_file, wing_with_effects),
+    "docs/inference.md": (strain_library,),
+    "docs/python.md": (wing_fmu, drafted_binding, without_the_fmu, verdict_folder),
+    "docs/real_wing.md": (converted_wing,),
+    "docs/rig_in_ten_minutes.md": (empty_rig,),
+    "docs/use_the_wing_in.md": (wing_fmu,),
+    "docs/verdict.md": (verdict_folder,),
+}
+"""What is in the reader's folder before the first block."""
+
+MADE_ONCE = {
+    "README.md": ("mission", "runs/demo"),
+    "docs/calibrate_a_wing.md": ("calibrated_wing", "calibrations/wing_7"),
+    "docs/discrepancy_missions.md": ("short_mission", "runs/mission"),
+    "docs/report.md": ("mission", "runs/level_turns"),
+    "docs/run_folder.md": ("mission", "runs/level_turns"),
+}
+"""Folders that fixtures make, and where the page has them."""
+
+MINUTES = {"docs/real_wing.md"}
+"""Pages whose search takes minutes of processor time: run where UAV_TWIN_LONG_TESTS is set."""
+
+MODULES = {"docs/use_the_wing_in.md": "libcosimpy"}
+"""What the page tells the reader to install; without it the blocks before are run."""
+
+
+@pytest.fixture(scope="module")
+def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of a mission."""
+    folder = tmp_path_factory.mktemp("mission")
+    command(folder, "run", "level_turns", "--out", "run")
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def short_mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of twelve turns, each of which has damage of its own in the search for an effect."""
+    folder = tmp_path_factory.mktemp("short_mission")
+    scenario = (ROOT / "scenarios" / "growing_damage.toml").read_text(encoding="utf-8")
+    (folder / "short.toml").write_text(re.sub(r"(?m)^steps = \d+", "steps = 12", scenario), encoding="utf-8")
+    command(folder, "run", "short.toml", "--out", "run")
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def calibrated_wing(
+    make_calibration: Callable[..., CalibrationResult], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """The folder of a calibration."""
+    folder = tmp_path_factory.mktemp("calibration")
+    save_calibration(make_calibration(), folder / "calibration.nc")
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(WITH_PYTHON))
+def test_the_blocks_of_a_page_run_as_printed(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    if name in MINUTES and not os.environ.get("UAV_TWIN_LONG_TESTS"):
+        pytest.skip("takes minutes of processor time; set UAV_TWIN_LONG_TESTS to run it")
+    for prepare in READER_HAS.get(name, ()):
+        prepare(tmp_path)
+    if name in MADE_ONCE:
+        fixture, place = MADE_ONCE[name]
+        shutil.copytree(request.getfixturevalue(fixture), tmp_path / place)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {"__name__": "__main__"}
+    for number, block in enumerate(blocks(WITH_PYTHON[name], "python"), 1):
+        if name in MODULES and MODULES[name] in block:
+            pytest.importorskip(MODULES[name])
+        exec(compile(block, f"{name}, block {number}", "exec"), names)

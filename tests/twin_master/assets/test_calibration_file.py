@@ -1,0 +1,197 @@
+"""A calibration file in a scenario: what the twin draws from it, what the run keeps, what is refused."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.errors import CalibrationRecordError
+from calibration.wing.result import CalibrationResult
+from calibration.wing.result_file import load_calibration, save_calibration
+from calibration.wing.wing_record import calibrated_wing, description, run_record
+from reporting.progress import SilentProgress
+from scenarios import scenario_files
+from twin_master.assets.fmu_source import FmuSource
+from twin_master.assets.parameter import draw_parameter
+from twin_master.assets.resolution import (
+    Overrides,
+    asset_source,
+    located_scenario,
+    portable_scenario,
+    resolve_scenario,
+)
+from twin_master.errors import MissionInputError, ScenarioError
+from twin_master.run_folder import to_json
+from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.scenario.schema import Calibration
+
+MakeCalibration = Callable[..., CalibrationResult]
+TEXT = scenario_files()["level_turns"].read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def file(tmp_path: Path, make_calibration: MakeCalibration) -> Path:
+    return save_calibration(make_calibration(), tmp_path / "my wing.nc")
+
+
+def section(file: Path | str | None, **others: object) -> Calibration:
+    table = {"parameter": "young_modulus_factor", "source": "file", "file": str(file), "draws": 20}
+    return Calibration.model_validate(table | others)
+
+
+def scenario_with(folder: Path, calibration: str) -> Path:
+    """The shipped scenario with another table `calibration`."""
+    begin, end = TEXT.index("[calibration]"), TEXT.index("[truth]")
+    path = folder / "mine.toml"
+    path.write_text(f"{TEXT[:begin]}[calibration]\n{calibration}\n\n{TEXT[end:]}", encoding="utf-8")
+    return path
+
+
+def test_draws_come_from_the_samples(file: Path) -> None:
+    result = load_calibration(file)
+    for name in ("young_modulus_factor", "servo_mass"):
+        draws = draw_parameter(section(file, parameter=name), 3)
+        assert draws.name == name
+        assert set(draws.values.tolist()) <= set(result.draws_of(name).tolist())
+        assert len(draws.values) == 20
+        assert draws.mean == result.mean(name)
+        assert draws.standard_deviation == result.standard_deviation(name)
+        assert "Wing 7 (é)" in draws.source
+    again = draw_parameter(section(file), 3)
+    np.testing.assert_array_equal(again.values, draw_parameter(section(file), 3).values)
+    assert not np.array_equal(again.values, draw_parameter(section(file), 4).values)
+    everything = draw_parameter(section(file, draws=40), 3).values
+    np.testing.assert_array_equal(np.sort(everything), np.sort(result.draws_of("young_modulus_factor")))
+
+
+def test_a_parameter_that_the_file_has_not(file: Path) -> None:
+    with pytest.raises(CalibrationRecordError, match="no samples of `wall_thickness`"):
+        draw_parameter(section(file, parameter="wall_thickness"), 0)
+
+
+def test_the_records_are_plain_and_the_same_for_the_same_file(file: Path) -> None:
+    result = load_calibration(file)
+    text = to_json(run_record(result, "young_modulus_factor"))
+    assert text == to_json(run_record(load_calibration(file), "young_modulus_factor"))
+    record = json.loads(text)
+    state = record["state"]["servo_mass"]
+    assert state["unit"] == "kg"
+    assert state["standard_deviation"] == pytest.approx(result.standard_deviation("servo_mass"))
+    assert state["interval_95"] == pytest.approx(np.quantile(result.samples[:, 1], [0.025, 0.975]))
+    np.testing.assert_allclose(
+        calibrated_wing(result)["correlation"]["matrix"],
+        np.corrcoef(result.samples, rowvar=False),
+        atol=1e-12,
+    )
+    grid, density = (np.array(record["posterior"][name]) for name in ("grid", "density"))
+    assert np.trapezoid(density, grid) == pytest.approx(1.0, abs=0.05)
+    assert "'Wing 7 (é)'" in description(result)
+    assert f"servo_mass {result.mean('servo_mass'):.6g} +- " in description(result)
+
+
+def test_a_figure_that_does_not_vary_is_kept_too(make_calibration: MakeCalibration) -> None:
+    result = make_calibration(count=1)
+    record = run_record(result, "young_modulus_factor")
+    to_json(record)
+    assert record["posterior"] == {}
+    assert record["correlation"]["matrix"] == np.eye(5).tolist()
+
+
+def test_the_schema(tmp_path: Path) -> None:
+    table = tomllib.loads(TEXT)
+    table["calibration"] = {"parameter": "young_modulus_factor", "source": "file"}
+    with pytest.raises(ScenarioError, match="source `file` needs `file`"):
+        parse_scenario(table, "mine.toml")
+    table["calibration"] = {"parameter": "e", "source": "fixed", "mean": 1.0, "file": "x.nc"}
+    with pytest.raises(ScenarioError, match="`file` belongs to the calibration source `file`"):
+        parse_scenario(table, "mine.toml")
+
+
+def test_paths_start_at_the_scenario_and_leave_no_trace_of_the_machine(file: Path) -> None:
+    text = 'parameter = "young_modulus_factor"\nsource = "file"\nfile = "my wing.nc"'
+    path = scenario_with(file.parent, text)
+    scenario = resolve_scenario(load_scenario(path), Overrides())
+    assert scenario.calibration.file == str(file)
+    assert (scenario.asset.kind, scenario.belief.kind) == ("calibration", "calibration")
+    portable = portable_scenario(scenario)
+    assert portable.calibration.file == "asset/calibration.nc"
+    assert str(file.parent) not in json.dumps(portable.to_dict())
+    located = located_scenario(portable, Path("/elsewhere"))
+    assert located.calibration.file == "/elsewhere/asset/calibration.nc"
+    source = asset_source(scenario)
+    assert isinstance(scenario.asset.source(scenario), FmuSource)
+    source.check()
+    assert set(source.files()) == {"asset/binding.toml", "asset/calibration.nc"}
+    assert source.files()["asset/calibration.nc"] == file.read_bytes()
+
+
+def test_the_option_stands_over_the_scenario(file: Path, tmp_path: Path) -> None:
+    loaded = load_scenario("level_turns")
+    scenario = resolve_scenario(loaded, Overrides(calibration=file))
+    assert (scenario.calibration.source, scenario.calibration.file) == ("file", str(file))
+    assert scenario.calibration.draws == loaded.scenario.calibration.draws
+    assert scenario.asset.parameters == loaded.scenario.asset.parameters  # the truth stays the scenario's
+    mine = scenario_with(tmp_path, 'parameter = "young_modulus_factor"\nsource = "file"\nfile = "other.nc"')
+    scenario = resolve_scenario(load_scenario(mine), Overrides(calibration=file))
+    assert scenario.calibration.file == str(file)
+
+
+def test_what_is_refused_before_a_folder_is_made(file: Path, tmp_path: Path, library_file: Path) -> None:
+    loaded = load_scenario("level_turns")
+    with pytest.raises(MissionInputError, match="a strain library brings its own samples"):
+        resolve_scenario(loaded, Overrides(calibration=file, strain_library=library_file))
+    text = TEXT.replace('design = "uav_wing"', 'design = "calibration"')
+    (tmp_path / "no.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(MissionInputError, match="there is no calibration file: give --calibration"):
+        resolve_scenario(load_scenario(tmp_path / "no.toml"), Overrides())
+    damaged = tmp_path / "damaged.nc"
+    damaged.write_bytes(file.read_bytes()[:9000])
+    for path, word in ((damaged, "damaged"), (tmp_path / "missing.nc", "not there")):
+        with pytest.raises(CalibrationRecordError, match=word):
+            asset_source(resolve_scenario(loaded, Overrides(calibration=path))).check()
+
+
+def test_the_wing_among_several_fmus_is_tailored_too(file: Path, tmp_path: Path) -> None:
+    scenario = resolve_scenario(load_scenario("three_fmus"), Overrides(calibration=file))
+    assert [component.design for component in scenario.asset.component] == [None, "calibration", None]
+    source = asset_source(scenario)
+    source.check()
+    (tmp_path / "run").mkdir()
+    hashes = source.prepare(tmp_path / "run", SilentProgress())
+    assert hashes["design"] == load_calibration(file).design_hash
+    with zipfile.ZipFile(tmp_path / "run" / "asset" / "components" / "wing.fmu") as archive:
+        record = json.loads(archive.read("resources/calibration.json"))
+    assert record["asset"] == "Wing 7 (é)"
+    moved = located_scenario(portable_scenario(scenario), tmp_path / "run")
+    assert moved.asset.component[1].design == "calibration"
+
+
+def test_a_design_file_that_asset_and_component_share_is_tailored_in_both(file: Path, tmp_path: Path) -> None:
+    text = scenario_files()["three_fmus"].read_text(encoding="utf-8")
+    assert text.count('design = "uav_wing"') == 2
+    path = tmp_path / "shared.toml"
+    path.write_text(text.replace('design = "uav_wing"', 'design = "my.toml"'), encoding="utf-8")
+    scenario = resolve_scenario(load_scenario(path), Overrides(calibration=file))
+    assert scenario.belief.kind == "calibration"
+    assert scenario.asset.component[1].design == "calibration"
+    asset_source(scenario).check()
+
+
+def test_a_component_cannot_have_the_design_of_a_calibration_that_is_not_there(tmp_path: Path) -> None:
+    text = scenario_files()["three_fmus"].read_text(encoding="utf-8")
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace('design = "uav_wing"', 'design = "calibration"', 1), encoding="utf-8")
+    with pytest.raises(MissionInputError, match="the design of a calibration is asked for, and there is no"):
+        resolve_scenario(load_scenario(path), Overrides())
+
+
+def test_an_ssp_file_takes_the_place_of_a_script(tmp_path: Path) -> None:
+    scenario = resolve_scenario(load_scenario("pump_wear"), Overrides(ssp=tmp_path / "pump.ssp"))
+    assert scenario.asset.kind == "ssp"
+    assert scenario.asset.parameters == load_scenario("pump_wear").scenario.asset.parameters

@@ -1,0 +1,349 @@
+"""Coupled FMUs as the asset of a mission: as one FMU, in a worker, resumed, and from an SSP file."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fmu_asset.door.binding import load_binding
+from fmu_asset.errors import AlgebraicLoopError, CouplingError, FmuError, SspError
+from reporting.progress import SilentProgress
+from scenarios import binding_files, scenario_files
+from twin_master import workflow
+from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
+from twin_master.assets.system_export import export_scenario
+from twin_master.errors import MissionInputError, ScenarioError
+from twin_master.mission.plant import Plant
+from twin_master.mission.truth import Truth
+from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.study import fly_many
+from twin_master.workflow import new_run, resume_run
+
+HERE = Path(__file__).with_name("heat_exchanger")
+COUPLED = """[asset]
+kind = "coupled"
+binding = "coupled.toml"
+parameters = { conductance = 6100.0 }
+load = { wall_temperature = 80.0 }
+
+[[asset.component]]
+name = "exchanger"
+fmu = "HeatExchanger.fmu"
+parameters = { conductance = 5000.0 }
+
+[[asset.connection]]
+source = "flow"
+target = "exchanger.mass_flow"
+
+[[asset.connection]]
+source = "fouling"
+target = "exchanger.fouling"
+
+[[asset.connection]]
+source = "exchanger.outlet"
+target = "outlet"
+
+[belief]
+kind = "asset"
+
+[calibration]"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The heat exchanger as one FMU, and as a system of one component."""
+    place = tmp_path_factory.mktemp("coupled")
+    for path in HERE.iterdir():
+        if path.is_file():
+            shutil.copy(path, place)
+    subprocess.run(
+        [sys.executable, "-m", "pythonfmu", "build", "-f", "HeatExchanger.py"],
+        cwd=place, check=True, capture_output=True,
+    )  # fmt: skip
+    binding = (place / "binding.toml").read_text(encoding="utf-8")
+    for old, new in (
+        ('variable = "mass_flow"', 'variable = "flow"'),
+        ('variable = "wall_temperature"', 'variable = "exchanger.wall_temperature"'),
+        ('variable = "misbehaviour"', 'variable = "exchanger.misbehaviour"'),
+        ('variable = "conductance"', 'variable = "exchanger.conductance"'),
+        ('["middle", "outlet"]', '["exchanger.middle", "outlet"]'),
+        ('variable = "heat"', 'variable = "exchanger.heat"'),
+    ):
+        assert old in binding
+        binding = binding.replace(old, new)
+    (place / "coupled.toml").write_text(binding, encoding="utf-8")
+    text = (place / "fouling.toml").read_text(encoding="utf-8")
+    before, rest = text.split("[asset]\n")
+    _, after = rest.split("[calibration]")
+    (place / "coupled_fouling.toml").write_text(before + COUPLED + after, encoding="utf-8")
+    return place
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_report() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+        yield
+
+
+@pytest.fixture(scope="module")
+def direct(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The mission with the one FMU, and with the system of one component."""
+    place = tmp_path_factory.mktemp("direct")
+    return {
+        name: new_run(load_scenario(folder / f"{name}.toml"), place / name).folder
+        for name in ("fouling", "coupled_fouling")
+    }
+
+
+def changed(folder: Path, name: str, *changes: tuple[str, str]) -> Path:
+    text = (folder / "coupled_fouling.toml").read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    path = folder / f"{name}.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def rows(run: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((run / "csv").iterdir())}
+
+
+def test_a_system_of_one_fmu_flies_as_the_fmu_alone(
+    folder: Path, direct: dict[str, Path], tmp_path: Path
+) -> None:
+    assert rows(direct["coupled_fouling"]) == rows(direct["fouling"])
+    loaded = load_scenario(folder / "coupled_fouling.toml")
+    inside = new_run(loaded, tmp_path / "run", Overrides(in_process=True)).folder
+    assert rows(inside) == rows(direct["fouling"])
+
+
+def test_a_resumed_flight_is_bit_identical(
+    folder: Path,
+    direct: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    die_after_turn: Callable[..., None],
+) -> None:
+    """The FMU cannot save its state: its inputs are replayed. What is flown lies in the run folder."""
+    loaded = load_scenario(folder / "coupled_fouling.toml")
+    whole = direct["coupled_fouling"]
+    with monkeypatch.context() as patch:
+        die_after_turn(patch, 11)
+        with pytest.raises(KeyboardInterrupt):
+            new_run(loaded, tmp_path / "part")
+    resume_run(tmp_path / "part")
+    names = ("run.nc", "config.json", "summary.json", "checkpoint.jsonl", "asset/components/exchanger.fmu")
+    for name in names:
+        assert (tmp_path / "part" / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("name", ["coupled_fouling", "fouling"])
+def test_an_exported_system_flies_the_same_mission(
+    folder: Path, direct: dict[str, Path], tmp_path: Path, name: str
+) -> None:
+    """From the coupled scenario and from that of one FMU; the run folder holds the SSP file."""
+    loaded = load_scenario(folder / f"{name}.toml")
+    ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False, progress=SilentProgress())
+    flown = new_run(loaded, tmp_path / "flown", Overrides(ssp=ssp)).folder
+    assert rows(flown) == rows(direct[name])
+    assert (flown / "asset" / "system.ssp").read_bytes() == ssp.read_bytes()
+    ssp.unlink()
+    assert rows(resume_run(flown).folder) == rows(direct[name])
+
+
+def test_what_does_not_fit_is_said_before_a_folder_is_made(folder: Path, tmp_path: Path) -> None:
+    for name, change, kind, words in (
+        ("component", ('source = "exchanger.outlet"', 'source = "boiler.outlet"'), CouplingError,
+         r"'boiler\.outlet' begins with no component; the components are exchanger"),
+        ("variable", ('target = "exchanger.mass_flow"', 'target = "exchanger.flow"'), CouplingError,
+         "has no variable 'flow'"),
+        ("missing", ("HeatExchanger.fmu", "Missing.fmu"), MissionInputError, r"Missing\.fmu cannot be read"),
+        ("setting", ("conductance = 5000.0", "conduction = 5000.0"), CouplingError,
+         "no variable 'conduction'"),
+        ("twice", ('parameters = { conductance = 5000.0 }',
+                   'parameters = { conductance = 5000.0, "conductance[{1..1}]" = 1.0 }'), CouplingError,
+         "no variable 'conductance"),
+        ("loop", ('source = "flow"', 'source = "exchanger.heat"'), AlgebraicLoopError,
+         "close an algebraic loop"),
+        ("binding", ('target = "outlet"', 'target = "exit"'), CouplingError, "no connector 'outlet'"),
+        ("truth", ('kind = "scripted"', 'kind = "asset"\nstate = { fouling = "heat" }'), ScenarioError,
+         "leaves damage, noise and faults to the asset"),
+        ("both", ('binding = "coupled.toml"', 'binding = "coupled.toml"\nfile = "x.ssp"'), ScenarioError,
+         "unknown key `asset.file`"),
+        ("neither", ('fmu = "HeatExchanger.fmu"\n', ""), ScenarioError, "needs one of `fmu` and `design`"),
+        ("kind", ('kind = "coupled"', 'kind = "fmu"\nfile = "HeatExchanger.fmu"'), ScenarioError,
+         "unknown key `asset.component`"),
+        ("key", ("target = ", "to = "), ScenarioError, r"unknown key `asset\.connection\[1\]\.to`"),
+        ("seeds", ("load = {", 'seeds = ["seed"]\nload = {'), MissionInputError, "parameter seed, which"),
+    ):  # fmt: skip
+        path = changed(folder, name, change)
+        with pytest.raises(kind, match=words) as caught:
+            new_run(load_scenario(path), tmp_path / name)
+        assert "\n" not in str(caught.value)
+    loaded = load_scenario(folder / "coupled_fouling.toml")
+    (tmp_path / "bad.ssp").write_bytes(b"nothing")
+    for overrides, words in (
+        (Overrides(fmu=folder / "HeatExchanger.fmu"), "the scenario couples several"),
+        (Overrides(ssp=tmp_path / "bad.ssp", fmu=folder / "HeatExchanger.fmu"), "give neither --fmu"),
+        (Overrides(ssp=tmp_path / "none.ssp"), "none.ssp cannot be read"),
+        (Overrides(ssp=tmp_path / "bad.ssp"), "not a sound SSP archive"),
+    ):
+        with pytest.raises((MissionInputError, SspError, FmuError), match=words):
+            new_run(loaded, tmp_path / "run", overrides)
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.ssp"]
+
+
+def test_an_asset_with_its_own_damage_needs_a_model_for_the_twin(folder: Path, tmp_path: Path) -> None:
+    text = (folder / "coupled_fouling.toml").read_text(encoding="utf-8")
+    text = text[: text.index("[truth]")] + '[truth]\nkind = "asset"\nstate = { fouling = "heat" }\n'
+    path = folder / "own.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(MissionInputError, match="name a model for the twin in the table `belief`"):
+        new_run(load_scenario(path), tmp_path / "run")
+
+
+def test_the_schema_of_the_truth() -> None:
+    path = scenario_files()["three_fmus"]
+    table = tomllib.loads(path.read_text(encoding="utf-8"))
+    for change, words in (
+        ({"state": {"z1": "z1"}}, "`truth.state` must have one entry for each state"),
+        ({"kind": "random_growth"}, "belong to the kind `asset`"),
+        ({"kind": "random_growth", "state": {}, "observation": None, "received": None},
+         "`truth.noise` is missing"),
+        ({"noise": {"standard_deviation": 1e-4}}, "leaves damage, noise and faults to the asset"),
+    ):  # fmt: skip
+        truth = {key: value for key, value in (table["truth"] | change).items() if value is not None}
+        with pytest.raises(ScenarioError, match=words):
+            parse_scenario(table | {"truth": truth}, "x")
+
+
+# ---------------------------------------------------------------------- with the shipped wing
+
+
+def shipped(name: str, tmp_path: Path, *changes: tuple[str, str]) -> LoadedScenario:
+    """Return a shipped scenario with changes, and with a calibration that costs nothing."""
+    text = scenario_files()[name].read_text(encoding="utf-8")
+    calibration = text[text.index("[calibration]") : text.index("[truth]")]
+    text = text.replace(
+        calibration, '[calibration]\nparameter = "young_modulus_factor"\nsource = "fixed"\nmean = 1.0073\n\n'
+    )
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    path = tmp_path / f"{name}.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_scenario(path)
+
+
+def plant_of(loaded: LoadedScenario, folder: Path) -> Plant:
+    scenario = resolve_scenario(loaded, Overrides(in_process=True))
+    source = asset_source(scenario)
+    source.check()
+    source.prepare(folder, SilentProgress())
+    truth = Truth(scenario, build_graphical_model(scenario), scenario.mission.seed)
+    return Plant(scenario, truth, source.open())
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wing")
+def test_three_fmus_live_the_script_of_a_scenario(tmp_path: Path) -> None:
+    """Damage, drift and lost gauges of failing_gauges, once as its truth and once in the FMUs: to the bit."""
+    script = {
+        1: (10, 19, "z1", 0.02), 2: (20, 20, "z1", 0.2), 3: (30, 30, "z1", 0.2),
+        4: (5, 14, "z2", 0.02), 5: (5, 5, "z2", 0.2), 6: (25, 25, "z2", 0.2),
+    }  # fmt: skip
+    entries = ", ".join(
+        f'"script[{i}].first" = {first}.0, "script[{i}].last" = {last}.0, "script[{i}].{region}" = {gain}'
+        for i, (first, last, region, gain) in script.items()
+    )
+    faults = (
+        '"dropout_start[1]" = 28.0, "dropout_end[1]" = 1000.0, "dropout_start[{17..20}]" = 12.0, '
+        '"dropout_end[{17..20}]" = 19.0, "blackout.start" = 36.0, "blackout.end" = 38.0, '
+        '"drift_rate[12]" = 6e-6, "drift_start[12]" = 8.0'
+    )
+    split = plant_of(
+        shipped(
+            "three_fmus",
+            tmp_path,
+            ('"probability.z1" = 0.10, "probability.z2" = 0.10', entries),
+            ('noise = 150e-6, "dropout_start[6]" = 20.0, "dropout_end[6]" = 30.0', faults),
+        ),
+        tmp_path / "split",
+    )
+    single = plant_of(
+        shipped(
+            "failing_gauges",
+            tmp_path,
+            ("standard_deviation_microstrain = 150", "standard_deviation_microstrain = 0"),
+        ),
+        tmp_path / "single",
+    )
+    controls = np.random.default_rng(3).integers(2, size=50)
+    for step, control in enumerate(controls):
+        previous = int(controls[step - 1]) if step else None
+        np.testing.assert_array_equal(
+            split.turn(int(control), previous), single.turn(int(control), previous), err_msg=str(step)
+        )
+    ours, theirs = split.record(), single.record()
+    np.testing.assert_array_equal(ours.state, theirs.state)
+    np.testing.assert_array_equal(ours.observation, theirs.observation)
+    for name, values in theirs.monitors.items():
+        np.testing.assert_array_equal(ours.monitors[name], values)
+    assert theirs.state.max() == 0.6
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wing")
+def test_the_shipped_scenario_in_process_in_workers_and_resumed(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    die_after_turn: Callable[..., None],
+) -> None:
+    loaded = shipped("three_fmus", tmp_path, ("steps = 50", "steps = 24"))
+    whole = new_run(loaded, tmp_path / "whole").folder
+    inside = new_run(loaded, tmp_path / "inside", Overrides(in_process=True)).folder
+    assert rows(inside) == rows(whole)
+    with monkeypatch.context() as patch:
+        die_after_turn(patch, 9)
+        with pytest.raises(KeyboardInterrupt):
+            new_run(loaded, tmp_path / "part")
+    resume_run(tmp_path / "part")
+    for name in ("run.nc", "config.json", "summary.json", "checkpoint.jsonl"):
+        assert (tmp_path / "part" / name).read_bytes() == (whole / name).read_bytes(), name
+    drawn = [asset_source(resolve_scenario(loaded, Overrides(seed=seed))).parameters() for seed in (7, 8)]
+    assert all(drawn[0][name] != drawn[1][name] for name in ("damage_seed", "gauge_seed"))
+    received = np.genfromtxt(whole / "csv" / "observed.csv", delimiter=",", skip_header=1)[:, 6]
+    assert np.flatnonzero(np.isnan(received)).tolist() == [20, 21, 22, 23]  # the sixth gauge is lost
+    ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False, progress=SilentProgress())
+    assert rows(new_run(loaded, tmp_path / "ssp", Overrides(ssp=ssp)).folder) == rows(whole)
+
+
+def test_many_lives_of_an_asset_with_its_own_damage_are_refused() -> None:
+    scenario = load_scenario("three_fmus").scenario
+    with pytest.raises(MissionInputError, match="every seed would fly the same life"):
+        fly_many(scenario, asset_source(resolve_scenario(load_scenario("three_fmus"), Overrides())), range(3))
+
+
+def test_the_law_of_the_shipped_damage_is_what_the_twin_believes() -> None:
+    scenario = load_scenario("three_fmus").scenario
+    (damage, *_) = scenario.asset.component
+    values = damage.parameters
+    for control in scenario.control:
+        severity = (control.values["load_factor"] / values["reference_load_factor"]) ** values["exponent"]
+        for region in ("z1", "z2"):
+            assert values[f"probability.{region}"] * severity == pytest.approx(
+                scenario.transition.probability[control.name], rel=1e-12
+            )
+    assert {factor.levels[1] - factor.levels[0] for factor in scenario.state} == {values["level"]}
+    binding = load_binding(binding_files()["three_fmus"])
+    assert binding.step_size == 1.0

@@ -1,0 +1,467 @@
+"""A twin that believes another model than the one that flies: sources, misfit, refusals, runs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibration.wing.result import CalibrationResult
+from calibration.wing.result_file import load_calibration, save_calibration
+from fe.reduction.model_cache import reduced_model
+from fe.runtime.reduced import ReducedModel
+from reporting.progress import SilentProgress
+from scenarios import scenario_files
+from twin_master import workflow
+from twin_master.assets.asset_source import PairedSource
+from twin_master.assets.interface import AssetReading, StatelessAsset
+from twin_master.assets.mismatch import find_misfit
+from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
+from twin_master.assets.strain_library import load_strain_library
+from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.errors import MissingObservationModelError, MissionInputError, ScenarioError
+from twin_master.mission.preparation import prepare_knowledge
+from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.reading import LoadedScenario, load_scenario
+from twin_master.scenario.schema import Scenario
+from twin_master.study import Study, fly_many, in_credible_set
+from twin_master.workflow import new_run, resume_run
+from uav_twin import cli
+
+ROOT = Path(__file__).parents[3]
+TEXT = scenario_files()["model_mismatch"].read_text(encoding="utf-8")
+SAME = ("run.nc", "config.json", "summary.json", "calibration.json", "wing.vtu", "csv/health.csv")
+
+
+def write_scenario(folder: Path, *changes: tuple[str, str]) -> Path:
+    text = TEXT
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    path = folder / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+FILE = '# file = "UAVconfig.json" # here, or by --strain-library\n'
+DESIGN = 'design = "uav_wing"\n'
+FLOWN = 'kind = "strain_library"\n'
+MODEL = '[belief]\nkind = "design"\n'
+ITSELF = '[belief]\nkind = "asset"\n'
+REFUSED = {
+    "no design": ((DESIGN, ""), ["`belief.design` is missing"]),
+    "a design for nothing": ((MODEL, '[belief]\nkind = "asset"\n'), ["unknown key `belief.design`", "kind"]),
+    "a binding": ((FLOWN, FLOWN + 'binding = "uav_wing"\n'), ["unknown key `asset.binding`", "kind, file"]),
+    "parameters": ((FLOWN, FLOWN + "parameters = { young_modulus_factor = 1.0 }\n"), ["`asset.parameters`"]),
+    "an unknown model": ((MODEL, '[belief]\nkind = "oracle"\n'),
+                         ["asset, calibration, design, library, strain_library", "'oracle' came", "belief"]),
+    "no kind of belief": ((MODEL, "[belief]\n"), ["`kind` must be one of", "it is missing", "belief"]),
+    "a library that is not named": ((MODEL, '[belief]\nkind = "library"\n'), ["`belief.file` is missing"]),
+    "errors of too few sensors": (("# model_error_percent = 3", "model_error_percent = [3, 4]"),
+                                  ["observation.model_error_percent", "24", "2 came"]),
+    "a negative error": (("# model_error_percent = 3", "model_error_percent = -3"),
+                         ["observation.model_error_percent", "0"]),
+    "an error in words": (("# model_error_percent = 3", 'model_error_percent = "small"'),
+                          ["observation.model_error_percent", "small"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", sorted(REFUSED))
+def test_combinations_that_mean_nothing_are_refused_in_one_sentence(case: str, tmp_path: Path) -> None:
+    change, words = REFUSED[case]
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(write_scenario(tmp_path, change))
+    sentence = str(caught.value)
+    assert "\n" not in sentence
+    for word in words:
+        assert word in sentence, sentence
+
+
+def test_without_the_library_one_sentence_says_where_to_get_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["uav-twin", "run", "model_mismatch", "--out", str(tmp_path / "run")])
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    assert caught.value.code == 1
+    error = capsys.readouterr().err
+    for word in ("UAV-Digital-Twin", "UAVconfig.json", "--strain-library FILE", "asset.file"):
+        assert word in error
+    assert "Traceback" not in error
+    assert not list(tmp_path.iterdir())
+
+
+def resolved(library: Path, path: Path | str = "model_mismatch") -> Scenario:
+    return resolve_scenario(load_scenario(path), Overrides(strain_library=library))
+
+
+def test_the_twin_may_believe_a_calibrated_wing(
+    library_file: Path, tmp_path: Path, make_calibration: Callable[..., CalibrationResult]
+) -> None:
+    file = save_calibration(make_calibration(), tmp_path / "wing.nc")
+    overrides = Overrides(strain_library=library_file, calibration=file)
+    scenario = resolve_scenario(load_scenario("model_mismatch"), overrides)
+    source = asset_source(scenario)
+    source.check()
+    assert source.origin.differ
+    assert sorted(source.files()) == ["asset/UAVconfig.json", "asset/calibration.nc"]
+    (tmp_path / "run" / "asset").mkdir(parents=True)
+    hashes = source.prepare(tmp_path / "run", SilentProgress())
+    assert {"strain_library", "calibration", "design"} <= {*hashes}
+    assert hashes["design"] == load_calibration(file).design_hash
+    found = source.draws(3)
+    assert found.mean == load_calibration(file).mean("young_modulus_factor")
+    with pytest.raises(MissionInputError, match="brings its own samples"):
+        resolve_scenario(load_scenario("level_turns"), overrides)
+
+
+def test_the_option_names_the_file_and_keeps_the_model(library_file: Path, tmp_path: Path) -> None:
+    scenario = resolved(library_file)
+    assert scenario.asset.file == str(library_file)
+    assert scenario.another_model
+    own = resolved(library_file, "level_turns")
+    assert own.belief.kind == "asset"
+    assert not own.another_model
+    assert not asset_source(own).origin.differ
+    source = asset_source(scenario)
+    assert isinstance(source, PairedSource)
+    assert source.origin.differ
+    assert source.origin.asset == "strain library"
+    source.check()
+    assert set(source.files()) == {"asset/UAVconfig.json", "asset/design.toml"}
+    named = write_scenario(tmp_path, (FILE, f'file = "{library_file}"\n'))
+    assert asset_source(resolve_scenario(load_scenario(named), Overrides())).origin.differ
+    with pytest.raises(ScenarioError, match="binding"):
+        resolve_scenario(load_scenario("model_mismatch"), Overrides(fmu=tmp_path / "x.fmu"))
+
+
+def test_what_asset_and_model_cannot_agree_on_is_refused(library_file: Path, tmp_path: Path) -> None:
+    with pytest.raises(MissingObservationModelError, match=r"3g at load factor 3, .* 2\.5"):
+        asset_source(resolved(library_file, write_scenario(tmp_path, ("= 3.0 }", "= 2.5 }"))))
+    other = resolved(library_file, write_scenario(tmp_path, ('"young_modulus_factor"', '"stiffness"')))
+    source = asset_source(other)
+    with pytest.raises(MissingObservationModelError, match=r"young_modulus_factor.*set `belief\.kind`"):
+        source.check()
+    with pytest.raises(MissingObservationModelError, match="24 gauges"):
+        asset_source(resolved(library_file, write_scenario(tmp_path, ("count = 24", "count = 23"))))
+    missing = resolved(library_file, write_scenario(tmp_path, (DESIGN, 'design = "no.toml"\n')))
+    with pytest.raises(MissionInputError, match=r"no\.toml cannot be read"):
+        asset_source(missing).check()
+
+
+def linear_case(seed: int, spread: float) -> tuple[np.ndarray, ...]:
+    """Strains that are linear in the state: base (G), slopes (F, G), draws' offsets (E, G)."""
+    random = np.random.default_rng(seed)
+    return (
+        random.uniform(500e-6, 3000e-6, 24),
+        random.uniform(0.0, 2000e-6, (2, 24)),
+        spread * random.standard_normal((4, 24)),
+    )
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1), spread=st.sampled_from([0.0, 30e-6]))
+def test_the_bias_of_a_linear_model_is_that_of_least_squares(seed: int, spread: float) -> None:
+    """Where everything is linear the bias is exact: whiten by the covariance, and solve by lstsq."""
+    scenario = load_scenario("level_turns").scenario
+    model = build_graphical_model(scenario)
+    base, slopes, offsets = linear_case(seed, spread)
+    offsets = offsets - offsets.mean(axis=0)
+    factor = np.array([control.values["load_factor"] for control in scenario.control]) / 3.0
+    table = (base + model.states.coordinates @ slopes)[None, :, None, :] + offsets[:, None, None, :]
+    sensors = GaussianSensorModel(table * factor[:, None], 125e-6)
+    wrong = 60e-6 * np.random.default_rng(seed + 1).standard_normal(24)
+
+    def observe(control: Any, health: Any) -> AssetReading:
+        scale = control["load_factor"] / 3.0
+        return AssetReading(scale * (base + np.array([health["z1"], health["z2"]]) @ slopes - wrong))
+
+    misfit = find_misfit(scenario, model, sensors, StatelessAsset(observe))
+    np.testing.assert_allclose(misfit.difference, np.broadcast_to(wrong * factor[:, None], (25, 2, 24)))
+    np.testing.assert_allclose(misfit.bias, misfit.bias_per_sensor.sum(axis=-1))
+    for control, scale in enumerate(factor):
+        covariance = 125e-6**2 * np.eye(24) + scale**2 * offsets.T @ offsets / 4
+        root = np.linalg.cholesky(covariance)
+        expected, *_ = np.linalg.lstsq(
+            np.linalg.solve(root, scale * slopes.T), np.linalg.solve(root, -scale * wrong), rcond=None
+        )
+        np.testing.assert_allclose(misfit.bias[7, control], expected, rtol=1e-6, atol=1e-9)
+    relative = wrong / (base - wrong)
+    np.testing.assert_allclose(misfit.relative[0, 1], relative)
+    largest, sensor = misfit.largest
+    assert largest == pytest.approx(np.abs(misfit.relative).max())
+    assert np.abs(misfit.relative[..., sensor]).max() == pytest.approx(largest)
+    assert misfit.rms == pytest.approx(np.sqrt(np.mean(misfit.per_sensor**2)))
+
+
+@settings(deadline=None)
+@given(
+    weights=st.lists(st.integers(0, 5), min_size=25, max_size=25).filter(any),
+    truth=st.tuples(st.integers(0, 80), st.integers(0, 80)),
+)
+def test_the_credible_set_by_enumeration(weights: list[int], truth: tuple[int, int]) -> None:
+    """The set of all states at least as probable as p, for the largest p at which it holds 90 %."""
+    model = build_graphical_model(load_scenario("level_turns").scenario)
+    probability = np.array(weights) / sum(weights)
+    sets = [[s for s in range(25) if weights[s] >= least] for least in (5, 4, 3, 2, 1)]
+    smallest = next(s for s in sets if 10 * sum(weights[i] for i in s) >= 9 * sum(weights))
+    levels = np.arange(0, 81, 20)
+    near = [
+        {int(level) for level in levels if abs(level - z) == np.abs(levels - z).min()} for z in truth
+    ]  # fmt: skip
+    expected = any(
+        round(100 * model.states.coordinates[s, 0]) in near[0]
+        and round(100 * model.states.coordinates[s, 1]) in near[1]
+        for s in smallest
+    )
+    found = in_credible_set(model, probability[None], np.array([truth]) / 100.0)
+    assert found.tolist() == [expected]
+
+
+def test_standard_errors_of_a_study() -> None:
+    random = np.random.default_rng(1)
+    error = random.standard_normal((50, 2))
+    study = Study(
+        seeds=tuple(range(50)),
+        delay=np.r_[np.ones(40), np.full(5, np.inf), np.full(5, np.nan)],
+        early=np.arange(50) < 10,
+        error=error,
+        squared_error=error**2,
+        log_evidence=np.full(50, 3.0),
+        credible=np.r_[np.zeros(25), np.ones(25)],
+    )
+    assert study.within(2).value == pytest.approx(40 / 45)
+    assert study.within(2).error == pytest.approx(np.sqrt(40 / 45 * 5 / 45 / 45))
+    assert study.early_fallback.error == pytest.approx(np.sqrt(0.2 * 0.8 / 50))
+    assert study.evidence.value == 3.0
+    assert study.evidence.error == 0.0
+    assert study.credible_share.error == pytest.approx(0.5 / 7.0)
+    again = [np.sqrt(np.mean(random.choice(error[:, 0], 50) ** 2)) for _ in range(4000)]
+    assert study.rms(0).value == pytest.approx(study.rms_error[0])
+    assert study.rms(0).error == pytest.approx(np.std(again), rel=0.1)  # the bootstrap
+    assert study.bias(1).value == pytest.approx(error[:, 1].mean())
+
+
+def test_a_model_error_reaches_the_twin(library_file: Path, tmp_path: Path) -> None:
+    """A twin that doubts its model trusts an observation less, and its run says what it assumed."""
+    path = write_scenario(
+        tmp_path, (MODEL + DESIGN, ITSELF), ("# model_error_percent", "model_error_percent")
+    )
+    doubting = resolved(library_file, path)
+    assert doubting.observation.model_error == pytest.approx(0.03)
+    certain = resolved(library_file, write_scenario(tmp_path, (MODEL + DESIGN, ITSELF)))
+    spread = []
+    for scenario in (certain, doubting):
+        source = asset_source(scenario)
+        knowledge = prepare_knowledge(scenario, source, 1)
+        observation = source.open().step({"load_factor": 3.0}, {"z1": 0.0, "z2": 0.0}).values
+        model, belief = knowledge.model, knowledge.sensor_model.log_likelihood(observation, 1)
+        weights = np.exp(belief - belief.max())
+        spread.append(model.states.standard_deviation(weights / weights.sum()))
+    assert np.all(spread[1] > spread[0])
+    each = [float(value) for value in range(24)]
+    listed = write_scenario(tmp_path, ("# model_error_percent = 3", f"model_error_percent = {each}"))
+    scenario = load_scenario(listed).scenario
+    np.testing.assert_allclose(scenario.observation.model_error, np.arange(24) / 100.0)
+    assert Scenario.model_validate(scenario.to_dict()) == scenario
+
+
+def library_of(wing: ReducedModel, scale: np.ndarray, e: float = 1.0073) -> dict[str, object]:
+    """A library in the published format of a wing whose gauges show `scale` times what its model says."""
+    levels = (0, 20, 40, 60, 80)
+
+    def strains(factor: float, z1: int, z2: int, load: float) -> list[float]:
+        strain = wing.static_response(factor, (z1 / 100, z2 / 100), load).strain
+        return list(1e6 * scale * strain)
+
+    draws = {"mean": e, "1.0": 1.0, "1.01": 1.01}
+    return {
+        "states": [list(levels), list(levels)],
+        "controls": ["2g", "3g"],
+        "gamma": 0.6,
+        "transition_probabilities": {"2g": 0.05, "3g": 0.1},
+        "observations": {
+            str(z1): {
+                str(z2): {
+                    f"{load}g": {name: strains(factor, z1, z2, load) for name, factor in draws.items()}
+                    for load in (2, 3)
+                }
+                for z2 in levels
+            }
+            for z1 in levels
+        },
+    }
+
+
+@pytest.fixture(scope="module")
+def wing() -> ReducedModel:
+    """The shipped wing, from the cache if an earlier test or run built it."""
+    return reduced_model()
+
+
+@pytest.fixture(scope="module")
+def scale() -> np.ndarray:
+    scale = 1.0 + 0.03 * np.random.default_rng(6).standard_normal(24)
+    scale[22] = 0.9
+    return scale
+
+
+@pytest.fixture(scope="module")
+def twisted(wing: ReducedModel, scale: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("library") / "UAVconfig.json"
+    path.write_text(json.dumps(library_of(wing, scale)), encoding="utf-8")
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wing")
+class TestOnTheWing:
+    """The shipped wing's model believed, and libraries of wings that differ from it by a known share."""
+
+    def sources(self, wing: ReducedModel, library: Path) -> tuple[Scenario, ReducedModelSource, PairedSource]:
+        scenario = load_scenario("level_turns").scenario
+        own = ReducedModelSource(scenario, wing)
+        flown = StrainLibrarySource(scenario, load_strain_library(library), "h")
+        return scenario, own, PairedSource(flown, own)
+
+    def test_a_library_of_the_same_wing_is_no_mismatch(self, wing: ReducedModel, tmp_path: Path) -> None:
+        path = tmp_path / "UAVconfig.json"
+        path.write_text(json.dumps(library_of(wing, np.ones(24))), encoding="utf-8")
+        scenario, own, mixed = self.sources(wing, path)
+        knowledge = prepare_knowledge(scenario, mixed, 1)
+        np.testing.assert_array_equal(
+            knowledge.sensor_model.value_per_draw,
+            prepare_knowledge(scenario, own, 1).sensor_model.value_per_draw,
+        )
+        misfit = find_misfit(scenario, knowledge.model, knowledge.sensor_model, mixed.open())
+        # All that is left is the mean of e, which is not quite 1.0073: strains go with 1 / e at most.
+        mean = own.draws(1).mean
+        assert misfit.rms < 1.2 * abs(mean / 1.0073 - 1.0) + 1e-5
+        assert np.abs(misfit.bias).max() < 0.01
+
+    def test_the_misfit_is_what_was_put_in_and_the_estimate_goes_where_it_says(
+        self, wing: ReducedModel, twisted: Path, scale: np.ndarray
+    ) -> None:
+        scenario, own, mixed = self.sources(wing, twisted)
+        knowledge = prepare_knowledge(scenario, mixed, 0)
+        misfit = find_misfit(scenario, knowledge.model, knowledge.sensor_model, mixed.open())
+        np.testing.assert_allclose(
+            1.0 + misfit.relative, np.broadcast_to(1.0 / scale, (25, 2, 24)), rtol=1e-3
+        )
+        assert misfit.largest[1] == int(np.argmax(np.abs(1.0 / scale - 1.0)))
+        seeds = range(12)
+        right, wrong = (fly_many(scenario, source, seeds, calibration_seed=0) for source in (own, mixed))
+        assert wrong.evidence.value < right.evidence.value - 1.0
+        assert wrong.rms_error[1] > right.rms_error[1] + 0.02
+        expected = misfit.bias[knowledge.model.states.index((0.2, 0.4)), 1]
+        assert np.abs(expected[1]) > 0.05
+        assert np.sign(wrong.bias(1).value) == np.sign(expected[1])
+        assert wrong.credible_share.value < right.credible_share.value
+
+    def test_a_run_says_that_asset_and_model_differ_and_is_resumed_bit_for_bit(
+        self,
+        wing: ReducedModel,
+        twisted: Path,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        die_after_turn: Callable[..., None],
+    ) -> None:
+        loaded = load_scenario("model_mismatch")
+        over = Overrides(strain_library=twisted)
+        whole = new_run(loaded, tmp_path / "whole", over)
+        assert whole.origin.differ
+        page = whole.report.read_text(encoding="utf-8")
+        assert "model differ: flown was the strain library" in page
+        assert "reduced model of the design" in page
+        summary = json.loads((whole.folder / "summary.json").read_text(encoding="utf-8"))
+        assert summary["asset_and_model_differ"] is True
+        assert summary["asset"] == "strain library"
+        figures = {figure.key: figure for figure in whole.figures}
+        assert float(figures["model_misfit_rms"].value or 0.0) == pytest.approx(4.0, abs=1.5)
+        assert set(figures) <= {*resolved(twisted).figure_names}
+        with xr.open_datatree(whole.folder / "run.nc", engine="h5netcdf") as tree:
+            assert tree.attrs["asset"] == "strain library"
+            assert tree.attrs["twin_model"].startswith("reduced model of the design")
+            flown = load_strain_library(twisted).strain_at((0.0, 0.0), 1)
+            np.testing.assert_allclose(tree["truth"]["strain"][0], flown)
+            mean = float(figures["young_modulus_factor_mean"].value or 0.0)
+            believed = wing.static_response(mean, (0.0, 0.0), 3.0).strain
+            np.testing.assert_allclose(tree["filtered"]["quantity_mean"][0], believed, rtol=1e-3)
+        assert (whole.folder / "wing.vtu").stat().st_size > 10_000
+        config = json.loads((whole.folder / "config.json").read_text(encoding="utf-8"))
+        assert config["inputs"]["design"] == wing.design_hash
+        assert set(config["inputs"]) == {"design", "strain_library"}
+        self.resume_elsewhere(loaded, twisted, tmp_path, monkeypatch, die_after_turn, whole.folder)
+
+    def resume_elsewhere(
+        self,
+        loaded: LoadedScenario,
+        library: Path,
+        place: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        die_after_turn: Callable[..., None],
+        whole: Path,
+    ) -> None:
+        copy = place / "copy" / "UAVconfig.json"
+        copy.parent.mkdir()
+        copy.write_bytes(library.read_bytes())
+        monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+        with monkeypatch.context() as patch:
+            die_after_turn(patch, 23)
+            with pytest.raises(KeyboardInterrupt):
+                new_run(loaded, place / "part", Overrides(strain_library=copy))
+        copy.unlink()
+        moved = (place / "part").rename(place / "moved")
+        resume_run(moved)
+        for name in SAME:
+            assert (moved / name).read_bytes() == (whole / name).read_bytes(), name
+        for path in moved.rglob("*"):
+            if path.is_file():
+                assert str(place).encode() not in path.read_bytes(), path
+
+    def test_the_study_prints_its_table(self, wing: ReducedModel, twisted: Path) -> None:
+        """Scaled gauge by gauge, the model of the twin is that of this library, and is as good as the own."""
+        result = subprocess.run(
+            [sys.executable, "-m", "benchmarks.study_level_turns", "--combinations", "--strain-library",
+             str(twisted), "--missions", "3", "--first-seed", "0", "--model-error", "0", "scaled",
+             "--markdown"],
+            cwd=ROOT, capture_output=True, text=True, check=False, timeout=600,
+        )  # fmt: skip
+        assert result.returncode in (0, 1), result.stderr
+        rows = [line.strip("| ").split(" | ") for line in result.stdout.splitlines() if line.startswith("|")]
+        assert [len(row) for row in rows] == [8] * 10 + [12] * 8
+        found = {
+            tuple(row[:3]): [float(cell.strip("*").split()[0]) for cell in row[6:11]] for row in rows[12:]
+        }
+        assert len(found) == 6
+        own = found["our wing", "our wing", "none"]
+        np.testing.assert_allclose(
+            found["library", "our wing", "none, gauges scaled"], own, atol=1.0
+        )  # between the levels the library is interpolated
+        assert found["library", "our wing", "none"][-1] < own[-1] - 1.0
+
+    def test_study_on_the_published_library(self, wing: ReducedModel, published_library: Path) -> None:
+        """Our model holds the wing of the authors well enough to steer it; bounds for 30 missions."""
+        scenario, _, mixed = self.sources(wing, published_library)
+        knowledge = prepare_knowledge(scenario, mixed, 0)
+        misfit = find_misfit(scenario, knowledge.model, knowledge.sensor_model, mixed.open())
+        assert misfit.rms < 0.06
+        observation = scenario.observation.model_copy(update={"model_error": 0.03})
+        doubting = scenario.model_copy(update={"observation": observation})
+        certain, doubtful = (fly_many(chosen, mixed, range(30)) for chosen in (scenario, doubting))
+        assert certain.share_within(2) >= 0.9
+        assert certain.rms_error[0] <= 0.055
+        assert doubtful.early_share <= certain.early_share
+        assert doubtful.evidence.value > certain.evidence.value
+        assert certain.rms_error[1] < 0.2

@@ -1,0 +1,262 @@
+"""Sampling an FMU into an observation library: values, processes, kills, memories, crashes."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fmu_asset.errors import FmuCallError, FmuTimeoutError, FmuWorkerError
+from fmu_asset.packing.script import build_script_fmu
+from twin_master.assets.observation_library import load_observation_library
+from twin_master.errors import InvalidObservationLibraryError
+from twin_master.library import worker as library_worker
+from twin_master.library.grid import SamplingGrid
+from twin_master.library.request import grid_of_fmu, parse_grid
+from twin_master.library.sampling import blocks_folder, sample_library
+
+BINDING = """
+[binding]
+name = "wayward"
+step_size = 1.0
+[control.push]
+variable = "push"
+unit = "N"
+[control.mode]
+variable = "mode"
+unit = "1"
+[health.wear]
+variable = "wear"
+unit = "1"
+[parameter.gain]
+variable = "gain"
+unit = "1"
+[observation.lever]
+variables = ["shown", "double"]
+unit = ["m", "mm"]
+"""
+FINE, LAG, COUNT, DIE, SLEEP, REFUSE, SLOW = (float(mode) for mode in range(7))
+WEAR, GAIN, PUSH = (0.0, 0.25, 0.5), (0.9, 1.0, 1.1), (2.0, 4.0)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("wayward")
+    fmu = build_script_fmu(Path(__file__).with_name("wayward.py"), folder / "wayward.fmu").path
+    (folder / "binding.toml").write_text(BINDING)
+    return fmu, folder / "binding.toml"
+
+
+def grid(files: tuple[Path, Path], mode: float = FINE, **changes: object) -> SamplingGrid:
+    texts = [
+        f"wear={','.join(map(str, WEAR))}",
+        f"gain={','.join(map(str, GAIN))}",
+        f"push={','.join(map(str, PUSH))}",
+        f"mode={mode}",
+    ]
+    return replace(grid_of_fmu(*files, texts), **changes)  # type: ignore[arg-type]
+
+
+def test_the_library_holds_what_the_formula_says_with_names_and_units(
+    files: tuple[Path, Path], tmp_path: Path
+) -> None:
+    outcome = sample_library(grid(files), tmp_path / "lever.nc", workers=1)
+    expected = np.array([[[g * p / (1.0 + w) for p in PUSH] for w in WEAR] for g in GAIN])
+    np.testing.assert_allclose(outcome.library.values[..., 0], expected, rtol=1e-15)
+    np.testing.assert_allclose(outcome.library.values[..., 1], 2e3 * expected, rtol=1e-15)
+    assert not blocks_folder(outcome.path).exists()
+    with xr.open_dataset(outcome.path, engine="h5netcdf") as stored:
+        assert stored["observation"].dims == ("draw", "wear", "control", "sensor")
+        assert stored["wear"].attrs["units"] == "1"
+        assert list(stored["sensor"].values) == ["shown", "double"]
+        assert list(stored["sensor_unit"].values) == ["m", "mm"]
+        assert stored["control_push"].attrs["units"] == "N"
+        assert float(stored["observation"].sel(wear=0.25)[1, 1, 0]) == 3.2
+    read = load_observation_library(outcome.path)
+    np.testing.assert_array_equal(read.values, outcome.library.values)
+    assert (read.parameter, read.draws.tolist(), read.controls) == (
+        "gain", list(GAIN), ("push = 2, mode = 0", "push = 4, mode = 0"),
+    )  # fmt: skip
+
+
+def test_the_bytes_do_not_depend_on_the_number_of_processes(files: tuple[Path, Path], tmp_path: Path) -> None:
+    many = grid(files, draws=tuple(np.linspace(0.8, 1.2, 30)))
+    paths = [sample_library(many, tmp_path / f"{n}.nc", workers=n).path for n in (1, 3)]
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+@pytest.fixture
+def heard_interruptions() -> Iterator[None]:
+    """What a shell starts in the background ignores SIGINT, and so would its children."""
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, former)
+
+
+@pytest.mark.usefixtures("heard_interruptions")
+@pytest.mark.parametrize("signals", [[signal.SIGKILL], [signal.SIGINT, signal.SIGKILL]])
+def test_what_an_interrupted_sampling_finished_is_kept(
+    files: tuple[Path, Path], tmp_path: Path, signals: list[signal.Signals]
+) -> None:
+    slow = grid(files, SLOW, draws=tuple(np.linspace(0.8, 1.2, 20)))
+    whole = sample_library(slow, tmp_path / "whole.nc", workers=2)
+    fmu, binding = files
+    out = tmp_path / "part.nc"
+    command = [sys.executable, "-m", "uav_twin", "library", "sample", "--quiet", "--workers", "1"]
+    command += ["--fmu", str(fmu), "--binding", str(binding), "--out", str(out), "--grid", "wear=0,0.25,0.5"]
+    command += ["--grid", "gain=0.8:1.2:20", "--grid", "push=2,4", "--grid", f"mode={SLOW}"]
+    wanted = 0
+    for end in signals:
+        wanted += 5
+        root = str(Path(__file__).parents[3])
+        resume = ["--resume"] if wanted > 5 else []
+        process = subprocess.Popen([*command, *resume], cwd=root, stderr=subprocess.PIPE)
+        while len(list(blocks_folder(out).glob("block_*.npz"))) < wanted and process.poll() is None:
+            time.sleep(0.01)
+        process.send_signal(end)
+        words = process.communicate()[1].decode()
+        if end == signal.SIGINT:
+            assert process.returncode == 130
+            assert words.startswith("Interrupted; finished blocks are kept")
+            assert "Traceback" not in words
+    assert not out.exists()
+    with pytest.raises(InvalidObservationLibraryError, match=r"part\.nc\.blocks holds the finished blocks"):
+        sample_library(slow, out)
+    with pytest.raises(InvalidObservationLibraryError, match=r"another FMU, binding, grid .*\(draws\)"):
+        sample_library(grid(files, SLOW), out, resume=True)
+    outcome = sample_library(slow, out, workers=2, resume=True)
+    assert wanted <= outcome.kept_blocks < outcome.block_count
+    assert out.read_bytes() == whole.path.read_bytes()
+
+
+def test_a_damaged_block_is_sampled_again(
+    files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = sample_library(grid(files), tmp_path / "whole.nc", workers=1)
+
+    def full_disk(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    out = tmp_path / "part.nc"
+    with monkeypatch.context() as patch:
+        patch.setattr("twin_master.library.sampling.write_observation_library", full_disk)
+        with pytest.raises(KeyboardInterrupt):
+            sample_library(grid(files), out, workers=1)
+    (blocks_folder(out) / "block_00003.npz").write_bytes(b"PK half a block")
+    outcome = sample_library(grid(files), out, workers=1, resume=True)
+    assert outcome.block_count - outcome.kept_blocks == 1
+    assert out.read_bytes() == whole.path.read_bytes()
+
+
+def test_an_fmu_that_remembers_is_refused_and_sampled_from_a_fresh_start(
+    files: tuple[Path, Path], tmp_path: Path
+) -> None:
+    for mode in (LAG, COUNT):
+        with pytest.raises(
+            InvalidObservationLibraryError, match=r"remembers earlier steps: at wear = .*--settle"
+        ):
+            sample_library(grid(files, mode), tmp_path / "lever.nc", workers=1, replace_existing=True)
+    with pytest.raises(InvalidObservationLibraryError, match="has not settled after 3 steps"):
+        sample_library(
+            grid(files, LAG, settling_steps=3), tmp_path / "lever.nc", workers=1, replace_existing=True
+        )
+    lagging = grid(files, LAG, settling_steps=40)
+    settled = sample_library(lagging, tmp_path / "lever.nc", workers=1, replace_existing=True)
+    exact = sample_library(grid(files), tmp_path / "exact.nc", workers=1)
+    np.testing.assert_allclose(settled.library.values, exact.library.values, rtol=1e-11)
+    assert settled.library.settling_steps == 40
+
+
+def test_a_refused_point_a_crash_and_a_hanging_fmu_are_one_sentence_each(
+    files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "lever.nc"
+    with pytest.raises(
+        FmuCallError, match=r"at wear = 0\.5, control push = 2, mode = 5, gain = 0\.9: .*Discard"
+    ):
+        sample_library(grid(files, REFUSE), out, workers=2)
+    # What came before is kept, so that the user can mend the FMU's surroundings and go on.
+    assert list(blocks_folder(out).glob("block_*.npz"))
+    with pytest.raises(FmuWorkerError, match=r"died \(signal 6\)"):
+        sample_library(grid(files, DIE), out, workers=1, replace_existing=True)
+    monkeypatch.setattr(library_worker, "_START_LIMIT", 2.0)
+    with pytest.raises(FmuTimeoutError, match=r"longer than 0\.1 s a step"):
+        sample_library(grid(files, SLEEP, step_timeout=0.1), out, workers=1, replace_existing=True)
+    assert not out.exists()
+
+
+def test_what_does_not_fit_is_named_before_anything_is_started(
+    files: tuple[Path, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "lever.nc"
+    for changes, words in (
+        (
+            {"states": {"tear": (0.0,)}},
+            "the state tear, which the binding wayward does not know; it knows wear",
+        ),
+        ({"controls": {"a": {"pull": 1.0}}}, "control input pull"),
+        ({"parameter": "gains"}, "the parameter gains"),
+        ({"states": {}}, "needs at least one state"),
+        ({"states": {"wear": (0.2, 0.1)}}, "must increase"),
+    ):
+        with pytest.raises(InvalidObservationLibraryError, match=words):
+            sample_library(grid(files, **changes), out, workers=1)  # type: ignore[arg-type]
+    with pytest.raises(InvalidObservationLibraryError, match="suffix"):
+        sample_library(grid(files), tmp_path / "lever.csv", workers=1)
+    with pytest.raises(InvalidObservationLibraryError, match="at least 1"):
+        sample_library(grid(files), out, workers=0)
+    out.write_bytes(b"a library")
+    with pytest.raises(InvalidObservationLibraryError, match="exists"):
+        sample_library(grid(files), out, workers=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["lever.nc"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("wear", "NAME=VALUES"),
+        ("tear=1", "NAME=VALUES with a name of the binding wayward"),
+        ("wear=a,b", "must give numbers"),
+        ("wear=0:1:0", "must give numbers"),
+        ("wear=0:1", "must give numbers"),
+        ("wear=nan", "must give numbers"),
+    ],
+)
+def test_a_grid_that_is_none_is_refused(files: tuple[Path, Path], text: str, words: str) -> None:
+    with pytest.raises(InvalidObservationLibraryError, match=words):
+        grid_of_fmu(*files, [text])
+
+
+def test_grids_are_read(files: tuple[Path, Path]) -> None:
+    from fmu_asset.door.binding import load_binding
+
+    found = parse_grid(["health.wear=0:1:5", "push=1,2", "gain=3"], load_binding(files[1]))
+    assert found["health"] == {"wear": (0.0, 0.25, 0.5, 0.75, 1.0)}
+    assert found["control"] == {"push": (1.0, 2.0)}
+    assert found["parameter"] == {"gain": (3.0,)}
+
+
+@given(st.integers(1, 40), st.lists(st.integers(1, 12), min_size=1, max_size=3), st.integers(1, 6))
+def test_blocks_cover_every_point_once(draws: int, levels: list[int], controls: int) -> None:
+    made = SamplingGrid(
+        "f", "b", "r", "p", tuple(range(draws)), {str(k): tuple(range(n)) for k, n in enumerate(levels)},
+        {str(k): {} for k in range(controls)},
+    )  # fmt: skip
+    points = [index for first, last in made.blocks for index in range(first, last)]
+    assert points == list(range(draws * int(np.prod(levels)) * controls))
+    assert len(made.blocks) <= 64 or len(made.blocks) == -(-made.size // 4096)
+    again = SamplingGrid.from_json(made.to_json())
+    assert (again.blocks, again.shape) == (made.blocks, made.shape)
+    draw, state, control = made.point(made.size - 1)
+    assert (draw, control) == (draws - 1, str(controls - 1))
+    assert list(state.values()) == [n - 1 for n in levels]

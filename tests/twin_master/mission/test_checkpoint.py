@@ -1,0 +1,128 @@
+"""The checkpoint: what goes in comes out to the last bit, and one that was changed is refused."""
+
+from __future__ import annotations
+
+import resource
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reporting.errors import DiskFullError
+from twin_master.errors import NotResumableError
+from twin_master.mission import checkpoint
+from twin_master.mission.checkpoint import CHECKPOINT_NAME, Checkpoint, FlownTurn, open_checkpoint
+
+STATE = b"state\x00\xff"
+
+
+def flown(count: int) -> list[FlownTurn]:
+    generator = np.random.default_rng(0)
+    turns = []
+    for number in range(count):
+        observed = generator.standard_normal(24)
+        observed[number] = np.nan
+        monitors = {"a.b": float(generator.random())}
+        state, noise_free = generator.random(2), generator.random(24)
+        turns.append(FlownTurn(1, number % 2, observed, state, noise_free, monitors, STATE * (number + 1)))
+    return turns
+
+
+def write(folder: Path, turns: list[FlownTurn]) -> bytes:
+    with open_checkpoint(folder, "abc") as file:
+        for turn in turns:
+            file.keep(turn)
+    return (folder / CHECKPOINT_NAME).read_bytes()
+
+
+def read(folder: Path, config_hash: str = "abc") -> Checkpoint | None:
+    with open_checkpoint(folder, config_hash) as file:
+        return file.checkpoint
+
+
+def test_round_trip_is_exact(tmp_path: Path) -> None:
+    turns = flown(3)
+    write(tmp_path, turns)
+    found = read(tmp_path)
+    assert found is not None
+    assert found.turns == 3
+    assert found.observed.tobytes() == np.array([turn.observed for turn in turns]).tobytes()
+    assert found.control_index.tolist() == [1, 1, 1, 0]
+    assert found.plant.state.tobytes() == np.array([turn.state for turn in turns]).tobytes()
+    assert found.plant.observation.tobytes() == np.array([turn.observation for turn in turns]).tobytes()
+    assert found.plant.monitors["a.b"].tolist() == [turn.monitors["a.b"] for turn in turns]
+    assert found.asset_state == 3 * STATE
+
+
+def test_none_before_the_first_turn(tmp_path: Path) -> None:
+    assert read(tmp_path) is None
+
+
+def test_a_line_cut_off_anywhere_is_flown_again(tmp_path: Path) -> None:
+    turns = flown(4)
+    whole = write(tmp_path, turns)
+    ends = [n + 1 for n, byte in enumerate(whole) if byte == ord("\n")]
+    for cut in [0, 1, ends[0] - 1, ends[0], ends[0] + 70, ends[1] - 1, ends[1], ends[3] + 1, ends[4] - 1]:
+        (tmp_path / CHECKPOINT_NAME).write_bytes(whole[:cut])
+        left = sum(end <= cut for end in ends[1:])
+        with open_checkpoint(tmp_path, "abc") as file:
+            assert file.turns == left
+            for turn in turns[left:]:
+                file.keep(turn)
+        assert (tmp_path / CHECKPOINT_NAME).read_bytes() == whole
+
+
+def test_a_changed_or_foreign_checkpoint_is_refused(tmp_path: Path) -> None:
+    whole = write(tmp_path, flown(3))
+    with pytest.raises(NotResumableError, match="another configuration"):
+        read(tmp_path, "other")
+    path = tmp_path / CHECKPOINT_NAME
+    lines = whole.splitlines(keepends=True)
+    strain = str(flown(1)[0].observed[5]).encode()
+    for damaged, line in (
+        (whole.replace(strain, b"0.25"), 2),
+        (lines[0] + lines[2] + lines[1], 2),
+        (lines[0] + lines[1] + lines[3], 3),
+        (whole[:-2] + b"\n", 4),
+        (b"no checkpoint\n" + whole, 1),
+        (b"no checkpoint", 1),
+        (b"PK\x03\x04\xff", 1),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises(NotResumableError, match=rf"line {line} of .*changed or is damaged.*--replace"):
+            read(tmp_path)
+
+
+def test_large_states_are_kept_less_often_and_their_turns_flown_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoint, "STATE_ALLOWANCE", 300)
+    monkeypatch.setattr(checkpoint, "STATE_SHARE", 30)
+    content = np.random.default_rng(1).bytes(100)  # 144 characters in the file
+    turns = [replace(turn, asset_state=content) for turn in flown(12)]
+    whole = write(tmp_path, turns)
+    found = read(tmp_path)
+    assert found is not None
+    assert found.turns == 10
+    with open_checkpoint(tmp_path, "abc") as file:
+        for turn in turns[found.turns :]:
+            file.keep(turn)
+    assert (tmp_path / CHECKPOINT_NAME).read_bytes() == whole
+
+
+def test_a_full_disk_leaves_the_turns_before(tmp_path: Path) -> None:
+    turns = flown(3)
+    size = len(write(tmp_path, turns[:2]))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        with open_checkpoint(tmp_path, "abc") as file:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size + 50, hard))
+            with pytest.raises(DiskFullError, match="No space is left"):
+                file.keep(turns[2])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert (tmp_path / CHECKPOINT_NAME).stat().st_size == size

@@ -1,0 +1,201 @@
+"""A run whose FMU crashes, hangs or lies stops with one sentence, and goes on when the cause is gone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import xarray as xr
+
+from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
+from twin_master import workflow
+from twin_master.scenario.reading import load_scenario
+from twin_master.workflow import new_run, resume_run
+
+BINDING = """
+[binding]
+name = "hostile"
+step_size = 1.0
+
+[control.u]
+variable = "u"
+unit = "m/s"
+
+[health.d]
+variable = "d"
+unit = "1"
+
+[parameter.k]
+variable = "k"
+unit = "1"
+
+[observation.y]
+variables = "y"
+unit = "m"
+
+[limits]
+step_time = 3.0
+memory = 400.0
+"""
+SCENARIO = """
+format = 2
+
+[mission]
+name = "hostile"
+steps = 30
+prediction_steps = 3
+first_control = "low"
+seed = 4
+
+[[state]]
+name = "d"
+title = "damage"
+unit = "1"
+levels = [0.0, 0.2, 0.4]
+prior = [1, 0, 0]
+
+[[control]]
+name = "low"
+values = { u = 2.0 }
+
+[[control]]
+name = "high"
+values = { u = 4.0 }
+
+[observation]
+role = "y"
+count = 1
+unit = "m"
+standard_deviation = 0.1
+
+[transition]
+kind = "independent_worsening"
+probability = { low = 0.05, high = 0.1 }
+
+[rewards]
+health_limit = 80.0
+error_scale = 0.5
+control = { low = -0.2, high = 0.2 }
+control_weight = 1.0
+
+[planner]
+gamma = 0.8
+
+[asset]
+kind = "fmu"
+file = "FMU"
+binding = "binding.toml"
+
+[belief]
+kind = "asset"
+
+[calibration]
+parameter = "k"
+source = "normal"
+mean = 1.0
+standard_deviation = 0.01
+draws = 5
+
+[truth]
+kind = "scripted"
+gains = [{ state = "d", first_step = 8, gain = 0.2 }]
+
+[truth.noise]
+standard_deviation = 0.1
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+
+
+def scenario(folder: Path, fmu: Path) -> Any:
+    (folder / "binding.toml").write_text(BINDING, encoding="utf-8")
+    (folder / "scenario.toml").write_text(SCENARIO.replace("FMU", str(fmu)), encoding="utf-8")
+    return load_scenario(folder / "scenario.toml")
+
+
+@pytest.mark.parametrize(
+    ("what", "kind", "sentence"),
+    [
+        ("SEGFAULT", FmuWorkerError, r"step 20 from t = 20 s: .*SIGSEGV"),
+        ("HANG", FmuTimeoutError, r"step 20 from t = 20 s: .*longer than 3 s for the step"),
+        ("LEAK_IN_STEP", FmuMemoryError, r"more than the limit of 400 MiB"),
+    ],
+)
+def test_a_run_is_resumed_once_the_cause_is_gone(
+    foreign_fmu: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    what: str,
+    kind: type[FmuError],
+    sentence: str,
+) -> None:
+    fmu = foreign_fmu("hostile2", what, "STATELESS", "AFTER=20")
+    flag = tmp_path / "flag"
+    monkeypatch.setenv("HOSTILE_FLAG", str(flag))
+    loaded = scenario(tmp_path, fmu)
+    whole = new_run(loaded, tmp_path / "whole").folder
+    flag.touch()
+    with pytest.raises(kind, match=sentence):
+        new_run(loaded, tmp_path / "part")
+    with pytest.raises(kind, match=sentence):
+        resume_run(tmp_path / "part")
+    flag.unlink()
+    resume_run(tmp_path / "part")
+    for name in ("run.nc", "config.json", "summary.json", "csv/observed.csv"):
+        assert (tmp_path / "part" / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+ARRAY_BINDING = """
+[binding]
+name = "array"
+step_size = 1.0
+
+[control.u]
+variable = "u[1]"
+unit = "1"
+
+[health.d]
+variable = "u[2]"
+unit = "1"
+
+[parameter.k]
+variable = "gain"
+unit = "1"
+
+[observation.y]
+variables = "y"
+unit = "m"
+
+[record]
+variables = ["calls", "y"]
+"""
+
+
+def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu: Any, tmp_path: Path) -> None:
+    """Its outputs grow with every step, so that only the way through twin, store and names is looked at."""
+    fmu = foreign_fmu.changed("array3", "names", ('name="calls"', 'name="state/calls"'))
+    (tmp_path / "binding.toml").write_text(
+        ARRAY_BINDING.replace('"calls"', '"state/calls"'), encoding="utf-8"
+    )
+    text = (
+        SCENARIO.replace("FMU", str(fmu)).replace("count = 1", "count = 2").replace("steps = 30", "steps = 3")
+    )
+    text = text.replace("standard_deviation = 0.1", "standard_deviation = 0.05")
+    (tmp_path / "scenario.toml").write_text(text, encoding="utf-8")
+    folder = new_run(load_scenario(tmp_path / "scenario.toml"), tmp_path / "run").folder
+    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
+        tree.load()
+    truth = tree["truth"]
+    assert truth["state_calls"].values.tolist() == [1.0, 2.0, 3.0]
+    assert truth["y[1]"].attrs["units"] == "mm"
+    assert truth["y"].attrs["units"] == "m"
+    assert truth["y"].shape == (3, 2)
+    assert truth["y"].values[:, 1].tolist() == pytest.approx((1e-3 * truth["y[2]"].values).tolist())
+    (tmp_path / "scenario.toml").write_text(text.replace("count = 2", "count = 3"), encoding="utf-8")
+    with pytest.raises(Exception, match=r"observes 2 values of `y`, and the scenario expects 3"):
+        new_run(load_scenario(tmp_path / "scenario.toml"), tmp_path / "other")
+    assert not (tmp_path / "other").exists()

@@ -1,0 +1,181 @@
+"""The mission loop: timing, resuming at every turn, and what stops it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin_master.assets.interface import AssetReading, StatelessAsset
+from twin_master.assets.strain_library import load_strain_library
+from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.errors import AssetOutputError, NotResumableError
+from twin_master.mission.checkpoint import FlownTurn, checkpoint_of
+from twin_master.mission.loop import Flight, fly
+from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.scenario.reading import load_scenario
+from twin_master.study import fly_many
+
+
+@pytest.fixture(params=["level_turns", "growing_damage", "failing_gauges"])
+def source(request: pytest.FixtureRequest, library_file: Path) -> StrainLibrarySource:
+    scenario = load_scenario(request.param).scenario
+    return StrainLibrarySource(scenario, load_strain_library(library_file), "h")
+
+
+def knowledge_of(source: StrainLibrarySource) -> Knowledge:
+    return prepare_knowledge(source._scenario, source, 3)
+
+
+def flown(source: StrainLibrarySource, knowledge: Knowledge, seed: int = 3, **options: object) -> Flight:
+    plant = knowledge.plant(knowledge.truth(seed), source.open())
+    return fly(knowledge.scenario, knowledge.twin(), plant, **options)  # type: ignore[arg-type]
+
+
+def same(first: Flight, second: Flight) -> bool:
+    arrays = (
+        "observed",
+        "control_index",
+        "filtered",
+        "log_evidence",
+        "smoothed",
+        "predicted",
+        "decision_probability",
+    )
+    return all(
+        np.array_equal(getattr(first, name), getattr(second, name), equal_nan=name == "observed")
+        for name in arrays
+    ) and np.array_equal(first.truth.state, second.truth.state)
+
+
+def test_resuming_after_any_turn_is_bit_identical(source: StrainLibrarySource) -> None:
+    knowledge = knowledge_of(source)
+    kept: list[FlownTurn] = []
+    whole = flown(source, knowledge, keep=kept.append)
+    assert len(kept) == 50
+    for turns in (1, 2, 17, 49, 50):
+        rest = flown(source, knowledge, checkpoint=checkpoint_of(kept[:turns]))
+        assert rest.resumed_at == turns
+        assert len(rest.timing) == 50 - turns
+        assert same(whole, rest)
+
+
+def test_timing_of_a_turn(library_file: Path) -> None:
+    """Control u_t is in force while d_t, the gain of step t included, is observed."""
+    scenario = load_scenario("level_turns").scenario
+    source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
+    asked: list[tuple[float, float, float]] = []
+    inner = source.open()
+
+    def observe(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        asked.append((control["load_factor"], health["z1"], health["z2"]))
+        return inner.step(control, health)
+
+    knowledge = prepare_knowledge(scenario, source, 1)
+    plant = knowledge.plant(knowledge.truth(1), StatelessAsset(observe))
+    flight = fly(scenario, knowledge.twin(), plant)
+    assert asked[0] == (3.0, 0.0, 0.0)
+    assert asked[5][1:] == (0.0, 0.22)
+    assert asked[30][1:] == (0.6, 0.6)
+    assert [load for load, _, _ in asked] == [(2.0, 3.0)[index] for index in flight.control_index]
+    for step in range(49):  # u_{t+1} is the mode of the policy at the state as observed at t
+        assert flight.control_index[step + 1] == np.argmax(flight.filtered[step] @ knowledge.plan.policy)
+
+
+def test_a_mission_is_steered_by_the_rule_of_its_scenario(library_file: Path) -> None:
+    """Damage only grows: the rule that looks ahead falls back no later, and earlier in some missions."""
+    base = load_scenario("level_turns").scenario
+    noisy = base.observation.model_copy(update={"standard_deviation": 1e-3})
+    base = base.model_copy(update={"observation": noisy})
+    first_gentle: dict[str, list[int]] = {}
+    for rule in ("filtered", "predicted"):
+        planner = base.planner.model_copy(update={"decide_on": rule})
+        scenario = base.model_copy(update={"planner": planner})
+        source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
+        knowledge = prepare_knowledge(scenario, source, 0)
+        first_gentle[rule] = []
+        for seed in range(40):
+            flight = flown(source, knowledge, seed)
+            belief = flight.filtered
+            if rule == "predicted":
+                matrix = knowledge.model.transition.matrix[flight.control_index]
+                belief = np.einsum("ts,tsr->tr", flight.filtered, matrix)
+            asked = belief @ knowledge.plan.policy
+            np.testing.assert_allclose(flight.decision_probability, asked, atol=1e-14)
+            np.testing.assert_array_equal(flight.control_index[1:], asked[:-1].argmax(axis=1))
+            first_gentle[rule].append(int(np.argmin(flight.control_index)))
+    earlier = np.subtract(first_gentle["filtered"], first_gentle["predicted"])
+    assert np.all(earlier >= 0)
+    assert np.any(earlier > 0)
+
+
+def test_the_observation_is_the_truth_with_noise_and_nothing_else_reaches_the_twin(
+    library_file: Path,
+) -> None:
+    scenario = load_scenario("level_turns").scenario
+    source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
+    knowledge = prepare_knowledge(scenario, source, 1)
+    flight = flown(source, knowledge, 1)
+    residual = flight.observed - flight.truth.observation
+    np.testing.assert_allclose(residual, knowledge.truth(1).noise, atol=1e-12)
+    twin = knowledge.twin()
+    again = [twin.turn(row, int(u)) for row, u in zip(flight.observed, flight.control_index, strict=True)]
+    np.testing.assert_array_equal([turn.filtered for turn in again], flight.filtered)
+    np.testing.assert_array_equal(twin.smoothed(), flight.smoothed)
+
+
+def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(library_file: Path) -> None:
+    scenario = load_scenario("level_turns").scenario
+    source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
+    knowledge = prepare_knowledge(scenario, source, 1)
+    inner = source.open()
+    count = 0
+
+    def broken(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        nonlocal count
+        count += 1
+        values = inner.step(control, health).values
+        if count == 4:
+            values[7] = np.nan
+        return AssetReading(values)
+
+    kept: list[FlownTurn] = []
+    plant = knowledge.plant(knowledge.truth(1), StatelessAsset(broken))
+    with pytest.raises(AssetOutputError, match=r"step 3: .*NaN.*`strain` 8 under the control `3g`"):
+        fly(scenario, knowledge.twin(), plant, keep=kept.append)
+    assert len(kept) == 3
+    short = knowledge.plant(
+        knowledge.truth(1), StatelessAsset(lambda _control, _health: AssetReading(np.zeros(3)))
+    )
+    with pytest.raises(AssetOutputError, match="expects 24 values"):
+        fly(scenario, knowledge.twin(), short)
+
+
+def test_a_checkpoint_whose_decisions_do_not_follow_is_refused(library_file: Path) -> None:
+    scenario = load_scenario("level_turns").scenario
+    source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
+    knowledge = prepare_knowledge(scenario, source, 1)
+    kept: list[FlownTurn] = []
+    flown(source, knowledge, keep=kept.append)
+    kept[5] = replace(kept[5], control_index=1 - kept[5].control_index)
+    altered = checkpoint_of(kept[:10])
+    with pytest.raises(NotResumableError, match="after turn 4"):
+        flown(source, knowledge, checkpoint=altered)
+
+
+def test_study_on_the_published_library(published_library: Path) -> None:
+    """Policy and reliability of the reference twin; the bars are those of 300 missions, widened for 60."""
+    scenario = load_scenario("level_turns").scenario
+    source = StrainLibrarySource(scenario, load_strain_library(published_library), "h")
+    knowledge = prepare_knowledge(scenario, source, 0)
+    z1 = knowledge.model.states.coordinates[:, 0]
+    np.testing.assert_array_equal(knowledge.plan.control_index, np.where(z1 < 0.59, 1, 0))
+    margin = (knowledge.plan.action_value[:, 1] - knowledge.plan.action_value[:, 0]).reshape(5, 5)
+    np.testing.assert_allclose(margin[2:4, 0], [0.007, -0.059], atol=1e-3)
+    study = fly_many(scenario, source, range(60))
+    assert study.share_within(2) >= 0.95
+    assert study.early_share <= 0.2
+    assert np.all(study.rms_error <= [0.045, 0.13])

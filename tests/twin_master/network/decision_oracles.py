@@ -1,0 +1,160 @@
+"""Independent answers for tests of inference: enumeration, arbitrary precision, variable elimination."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import warnings
+from decimal import Decimal, localcontext
+
+import numpy as np
+
+from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace, TransitionModel
+
+
+def random_model(rng, shape=(2, 2), controls=2, zeros=0.4, sparse_prior=True):
+    """A model with random dense-with-holes transitions."""
+    size = int(np.prod(shape))
+    matrix = rng.dirichlet(np.ones(size), (controls, size))
+    matrix[rng.random(matrix.shape) < zeros] = 0.0
+    for control in range(controls):
+        for state in range(size):
+            matrix[control, state, rng.integers(size)] += 0.1
+    matrix /= matrix.sum(axis=2, keepdims=True)
+    prior = rng.dirichlet(np.ones(size))
+    if sparse_prior:
+        prior[rng.random(size) < zeros] = 0.0
+        prior[rng.integers(size)] += 0.1
+        prior /= prior.sum()
+    space = StateSpace(tuple(Factor(f"f{i}", tuple(map(float, range(n)))) for i, n in enumerate(shape)))
+    return GraphicalModel(space, tuple(f"u{i}" for i in range(controls)), prior, TransitionModel(matrix))
+
+
+def enumerate_trajectories(model, control, log_likelihood):
+    """Filtered, smoothed and log evidence by summing over every joint trajectory."""
+    steps, size = log_likelihood.shape
+    matrix = model.transition.matrix
+    likelihood = np.exp(log_likelihood)
+    filtered, evidence = np.zeros((steps, size)), np.zeros(steps)
+    forecast, smoothed = np.zeros((steps, size)), np.zeros((steps, size))
+    for length in range(1, steps + 1):
+        for path in itertools.product(range(size), repeat=length):
+            joint = model.prior[path[0]]
+            for t in range(1, length):
+                joint *= matrix[control[t - 1], path[t - 1], path[t]]
+            for t in range(length - 1):
+                joint *= likelihood[t, path[t]]
+            forecast[length - 1, path[-1]] += joint
+            joint *= likelihood[length - 1, path[-1]]
+            filtered[length - 1, path[-1]] += joint
+            evidence[length - 1] += joint
+            if length == steps:
+                for t in range(steps):
+                    smoothed[t, path[t]] += joint
+    forecast /= forecast.sum(axis=1, keepdims=True)
+    log_evidence = np.diff(np.log(evidence), prepend=0.0)
+    return forecast, filtered / evidence[:, None], smoothed / evidence[-1], log_evidence
+
+
+def enumerate_prediction(model, belief, control, policy, horizon):
+    """p(D_{t+h}, U_{t+h}) by summing over every trajectory of states and controls."""
+    size, controls = policy.shape
+    matrix = model.transition.matrix
+    joint = np.zeros((horizon, size, controls))
+    for h in range(1, horizon + 1):
+        for states in itertools.product(range(size), repeat=h + 1):
+            for chosen in itertools.product(range(controls), repeat=h):
+                probability = belief[states[0]] * matrix[control, states[0], states[1]]
+                for k in range(h):
+                    probability *= policy[states[k + 1], chosen[k]]
+                    if k < h - 1:
+                        probability *= matrix[chosen[k], states[k + 1], states[k + 2]]
+                joint[h - 1, states[-1], chosen[-1]] += probability
+    return joint
+
+
+def precise_forward_backward(model, control, log_likelihood, digits=40):
+    """Filtered, smoothed, log filtered and log evidence with `digits` digits and an unbounded exponent."""
+    with localcontext() as context:
+        context.prec, context.Emax, context.Emin = digits, 10**17, -(10**17)
+        steps, size = log_likelihood.shape
+        matrix = [
+            [[(i, Decimal(float(m[i, j]))) for i in range(size) if m[i, j] > 0] for j in range(size)]
+            for m in model.transition.matrix
+        ]
+        following = [
+            [[(j, Decimal(float(m[i, j]))) for j in range(size) if m[i, j] > 0] for i in range(size)]
+            for m in model.transition.matrix
+        ]
+        zero = Decimal(0)
+        likelihood = [
+            [Decimal(float(x)).exp() if np.isfinite(x) else zero for x in row] for row in log_likelihood
+        ]
+        belief = [Decimal(float(p)) for p in model.prior]
+        filtered, log_evidence = [], []
+        for t in range(steps):
+            if t:
+                table = matrix[control[t - 1]]
+                belief = [sum((belief[i] * p for i, p in table[j]), zero) for j in range(size)]
+            belief = [b * x for b, x in zip(belief, likelihood[t], strict=True)]
+            total = sum(belief, zero)
+            belief = [b / total for b in belief]
+            filtered.append(belief)
+            log_evidence.append(float(total.ln()))
+        message = [Decimal(1)] * size
+        smoothed = [filtered[-1]]
+        for t in range(steps - 2, -1, -1):
+            weighted = [m * x for m, x in zip(message, likelihood[t + 1], strict=True)]
+            table = following[control[t]]
+            message = [sum((weighted[j] * p for j, p in table[i]), zero) for i in range(size)]
+            total = sum(message, zero)
+            message = [m / total for m in message]
+            joint = [f * m for f, m in zip(filtered[t], message, strict=True)]
+            total = sum(joint, zero)
+            smoothed.append([x / total for x in joint])
+        log_filtered = [[float(x.ln()) if x else -np.inf for x in row] for row in filtered]
+        as_float = [[[float(x) for x in row] for row in rows] for rows in (filtered, smoothed[::-1])]
+    return np.array(as_float[0]), np.array(as_float[1]), np.array(log_filtered), np.array(log_evidence)
+
+
+def eliminate_variables(model, control, log_likelihood, policy, horizon):
+    """Smoothed beliefs, and joint-free predictions of state and control, by pgmpy, one variable a query."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        logging.getLogger("pgmpy").setLevel(logging.ERROR)
+        inference, evidence = elimination_problem(model, control, log_likelihood, policy, horizon)
+        steps = len(control)
+
+        def query(name):
+            return inference.query([name], evidence=evidence, show_progress=False).values
+
+        smoothed = np.array([query(f"D{t}") for t in range(steps)])
+        states = np.array([query(f"D{t}") for t in range(steps, steps + horizon)])
+        controls = np.array([query(f"U{t}") for t in range(steps, steps + horizon)])
+    return smoothed, states, controls
+
+
+def elimination_problem(model, control, log_likelihood, policy, horizon):
+    """The unrolled network in pgmpy; an observation is a child that is seen with the likelihood's odds."""
+    from pgmpy.factors.discrete import TabularCPD
+    from pgmpy.inference import VariableElimination
+    from pgmpy.models import DiscreteBayesianNetwork
+
+    steps, size = log_likelihood.shape
+    matrix, controls = model.transition.matrix, len(model.controls)
+    tables = [TabularCPD("D0", size, model.prior[:, None])]
+    for t in range(1, steps + 1):
+        tables.append(TabularCPD(f"D{t}", size, matrix[control[t - 1]].T, [f"D{t - 1}"], [size]))
+    for t in range(steps, steps + horizon):
+        tables.append(TabularCPD(f"U{t}", controls, policy.T, [f"D{t}"], [size]))
+        if t > steps:
+            flat = matrix.transpose(2, 1, 0).reshape(size, size * controls)
+            tables.append(TabularCPD(f"D{t}", size, flat, [f"D{t - 1}", f"U{t - 1}"], [size, controls]))
+    for t in range(steps):
+        odds = np.exp(log_likelihood[t] - log_likelihood[t].max())
+        tables.append(TabularCPD(f"O{t}", 2, np.stack([1 - odds, odds]), [f"D{t}"], [size]))
+    network = DiscreteBayesianNetwork(
+        [(parent, table.variable) for table in tables for parent in table.variables[1:]]
+    )
+    network.add_cpds(*tables)
+    return VariableElimination(network), {f"O{t}": 1 for t in range(steps)}

@@ -1,0 +1,191 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from twin_master.errors import InvalidDistributionError, InvalidModelError
+from twin_master.network.distributions import distribution, stochastic_matrix
+from twin_master.network.graphical_model import (
+    Factor,
+    GraphicalModel,
+    StateSpace,
+    TransitionModel,
+    deterministic_policy,
+    worsening_table,
+)
+
+LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8)
+SPACE = StateSpace((Factor("z1", LEVELS), Factor("z2", (0.0, 0.5, 1.0))))
+
+
+def test_joint_states_are_in_c_order():
+    assert SPACE.shape == (5, 3)
+    assert SPACE.size == 15
+    np.testing.assert_array_equal(SPACE.coordinates[:4], [[0, 0], [0, 0.5], [0, 1], [0.2, 0]])
+    assert SPACE.index((0.4, 0.5)) == 2 * 3 + 1
+    assert SPACE.certain((0.8, 1.0))[-1] == 1.0
+
+
+def test_a_value_that_is_no_level_is_refused():
+    with pytest.raises(InvalidModelError, match=r"0\.3 is no level of factor 'z1'"):
+        SPACE.index((0.3, 0.5))
+    with pytest.raises(InvalidModelError, match="no level"):
+        SPACE.index((float("nan"), 0.5))
+    with pytest.raises(InvalidModelError, match="one level for each"):
+        SPACE.index((0.4,))
+
+
+@given(arrays(np.float64, (4, 15), elements=st.floats(0.0, 1.0)))
+def test_moments_and_marginals_of_a_belief(weights):
+    weights = weights + 1e-3
+    belief = weights / weights.sum(axis=1, keepdims=True)
+    first = belief.reshape(4, 5, 3).sum(axis=2)
+    second = belief.reshape(4, 5, 3).sum(axis=1)
+    np.testing.assert_allclose(SPACE.marginal(belief, "z1"), first, rtol=1e-14)
+    np.testing.assert_allclose(SPACE.marginal(belief[0], "z2"), second[0], rtol=1e-14)
+    mean = first @ LEVELS
+    np.testing.assert_allclose(SPACE.mean(belief)[:, 0], mean, rtol=1e-13, atol=1e-15)
+    variance = first @ np.square(LEVELS) - mean**2
+    np.testing.assert_allclose(SPACE.standard_deviation(belief)[:, 0] ** 2, variance, atol=1e-14)
+
+
+def test_a_certain_belief_has_no_spread():
+    assert np.all(SPACE.standard_deviation(SPACE.certain((0.6, 1.0))) == 0.0)
+
+
+def test_unknown_factor():
+    with pytest.raises(InvalidModelError, match="no factor is named 'z3'"):
+        SPACE.marginal(np.full(15, 1 / 15), "z3")
+
+
+@pytest.mark.parametrize("levels", [(), (0.2, 0.1), (0.0, 0.0), (0.0, float("inf"))])
+def test_levels_must_increase(levels):
+    with pytest.raises(InvalidModelError, match="'z1'"):
+        Factor("z1", levels)
+
+
+def test_names_must_differ():
+    with pytest.raises(InvalidModelError, match="different names"):
+        StateSpace((Factor("z", LEVELS), Factor("z", LEVELS)))
+    with pytest.raises(InvalidModelError, match="different names"):
+        StateSpace(())
+    with pytest.raises(InvalidModelError, match="needs a name"):
+        Factor("", LEVELS)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ([0.5, 0.5 + 1e-11], r"T: row 1 does not sum to one"),
+        ([1.5, -0.5], r"T: row 1 holds a negative probability"),
+        ([float("nan"), 1.0], r"T: row 1 holds a value that is not finite"),
+        ([float("inf"), 0.0], r"T: row 1 holds a value that is not finite"),
+    ],
+)
+def test_a_row_that_is_no_distribution_is_named(bad, message):
+    with pytest.raises(InvalidDistributionError, match=message):
+        stochastic_matrix([[1.0, 0.0], bad], name="T")
+
+
+def test_the_row_is_named_in_a_stack_of_matrices_and_in_a_vector():
+    stack = np.tile(np.eye(3), (2, 1, 1))
+    stack[1, 2, 2] = 0.95
+    with pytest.raises(InvalidDistributionError, match=r"row \(1, 2\) does not sum to one \(sum 0.95"):
+        TransitionModel(stack)
+    with pytest.raises(InvalidDistributionError, match="prior: the distribution does not sum to one"):
+        distribution([0.5, 0.4], size=2, name="prior")
+    with pytest.raises(InvalidDistributionError, match=r"expected shape \(3,\)"):
+        distribution([0.5, 0.5], size=3, name="prior")
+    with pytest.raises(InvalidDistributionError, match="shape"):
+        stochastic_matrix([], name="T")
+
+
+def test_rounding_within_the_tolerance_passes_and_the_result_is_a_read_only_copy():
+    rows = np.array([[0.1] * 10])
+    checked = stochastic_matrix(rows, name="T")
+    rows[0, 0] = 5.0
+    assert checked[0, 0] == 0.1
+    with pytest.raises(ValueError, match="read-only"):
+        checked[0, 0] = 1.0
+
+
+def test_the_last_level_absorbs():
+    table = worsening_table(3, 0.1)
+    np.testing.assert_allclose(table, [[0.9, 0.1, 0], [0, 0.9, 0.1], [0, 0, 1]], rtol=1e-15)
+    np.testing.assert_array_equal(worsening_table(1, 0.3), [[1.0]])
+    with pytest.raises(InvalidModelError, match=r"probability in \[0, 1\]"):
+        worsening_table(3, 1.1)
+
+
+def test_rows_at_the_damage_limit_sum_to_one():
+    """The authors' published table leaves 0.95 and 0.90 in the rows with exactly one region at its limit."""
+    transition = TransitionModel.from_factors([[worsening_table(5, p)] * 2 for p in (0.05, 0.10)])
+    np.testing.assert_allclose(transition.matrix.sum(axis=2), 1.0, rtol=0, atol=1e-15)
+    limit = StateSpace((Factor("z1", LEVELS), Factor("z2", LEVELS)))
+    row = transition.matrix[1, limit.index((0.8, 0.2))]
+    assert row[limit.index((0.8, 0.2))] == pytest.approx(0.9)
+    assert row[limit.index((0.8, 0.4))] == pytest.approx(0.1)
+
+
+def test_joint_transition_is_the_product_of_the_factors():
+    first, second = worsening_table(5, 0.2), worsening_table(3, 0.3)
+    matrix = TransitionModel.from_factors([[first, second]]).matrix[0]
+    for i in range(5):
+        for j in range(3):
+            expected = np.outer(first[i], second[j]).ravel()
+            np.testing.assert_allclose(matrix[i * 3 + j], expected, rtol=1e-15)
+
+
+def test_predecessor_lists_hold_every_non_zero_transition_and_no_other():
+    matrix = TransitionModel.from_factors(
+        [[worsening_table(4, p), worsening_table(3, 0.5)] for p in (0.0, 1.0)]
+    )
+    sparse = matrix.sparse
+    rebuilt = np.zeros_like(matrix.matrix)
+    for control in range(2):
+        for state in range(12):
+            row = control * 12 + state
+            for k in range(sparse.start[row], sparse.start[row + 1]):
+                rebuilt[control, sparse.source[k], state] = sparse.probability[k]
+    np.testing.assert_array_equal(rebuilt, matrix.matrix)
+    np.testing.assert_allclose(np.exp(sparse.log_probability), sparse.probability, rtol=1e-15)
+
+
+def test_transition_shapes_are_checked():
+    with pytest.raises(InvalidModelError, match="controls, states, states"):
+        TransitionModel(np.full((2, 3, 4), 0.25))
+    with pytest.raises(InvalidModelError, match="same states"):
+        TransitionModel.from_factors([[np.eye(2)], [np.eye(3)]])
+    with pytest.raises(InvalidModelError, match="square table"):
+        TransitionModel.from_factors([[[[0.5, 0.5]]]])
+    with pytest.raises(InvalidModelError, match="square table"):
+        TransitionModel.from_factors([[]])
+
+
+def test_model_checks_that_its_parts_fit():
+    transition = TransitionModel.from_factors([[worsening_table(5, 0.1), worsening_table(3, 0.1)]])
+    prior = SPACE.certain((0.0, 0.0))
+    model = GraphicalModel(SPACE, ("hold",), prior, transition)
+    assert model.log_prior[0] == 0.0
+    assert np.all(np.isneginf(model.log_prior[1:]))
+    with pytest.raises(InvalidModelError, match="2 controls and 15 states"):
+        GraphicalModel(SPACE, ("2g", "3g"), prior, transition)
+    with pytest.raises(InvalidModelError, match="different names"):
+        GraphicalModel(SPACE, (), prior, transition)
+    with pytest.raises(InvalidDistributionError, match="prior"):
+        GraphicalModel(SPACE, ("hold",), prior[:-1], transition)
+    with pytest.raises(InvalidDistributionError, match="prior"):
+        GraphicalModel(SPACE, ("hold",), 2 * prior, transition)
+    with pytest.raises(InvalidModelError, match=r"policy: expected shape \(15, 1\)"):
+        model.policy([[0.5, 0.5]] * 15)
+    assert model.policy(np.ones((15, 1))).shape == (15, 1)
+
+
+def test_deterministic_policy():
+    np.testing.assert_array_equal(deterministic_policy([1, 0], 3), [[0, 1, 0], [1, 0, 0]])
+    for bad in ([0, 3], [-1, 0], [0.0, 1.0]):
+        with pytest.raises(InvalidModelError, match="control index between 0 and 2"):
+            deterministic_policy(bad, 3)

@@ -1,0 +1,295 @@
+from __future__ import annotations
+
+import pickle
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
+from twin_master.network.graphical_model import (
+    Factor,
+    GraphicalModel,
+    StateSpace,
+    TransitionModel,
+    deterministic_policy,
+    worsening_table,
+)
+from twin_master.network.inference import (
+    ObservationContext,
+    filter_sequence,
+    filter_step,
+    known_control,
+    predict,
+    smooth,
+    smooth_many_twins,
+)
+
+sys.path.insert(0, str(Path(__file__).parent))
+from decision_oracles import (
+    eliminate_variables,
+    enumerate_prediction,
+    enumerate_trajectories,
+    precise_forward_backward,
+    random_model,
+)
+
+LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8)
+EXACT = {"rtol": 1e-10, "atol": 1e-12}
+
+
+def worsening_model(levels=LEVELS, probabilities=(0.05, 0.10)):
+    space = StateSpace((Factor("z1", levels), Factor("z2", levels)))
+    tables = [[worsening_table(len(levels), p)] * 2 for p in probabilities]
+    prior = space.certain((levels[0], levels[0]))
+    return GraphicalModel(space, ("2g", "3g"), prior, TransitionModel.from_factors(tables))
+
+
+MODEL = worsening_model()
+
+
+def infer(model, control, log_likelihood):
+    filtered = filter_sequence(model, control, log_likelihood)
+    return filtered, smooth(model, control, filtered.log_filtered).smoothed
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_filter_smoother_and_evidence_equal_enumeration(seed):
+    """Random transitions with zeros; steps without any observation; every joint trajectory summed."""
+    rng = np.random.default_rng(seed)
+    model = random_model(rng, shape=(2, 2) if seed % 2 else (5,))
+    steps = 5
+    control = rng.integers(0, 2, steps)
+    log_likelihood = rng.normal(size=(steps, model.states.size)) * 4
+    log_likelihood[rng.random(steps) < 0.3] = 0.0
+    filtered, smoothed = infer(model, control, log_likelihood)
+    oracle = enumerate_trajectories(model, control, log_likelihood)
+    np.testing.assert_allclose(filtered.forecast, oracle[0], **EXACT)
+    np.testing.assert_allclose(filtered.filtered, oracle[1], **EXACT)
+    np.testing.assert_allclose(smoothed, oracle[2], **EXACT)
+    np.testing.assert_allclose(filtered.log_evidence, oracle[3], rtol=0, atol=1e-10)
+    np.testing.assert_array_equal(np.exp(filtered.log_filtered) == 0, oracle[1] == 0)
+
+
+def test_states_that_an_observation_rules_out():
+    rng = np.random.default_rng(3)
+    model = random_model(rng, zeros=0.0)
+    log_likelihood = rng.normal(size=(4, 4))
+    log_likelihood[0, :2] = log_likelihood[2, 1:] = -np.inf
+    control = [0, 1, 1, 0]
+    filtered, smoothed = infer(model, control, log_likelihood)
+    oracle = enumerate_trajectories(model, control, log_likelihood)
+    np.testing.assert_allclose(filtered.filtered, oracle[1], **EXACT)
+    np.testing.assert_allclose(smoothed, oracle[2], **EXACT)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_prediction_equals_enumeration(seed):
+    """The control node is marginalised: every trajectory of states and controls is summed."""
+    rng = np.random.default_rng(seed)
+    model = random_model(rng, shape=(3,))
+    policy = model.policy(rng.dirichlet(np.ones(2), 3) if seed % 2 else np.eye(2)[rng.integers(0, 2, 3)])
+    belief = rng.dirichlet(np.ones(3))
+    predicted = predict(model, belief, seed % 2, policy, 4)
+    oracle = enumerate_prediction(model, belief, seed % 2, policy, 4)
+    np.testing.assert_allclose(predicted.joint, oracle, **EXACT)
+    np.testing.assert_allclose(predicted.predicted, oracle.sum(axis=2), **EXACT)
+    np.testing.assert_allclose(predicted.control_probability, oracle.sum(axis=1), **EXACT)
+
+
+def test_the_first_predicted_step_goes_through_the_known_control():
+    belief = np.full(25, 0.04)
+    policy = deterministic_policy(np.zeros(25, dtype=int), 2)
+    predicted = predict(MODEL, belief, 1, policy, 2).predicted
+    np.testing.assert_allclose(predicted[0], belief @ MODEL.transition.matrix[1], rtol=1e-14)
+    np.testing.assert_allclose(predicted[1], predicted[0] @ MODEL.transition.matrix[0], rtol=1e-14)
+    assert predict(MODEL, belief, 1, policy, 0).joint.shape == (0, 25, 2)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_smoothing_and_prediction_equal_variable_elimination(seed):
+    rng = np.random.default_rng(seed)
+    model = worsening_model(levels=LEVELS[:3], probabilities=(0.2, 0.4))
+    control = rng.integers(0, 2, 6)
+    log_likelihood = rng.normal(size=(6, 9)) * 3
+    log_likelihood[2] = 0.0
+    policy = model.policy(rng.dirichlet(np.ones(2), 9))
+    filtered, smoothed = infer(model, control, log_likelihood)
+    predicted = predict(model, filtered.filtered[-1], control[-1], policy, 3)
+    oracle = eliminate_variables(model, control, log_likelihood, policy, 3)
+    np.testing.assert_allclose(smoothed, oracle[0], **EXACT)
+    np.testing.assert_allclose(predicted.predicted, oracle[1], **EXACT)
+    np.testing.assert_allclose(predicted.control_probability, oracle[2], **EXACT)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    scale=st.sampled_from([1.0, 300.0, 1e4, 1e6]),
+    steps=st.integers(1, 40),
+    shift=st.sampled_from([0.0, -1e5, 1e5]),
+)
+def test_extreme_likelihoods_equal_arbitrary_precision(seed, scale, steps, shift):
+    """Differences of thousands of nats and more: entries that are zero in double precision come back."""
+    rng = np.random.default_rng(seed)
+    model = random_model(rng, shape=(2, 3), zeros=0.6)
+    control = rng.integers(0, 2, steps)
+    log_likelihood = rng.normal(size=(steps, 6)) * scale + shift
+    filtered, smoothed = infer(model, control, log_likelihood)
+    oracle = precise_forward_backward(model, control, log_likelihood)
+    # A log-likelihood of size L is itself only known to L * 1e-16.
+    known = max(1e-10, 1e-15 * steps * (scale + abs(shift)) * 5)
+    np.testing.assert_allclose(filtered.filtered, oracle[0], rtol=known, atol=1e-300)
+    np.testing.assert_allclose(smoothed, oracle[1], rtol=known, atol=1e-290)
+    finite = np.isfinite(oracle[2])
+    np.testing.assert_array_equal(np.isfinite(filtered.log_filtered), finite)
+    np.testing.assert_allclose(filtered.log_filtered[finite], oracle[2][finite], rtol=1e-13, atol=known)
+    np.testing.assert_allclose(filtered.log_evidence, oracle[3], rtol=1e-13, atol=known)
+
+
+def test_a_state_that_underflows_comes_back():
+    """Data of 2,000 nats for the wrong state are outweighed later; no floor decides, the data do."""
+    wrong, right = 0, 24
+    log_likelihood = np.zeros((12, 25))
+    log_likelihood[:, wrong] = 0.0
+    log_likelihood[8, wrong] = 2000.0
+    log_likelihood[11] = -9000.0
+    log_likelihood[11, right] = -100.0
+    control = np.ones(12, dtype=int)
+    filtered, smoothed = infer(MODEL, control, log_likelihood)
+    assert filtered.filtered[8, wrong] == pytest.approx(1.0)
+    assert filtered.filtered[8, right] == 0.0
+    forecast = MODEL.prior @ np.linalg.matrix_power(MODEL.transition.matrix[1], 8)
+    assert filtered.log_filtered[8, right] == pytest.approx(
+        np.log(forecast[right] / forecast[wrong]) - 2000.0, rel=1e-13
+    )
+    assert filtered.filtered[11, right] == pytest.approx(1.0)
+    oracle = precise_forward_backward(MODEL, control, log_likelihood)
+    np.testing.assert_allclose(filtered.filtered, oracle[0], **EXACT)
+    np.testing.assert_allclose(smoothed, oracle[1], **EXACT)
+    assert smoothed[8, right] > 0.05
+
+
+def test_stable_over_ten_thousand_steps():
+    rng = np.random.default_rng(0)
+    steps = 10_000
+    model = random_model(rng, shape=(2, 2), zeros=0.3)
+    control = rng.integers(0, 2, steps)
+    log_likelihood = rng.normal(size=(steps, 4)) * rng.choice([0.1, 5.0, 800.0], size=(steps, 1))
+    log_likelihood[rng.random(steps) < 0.2] = 0.0
+    filtered, smoothed = infer(model, control, log_likelihood)
+    oracle = precise_forward_backward(model, control, log_likelihood, digits=30)
+    np.testing.assert_allclose(filtered.filtered, oracle[0], **EXACT)
+    np.testing.assert_allclose(smoothed, oracle[1], **EXACT)
+    np.testing.assert_allclose(filtered.log_evidence.sum(), oracle[3].sum(), rtol=1e-12)
+    np.testing.assert_allclose(smoothed.sum(axis=1), 1.0, rtol=1e-13)
+
+
+def test_step_by_step_equals_the_sequence():
+    rng = np.random.default_rng(5)
+    control = rng.integers(0, 2, 20)
+    log_likelihood = rng.normal(size=(20, 25)) * 200
+    filtered = filter_sequence(MODEL, control, log_likelihood)
+    carried, before = None, None
+    for t in range(20):
+        step = filter_step(MODEL, carried, before, log_likelihood[t])
+        np.testing.assert_allclose(step.filtered, filtered.filtered[t], rtol=1e-12, atol=1e-300)
+        np.testing.assert_allclose(step.forecast, filtered.forecast[t], rtol=1e-12, atol=1e-300)
+        np.testing.assert_allclose(step.log_filtered, filtered.log_filtered[t], rtol=1e-13)
+        assert step.log_evidence == pytest.approx(filtered.log_evidence[t], rel=1e-13)
+        carried, before = step.log_filtered, int(control[t])
+
+
+def test_many_twins_equal_one_by_one():
+    rng = np.random.default_rng(6)
+    control = rng.integers(0, 2, (7, 15))
+    log_likelihood = rng.normal(size=(7, 15, 25)) * 100
+    for workers in (1, 2, 20, None):
+        filtered, smoothed = smooth_many_twins(MODEL, control, log_likelihood, workers=workers)
+        for twin in range(7):
+            alone, alone_smoothed = infer(MODEL, control[twin], log_likelihood[twin])
+            np.testing.assert_array_equal(filtered.filtered[twin], alone.filtered)
+            np.testing.assert_array_equal(filtered.log_evidence[twin], alone.log_evidence)
+            np.testing.assert_allclose(smoothed.smoothed[twin], alone_smoothed, rtol=1e-11, atol=1e-290)
+
+
+def test_without_observation_the_belief_follows_the_dynamics():
+    control = [1, 1, 0, 1]
+    filtered, smoothed = infer(MODEL, control, np.zeros((4, 25)))
+    belief = MODEL.prior
+    for t in range(4):
+        np.testing.assert_allclose(filtered.filtered[t], belief, rtol=1e-13, atol=1e-300)
+        np.testing.assert_allclose(smoothed[t], belief, rtol=1e-13, atol=1e-300)
+        belief = belief @ MODEL.transition.matrix[control[t]]
+    np.testing.assert_allclose(filtered.log_evidence, 0.0, atol=1e-14)
+
+
+def test_a_constant_in_the_log_likelihood_moves_the_evidence_alone():
+    rng = np.random.default_rng(8)
+    log_likelihood = rng.normal(size=(10, 25)) * 30
+    one = filter_sequence(MODEL, [1] * 10, log_likelihood)
+    other = filter_sequence(MODEL, [1] * 10, log_likelihood - 1e5)
+    np.testing.assert_allclose(other.filtered, one.filtered, rtol=1e-9, atol=1e-300)
+    np.testing.assert_allclose(other.log_evidence, one.log_evidence - 1e5, rtol=1e-14)
+
+
+def test_an_impossible_observation_names_twin_step_and_sensors():
+    log_likelihood = np.zeros((5, 25))
+    log_likelihood[3] = -np.inf
+    log_likelihood[3, 24] = 0.0  # cannot be reached from no damage in three steps
+    context = ObservationContext("N57", 10, lambda step: {"gauge 17": 40.0 + step})
+    with pytest.raises(ImpossibleObservation, match=r"'N57', step 13: .* gauge 17: \+53 sd") as caught:
+        filter_sequence(MODEL, [1] * 5, log_likelihood, context)
+    assert (caught.value.twin, caught.value.step) == ("N57", 13)
+    assert caught.value.worst_residuals == {"gauge 17": 53.0}
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+    first = filter_sequence(MODEL, [1] * 3, log_likelihood[:3])
+    with pytest.raises(ImpossibleObservation, match="'N57', step 10"):
+        filter_step(MODEL, first.log_filtered[-1], 1, log_likelihood[3], ObservationContext("N57", 10))
+    many = np.stack([np.zeros((5, 25)), log_likelihood, log_likelihood])
+    with pytest.raises(ImpossibleObservation, match="twin 1', step 3"):
+        smooth_many_twins(MODEL, np.ones((3, 5), dtype=int), many)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_log_likelihoods_must_be_numbers(value):
+    log_likelihood = np.zeros((3, 25))
+    log_likelihood[1, 7] = value
+    with pytest.raises(InvalidObservationError, match=r"log-likelihood at \(1, 7\)"):
+        filter_sequence(MODEL, [1] * 3, log_likelihood)
+    with pytest.raises(InvalidObservationError, match=r"log-likelihood at \(7,\)"):
+        filter_step(MODEL, None, None, log_likelihood[1])
+
+
+def test_shapes_and_controls_are_checked():
+    with pytest.raises(InvalidModelError, match=r"expected shape \(2, 25\)"):
+        filter_sequence(MODEL, [1, 1], np.zeros((3, 25)))
+    with pytest.raises(InvalidModelError, match="between 0 and 1"):
+        filter_sequence(MODEL, [1, 2], np.zeros((2, 25)))
+    with pytest.raises(InvalidModelError, match="one control for each step"):
+        filter_sequence(MODEL, 1, np.zeros(25))
+    with pytest.raises(InvalidModelError, match="one control for each step"):
+        smooth(MODEL, [[1]], np.zeros((1, 1, 25)))
+    with pytest.raises(InvalidModelError, match=r"\(twins, steps\)"):
+        smooth_many_twins(MODEL, [1], np.zeros((1, 25)))
+    with pytest.raises(InvalidModelError, match="both or neither"):
+        filter_step(MODEL, None, 1, np.zeros(25))
+    policy = deterministic_policy([0] * 25, 2)
+    with pytest.raises(InvalidModelError, match=r"belief of shape \(25,\)"):
+        predict(MODEL, np.ones(3), 0, policy, 1)
+    with pytest.raises(InvalidModelError, match="horizon of 0 or more"):
+        predict(MODEL, np.ones(25), 0, policy, -1)
+
+
+def test_an_empty_history_is_no_error():
+    filtered = filter_sequence(MODEL, [], np.zeros((0, 25)))
+    assert filtered.filtered.shape == (0, 25)
+    assert smooth(MODEL, [], filtered.log_filtered).smoothed.shape == (0, 25)
+
+
+def test_known_control():
+    joint = known_control([[0.25, 0.75]], [1], 3)
+    np.testing.assert_array_equal(joint, [[[0, 0.25, 0], [0, 0.75, 0]]])

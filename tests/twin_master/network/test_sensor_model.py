@@ -1,0 +1,207 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import logsumexp
+from scipy.stats import kstest, norm
+
+from twin_master.errors import InvalidModelError, InvalidObservationError
+from twin_master.network.inference import known_control
+from twin_master.network.sensor_model import GaussianSensorModel
+
+DRAWS, STATES, CONTROLS, SENSORS = 5, 4, 2, 6
+
+
+def random_case(seed, spread=1.0):
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(DRAWS, STATES, CONTROLS, SENSORS)) * spread
+    weight = rng.dirichlet(np.ones(DRAWS))
+    deviation = rng.uniform(0.5, 2.0, SENSORS)
+    observation = rng.normal(size=SENSORS) * spread
+    return rng, values, weight, deviation, observation
+
+
+@settings(deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    spread=st.sampled_from([1.0, 50.0, 1e4]),
+    lost=st.lists(st.booleans(), min_size=SENSORS, max_size=SENSORS),
+    control=st.integers(0, CONTROLS - 1),
+)
+def test_likelihood_is_the_integral_and_eq_32_its_approximation(seed, spread, lost, control):
+    _, values, weight, deviation, observation = random_case(seed, spread)
+    observation[lost] = np.nan
+    log_density = norm.logpdf(observation, values[:, :, control], deviation)  # (E, S, G)
+    seen = ~np.isnan(observation)
+    outside = logsumexp(log_density[..., seen].sum(axis=2), b=weight[:, None], axis=0)
+    inside = logsumexp(log_density[..., seen], b=weight[:, None, None], axis=0).sum(axis=1)
+    model = GaussianSensorModel(values, deviation, weight)
+    printed = GaussianSensorModel(values, deviation, weight, average="inside")
+    if not seen.any():
+        outside = inside = np.zeros(STATES)
+    np.testing.assert_allclose(model.log_likelihood(observation, control), outside, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(printed.log_likelihood(observation, control), inside, rtol=1e-12, atol=1e-12)
+
+
+def test_both_averages_agree_for_one_draw_and_one_sensor():
+    _, values, weight, deviation, observation = random_case(1)
+    for chosen, share in ((values[:1], None), (values[..., :1], weight)):
+        sensors = chosen.shape[-1]
+        pair = [
+            GaussianSensorModel(chosen, deviation[:sensors], share, average=average).log_likelihood(
+                observation[:sensors], 1
+            )
+            for average in ("outside", "inside")
+        ]
+        np.testing.assert_allclose(pair[0], pair[1], rtol=1e-13)
+
+
+def test_a_sequence_is_its_steps():
+    rng, values, weight, deviation, _ = random_case(2)
+    observations = rng.normal(size=(9, SENSORS))
+    observations[3] = np.nan
+    observations[5, 2] = np.nan
+    control = rng.integers(0, CONTROLS, 9)
+    model = GaussianSensorModel(values, deviation, weight)
+    rows = model.log_likelihood_sequence(observations, control)
+    for t in range(9):
+        np.testing.assert_array_equal(rows[t], model.log_likelihood(observations[t], int(control[t])))
+
+
+def test_when_all_sensors_are_lost_the_step_is_flagged_and_says_nothing():
+    _, values, weight, deviation, observation = random_case(3)
+    model = GaussianSensorModel(values, deviation, weight)
+    lost = np.full(SENSORS, np.nan)
+    assert np.all(model.log_likelihood(lost, 0) == 0.0)
+    partly = observation.copy()
+    partly[:2] = np.nan
+    np.testing.assert_array_equal(
+        model.observed_count([lost, observation, partly]), [0, SENSORS, SENSORS - 2]
+    )
+
+
+def test_far_observations_stay_comparable_and_beyond_double_precision_they_are_impossible():
+    model = GaussianSensorModel(np.arange(2.0).reshape(1, 2, 1, 1), 1e-3)
+    low, high = model.log_likelihood([500.0], 0)
+    assert high - low == pytest.approx((500.0**2 - 499.0**2) / 2e-6, rel=1e-12)
+    assert low < -1e11
+    assert np.all(np.isneginf(model.log_likelihood([1e200], 0)))
+
+
+def test_one_standard_deviation_for_all_sensors():
+    _, values, weight, _, observation = random_case(4)
+    one = GaussianSensorModel(values, 0.7, weight)
+    each = GaussianSensorModel(values, np.full(SENSORS, 0.7), weight)
+    np.testing.assert_array_equal(one.log_likelihood(observation, 0), each.log_likelihood(observation, 0))
+    np.testing.assert_array_equal(one.standard_deviation, np.full(SENSORS, 0.7))
+
+
+def test_predictive_check_of_a_model_that_holds():
+    """Observations drawn from the model: uniform transforms, unit residuals, coverage as stated."""
+    rng, values, weight, deviation, _ = random_case(5)
+    model = GaussianSensorModel(values, deviation, weight)
+    steps = 4000
+    belief = rng.dirichlet(np.ones(STATES))
+    draw = rng.choice(DRAWS, steps, p=weight)
+    state = rng.choice(STATES, steps, p=belief)
+    observations = values[draw, state, 1] + rng.normal(size=(steps, SENSORS)) * deviation
+    check = model.predictive_check(known_control(np.tile(belief, (steps, 1)), 1, CONTROLS), observations)
+    for sensor in range(SENSORS):
+        assert kstest(check.probability_integral_transform[:, sensor], "uniform").pvalue > 1e-3
+    np.testing.assert_allclose(check.residual.mean(axis=0), 0.0, atol=0.08)
+    np.testing.assert_allclose(check.residual.std(axis=0), 1.0, atol=0.05)
+    np.testing.assert_allclose(check.coverage(0.95), 0.95, atol=0.02)
+    np.testing.assert_allclose(check.coverage(0.5), 0.5, atol=0.04)
+
+
+@settings(deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    lost=st.lists(st.booleans(), min_size=SENSORS, max_size=SENSORS),
+    average=st.sampled_from(["outside", "inside"]),
+)
+def test_a_model_error_widens_each_density_by_a_share_of_the_prediction(seed, lost, average):
+    rng, values, weight, deviation, observation = random_case(seed)
+    observation[lost] = np.nan
+    error = rng.uniform(0.0, 0.5, SENSORS)
+    mean = np.einsum("e,esug->sug", weight, values)
+    total = np.sqrt(deviation**2 + (error * mean) ** 2)
+    model = GaussianSensorModel(values, deviation, weight, average, model_error=error)
+    np.testing.assert_allclose(model.total_standard_deviation, total, rtol=1e-13)
+    seen = ~np.isnan(observation)
+    density = norm.logpdf(observation, values[:, :, 1], total[:, 1])[..., seen]  # (E, S, G)
+    if average == "outside":
+        expected = logsumexp(density.sum(axis=2), b=weight[:, None], axis=0)
+    else:
+        expected = logsumexp(density, b=weight[:, None, None], axis=0).sum(axis=1)
+    if not seen.any():
+        expected = np.zeros(STATES)
+    np.testing.assert_allclose(model.log_likelihood(observation, 1), expected, rtol=1e-12, atol=1e-12)
+    joint = rng.dirichlet(np.ones(STATES * CONTROLS), 3).reshape(3, STATES, CONTROLS)
+    noise = np.sqrt(np.einsum("bsu,sug->bg", joint, total**2))
+    np.testing.assert_allclose(model.noise(joint), noise, rtol=1e-13)
+
+
+def test_no_model_error_changes_not_a_bit():
+    _, values, weight, deviation, observation = random_case(9)
+    without = GaussianSensorModel(values, deviation, weight)
+    zero = GaussianSensorModel(values, deviation, weight, model_error=np.zeros(SENSORS))
+    np.testing.assert_array_equal(zero.log_likelihood(observation, 0), without.log_likelihood(observation, 0))
+    one = GaussianSensorModel(values, deviation, weight, model_error=0.1)
+    each = GaussianSensorModel(values, deviation, weight, model_error=np.full(SENSORS, 0.1))
+    np.testing.assert_array_equal(one.log_likelihood(observation, 0), each.log_likelihood(observation, 0))
+    np.testing.assert_array_equal(one.model_error, np.full(SENSORS, 0.1))
+
+
+def test_predictive_check_of_a_model_with_the_error_that_it_assumes():
+    rng, values, weight, deviation, _ = random_case(8)
+    model = GaussianSensorModel(values, deviation, weight, model_error=0.4)
+    steps = 4000
+    belief = rng.dirichlet(np.ones(STATES))
+    draw, state = rng.choice(DRAWS, steps, p=weight), rng.choice(STATES, steps, p=belief)
+    total = model.total_standard_deviation[state, 1]
+    observations = values[draw, state, 1] + rng.normal(size=(steps, SENSORS)) * total
+    check = model.predictive_check(known_control(np.tile(belief, (steps, 1)), 1, CONTROLS), observations)
+    for sensor in range(SENSORS):
+        assert kstest(check.probability_integral_transform[:, sensor], "uniform").pvalue > 1e-3
+    np.testing.assert_allclose(check.residual.std(axis=0), 1.0, atol=0.05)
+
+
+def test_predictive_check_leaves_lost_sensors_out():
+    _, values, weight, deviation, observation = random_case(6)
+    observation[2] = np.nan
+    check = GaussianSensorModel(values, deviation, weight).predictive_check(
+        known_control(np.full(STATES, 0.25), 0, CONTROLS), observation
+    )
+    assert np.isnan(check.residual[2])
+    assert np.isnan(check.probability_integral_transform[2])
+    assert np.isfinite(check.mean[2])
+    assert np.isnan(check.coverage()[2])
+    assert np.all(np.isfinite(np.delete(check.residual, 2)))
+
+
+def test_bad_input_is_refused():
+    _, values, weight, deviation, observation = random_case(7)
+    model = GaussianSensorModel(values, deviation, weight)
+    for bad in (0.0, -1.0, np.nan, np.ones(SENSORS + 1), np.r_[deviation[:-1], np.inf]):
+        with pytest.raises(InvalidModelError, match="positive noise standard deviation"):
+            GaussianSensorModel(values, bad, weight)
+    for bad in (-0.1, np.nan, np.inf, np.ones(SENSORS + 1)):
+        with pytest.raises(InvalidModelError, match="relative model error"):
+            GaussianSensorModel(values, deviation, weight, model_error=bad)
+    with pytest.raises(InvalidModelError, match="'outside' or 'inside'"):
+        GaussianSensorModel(values, deviation, weight, average="both")
+    with pytest.raises(InvalidObservationError, match=f"expected {SENSORS} sensor values"):
+        model.log_likelihood(observation[:-1], 0)
+    observation[3] = -np.inf
+    with pytest.raises(InvalidObservationError, match=r"\(3,\) is infinite"):
+        model.log_likelihood(observation, 0)
+    observation[3] = 0.0
+    with pytest.raises(InvalidModelError, match="control indices between 0 and 1"):
+        model.log_likelihood(observation, 2)
+    with pytest.raises(InvalidModelError, match=r"\(steps, sensors\)"):
+        model.log_likelihood_sequence(observation[None], [0, 1])
+    with pytest.raises(InvalidModelError, match="one belief for each observation"):
+        model.predictive_check(known_control(np.full(STATES, 0.25), 0, CONTROLS), observation[None])

@@ -1,0 +1,161 @@
+"""The one name to import: what it hands on, that it does so lazily, and whose files may hide ours."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import uav_twin
+from uav_twin import _HOMES
+
+ROOT = Path(__file__).parents[2]
+
+
+def python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a script that lies in a folder, as a user does."""
+    script = folder / "my_script.py"
+    script.write_text(code, encoding="utf-8")
+    return subprocess.run(
+        [sys.executable, str(script)], cwd=folder, check=False, capture_output=True, text=True
+    )
+
+
+def test_every_name_is_there_and_documented() -> None:
+    assert 15 <= len(uav_twin.__all__) <= 25
+    assert sorted(_HOMES) == sorted(uav_twin.__all__)
+    assert set(uav_twin.__all__) <= set(dir(uav_twin))
+    # The import of a module of the command line would take the place of a name like it.
+    assert not {path.stem for path in Path(uav_twin.__file__).parent.glob("*.py")} & {*uav_twin.__all__}
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    for name in uav_twin.__all__:
+        found = getattr(uav_twin, name)
+        assert callable(found)
+        assert found.__doc__, name
+        assert f"`{name}`" in page, name
+
+
+def test_type_checkers_are_told_the_same_homes() -> None:
+    tree = ast.parse(Path(uav_twin.__file__).read_text(encoding="utf-8"))
+    (told,) = (node for node in tree.body if isinstance(node, ast.If))
+    homes = {}
+    for line in told.body:
+        assert isinstance(line, ast.ImportFrom)
+        for alias in line.names:
+            renamed = alias.asname is not None and alias.asname != alias.name
+            homes[alias.asname or alias.name] = f"{line.module}:{alias.name}" if renamed else line.module
+    assert homes == _HOMES
+
+
+def test_the_import_is_lazy_and_an_unknown_name_is_refused(tmp_path: Path) -> None:
+    found = python("import sys, uav_twin\nprint('numpy' in sys.modules, 'fe' in sys.modules)", tmp_path)
+    assert found.stdout.split() == ["False", "False"], found.stderr
+    with pytest.raises(AttributeError, match=r"no attribute 'simulate_fmu'.*load_design"):
+        uav_twin.simulate_fmu  # noqa: B018
+
+
+@pytest.mark.parametrize("hidden", ["fe.py", "reporting.py", "scenarios", "scenarios/__init__.py"])
+@pytest.mark.parametrize(
+    "use", ["import uav_twin; uav_twin.load_design()", "from uav_twin import load_design; load_design()"]
+)
+def test_a_file_that_hides_a_package_is_named(hidden: str, use: str, tmp_path: Path) -> None:
+    """A folder without `__init__.py` hides nothing where ours is found, and is left in peace."""
+    if hidden.endswith(".py"):
+        (tmp_path / hidden).parent.mkdir(exist_ok=True)
+        (tmp_path / hidden).write_text("", encoding="utf-8")
+    else:
+        (tmp_path / hidden).mkdir()
+    found = python(use, tmp_path)
+    if hidden == "scenarios":
+        assert found.returncode == 0, found.stderr
+        return
+    assert found.returncode == 1
+    last = found.stderr.strip().splitlines()[-1]
+    name, place = Path(hidden).parts[0].removesuffix(".py"), tmp_path / Path(hidden).parts[0]
+    assert last.startswith("uav_twin.shadowing.ShadowedPackageError: ")
+    assert f"{place} hides the package `{name}` of uav-twin" in last
+    assert "rename it" in last
+
+
+def test_the_command_names_it_too(tmp_path: Path) -> None:
+    (tmp_path / "fe.py").write_text("", encoding="utf-8")
+    found = subprocess.run(
+        [sys.executable, "-m", "uav_twin", "wing"], cwd=tmp_path, check=False, capture_output=True, text=True
+    )
+    assert found.returncode == 1
+    assert found.stdout == ""
+    assert found.stderr.count("\n") == 1
+    assert f"{tmp_path / 'fe.py'} hides the package `fe` of uav-twin" in found.stderr
+
+
+def test_a_model_from_tables_is_the_same_as_from_its_parts() -> None:
+    from twin_master.errors import InvalidModelError
+    from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace, TransitionModel
+
+    worse = [[0.9, 0.1], [0.0, 1.0]]
+    three = [[0.8, 0.2, 0.0], [0.0, 0.7, 0.3], [0.0, 0.0, 1.0]]
+    levels = {"a": (0.0, 0.5), "b": (0.0, 0.2, 0.4)}
+    tables = {"soft": {"a": np.eye(2), "b": np.eye(3)}, "hard": {"b": three, "a": worse}}
+    found = GraphicalModel.from_tables(levels, tables)
+    states = StateSpace((Factor("a", (0.0, 0.5)), Factor("b", (0.0, 0.2, 0.4))))
+    moves = TransitionModel.from_factors([[np.eye(2), np.eye(3)], [worse, three]])
+    assert found.states == states
+    assert found.controls == ("soft", "hard")
+    np.testing.assert_array_equal(found.prior, states.certain((0.0, 0.0)))
+    np.testing.assert_array_equal(found.transition.matrix, moves.matrix)
+    np.testing.assert_allclose(found.transition.matrix[1], np.kron(worse, three), rtol=0, atol=1e-15)
+    given = GraphicalModel.from_tables(levels, tables, {"a": (0.25, 0.75), "b": (0.5, 0.5, 0.0)})
+    np.testing.assert_array_equal(given.prior, np.kron((0.25, 0.75), (0.5, 0.5, 0.0)))
+    with pytest.raises(InvalidModelError, match="hard: expected one table for each of the factors a, b"):
+        GraphicalModel.from_tables(levels, {**tables, "hard": {"a": worse}})
+
+
+@pytest.mark.usefixtures("no_report_drawn")
+def test_a_policy_of_ones_own_is_flown_kept_and_resumed(tmp_path: Path, library_file: Path) -> None:
+    from twin_master.errors import NotResumableError
+
+    flown = {"strain_library": library_file}
+    known = uav_twin.prepare_twin("level_turns", flown)
+    controls = known.model.controls
+    gentle = np.zeros((known.model.states.size, len(controls)))
+    gentle[:, 0] = 1.0
+    folder = tmp_path / "run"
+    uav_twin.fly("level_turns", folder, flown, policy=gentle, report=False)
+    run = uav_twin.open_run(folder)
+    np.testing.assert_array_equal(np.load(folder / "policy.npy"), gentle)
+    assert not run["policy"]["control_index"].values.any()
+    first = int(run["observed"]["control_index"][0])
+    assert run["observed"]["control_index"].values[1:].tolist() == [0] * (len(run["observed"]["step"]) - 1)
+    assert first == controls.index(known.scenario.mission.first_control)
+    before = (folder / "run.nc").read_bytes()
+    uav_twin.resume(folder, report=False)
+    assert (folder / "run.nc").read_bytes() == before
+    (folder / "run.nc").unlink()  # a run that is finished is not flown again
+    np.save(folder / "policy.npy", gentle[:, ::-1])
+    with pytest.raises(NotResumableError, match="policy changed"):
+        uav_twin.resume(folder, report=False)
+
+
+def test_a_policy_of_another_shape_costs_no_folder(tmp_path: Path, library_file: Path) -> None:
+    from twin_master.errors import InvalidModelError, MissionInputError
+
+    folder = tmp_path / "run"
+    with pytest.raises(InvalidModelError, match="policy: expected shape"):
+        uav_twin.fly("level_turns", folder, {"strain_library": library_file}, policy=np.ones((3, 1)))
+    with pytest.raises(MissionInputError, match="sead came"):
+        uav_twin.fly("level_turns", folder, {"sead": 1})
+    assert not folder.exists()
+
+
+@pytest.fixture
+def no_report_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail where a report is drawn although none was asked for."""
+
+    def drawn(_folder: Path) -> Path:
+        raise AssertionError("a report was drawn")
+
+    monkeypatch.setattr("twin_master.workflow._report", drawn)

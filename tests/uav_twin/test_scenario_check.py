@@ -1,0 +1,135 @@
+"""`uav-twin scenario check`, and the options that all commands have."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from scenarios import scenario_files
+from twin_master.errors import MissionInputError
+from twin_master.scenario.reading import load_scenario
+from twin_master.scenario_check import check_scenario
+from uav_twin import cli
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Run the command line in this process and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["uav-twin", *arguments])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    code = caught.value.code
+    return 0 if code is None else int(code)
+
+
+def leaves(command: object, *words: str) -> list[tuple[tuple[str, ...], object]]:
+    """Return every command with the words that call it."""
+    found = [(words, command)]
+    for name, inner in getattr(command, "commands", {}).items():
+        found += leaves(inner, *words, name)
+    return found
+
+
+def test_every_command_takes_quiet_and_verbose() -> None:
+    from reporting import terminal
+
+    everything = leaves(terminal.with_common_options(cli.app))
+    assert len(everything) > 25
+    for words, command in everything:
+        options = [option for parameter in command.params for option in parameter.opts]  # type: ignore[attr-defined]
+        for option in ("--quiet", "-q", "--verbose", "-v"):
+            assert options.count(option) == 1, (words, option)
+        assert command.help, words  # type: ignore[attr-defined]
+
+
+def test_a_scenario_is_described(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(monkeypatch, "scenario", "check", "level_turns") == 0
+    text = capsys.readouterr().out
+    assert "Flown: FMU of the reduced model of the design." in text
+    assert "Believed: reduced model of the design." in text
+    assert "25 states, z1 (5 levels), z2 (5 levels)" in text
+    assert "50 turns, 10 ahead" in text
+    assert call(monkeypatch, "scenario", "check", "level_turns", "--json", "-q") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert (record["states"], record["turns"], record["sensors"]) == (25, 50, 24)
+    # at least predictions (E, S, U, G), transitions (U, S, S) and beliefs of 60 steps
+    assert record["memory"] > 8 * (100 * 25 * 2 * 24 + 2 * 25**2 + 25 * 60)
+    assert call(monkeypatch, "scenario", "check", "level_turns", "-q") == 0
+    assert capsys.readouterr().out == ""
+    assert call(monkeypatch, "scenario", "check", "level_turns", "-q", "-v") == 2
+    assert "exclude each other" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", sorted(scenario_files()))
+def test_every_shipped_scenario_is_sound_or_says_what_it_needs(name: str) -> None:
+    if name == "model_mismatch":  # it names no strain library of its own
+        with pytest.raises(MissionInputError, match="--strain-library FILE"):
+            check_scenario(load_scenario(name))
+        return
+    found = check_scenario(load_scenario(name))
+    assert found.name == name
+    assert found.memory > 0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (
+            'role = "strain"',
+            'role = "stress"',
+            "The binding uav_wing has no observation 'stress'",
+        ),
+        ('design = "uav_wing"', 'design = "my_wing.toml"', "my_wing.toml cannot be read"),
+        ('binding = "uav_wing"', 'binding = "my_binding.toml"', "my_binding.toml cannot be read"),
+        ("steps = 50", "steps = -1", "steps"),
+    ],
+)
+def test_a_fault_is_one_sentence(
+    old: str,
+    new: str,
+    sentence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    text = scenario_files()["level_turns"].read_text(encoding="utf-8")
+    assert old in text
+    (tmp_path / "mine.toml").write_text(text.replace(old, new), encoding="utf-8")
+    assert call(monkeypatch, "scenario", "check", str(tmp_path / "mine.toml")) == 1
+    caught = capsys.readouterr()
+    assert caught.out == ""
+    assert sentence in caught.err
+    assert len(caught.err.strip().splitlines()) == 1
+
+
+def test_version(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    from importlib.metadata import version
+
+    assert call(monkeypatch, "--version") == 0
+    assert capsys.readouterr().out == f"uav-twin {version('uav-twin')}\n"
+
+
+def test_ctrl_c_ends_every_command_alike(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fe.wing.design.load_design", interrupted)
+    assert call(monkeypatch, "wing") == 130
+    assert capsys.readouterr().err == "Interrupted.\n"
+
+
+def test_verbose_shows_the_traceback_and_the_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call(monkeypatch, "scenario", "check", "nowhere") == 1
+    sentence = capsys.readouterr().err
+    assert "Traceback" not in sentence
+    assert call(monkeypatch, "scenario", "check", "nowhere", "-v") == 1
+    told = capsys.readouterr().err
+    assert "Traceback" in told
+    assert told.endswith(sentence)

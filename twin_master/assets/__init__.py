@@ -1,0 +1,1 @@
+"""What flies, and what the twin believes of it."""

@@ -1,0 +1,181 @@
+"""Where an asset and the twin's predicted observations of it come from.
+
+A mission knows a source only by its protocol. What a user may name stands in the files beside this one whose
+names end in `_source`: each holds the tables of its kinds and what is made of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reporting.files import atomic_write_bytes
+from reporting.progress import Progress
+from twin_master.assets.interface import Asset
+from twin_master.assets.parameter import ParameterDraws
+from twin_master.errors import MissionInputError
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.scenario.asset import BeliefSection, FileSection
+from twin_master.scenario.schema import Scenario
+
+Float = NDArray[np.float64]
+
+
+def load_sources() -> None:
+    """Import every source, so that its kinds are known."""
+    for module in iter_modules([str(Path(__file__).parent)]):
+        if module.name.endswith("_source"):
+            import_module(f"{__package__}.{module.name}")
+
+
+@dataclass(frozen=True)
+class FlownAndBelieved:
+    """What is flown and what the twin believes, in words.
+
+    Attributes
+    ----------
+    asset, model : str
+        What is flown, and what predicts its observations.
+    differ : bool
+        Whether they are known to be different models.
+    """
+
+    asset: str
+    model: str
+    differ: bool = False
+
+
+class AssetSource(Protocol):
+    """Everything that a mission needs to know of its asset."""
+
+    @property
+    def origin(self) -> FlownAndBelieved:
+        """What is flown and what the twin believes, in words."""
+
+    def check(self) -> None:
+        """Look at what is given before anything is made; raise what is wrong with it."""
+
+    def files(self) -> dict[str, bytes]:
+        """Return the files to copy into the run folder, by their paths in it."""
+
+    def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
+        """Make ready what is flown, in the folder of the run; return the hashes of what went in."""
+
+    def draws(self, seed: int) -> ParameterDraws:
+        """Return draws of the uncertain parameter of the model."""
+
+    def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
+        """Return the predicted observations (E, S, U, G)."""
+
+    def open(self) -> Asset:
+        """Return the asset at its start."""
+
+    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
+        """Write the asset's field under an estimated state and a control; return whether it has one."""
+
+
+class AssetBelief(BeliefSection):
+    """The twin asks what is flown itself what to expect: for assets without memory."""
+
+    kind: Literal["asset"] = "asset"
+
+    def source(self, scenario: Scenario, flown: AssetSource) -> AssetSource:
+        """Return what is flown."""
+        return flown
+
+
+class PairedSource:
+    """The asset of one source; everything that the twin knows from another.
+
+    Parameters
+    ----------
+    asset : AssetSource
+        What is flown.
+    model : AssetSource
+        Parameter draws, predicted observations and field.
+    differ : bool
+        Whether the two are known to be different models.
+    """
+
+    def __init__(self, asset: AssetSource, model: AssetSource, *, differ: bool = True) -> None:
+        self._asset = asset
+        self._model = model
+        self._differ = differ
+
+    @property
+    def origin(self) -> FlownAndBelieved:
+        """Asset of the one, model of the other."""
+        asset, model = self._asset.origin, self._model.origin
+        return FlownAndBelieved(asset.asset, model.model, differ=self._differ or asset.differ or model.differ)
+
+    def check(self) -> None:
+        """Check both."""
+        self._asset.check()
+        self._model.check()
+
+    def files(self) -> dict[str, bytes]:
+        """Return the files of both."""
+        return {**self._asset.files(), **self._model.files()}
+
+    def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
+        """Prepare both; return the hashes of both."""
+        hashes = {**self._asset.prepare(folder, progress), **self._model.prepare(folder, progress)}
+        flown = hashes.get(FLOWN_DESIGN_HASH)
+        self._differ = self._differ or (flown is not None and hashes.get("design", flown) != flown)
+        return hashes
+
+    def draws(self, seed: int) -> ParameterDraws:
+        """Return draws of the parameter of the twin's model."""
+        return self._model.draws(seed)
+
+    def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
+        """Return the predictions (E, S, U, G) of the twin's model."""
+        return self._model.observation_table(draws, model)
+
+    def open(self) -> Asset:
+        """Return the asset at its start."""
+        return self._asset.open()
+
+    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
+        """Write the field of the twin's model."""
+        return self._model.write_field(path, state, control)
+
+
+FLOWN_DESIGN_HASH = "flown_design"
+"""Under which a source that packs a wing tells the hash of its design; that of the model is `design`."""
+
+
+def named_files(scenario: Scenario, section: FileSection) -> dict[str, Path]:
+    """Return what a table names, and the calibration file, by the places of their copies in a run folder."""
+    return {**section.all_files(), **scenario.calibration.all_files()}
+
+
+def read_files(files: Mapping[str, Path]) -> dict[str, bytes]:
+    """Return what files hold, by the places of their copies in a run folder.
+
+    Raises
+    ------
+    MissionInputError
+        One cannot be read.
+    """
+    contents = {}
+    for copy, path in files.items():
+        try:
+            contents[copy] = path.read_bytes()
+        except OSError as error:
+            raise MissionInputError(f"{path} cannot be read: {error.strerror or error}.") from error
+    return contents
+
+
+def keep_files(folder: Path, contents: Mapping[str, bytes]) -> None:
+    """Write the copies that are not in the run folder yet."""
+    for name, content in contents.items():
+        if not (folder / name).exists():
+            atomic_write_bytes(folder / name, content)

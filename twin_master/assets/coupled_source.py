@@ -1,0 +1,345 @@
+"""Several FMUs as the asset of a mission: joined in the scenario, or read from an SSP file."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from fmu_asset.companions import COMPANION_NAMES
+from reporting.files import atomic_write_bytes
+from reporting.progress import Progress
+from reporting.provenance import hash_file
+from twin_master.assets.asset_source import FlownAndBelieved
+from twin_master.assets.fmu_source import BINDING_COPY, FmuSection, FmuSource
+from twin_master.assets.parameter import check_calibration
+from twin_master.errors import MissionInputError
+from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, FileSection
+from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import Count, Flag, Number, Positive, Section, short
+
+if TYPE_CHECKING:
+    from fmu_asset.coupling.asset import CoupledAsset
+    from fmu_asset.coupling.structure import Setting, SettingValue, SystemStructure
+    from fmu_asset.coupling.wiring import Wiring
+    from fmu_asset.door.binding import Binding
+    from twin_master.assets.flown_fmu import Session
+
+SSP_COPY = "asset/system.ssp"
+COMPONENT_FOLDER = "asset/components"
+
+
+class ComponentSection(FileSection):
+    """One FMU of a coupled asset: a file, a companion by its name, or packed from a wing design."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$")]
+    fmu: str | None = None
+    design: str | None = None
+    substeps: Count = 1
+    """Steps that it makes in one step of the system."""
+    parameters: dict[str, Flag | Number | str] = Field(default_factory=dict)
+    """By the FMU's names and in its units; `gain[{1..4}]` stands for four of them."""
+
+    def copies(self) -> Mapping[str, str]:
+        """Return where the copies of FMU and design stand in a run folder."""
+        stem = f"{COMPONENT_FOLDER}/{self.name}"
+        return {"fmu": f"{stem}.fmu", "design": f"{stem}.toml"}
+
+    @property
+    def design_path(self) -> Path:
+        """The design that the component is packed of."""
+        return self.all_files()[self.copies()["design"]]
+
+    def _is_shipped(self, key: str, name: str) -> bool:
+        return name in COMPANION_NAMES if key == "fmu" else super()._is_shipped(key, name)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.fmu is None) == (self.design is None):
+            raise ValueError(f"the component `{self.name}` needs one of `fmu` and `design`")
+        return self
+
+
+class ConnectionSection(Section):
+    """What flows from one FMU of a coupled asset to another, or to and from the asset itself."""
+
+    source: Annotated[str, Field(min_length=1)]
+    target: Annotated[str, Field(min_length=1)]
+    factor: Number = 1.0
+    offset: Number = 0.0
+    delayed: Flag = False
+
+
+class SeveralSection(FmuSection):
+    """What is said of several FMUs, wherever they come from."""
+
+    algorithm: Literal["gauss_seidel", "jacobi"] = "gauss_seidel"
+    iterations: Count = 1
+    tolerance: Positive = 1e-9
+
+
+class SspSection(SeveralSection):
+    """Several FMUs, joined by an SSP file."""
+
+    kind: Literal["ssp"] = "ssp"
+    file: str
+
+    def copies(self) -> Mapping[str, str]:
+        """Return where the copies of binding and SSP file stand in a run folder."""
+        return {"binding": BINDING_COPY, "file": SSP_COPY}
+
+    def source(self, scenario: Scenario) -> SspSource:
+        """Return the system of the file."""
+        return SspSource(scenario, self)
+
+
+class CoupledSection(SeveralSection):
+    """Several FMUs, joined here."""
+
+    kind: Literal["coupled"] = "coupled"
+    component: Annotated[tuple[ComponentSection, ...], Field(min_length=1)]
+    connection: tuple[ConnectionSection, ...] = ()
+
+    def all_files(self) -> dict[str, Path]:
+        """Return the files of the components too, but for shipped ones, which are packed anew."""
+        found = super().all_files()
+        for component in self.component:
+            found |= {component.copies()[key]: Path(path) for key, path in component.own_files().items()}
+        return found
+
+    def moved(self, folder: Path) -> Self:
+        """Return the table with its relative paths from a folder."""
+        components = tuple(component.moved(folder) for component in self.component)
+        return super().moved(folder).model_copy(update={"component": components})
+
+    def portable(self) -> FileSection:
+        """Return the table with the paths of the copies inside a run folder."""
+        components = tuple(component.portable() for component in self.component)
+        return super().portable().model_copy(update={"component": components})
+
+    def source(self, scenario: Scenario) -> CoupledSource:
+        """Return the FMUs together."""
+        return CoupledSource(scenario, self)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        names = [component.name for component in self.component]
+        if len(set(names)) != len(names):
+            raise ValueError(f"each component needs a name of its own, and the names are {short(names)}")
+        return self
+
+
+class SeveralSource(FmuSource):
+    """Several FMUs as one asset.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        What is flown.
+    section : SeveralSection
+        Its table `asset`; variables of the binding are connectors of the system, or `component.variable`.
+    """
+
+    def __init__(self, scenario: Scenario, section: SeveralSection) -> None:
+        super().__init__(scenario, section)
+        self._several = section
+
+    def wiring(self) -> Wiring:
+        """Return the system as it is flown, once prepared."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """Read what is given where it is; join what needs no packing first.
+
+        Raises
+        ------
+        MissionInputError, SspError, CouplingError, FmuError, InvalidDesignError
+            Something cannot be read or does not fit.
+        """
+        from fmu_asset.archive.fmu_file import plain_folder
+        from fmu_asset.door.binding import load_binding
+
+        check_calibration(self._scenario.calibration)
+        self.files()
+        binding = load_binding(self._section.binding_path)
+        self._observed(binding)
+        self._inner_roles(binding)
+        self._check_names(binding)
+        folder = plain_folder()
+        try:
+            self._check_system(binding, folder)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _check_system(self, binding: Binding, folder: Path) -> None:
+        raise NotImplementedError
+
+    def _join(self, wiring: Wiring, binding: Binding) -> CoupledAsset:
+        several = self._several
+        from fmu_asset.coupling.asset import CoupledAsset
+
+        return CoupledAsset(
+            wiring,
+            binding,
+            algorithm=several.algorithm,
+            iterations=several.iterations,
+            tolerance=several.tolerance,
+            isolated=several.isolated,
+            step_timeout=several.step_timeout,
+            parameters=self.parameters(),
+        )
+
+    def _session(self) -> Session:
+        return self._join(self.wiring(), self.binding())
+
+
+class SspSource(SeveralSource):
+    """The system of an SSP file."""
+
+    @property
+    def origin(self) -> FlownAndBelieved:
+        """The system, twice."""
+        return FlownAndBelieved("system of an SSP file", "system of an SSP file")
+
+    def wiring(self) -> Wiring:
+        """Return the system as it is flown, once prepared."""
+        from fmu_asset.ssp.check import join_ssp
+        from fmu_asset.ssp.reader import read_ssp
+
+        return join_ssp(read_ssp(self._path(SSP_COPY), self._path(COMPONENT_FOLDER)))
+
+    def _check_system(self, binding: Binding, folder: Path) -> None:
+        from fmu_asset.ssp.check import join_ssp
+        from fmu_asset.ssp.reader import read_ssp
+
+        self._join(join_ssp(read_ssp(self._section.all_files()[SSP_COPY], folder)), binding)
+
+    def _make(self, progress: Progress) -> dict[str, str]:
+        self._session().close()  # what does not fit is said before anything is flown
+        return {"ssp": hash_file(self._path(SSP_COPY))}
+
+
+class CoupledSource(SeveralSource):
+    """The FMUs that the scenario joins."""
+
+    def __init__(self, scenario: Scenario, section: CoupledSection) -> None:
+        super().__init__(scenario, section)
+        self._coupled = section
+
+    @property
+    def origin(self) -> FlownAndBelieved:
+        """The FMUs together, twice."""
+        words = f"{len(self._coupled.component)} coupled FMUs"
+        return FlownAndBelieved(words, words)
+
+    def _check_system(self, binding: Binding, folder: Path) -> None:
+        from fe.wing.design import load_design
+        from fmu_asset.coupling.wiring import Wiring
+
+        components = self._coupled.component
+        for component in components:
+            if component.design not in (None, CALIBRATED_DESIGN_NAME):
+                load_design(component.design_path)
+        if all(component.design is None for component in components):
+            files = {component.name: _given_fmu(component, folder) for component in components}
+            self._join(Wiring(self._structure(files)), binding)
+        else:
+            self._structure({component.name: folder for component in components})
+
+    def _make(self, progress: Progress) -> dict[str, str]:
+        """Pack what is not an FMU yet."""
+        hashes = {}
+        with progress.stage("Packing the FMUs"):
+            for component in self._coupled.component:
+                hashes[f"fmu_{component.name}"] = hash_file(self._packed(component, progress))
+        self._session().close()  # what does not fit is said before anything is flown
+        return hashes
+
+    def _packed(self, component: ComponentSection, progress: Progress) -> Path:
+        """Return the FMU of a component in the run folder; packed if it is not there."""
+        from calibration.wing.result_file import load_calibration
+        from calibration.wing.wing_record import tailoring
+        from fe.wing.design import load_design
+        from fmu_asset.packing.wing_packing import pack_wing
+
+        target = self._path(component.copies()["fmu"])
+        if target.exists():
+            return target
+        if component.design is None:
+            return _given_fmu(component, target.parent)
+        if component.design == CALIBRATED_DESIGN_NAME:
+            wing = load_calibration(Path(self._scenario.calibration.file or ""))
+            pack_wing(wing.design, target, tailoring=tailoring(wing), replace=True, progress=progress)
+        else:
+            design = load_design(component.design_path)
+            pack_wing(design, target, replace=True, progress=progress)
+        return target
+
+    def wiring(self) -> Wiring:
+        """Return the system as it is flown, once prepared."""
+        from fmu_asset.coupling.wiring import Wiring
+
+        files = {component.name: component.copies()["fmu"] for component in self._coupled.component}
+        return Wiring(self._structure({name: self._path(copy) for name, copy in files.items()}))
+
+    def _structure(self, fmus: Mapping[str, Path]) -> SystemStructure:
+        """Return the system of the scenario's components and connections."""
+        from fmu_asset.coupling.structure import Component, Connector, SystemStructure, expand_connection
+
+        asset = self._coupled
+        names = [component.name for component in asset.component]
+        connections = tuple(
+            connection
+            for entry in asset.connection
+            for connection in expand_connection(
+                entry.source,
+                entry.target,
+                names,
+                factor=entry.factor,
+                offset=entry.offset,
+                delayed=entry.delayed,
+            )
+        )
+        # A connector of the system is an output where something comes to it, and an input where it gives.
+        connectors = dict.fromkeys(
+            [Connector(c.target.variable, "output") for c in connections if not c.target.component]
+            + [Connector(c.source.variable, "input") for c in connections if not c.source.component]
+        )
+        components = tuple(Component(c.name, fmus[c.name], _settings(c), c.substeps) for c in asset.component)
+        return SystemStructure(self._scenario.mission.name, components, tuple(connectors), connections)
+
+
+def _given_fmu(component: ComponentSection, folder: Path) -> Path:
+    """Return the FMU of a component that is a file or a companion, packed in the folder."""
+    from fmu_asset.companions.build import companion_bytes
+
+    assert component.fmu is not None
+    if component.fmu not in COMPANION_NAMES:
+        return Path(component.fmu)
+    content, _ = companion_bytes(component.fmu)
+    return atomic_write_bytes(folder / f"{component.name}.fmu", content)
+
+
+def _settings(component: ComponentSection) -> dict[str, Setting]:
+    from fmu_asset.coupling.structure import Setting
+    from fmu_asset.door.binding import expand
+
+    settings: dict[str, Setting] = {}
+    values: Mapping[str, SettingValue] = component.parameters
+    for pattern, value in values.items():
+        try:
+            names = expand(pattern)
+        except ValueError as error:
+            raise MissionInputError(
+                f"the parameters of the component `{component.name}` cannot be read: {error}."
+            ) from error
+        for name in names:
+            if name in settings:
+                raise MissionInputError(
+                    f"the component `{component.name}` is given `{name}` twice: keep one of the two."
+                )
+            settings[name] = Setting(value)
+    return settings

@@ -1,0 +1,149 @@
+"""Draws of the uncertain parameter of the model, from a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin_master.errors import MissingObservationModelError
+from twin_master.scenario.schema import Calibration
+from twin_master.seeds import generator, seed_sequence
+
+if TYPE_CHECKING:
+    from calibration.static.stiffness_curve import StiffnessCurve, TipStiffnessModel
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ParameterDraws:
+    """Equally weighted draws of one parameter of the asset's model.
+
+    Attributes
+    ----------
+    name : str
+        Parameter.
+    values : (E,)
+        Draws, SI.
+    mean, standard_deviation : float
+        Of the distribution that was drawn from.
+    source : str
+        Where the distribution comes from.
+    record : mapping or None
+        The whole calibration, ready for JSON.
+    """
+
+    name: str
+    values: Float
+    mean: float
+    standard_deviation: float
+    source: str
+    record: Mapping[str, Any] | None = None
+
+
+def draw_parameter(
+    calibration: Calibration, seed: int, model: TipStiffnessModel | None = None
+) -> ParameterDraws:
+    """Return draws of the calibrated parameter: Kapteyn et al. 2021, calibration step 2.
+
+    From the file of a whole calibration they are drawn from its samples, one from each of as many strata.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Section of the scenario.
+    seed : int
+        Seed of the run.
+    model : TipStiffnessModel, optional
+        The structural model, where its own stiffness curve is to be used.
+
+    Raises
+    ------
+    MissingObservationModelError
+        The scenario asks for the stiffness curve of a design and there is none.
+    CalibrationError
+        The measurements do not fit the model, or the calibration file cannot be read.
+    """
+    if calibration.source == "file":
+        return _draws_of_file(calibration, seed)
+    if calibration.source == "fixed":
+        assert calibration.mean is not None  # the schema asks for it
+        return ParameterDraws(
+            calibration.parameter,
+            np.array([calibration.mean]),
+            calibration.mean,
+            0.0,
+            "fixed in the scenario",
+        )
+    if calibration.source == "normal":
+        assert calibration.mean is not None
+        assert calibration.standard_deviation is not None
+        from scipy.special import ndtri
+
+        random = generator(seed, "calibration")
+        strata = (np.arange(calibration.draws) + random.random(calibration.draws)) / calibration.draws
+        values = calibration.mean + calibration.standard_deviation * ndtri(strata)
+        return ParameterDraws(
+            calibration.parameter,
+            random.permutation(values),
+            calibration.mean,
+            calibration.standard_deviation,
+            "normal distribution of the scenario",
+        )
+    # A scenario can be read without any of this, and it takes seconds to load.
+    from calibration.static.stiffness import PUBLISHED_LINE, calibrate_static, stiffness_curve_of
+
+    curve: StiffnessCurve = PUBLISHED_LINE
+    if calibration.curve == "design":
+        if model is None:
+            raise MissingObservationModelError(
+                "`calibration.curve` asks for the stiffness curve of a design, and the asset has none: "
+                "let the twin believe a `design`, or set `calibration.curve` to `published`."
+            )
+        curve = stiffness_curve_of(model)
+    sequence = seed_sequence(seed, "calibration")
+    found = calibrate_static(curve, seed=int(sequence.generate_state(1)[0]))
+    posterior = found.exact if calibration.method == "exact" else found.particle.posterior
+    return ParameterDraws(
+        name=calibration.parameter,
+        values=posterior.samples(sequence, calibration.draws, stratified=True),
+        mean=posterior.mean,
+        standard_deviation=posterior.standard_deviation,
+        source=f"static test of the wing, {calibration.method.replace('_', ' ')}, {curve.name}",
+        record=found.to_dict(),
+    )
+
+
+def _draws_of_file(calibration: Calibration, seed: int) -> ParameterDraws:
+    from calibration.wing.result_file import load_calibration
+    from calibration.wing.wing_record import run_record
+
+    name = calibration.parameter
+    found = load_calibration(Path(calibration.file or ""))
+    return ParameterDraws(
+        name=name,
+        values=found.stratified_draws(name, calibration.draws, seed_sequence(seed, "calibration")),
+        mean=found.mean(name),
+        standard_deviation=found.standard_deviation(name),
+        source=f"calibration of {found.asset}, {found.procedure}, {len(found.samples)} samples",
+        record=run_record(found, name),
+    )
+
+
+def check_calibration(calibration: Calibration) -> None:
+    """Read the calibration file, if there is one.
+
+    Raises
+    ------
+    CalibrationRecordError
+        It is damaged or of another kind, or has no samples of the parameter.
+    """
+    if calibration.file is not None:
+        from calibration.wing.result_file import load_calibration
+
+        load_calibration(Path(calibration.file)).draws_of(calibration.parameter)

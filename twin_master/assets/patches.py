@@ -1,0 +1,123 @@
+"""Missing effects in a mission: in the asset that flies, and in the model that the twin believes."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fe.runtime.patch import PortForce, SensorDrift
+from fe.runtime.patched_steps import PatchedSteps
+from fe.runtime.patched_wing import PatchedWing
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import DigitalState
+from fe.wing.design import WingDesign
+from fmu_asset.packing.patch_file import PatchFile, load_patch
+from fmu_asset.packing.patched_model import effect_values, patched_behaviour
+from fmu_asset.packing.patched_runtime import output_channels, plain_effects
+from fmu_asset.packing.wing_packing import arrays_for
+from fmu_asset.slaves.behaviour import Moment, UnacceptableEffectError, WingParameters
+from fmu_asset.slaves.variables import QUASI_STATIC
+from twin_master.assets.parameter import ParameterDraws
+from twin_master.assets.wing_model import check_wing_scenario, wing_observation_table
+from twin_master.errors import MissionInputError
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.scenario.schema import Scenario
+
+Float = NDArray[np.float64]
+
+
+def check_model_patch(patch: PatchFile, gauge_count: int, where: str = "The patch") -> None:
+    """Check that a model without time can carry the effects of a patch.
+
+    Raises
+    ------
+    MissionInputError
+        An effect depends on time or on what happened before.
+    PatchFileError
+        The wing cannot carry an effect.
+    """
+    for effect in patch.for_outputs(output_channels(gauge_count), where):
+        for item in effect.patch:
+            drifts = isinstance(item, SensorDrift) and item.exponent != 0.0
+            if drifts or (isinstance(item, PortForce) and item.hysteretic):
+                raise MissionInputError(
+                    f"the effect {effect.id!r} depends on {'time' if drifts else 'the loads before'}, and "
+                    "the twin predicts the readings of each state and control once for the whole mission: "
+                    "leave it out of `belief.patch`."
+                )
+
+
+def model_observation_table(
+    wing: ReducedModel,
+    scenario: Scenario,
+    draws: ParameterDraws,
+    model: GraphicalModel,
+    patch_file: Path | None,
+    design: WingDesign,
+) -> Float:
+    """Return the strains (E, S, U, G) that the twin predicts, with the effects of its patch if it has one.
+
+    Raises
+    ------
+    MissingObservationModelError, OutsideModelError
+        As `wing_observation_table`.
+    PatchFileError, MissionInputError
+        The patch cannot be read, or the model cannot carry it.
+    """
+    if patch_file is None:
+        return wing_observation_table(wing, scenario, draws, model)
+    check_wing_scenario(scenario, wing.gauge_count)
+    patch = load_patch(patch_file)
+    check_model_patch(patch, wing.gauge_count, str(patch_file))
+    effects = plain_effects(patch.for_outputs(output_channels(wing.gauge_count)))
+    arrays = arrays_for(design, patch)
+    steps = None if arrays is None else partial(PatchedSteps, wing, PatchedWing(arrays))
+    behaviour = patched_behaviour(wing, effects, steps)
+    moment = Moment(0.0, 0.0, effect_values(effects, active=True))
+    states, controls = model.states.coordinates, scenario.control
+    first, second = (scenario.state_names.index(name) for name in ("z1", "z2"))
+    force = scenario.asset.constant_load.get("tip_force", 0.0)
+    table = np.empty((len(draws.values), len(states), len(controls), wing.gauge_count))
+    try:
+        for row, value in enumerate(draws.values):
+            parameters = _parameters(float(value))
+            for state, levels in enumerate(states):
+                for index, control in enumerate(controls):
+                    inputs = (
+                        control.values["load_factor"],
+                        float(levels[first]),
+                        float(levels[second]),
+                        force,
+                    )
+                    table[row, state, index] = behaviour.start(parameters, inputs, moment).strain
+    except UnacceptableEffectError as error:
+        raise MissionInputError(f"the twin's model cannot carry {patch_file}: {error}") from error
+    return table
+
+
+def _parameters(young_modulus_factor: float) -> WingParameters:
+    state = DigitalState()
+    return WingParameters(
+        young_modulus_factor=young_modulus_factor,
+        damping_alpha=state.damping_alpha,
+        damping_beta=state.damping_beta,
+        servo_mass=state.servo_mass,
+        pitot_mass=state.pitot_mass,
+        initial_tip_displacement=0.0,
+        response=QUASI_STATIC,
+    )
+
+
+def effect_names(patch_file: Path, gauge_count: int) -> tuple[str, ...]:
+    """Return the variables that a patch adds to the FMU of a wing.
+
+    Raises
+    ------
+    PatchFileError
+        The patch cannot be read, or the FMU cannot carry it.
+    """
+    effects = plain_effects(load_patch(patch_file).for_outputs(output_channels(gauge_count), str(patch_file)))
+    return tuple(effect_values(effects, active=False))

@@ -1,0 +1,196 @@
+"""What is flown: the scenario with the command line's overrides, and where its asset comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from twin_master.assets.asset_source import AssetSource, PairedSource
+from twin_master.assets.strain_library import FILE_NAME
+from twin_master.errors import MissionInputError
+from twin_master.network.memory import check_scenario_fits
+from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, AssetSection
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.scenario.schema import Scenario
+
+
+@dataclass(frozen=True)
+class Overrides:
+    """What the command line says otherwise than the scenario file.
+
+    Attributes
+    ----------
+    seed : int or None
+        Seed of the run.
+    fmu, binding : Path or None
+        FMU to fly, and its binding.
+    strain_library : Path or None
+        Fly the library instead of an FMU, as asset and model; where the scenario flies a library anyway, the
+        file of that library.
+    library : Path or None
+        Believe this observation library.
+    in_process : bool
+        Fly the FMU in this process instead of a worker.
+    calibration : Path or None
+        The calibration file of the wing, instead of what the scenario says of its calibration.
+    ssp : Path or None
+        SSP file to fly in the place of the scenario's asset.
+    """
+
+    seed: int | None = None
+    fmu: Path | None = None
+    binding: Path | None = None
+    strain_library: Path | None = None
+    in_process: bool = False
+    calibration: Path | None = None
+    ssp: Path | None = None
+    library: Path | None = None
+
+
+def given_overrides(given: Overrides | Mapping[str, Any] | None) -> Overrides:
+    """Return overrides as a record; a mapping has the fields of `Overrides`, paths as texts too.
+
+    Raises
+    ------
+    MissionInputError
+        A key is no such field.
+    """
+    if isinstance(given, Overrides):
+        return given
+    values = dict(given or {})
+    known = {item.name: str(item.type) for item in fields(Overrides)}
+    if unknown := [key for key in values if key not in known]:
+        raise MissionInputError(
+            f"what differs from the scenario must be among {', '.join(known)}, and {', '.join(unknown)} came."
+        )
+    for key, value in values.items():
+        if "Path" in known[key] and value is not None:
+            values[key] = Path(value)
+    return Overrides(**values)
+
+
+def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
+    """Return the scenario with the overrides, its paths absolute.
+
+    Relative paths of a scenario file start at the folder of that file.
+
+    Raises
+    ------
+    MissionInputError
+        The overrides contradict each other, or the scenario.
+    ScenarioError
+        The scenario does not hold with them.
+    """
+    table = loaded.scenario.moved(loaded.path.resolve().parent).to_dict()
+    _check_overrides(overrides, table["asset"]["kind"])
+    _change_asset(table, overrides)
+    if overrides.library:
+        design = table["belief"].get("design")
+        table["belief"] = {"kind": "library", "file": str(overrides.library.resolve()), "design": design}
+    if overrides.calibration:
+        table["calibration"] |= {"source": "file", "file": str(overrides.calibration.resolve())}
+    if table["calibration"]["file"]:
+        _tailor(table)
+    elif any(part.get("design") == CALIBRATED_DESIGN_NAME for part in _wings(table)):
+        raise MissionInputError(
+            "the design of a calibration is asked for, and there is no calibration file: give --calibration, "
+            'or `source = "file"` in the table `calibration`.'
+        )
+    if overrides.seed is not None:
+        table["mission"]["seed"] = overrides.seed
+    return parse_scenario(table, str(loaded.path))
+
+
+def _check_overrides(overrides: Overrides, kind: str) -> None:
+    """Check that the overrides do not contradict each other, or what is flown."""
+    if overrides.strain_library and (overrides.fmu or overrides.binding):
+        raise MissionInputError("--strain-library flies no FMU: give either it or --fmu and --binding.")
+    if overrides.strain_library and overrides.library:
+        raise MissionInputError("--strain-library is asset and model itself: give either it or --library.")
+    if overrides.ssp and (overrides.strain_library or overrides.fmu):
+        raise MissionInputError("an SSP file is flown as it is: give neither --fmu nor --strain-library.")
+    if overrides.fmu and kind in ("coupled", "ssp"):
+        raise MissionInputError(
+            "--fmu flies one FMU, and the scenario couples several: change its components."
+        )
+
+
+def _change_asset(table: dict[str, Any], overrides: Overrides) -> None:
+    """Let something else fly; what is said of the asset stays, as far as the other kind knows it."""
+    flown = table["asset"]["kind"]
+    if overrides.ssp:
+        _change_kind(table, "ssp", overrides.ssp)
+    if overrides.fmu:
+        _change_kind(table, "fmu", overrides.fmu)
+    if overrides.strain_library:
+        file = overrides.strain_library
+        _change_kind(table, "strain_library", file / FILE_NAME if file.is_dir() else file)
+        if flown != "strain_library":
+            table["belief"] = {"kind": "asset"}
+    if overrides.binding:
+        table["asset"]["binding"] = str(overrides.binding.resolve())
+    if overrides.in_process and "isolated" in table["asset"]:
+        table["asset"]["isolated"] = False
+
+
+def _change_kind(table: dict[str, Any], kind: str, file: Path) -> None:
+    if table["asset"].get("patch"):
+        raise MissionInputError(
+            "`asset.patch` goes into the FMU that is packed of a design, and another asset is flown: leave "
+            "it out."
+        )
+    known = AssetSection.kinds()[kind].model_fields
+    kept = {key: value for key, value in table["asset"].items() if key in known}
+    table["asset"] = kept | {"kind": kind, "file": str(file.resolve())}
+
+
+def _wings(table: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the tables that may name a design."""
+    return [table["asset"], table["belief"], *table["asset"].get("component", ())]
+
+
+def _tailor(table: dict[str, Any]) -> None:
+    """Put the wing of the calibration file in the place of the designs that it describes."""
+    asset, belief = table["asset"], table["belief"]
+    if asset["kind"] == "strain_library" and belief["kind"] == "asset":
+        raise MissionInputError(
+            "a strain library brings its own samples of its parameter: fly it without a calibration file."
+        )
+    believed = belief.get("design")
+    for part in _wings(table):
+        if part.get("design") and (part is asset or part["design"] == believed):
+            part["design"] = CALIBRATED_DESIGN_NAME
+            if part.get("kind") == "design":
+                part["kind"] = "calibration"
+
+
+def portable_scenario(scenario: Scenario) -> Scenario:
+    """Return a resolved scenario that names the copies in the run folder, so that it holds on any machine."""
+    return scenario.portable()
+
+
+def located_scenario(scenario: Scenario, folder: Path) -> Scenario:
+    """Return a portable scenario with the paths of the copies in a run folder."""
+    return scenario.moved(folder)
+
+
+def asset_source(scenario: Scenario) -> AssetSource:
+    """Return what a resolved scenario flies and what its twin believes.
+
+    Raises
+    ------
+    MissionInputError
+        The scenario flies a strain library and names none, or the twin cannot believe what it is told to.
+    InvalidStrainLibraryError, MissingObservationModelError
+        The strain library is missing, damaged or does not fit the scenario.
+    InvalidModelError
+        The twin of the scenario does not fit in memory.
+    """
+    check_scenario_fits(scenario)
+    flown: AssetSource = scenario.asset.source(scenario)
+    believed: AssetSource = scenario.belief.source(scenario, flown)
+    if believed is flown:
+        return flown
+    return PairedSource(flown, believed, differ=scenario.another_model)

@@ -1,0 +1,153 @@
+"""The authors' published strain library, read from their repository's file as it is.
+
+`UAVconfig.json` of Kapteyn et al. 2021 holds the strains of their finite element model for a grid of damage
+states, two controls and thirty draws of Young's modulus. It serves as an observation model, and as an asset
+whose state may lie between the levels of the grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibration.errors import CalibrationError
+from calibration.published_strains import FILE_NAME, PublishedStrains, read_published_strains
+from twin_master.errors import InvalidStrainLibraryError
+from twin_master.network.graphical_model import Factor, StateSpace
+
+__all__ = ["FILE_NAME", "StrainLibrary", "load_strain_library"]
+
+Float = NDArray[np.float64]
+
+REGION_NAMES = ("z1", "z2")
+
+
+@dataclass(frozen=True)
+class StrainLibrary:
+    """Strains for every damage state, control and draw of Young's modulus.
+
+    Attributes
+    ----------
+    states : StateSpace
+        Stiffness loss of the regions z1 and z2, fractions.
+    controls : tuple of str
+        For example "2g", "3g".
+    young_modulus_factor : (E,) dimensionless
+        The draws e.
+    strain_per_draw : (E, S, U, G) dimensionless
+        Strain of each draw, joint state, control and gauge.
+    strain : (S, U, G) dimensionless
+        The entry "mean": the solution at e = 1.0073, not the average of the draws.
+    discount : float
+        gamma of the authors' planning problem.
+    worsening_probability : dict of str to float
+        Probability of each control to worsen a region by one level in a step.
+    """
+
+    states: StateSpace
+    controls: tuple[str, ...]
+    young_modulus_factor: Float
+    strain_per_draw: Float
+    strain: Float
+    discount: float
+    worsening_probability: Mapping[str, float]
+
+    @property
+    def gauge_count(self) -> int:
+        """Number G of gauges."""
+        return int(self.strain.shape[-1])
+
+    def strain_at(self, stiffness_loss: ArrayLike, control_index: int) -> Float:
+        """Return the strain of a damage state between the levels, as an asset would have it.
+
+        Multilinear in the stiffness losses, from the entry "mean".
+
+        Parameters
+        ----------
+        stiffness_loss : (regions,)
+            Fractions, inside the range of the levels.
+        control_index : int
+            Of `controls`.
+
+        Returns
+        -------
+        (G,) dimensionless
+
+        Raises
+        ------
+        InvalidStrainLibraryError
+            If the state lies outside the levels, or there is no such control.
+        """
+        loss = np.asarray(stiffness_loss, dtype=np.float64)
+        if loss.shape != (len(self.states.factors),) or not 0 <= control_index < len(self.controls):
+            raise InvalidStrainLibraryError(
+                f"expected one stiffness loss for each of {', '.join(self.states.names)} and a control index "
+                f"below {len(self.controls)}, got shape {loss.shape} and control {control_index}"
+            )
+        values = self.strain.reshape(*self.states.shape, *self.strain.shape[1:])[..., control_index, :]
+        for factor, value in zip(self.states.factors, loss, strict=True):
+            levels = np.asarray(factor.levels)
+            if not levels[0] <= value <= levels[-1]:
+                raise InvalidStrainLibraryError(
+                    f"the strain library covers {factor.name} from {levels[0]:g} to {levels[-1]:g}, "
+                    f"got {value:g}"
+                )
+            upper = min(int(np.searchsorted(levels, value, side="right")), len(levels) - 1)
+            lower = max(upper - 1, 0)
+            width = levels[upper] - levels[lower]
+            share = (value - levels[lower]) / width if width > 0.0 else 0.0
+            values = (1.0 - share) * values[lower] + share * values[upper]
+        result: Float = np.array(values, dtype=np.float64)
+        return result
+
+
+def load_strain_library(path: str | Path) -> StrainLibrary:
+    """Read the authors' library.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file `UAVconfig.json`, or the folder (such as a clone of their repository) that holds it.
+
+    Raises
+    ------
+    InvalidStrainLibraryError
+        If the file is missing, is no JSON, or lacks an entry; the entry is named.
+    """
+    path = Path(path)
+    file = path / FILE_NAME if path.is_dir() else path
+    try:
+        return _arranged(read_published_strains(file))
+    except CalibrationError as error:
+        raise InvalidStrainLibraryError(str(error)) from error
+    except KeyError as error:
+        raise InvalidStrainLibraryError(
+            f"the strain library {file} lacks the entry {error}; is it the file {FILE_NAME} as published?"
+        ) from error
+    except (TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise InvalidStrainLibraryError(
+            f"the strain library {file} is not in the published format: {error}"
+        ) from error
+
+
+def _arranged(published: PublishedStrains) -> StrainLibrary:
+    """Add the states and the planning problem to the published arrays."""
+    states = StateSpace(
+        tuple(Factor(name, levels) for name, levels in zip(REGION_NAMES, published.levels, strict=True))
+    )
+    strain = published.strain.reshape(states.size, *published.strain.shape[2:])
+    per_draw = published.strain_per_draw
+    probabilities = published.content["transition_probabilities"]
+    return StrainLibrary(
+        states=states,
+        controls=published.controls,
+        young_modulus_factor=published.young_modulus_factor,
+        strain_per_draw=per_draw.reshape(len(per_draw), *strain.shape),
+        strain=strain,
+        discount=float(published.content["gamma"]),
+        worsening_probability={control: float(probabilities[control]) for control in published.controls},
+    )

@@ -1,0 +1,159 @@
+"""A scenario's asset, or a wing design, as an SSP file."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from fe.wing.design import load_design
+from fmu_asset.archive.fmu_file import plain_folder, read_fmu
+from fmu_asset.coupling.layout import Layout
+from fmu_asset.coupling.roles import resolve_roles
+from fmu_asset.coupling.structure import (
+    Component,
+    Connection,
+    Connector,
+    Endpoint,
+    Setting,
+    SystemStructure,
+)
+from fmu_asset.coupling.wiring import Wiring
+from fmu_asset.door.binding import INPUT_ROLES, Binding, Parameter, load_binding
+from fmu_asset.packing.wing_packing import pack_wing
+from fmu_asset.ssp.writer import write_ssp
+from reporting.progress import Progress
+from scenarios import binding_files
+from twin_master.assets.coupled_source import SeveralSource
+from twin_master.assets.fmu_source import FmuSource
+from twin_master.assets.resolution import Overrides, resolve_scenario
+from twin_master.errors import MissionInputError
+from twin_master.scenario.reading import LoadedScenario
+
+
+def export_scenario(
+    loaded: LoadedScenario, out: Path, *, seed: int | None = None, replace_file: bool, progress: Progress
+) -> Path:
+    """Write the asset of a scenario as an SSP file.
+
+    The parameters of the scenario, its seeds drawn, and its constant loads stand in the parameter set.
+
+    Parameters
+    ----------
+    loaded : LoadedScenario
+        The scenario.
+    out : Path
+        The file to write.
+    seed : int, optional
+        Seed of the run, from which the seeds of the FMUs are drawn; that of the scenario by default.
+    replace_file : bool
+        Whether an existing file may be replaced.
+    progress : Progress
+        Shows the stages.
+
+    Raises
+    ------
+    MissionInputError
+        The scenario flies no FMU.
+    FmuError
+        The FMUs do not fit.
+    """
+    scenario = resolve_scenario(loaded, Overrides(seed=seed))
+    source = scenario.asset.source(scenario)
+    if not isinstance(source, FmuSource):
+        raise MissionInputError(
+            f"the scenario {scenario.mission.name} flies no FMU (its kind is `{scenario.asset.kind}`); only "
+            "FMUs can be exported."
+        )
+    source.check()
+    with _scratch() as scratch:
+        source.prepare(scratch, progress)
+        binding = source.binding()
+        if isinstance(source, SeveralSource):
+            wiring = source.wiring()
+        else:
+            binding = _with_own_names(binding, source.fmu_path(), source.parameters())
+            wiring = single_system(scenario.mission.name, source.fmu_path(), binding)
+        wiring, names = _with_values(wiring, binding, source.parameters(), scenario.asset.constant_load)
+        stop = scenario.mission.steps * binding.step_size
+        return write_ssp(wiring, out, parameter_names=names, stop_time=stop, replace=replace_file)
+
+
+def export_design(design: Path | None, out: Path, *, replace_file: bool, progress: Progress) -> Path:
+    """Write the wing of a design, the shipped one if absent, as an SSP file with one component."""
+    wing = load_design(design)
+    binding = load_binding(binding_files()["uav_wing"])
+    with _scratch() as scratch:
+        fmu = pack_wing(wing, scratch / "wing.fmu", progress=progress).path
+        wiring, names = _with_values(single_system(wing.name, fmu, binding), binding, {}, {})
+        return write_ssp(wiring, out, parameter_names=names, replace=replace_file)
+
+
+def single_system(name: str, fmu: Path, binding: Binding) -> Wiring:
+    """Return a system of one FMU, named as its binding, whose connectors are the variables of the binding."""
+    own = re.sub(r"[^A-Za-z0-9_]", "_", binding.name)
+    inputs = [scalar.variable for role in INPUT_ROLES for scalar in binding.inputs(role).values()]
+    outputs = dict.fromkeys(
+        [*binding.observation_variables, *(scalar.variable for scalar in binding.monitor.values())]
+    )
+    parameters = [parameter.variable for parameter in binding.parameter.values()]
+    connectors = [
+        *(Connector(variable, "input") for variable in inputs),
+        *(Connector(variable, "output") for variable in outputs),
+        *(Connector(variable, "parameter") for variable in parameters),
+    ]
+    connections = [
+        *(Connection(Endpoint("", v), Endpoint(own, v)) for v in (*inputs, *parameters)),
+        *(Connection(Endpoint(own, v), Endpoint("", v)) for v in outputs),
+    ]
+    component = Component(own, fmu)
+    return Wiring(SystemStructure(name, (component,), tuple(connectors), tuple(connections)))
+
+
+def _with_own_names(binding: Binding, fmu: Path, parameters: Mapping[str, float]) -> Binding:
+    """Return a binding that also has the parameters which go by their own names in the FMU."""
+    description = read_fmu(fmu)
+    added = {
+        name: Parameter(variable=name, unit=variable.unit or "1")
+        for name in parameters
+        if name not in binding.parameter and (variable := description.variable(name)) is not None
+    }
+    return binding.model_copy(update={"parameter": {**binding.parameter, **added}})
+
+
+def _with_values(
+    wiring: Wiring, binding: Binding, parameters: Mapping[str, float], load: Mapping[str, float]
+) -> tuple[Wiring, dict[Endpoint, str]]:
+    """Return the system with the values of a scenario, and the binding's names for its parameters."""
+    roles = resolve_roles(wiring, binding)
+    values = Layout(wiring, binding, roles).parameters(parameters)
+    for name, value in load.items():
+        for port in roles.inputs["load"][name]:
+            index = [c.name for c in wiring.structure.components].index(port.end.component)
+            values[index][port.end.variable] = port.conversion.to_fmu(value)
+    components = tuple(
+        replace(
+            component,
+            settings={**component.settings, **{key: Setting(number) for key, number in own.items()}},
+        )
+        for component, own in zip(wiring.structure.components, values, strict=True)
+    )
+    names = {
+        ports[0].end: name
+        for table in (roles.parameters, roles.inputs["load"])
+        for name, ports in table.items()
+        if len(ports) == 1
+    }
+    return Wiring(replace(wiring.structure, components=components)), names
+
+
+@contextmanager
+def _scratch() -> Iterator[Path]:
+    folder = plain_folder()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

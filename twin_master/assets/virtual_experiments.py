@@ -1,0 +1,112 @@
+"""The wing FMU on the test bench: the laboratory experiments of the calibration, flown through FMI."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from calibration.virtual_wing import RECORDED_GAUGE, SENSITIVITY, RingDownSignal, sampling_times
+from fe.runtime.state import DigitalState
+from fmu_asset.door.binding import Binding, load_binding
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.slaves.variables import QUASI_STATIC, TRANSIENT
+from scenarios import binding_files
+from twin_master.errors import MissionInputError
+
+BINDING = "uav_wing_laboratory"
+"""The shipped binding of the test bench."""
+
+
+class FmuTestBench:
+    """The wing FMU as a `calibration.virtual_wing.TestBench`: it is loaded and let go through FMI alone.
+
+    A weight is a tip force in the quasi-static response, and the displacement of its point of application is
+    read. A release is the parameter `initial_tip_displacement` of the transient response; each sample of the
+    record is a communication step. The FMU runs in a worker process of its own unless told otherwise.
+
+    Parameters
+    ----------
+    fmu : Path
+        The wing FMU.
+    truth : DigitalState
+        Its true state; the geometry is that of the FMU's wing.
+    gauge : int
+        Whose strain is recorded, counted from 1.
+    sensitivity : float
+        Of the strain signal [V].
+    isolated : bool
+        Whether the FMU runs in a worker process.
+
+    Raises
+    ------
+    MissionInputError
+        If the FMU has no such gauge.
+    FmuError
+        If the FMU cannot be flown or its parameters are out of range.
+    """
+
+    def __init__(
+        self,
+        fmu: Path,
+        truth: DigitalState,
+        *,
+        gauge: int = RECORDED_GAUGE,
+        sensitivity: float = SENSITIVITY,
+        isolated: bool = True,
+    ) -> None:
+        self._fmu, self._isolated = Path(fmu), isolated
+        self._binding = load_binding(binding_files()[BINDING])
+        gauges = len(self._binding.observation["strain"].variables)
+        if not 1 <= gauge <= gauges:
+            raise MissionInputError(
+                f"the FMU's wing has the gauges 1 to {gauges}, but {gauge} was asked for."
+            )
+        self._row, self._sensitivity = gauge - 1, sensitivity
+        self._parameters = {
+            "young_modulus_factor": truth.young_modulus_factor,
+            "servo_mass": truth.servo_mass,
+            "pitot_mass": truth.pitot_mass,
+            "damping_alpha": truth.damping_alpha,
+            "damping_beta": truth.damping_beta,
+        }
+        self._health = dict(zip(("z1", "z2"), truth.stiffness_loss, strict=True))
+        self._static = self._session(self._binding, {"response": float(QUASI_STATIC)})
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the worker."""
+        self._static.close()
+
+    def tip_displacement(self, load: float) -> float:
+        """Return the displacement [m] of the load point, 5 cm from the tip, under a load there [N]."""
+        seen = self._static.step({"load_factor": 0.0}, self._health, {"tip_force": load})
+        return seen.extra["load_point_displacement"]
+
+    def ring_down(
+        self, initial_tip_displacement: float, duration: float, sampling_rate: float
+    ) -> RingDownSignal:
+        """Hold the tip aside [m], let it go, and record for `duration` [s] at `sampling_rate` [Hz]."""
+        time = sampling_times(duration, sampling_rate)
+        header = self._binding.binding.model_copy(update={"step_size": 1.0 / sampling_rate})
+        binding = self._binding.model_copy(update={"binding": header})
+        release = {"response": float(TRANSIENT), "initial_tip_displacement": initial_tip_displacement}
+        strain = np.empty_like(time)
+        with self._session(binding, release) as session:
+            session.reset(control={"load_factor": 0.0}, health=self._health, load={"tip_force": 0.0})
+            strain[0] = session.observe().values[self._row]
+            for sample in range(1, time.size):
+                strain[sample] = session.step().values[self._row]
+        return RingDownSignal(time, self._sensitivity * strain)
+
+    def _session(self, binding: Binding, parameters: dict[str, float]) -> FmiAsset:
+        return FmiAsset(self._fmu, binding, isolated=self._isolated, parameters=self._parameters | parameters)

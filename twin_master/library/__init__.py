@@ -1,0 +1,1 @@
+"""Sampling FMUs into observation libraries."""

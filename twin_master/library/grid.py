@@ -1,0 +1,220 @@
+"""The grid over which an FMU is sampled, and one process's way through a block of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from math import prod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmu_asset.door.observation import Observation
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.errors import FmuError
+from twin_master.errors import InvalidObservationLibraryError
+
+Float = NDArray[np.float64]
+
+STEP_TIMEOUT = 60.0
+"""Wall-clock limit of a step where nothing else is said [s]."""
+MEMORY_TOLERANCE = 1e-8
+"""Two visits of a point that differ by more than this share of the value show that the FMU remembers."""
+SETTLED_TOLERANCE = 1e-3
+"""What may still change, as a share of the value, when a point is given as many steps again to settle."""
+
+_LONGEST_BLOCK = 4096
+_BLOCKS = 64
+_LONG_BLOCK = 32
+
+
+@dataclass(frozen=True)
+class SamplingGrid:
+    """What is sampled; plain values, sent to the processes as JSON.
+
+    Attributes
+    ----------
+    fmu, binding : str
+        The files.
+    role : str
+        Observation of the binding.
+    parameter : str
+        The uncertain parameter; empty without one.
+    draws : tuple of float
+        Its values; one, of no meaning, without a parameter.
+    states : dict of str to tuple of float
+        Levels of each state factor, the outermost first.
+    controls : dict of str to dict of str to float
+        Value of each control input under each control.
+    load, parameters : dict of str to float
+        What else is set; parameters but the uncertain one.
+    settling_steps : int
+        Steps from a fresh start at every point; 0 for an FMU without memory.
+    step_timeout : float
+        Wall-clock limit of a step [s].
+    """
+
+    fmu: str
+    binding: str
+    role: str
+    parameter: str
+    draws: tuple[float, ...]
+    states: Mapping[str, tuple[float, ...]]
+    controls: Mapping[str, Mapping[str, float]]
+    load: Mapping[str, float] = field(default_factory=dict)
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    settling_steps: int = 0
+    step_timeout: float = STEP_TIMEOUT
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of draws, levels of each factor, and controls."""
+        return (len(self.draws), *(len(levels) for levels in self.states.values()), len(self.controls))
+
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        return prod(self.shape)
+
+    @property
+    def blocks(self) -> tuple[tuple[int, int], ...]:
+        """First and last point (excluded) of each block; they depend on nothing but the grid."""
+        length = min(_LONGEST_BLOCK, max(1, -(-self.size // _BLOCKS)))
+        return tuple((first, min(first + length, self.size)) for first in range(0, self.size, length))
+
+    def point(self, index: int) -> tuple[int, dict[str, float], str]:
+        """Return draw, state and name of the control of a point."""
+        draw, *levels, control = (int(part) for part in np.unravel_index(index, self.shape))
+        state = {
+            name: float(values[level])
+            for (name, values), level in zip(self.states.items(), levels, strict=True)
+        }
+        return draw, state, list(self.controls)[control]
+
+    def to_json(self) -> str:
+        """Return the grid as text."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> SamplingGrid:
+        """Return the grid of a text."""
+        record: dict[str, Any] = json.loads(text)
+        record["draws"] = tuple(record["draws"])
+        record["states"] = {name: tuple(levels) for name, levels in record["states"].items()}
+        return cls(**record)
+
+
+class GridSampler:
+    """An FMU in this process that is asked for the observations of blocks of a grid.
+
+    Every block begins with a reset, so that what it gives does not depend on the blocks before it.
+
+    Parameters
+    ----------
+    grid : SamplingGrid
+        What is sampled.
+
+    Raises
+    ------
+    FmuError
+        The FMU cannot be opened, or binding or grid do not fit it.
+    """
+
+    def __init__(self, grid: SamplingGrid) -> None:
+        self._grid = grid
+        self._asset = FmiAsset(grid.fmu, grid.binding, isolated=False)
+        self._chosen = self._asset.binding.observation_slice(grid.role)
+
+    def close(self) -> None:
+        """End the FMU."""
+        self._asset.close()
+
+    def block(self, first: int, last: int) -> Float:
+        """Return the observations (last - first, G).
+
+        Raises
+        ------
+        InvalidObservationLibraryError
+            The FMU has a memory, or does not settle.
+        FmuError
+            The FMU failed; the sentence names the point.
+        """
+        rows = []
+        started = -1
+        for index in range(first, last):
+            draw = self._grid.point(index)[0]
+            if self._grid.settling_steps or draw != started:
+                self._start(index)
+                started, begin = draw, index
+            rows.append(self._ask(index))
+        values = np.array(rows)
+        if self._grid.settling_steps:
+            self._check_settled(last - 1, values[-1])
+        else:
+            # Once more, with other points in between and in another order; one is enough of a short block.
+            again = {begin, (begin + last) // 2} if last - first >= _LONG_BLOCK else {begin}
+            for index in sorted(again):
+                self._check_memory(index, values[index - first])
+        return values
+
+    def _start(self, index: int) -> None:
+        grid = self._grid
+        draw, state, control = grid.point(index)
+        setting = dict(grid.parameters)
+        if grid.parameter:
+            setting[grid.parameter] = grid.draws[draw]
+        try:
+            if grid.settling_steps:
+                self._asset.reset(setting, control=grid.controls[control], health=state, load=grid.load)
+            else:
+                self._asset.reset(setting)
+        except FmuError as error:
+            raise self._located(error, index) from error
+
+    def _ask(self, index: int) -> Float:
+        grid = self._grid
+        _, state, control = grid.point(index)
+        try:
+            for _ in range(max(grid.settling_steps, 1)):
+                seen: Observation = self._asset.step(grid.controls[control], state, grid.load)
+        except FmuError as error:
+            raise self._located(error, index) from error
+        return seen.values[self._chosen]
+
+    def _located(self, error: FmuError, index: int) -> FmuError:
+        return type(error)(f"at {self._name(index)}: {error.sentence}", error.messages)
+
+    def _name(self, index: int) -> str:
+        grid = self._grid
+        draw, state, control = grid.point(index)
+        parts = [f"{name} = {value:g}" for name, value in state.items()] + [f"control {control}"]
+        if grid.parameter:
+            parts.append(f"{grid.parameter} = {grid.draws[draw]:g}")
+        return ", ".join(parts)
+
+    def _check_memory(self, index: int, before: Float) -> None:
+        again = self._ask(index)
+        change = np.abs(again - before)
+        if np.any(change > MEMORY_TOLERANCE * np.maximum(np.abs(before), np.abs(again))):
+            worst = int(np.argmax(change))
+            raise InvalidObservationLibraryError(
+                f"the FMU {self._grid.fmu} remembers earlier steps: at {self._name(index)} it shows "
+                f"{self._sensor(worst)} = {before[worst]:.9g} and, on a later visit, {again[worst]:.9g}. "
+                "Give --settle STEPS, in which it settles from a fresh start at each point."
+            )
+
+    def _check_settled(self, index: int, before: Float) -> None:
+        after = self._ask(index)
+        change = np.abs(after - before)
+        if np.any(change > SETTLED_TOLERANCE * np.maximum(np.abs(before), np.abs(after))):
+            worst = int(np.argmax(change))
+            raise InvalidObservationLibraryError(
+                f"the FMU {self._grid.fmu} has not settled after {self._grid.settling_steps} steps: at "
+                f"{self._name(index)} it shows {self._sensor(worst)} = {before[worst]:.9g}, and as many "
+                f"steps later {after[worst]:.9g}. Give a larger --settle."
+            )
+
+    def _sensor(self, sensor: int) -> str:
+        return self._asset.binding.observation[self._grid.role].variables[sensor]

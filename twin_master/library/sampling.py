@@ -1,0 +1,334 @@
+"""Sampling an FMU over a grid into an observation library: in several processes, resumable after a kill."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import shutil
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fmu_asset.door.binding import Binding, load_binding
+from fmu_asset.door.session import FmiAsset
+from reporting.errors import DamagedFileError
+from reporting.files import (
+    TEMPORARY_SUFFIX,
+    atomic_write_text,
+    npz_bytes,
+    read_npz,
+    remove_leftovers,
+    write_error,
+)
+from reporting.progress import Progress, SilentProgress
+from reporting.provenance import hash_file
+from twin_master.assets.observation_library import ObservationLibrary, write_observation_library
+from twin_master.errors import InvalidObservationLibraryError
+from twin_master.library.grid import Float, SamplingGrid
+from twin_master.library.worker import SamplingProcess
+from twin_master.network.graphical_model import Factor, StateSpace
+from twin_master.network.memory import NUMBER, check_fits
+
+PLAN_NAME = "grid.json"
+_COPIES = 3  # of what was sampled: the blocks, all of them, and the library
+_AHEAD = 2  # blocks that a process has been asked for, so that it need not wait for its parent
+
+
+@dataclass(frozen=True)
+class SamplingOutcome:
+    """A library that was sampled.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    library : ObservationLibrary
+        Its content.
+    kept_blocks, block_count : int
+        Blocks that an interrupted sampling had finished, and all blocks.
+    workers : int
+        Processes.
+    seconds : float
+        Wall clock of the sampling itself.
+    """
+
+    path: Path
+    library: ObservationLibrary
+    kept_blocks: int
+    block_count: int
+    workers: int
+    seconds: float
+
+
+def processor_count() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def blocks_folder(out: Path) -> Path:
+    """Return where the finished blocks of a library that is being sampled are kept."""
+    return out.with_name(f"{out.name}.blocks")
+
+
+def sample_library(
+    grid: SamplingGrid,
+    out: Path,
+    *,
+    workers: int | None = None,
+    resume: bool = False,
+    replace_existing: bool = False,
+    progress: Progress | None = None,
+) -> SamplingOutcome:
+    """Ask an FMU for its observation at every point of a grid and write the library.
+
+    The bytes of the file do not depend on the number of processes nor on interruptions.
+
+    Parameters
+    ----------
+    grid : SamplingGrid
+        What is sampled.
+    out : Path
+        The NetCDF file. Finished blocks are kept in the folder `blocks_folder(out)` until it is written.
+    workers : int, optional
+        Number of processes; by default one for each processor.
+    resume : bool
+        Go on with the finished blocks of an interrupted sampling of the same grid.
+    replace_existing : bool
+        Take the place of an existing library, and forget the blocks of an interrupted sampling.
+    progress : Progress, optional
+        Shows the blocks.
+
+    Raises
+    ------
+    InvalidObservationLibraryError
+        The file exists, an interrupted sampling is there or is of another grid, the FMU has a memory or does
+        not settle.
+    InvalidModelError
+        What is asked for does not fit in memory.
+    FmuError
+        The FMU fails, or binding or grid do not fit it.
+    FileNotWrittenError
+        The disk is full or the folder cannot be written.
+    """
+    count = processor_count() if workers is None else workers
+    if count < 1:
+        raise InvalidObservationLibraryError(f"the number of workers must be at least 1, and {count} came.")
+    binding = load_binding(grid.binding)
+    _check_grid(grid, binding)
+    record = _record(grid)
+    folder = _prepare_folder(out, record, resume=resume, replace_existing=replace_existing)
+    with _locked(folder):
+        remove_leftovers(folder)
+        found = _read_blocks(grid, folder)
+        todo = [number for number in range(len(grid.blocks)) if number not in found]
+        begin = time.perf_counter()
+        with (progress or SilentProgress()).stage(
+            "Sampling the FMU", total=len(grid.blocks), unit="blocks"
+        ) as stage:
+            stage.advance(len(found))
+            for number, values in _sampled(grid, todo, min(count, max(len(todo), 1))):
+                _keep_block(_block_file(folder, number), values)
+                found[number] = values
+                stage.advance(1)
+        seconds = time.perf_counter() - begin
+        library = _library(grid, binding, record, np.concatenate([found[n] for n in sorted(found)]))
+        write_observation_library(out, library)
+        shutil.rmtree(folder, ignore_errors=True)
+    return SamplingOutcome(out, library, len(grid.blocks) - len(todo), len(grid.blocks), count, seconds)
+
+
+def _sampled(grid: SamplingGrid, todo: list[int], count: int) -> Iterator[tuple[int, Float]]:
+    """Yield number and observations of each block as they come."""
+    waiting = list(reversed(todo))
+    workers: list[SamplingProcess] = []
+    try:
+        if todo:
+            workers.extend(SamplingProcess(grid) for _ in range(count))
+        while True:
+            for _ in range(_AHEAD):  # one each before anyone has two
+                for worker in workers:
+                    if waiting and worker.load < _AHEAD:
+                        number = waiting.pop()
+                        worker.ask(number, *grid.blocks[number])
+            busy = {worker.connection: worker for worker in workers if worker.load}
+            if not busy:
+                return
+            limit = min(worker.deadline for worker in busy.values()) - time.monotonic()
+            for connection in wait(list(busy), timeout=None if math.isinf(limit) else max(limit, 0.0)):
+                worker = busy[connection]  # type: ignore[index]
+                result = worker.take()
+                if waiting and worker.load < _AHEAD:  # before the block is written
+                    number = waiting.pop()
+                    worker.ask(number, *grid.blocks[number])
+                yield result
+            for worker in busy.values():
+                worker.check_time()
+    finally:
+        for worker in workers:
+            worker.close()
+
+
+def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
+    """Check names against the binding and the binding against the FMU, before anything is started."""
+    wanted: dict[str, tuple[Iterable[str], Mapping[str, object]]] = {
+        "state": (grid.states, binding.health),
+        "control input": (next(iter(grid.controls.values()), {}), binding.control),
+        "load": (grid.load, binding.load),
+        "parameter": ([*grid.parameters, *([grid.parameter] if grid.parameter else [])], binding.parameter),
+    }
+    for what, (names, known) in wanted.items():
+        unknown = sorted({*names} - {*known})
+        if unknown:
+            raise InvalidObservationLibraryError(
+                f"the grid has the {what} {', '.join(unknown)}, which the binding {binding.name} does not "
+                f"know; it knows {', '.join(known) or 'none'}."
+            )
+    binding.observation_slice(grid.role)
+    if not grid.states or not grid.controls or not grid.draws:
+        raise InvalidObservationLibraryError(
+            "a grid needs at least one state and one control with values: give --grid NAME=VALUES for them."
+        )
+    for name, levels in grid.states.items():
+        if any(b <= a for a, b in itertools.pairwise(levels)):
+            raise InvalidObservationLibraryError(f"the levels of {name} must increase, and {levels} came.")
+    fmu = FmiAsset(grid.fmu, binding)
+    sensors = fmu.binding.observation_slice(grid.role)
+    count = sensors.stop - sensors.start
+    check_fits(
+        {f"{count} sensors at {grid.size} points": _COPIES * NUMBER * count * grid.size},
+        "take fewer levels, draws or controls",
+    )
+
+
+def _record(grid: SamplingGrid) -> dict[str, Any]:
+    """Return what a library is a function of: the grid with hashes in the place of files."""
+    record: dict[str, Any] = json.loads(grid.to_json())
+    del record["step_timeout"]
+    hashes = {"fmu": hash_file(Path(grid.fmu)), "binding": hash_file(Path(grid.binding))}
+    return record | hashes | {"version": version("uav-twin")}
+
+
+def _prepare_folder(out: Path, record: dict[str, Any], *, resume: bool, replace_existing: bool) -> Path:
+    if out.suffix != ".nc":
+        raise InvalidObservationLibraryError(
+            f"an observation library must have the suffix .nc, and {out} was given."
+        )
+    folder = blocks_folder(out)
+    plan = folder / PLAN_NAME
+    if replace_existing:
+        shutil.rmtree(folder, ignore_errors=True)
+    elif out.exists():
+        raise InvalidObservationLibraryError(f"{out} exists: choose another --out or give --replace.")
+    text = json.dumps(record, indent=1) + "\n"  # the order of the states matters
+    if folder.exists():
+        if not resume:
+            raise InvalidObservationLibraryError(
+                f"{folder} holds the finished blocks of an interrupted sampling: give --resume to go on with "
+                "them, or --replace to begin anew."
+            )
+        kept = plan.read_text(encoding="utf-8") if plan.is_file() else ""
+        if kept and kept != text:
+            raise InvalidObservationLibraryError(
+                f"{folder} holds blocks of another FMU, binding, grid or version ({_difference(kept, record)}"
+                "): give --replace to begin anew."
+            )
+        if kept:
+            return folder
+    atomic_write_text(plan, text)
+    return folder
+
+
+def _difference(kept: str, record: dict[str, Any]) -> str:
+    try:
+        before = json.loads(kept)
+    except ValueError:
+        return "damaged"
+    return ", ".join(key for key in record if before.get(key) != record[key]).replace("_", " ")
+
+
+def _block_file(folder: Path, number: int) -> Path:
+    return folder / f"block_{number:05d}.npz"
+
+
+def _keep_block(path: Path, values: Float) -> None:
+    """Keep a finished block, whole or not at all.
+
+    It is not flushed to the disk, which can take longer than sampling it: a block that a power failure
+    damages is recognised by its checksum and sampled again.
+    """
+    temporary = path.with_name(f".{path.stem}{TEMPORARY_SUFFIX}{path.suffix}")
+    try:
+        temporary.write_bytes(npz_bytes({"values": values}))
+        temporary.replace(path)
+    except OSError as error:
+        raise write_error(error, path) from error
+
+
+def _read_blocks(grid: SamplingGrid, folder: Path) -> dict[int, Float]:
+    """Return the finished blocks; one that is damaged is sampled again."""
+    found: dict[int, Float] = {}
+    for number, (first, last) in enumerate(grid.blocks):
+        path = _block_file(folder, number)
+        if path.is_file():
+            try:
+                values = read_npz(path)["values"]
+            except (DamagedFileError, KeyError):
+                continue
+            if values.ndim == 2 and len(values) == last - first:
+                found[number] = values
+    return found
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Take the folder for this process."""
+    import fcntl
+
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InvalidObservationLibraryError(
+                f"another process is sampling into {folder}: wait for it to end."
+            ) from None
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _library(grid: SamplingGrid, binding: Binding, record: dict[str, Any], rows: Float) -> ObservationLibrary:
+    vector = binding.observation[grid.role]
+    states = StateSpace(tuple(Factor(name, levels) for name, levels in grid.states.items()))
+    inputs = list(next(iter(grid.controls.values())))
+    return ObservationLibrary(
+        values=rows.reshape(len(grid.draws), states.size, len(grid.controls), -1),
+        role=grid.role,
+        sensors=vector.variables,
+        sensor_units=vector.units,
+        states=states,
+        state_units=tuple(binding.health[name].unit for name in grid.states),
+        controls=tuple(grid.controls),
+        control_values={
+            name: np.array([control[name] for control in grid.controls.values()]) for name in inputs
+        },
+        control_units={name: binding.control[name].unit for name in inputs},
+        parameter=grid.parameter,
+        parameter_unit=binding.parameter[grid.parameter].unit if grid.parameter else "1",
+        draws=np.array(grid.draws) if grid.parameter else np.array([np.nan]),
+        load=dict(grid.load),
+        parameters=dict(grid.parameters),
+        settling_steps=grid.settling_steps,
+        fmu_hash=record["fmu"],
+        binding_hash=record["binding"],
+        version=record["version"],
+    )

@@ -1,0 +1,1 @@
+"""The loop: plant, truth, twin, checkpoint."""

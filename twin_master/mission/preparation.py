@@ -1,0 +1,187 @@
+"""A twin, its plan and its plant, put together from a scenario, a source of assets and a seed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reporting.progress import Progress, SilentProgress
+from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.interface import Asset
+from twin_master.assets.parameter import ParameterDraws
+from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
+from twin_master.mission.plant import Plant
+from twin_master.mission.truth import Truth
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.planner import PlannedPolicy, given_policy, value_iteration
+from twin_master.network.rewards import RewardModel, RewardSettings
+from twin_master.network.sensor_model import GaussianSensorModel, check_noise
+from twin_master.network.twin import Twin, build_graphical_model
+from twin_master.scenario.reading import LoadedScenario, load_scenario
+from twin_master.scenario.schema import Scenario
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What the twin knows before it flies.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        What is to be flown.
+    model : GraphicalModel
+        S states, U controls.
+    draws : ParameterDraws
+        The calibrated parameter.
+    sensor_model : GaussianSensorModel
+        Predicted observations (E, S, U, G) and the assumed noise.
+    rewards : RewardModel
+        Rewards by state and control.
+    plan : PlannedPolicy
+        Value iteration, or the policy that was given.
+    """
+
+    scenario: Scenario
+    model: GraphicalModel
+    draws: ParameterDraws
+    sensor_model: GaussianSensorModel
+    rewards: RewardModel
+    plan: PlannedPolicy
+
+    @property
+    def planning_reward(self) -> Float:
+        """Expected reward of each state and control (S, U) that is planned with, eqs. (9)-(11)."""
+        weights = self.scenario.rewards
+        return self.rewards.planning_reward(weights.health_weight, weights.control_weight)
+
+    def twin(self, policy: ArrayLike | None = None) -> Twin:
+        """Return a twin that has seen nothing yet.
+
+        Parameters
+        ----------
+        policy : (S, U), optional
+            p(U | D), row-stochastic; that of the plan if left out.
+        """
+        return Twin(
+            self.scenario.mission.name,
+            self.model,
+            self.sensor_model,
+            self.plan.policy if policy is None else self.model.policy(policy),
+            self.scenario.mission.steps,
+            self.scenario.mission.prediction_steps,
+            self.scenario.planner.decide_on,
+        )
+
+    def truth(self, seed: int) -> Truth:
+        """Return what really happens under a seed."""
+        return Truth(self.scenario, self.model, seed)
+
+    def plant(self, truth: Truth, asset: Asset) -> Plant:
+        """Return an asset, driven by a truth."""
+        return Plant(self.scenario, truth, asset)
+
+
+def prepare_knowledge(
+    scenario: Scenario, source: AssetSource, seed: int, policy: Float | None = None
+) -> Knowledge:
+    """Calibrate, predict the observations of every state and control, and plan.
+
+    Kapteyn et al. 2021, eqs. (30) and (36).
+
+    Parameters
+    ----------
+    scenario : Scenario
+        What is to be flown.
+    source : AssetSource
+        Already prepared.
+    seed : int
+        Seed of the run.
+    policy : (S, U), optional
+        p(U | D) to fly instead of planning, row-stochastic.
+
+    Raises
+    ------
+    InvalidModelError
+        It does not fit in memory, or a sensor's noise is larger than all that it can show.
+    """
+    model = build_graphical_model(scenario)
+    draws = source.draws(seed)
+    predicted, section = source.observation_table(draws, model), scenario.observation
+    for key, deviation in (
+        ("observation.standard_deviation", section.standard_deviation),
+        ("truth.noise.standard_deviation", scenario.truth.noise.standard_deviation),
+    ):
+        check_noise(key, deviation, predicted, section.sensor_units)
+    sensor_model = GaussianSensorModel(
+        predicted,
+        section.standard_deviation,
+        average=section.average_over_draws,
+        model_error=section.model_error,
+    )
+    rewards = RewardModel(sensor_model, reward_settings(scenario))
+    transition, discount = model.transition.matrix, scenario.planner.gamma
+    reward = rewards.planning_reward(scenario.rewards.health_weight, scenario.rewards.control_weight)
+    if policy is None:
+        plan = value_iteration(transition, reward, discount)
+    else:
+        plan = given_policy(transition, reward, discount, model.policy(policy))
+    return Knowledge(scenario, model, draws, sensor_model, rewards, plan)
+
+
+def prepare_twin(
+    scenario: LoadedScenario | str | Path,
+    overrides: Overrides | Mapping[str, Any] | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Knowledge:
+    """Return what the twin of a scenario knows before its flight, without a run folder.
+
+    Parameters
+    ----------
+    scenario : LoadedScenario, str or Path
+        The scenario, its shipped name, or its file.
+    overrides : Overrides or mapping, optional
+        What differs from the file, as `fly` takes it.
+    progress : Progress, optional
+        Where the modelling reports.
+
+    Returns
+    -------
+    Knowledge
+        Graphical model, sensors, rewards and plan; `.twin()` is a twin that has seen nothing yet.
+
+    Raises
+    ------
+    TwinMasterError, FmuError, FiniteElementError, CalibrationError
+        With one clear sentence.
+    """
+    loaded = scenario if isinstance(scenario, LoadedScenario) else load_scenario(scenario)
+    resolved = resolve_scenario(loaded, given_overrides(overrides))
+    source = asset_source(resolved)
+    source.check()
+    with TemporaryDirectory(prefix="uav_twin_") as folder:
+        source.prepare(Path(folder), progress or SilentProgress())
+        return prepare_knowledge(resolved, source, resolved.mission.seed)
+
+
+def reward_settings(scenario: Scenario) -> RewardSettings:
+    """Return the figures of the rewards in the order of the scenario's controls."""
+    section = scenario.rewards
+    norm = section.normalise_error_by
+    return RewardSettings(
+        limit=section.health_limit,
+        control_reward=tuple(section.control[name] for name in scenario.control_names),
+        error_scale=section.error_scale,
+        control_normaliser=None if norm is None else tuple(c.values[norm] for c in scenario.control),
+        health_sensors=None
+        if section.health_sensors == "all"
+        else tuple(number - 1 for number in section.health_sensors),
+    )

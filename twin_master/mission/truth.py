@@ -1,0 +1,152 @@
+"""What really happens to the asset: its damage, the noise of its sensors and their faults.
+
+The truth belongs to the scenario and drives the asset. The twin is never handed a `Truth`; the two meet again
+only in the run store, for scoring.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin_master.errors import MissionError
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.scenario.schema import Scenario
+from twin_master.seeds import generator
+
+Float = NDArray[np.float64]
+
+_DECIMALS = 12
+"""Sums of scripted gains are rounded to this many digits, so that ten times 2 % and 40 % are 60 %."""
+
+
+class SensorStatus(IntEnum):
+    """What a sensor really does at a step."""
+
+    HEALTHY = 0
+    LOST = 1
+    DRIFTING = 2
+
+
+class Truth:
+    """Damage history, sensor noise and sensor faults of one mission.
+
+    All random numbers are drawn when it is made, so that a resumed mission meets the same ones.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        What happens.
+    model : GraphicalModel
+        States and transitions; random growth follows them, as the twin believes.
+    seed : int
+        Seed of the run.
+
+    Attributes
+    ----------
+    noise : (T, G)
+        Noise added to the raw observation, in its SI unit.
+    drift : (T, G)
+        Drift added to the raw observation, in its SI unit.
+    status : (T, G)
+        `SensorStatus` of each sensor.
+    in_asset : bool
+        Whether the asset carries damage, noise and faults; then all of the above is zero, and the asset
+        tells what happened.
+    """
+
+    def __init__(self, scenario: Scenario, model: GraphicalModel, seed: int) -> None:
+        steps, sensors = scenario.mission.steps, scenario.observation.count
+        deviation = np.asarray(scenario.truth.noise.standard_deviation)  # one, or one for each sensor
+        self.noise: Float = generator(seed, "noise").standard_normal((steps, sensors)) * deviation
+        self.drift: Float = np.zeros((steps, sensors))
+        self.status: NDArray[np.int8] = np.zeros((steps, sensors), dtype=np.int8)
+        self._apply_faults(scenario)
+        self.in_asset = scenario.truth.kind == "asset"
+        if self.in_asset:
+            self._state: StateRule = _untold
+        elif scenario.truth.kind == "scripted":
+            self._state = _scripted(scenario, model)
+        else:
+            self._state = _random_growth(model, generator(seed, "damage").random(steps))
+
+    def _apply_faults(self, scenario: Scenario) -> None:
+        steps = np.arange(scenario.mission.steps)
+        for fault in scenario.truth.sensor_faults:
+            if fault.sensors == "all":
+                sensors = np.arange(scenario.observation.count)
+            else:
+                sensors = np.asarray(fault.sensors) - 1
+            last = fault.last_step if fault.last_step is not None else scenario.mission.steps
+            active = (steps >= fault.first_step) & (steps <= last)
+            cells = np.ix_(active, sensors)
+            if fault.kind == "dropout":
+                self.status[cells] = SensorStatus.LOST
+            else:
+                assert fault.rate is not None  # the schema asks for it
+                self.drift[cells] += (fault.rate * (steps[active] - fault.first_step + 1.0))[:, None]
+                self.status[cells] = np.maximum(
+                    self.status[cells], SensorStatus.DRIFTING * (self.status[cells] != SensorStatus.LOST)
+                )
+
+    def state(self, step: int, previous_state: Float | None, previous_control: int | None) -> Float:
+        """Return the true state of a step: (F,), a value of each state factor in SI.
+
+        Parameters
+        ----------
+        step
+            The step, from 0.
+        previous_state, previous_control
+            State and control index of the step before; None at step 0.
+        """
+        return self._state(step, previous_state, previous_control)
+
+    def sense(self, step: int, observation: Float) -> Float:
+        """Return what the sensors say about an observation (G,): noise and drift added, lost ones NaN."""
+        sensed: Float = observation + self.noise[step] + self.drift[step]
+        sensed[self.status[step] == SensorStatus.LOST] = np.nan
+        return sensed
+
+
+StateRule = Callable[[int, "Float | None", "int | None"], Float]
+
+
+def _untold(_step: int, _previous_state: Float | None, _previous_control: int | None) -> Float:
+    raise MissionError("the damage of this asset is its own: it is read from the asset, not given to it.")
+
+
+def _scripted(scenario: Scenario, model: GraphicalModel) -> StateRule:
+    """Return the rule of a scripted history: the gain of a step is in the state of that step."""
+    names = list(scenario.state_names)
+    gain = np.zeros((scenario.mission.steps, len(names)))
+    gain[0] = model.states.coordinates[int(np.argmax(model.prior))]
+    for entry in scenario.truth.gains:
+        last = entry.last_step if entry.last_step is not None else entry.first_step
+        gain[entry.first_step : last + 1, names.index(entry.state)] += entry.gain
+    history = np.round(np.cumsum(gain, axis=0), _DECIMALS)
+
+    def rule(step: int, _previous_state: Float | None, _previous_control: int | None) -> Float:
+        state: Float = history[step].copy()
+        return state
+
+    return rule
+
+
+def _random_growth(model: GraphicalModel, uniform: Float) -> StateRule:
+    """Return the rule of damage that follows the prior and transitions of the model; `uniform` is (T,)."""
+    coordinates = model.states.coordinates
+
+    def rule(step: int, previous_state: Float | None, previous_control: int | None) -> Float:
+        if previous_state is None or previous_control is None:
+            row = model.prior
+        else:
+            row = model.transition.matrix[previous_control, model.states.index(tuple(previous_state))]
+        possible = np.flatnonzero(row > 0.0)
+        chosen = int(np.searchsorted(np.cumsum(row[possible]), uniform[step], side="right"))
+        state: Float = coordinates[possible[min(chosen, len(possible) - 1)]].copy()
+        return state
+
+    return rule

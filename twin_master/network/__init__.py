@@ -1,0 +1,1 @@
+"""The graphical model: states, inference, sensors, rewards, planning, the twin."""

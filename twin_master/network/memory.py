@@ -1,0 +1,92 @@
+"""What a twin needs in memory, told before it is built."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from math import prod
+from pathlib import Path
+
+from twin_master.errors import InvalidModelError
+from twin_master.scenario.schema import Scenario
+
+NUMBER = 8
+"""Bytes of a number."""
+TRANSITION_COPIES = 3
+"""The Kronecker products of the controls, the array of all of them, and the checked copy."""
+_PREDICTION_COPIES = 8
+"""The table, the checked copy, the copy ordered for the likelihood, and what the quantiles are taken from."""
+_HISTORY_COPIES = 4
+"""Belief before and after the observation, its logarithm, and the smoothed one."""
+_CONTROL_GROUP = Path("/sys/fs/cgroup/memory.max")
+
+
+def memory_size() -> float:
+    """Return the memory of this machine, or what of it this process may take [bytes]; infinite if unknown."""
+    try:
+        size = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):
+        return float("inf")
+    try:
+        return min(size, float(_CONTROL_GROUP.read_text(encoding="ascii")))
+    except (OSError, ValueError):  # no control group, or `max`
+        return size
+
+
+def check_fits(parts: Mapping[str, float], advice: str) -> None:
+    """Check that arrays fit in memory together.
+
+    Parameters
+    ----------
+    parts : dict of str to float
+        What is to be built, in words with its numbers, and its size [bytes].
+    advice : str
+        What makes it smaller.
+
+    Raises
+    ------
+    InvalidModelError
+        They do not; the sentence has all sizes.
+    """
+    needed, there = sum(parts.values()), memory_size()
+    if needed > there:
+        listed = ", ".join(f"{_gigabytes(size)} for {what}" for what, size in parts.items())
+        raise InvalidModelError(
+            f"this does not fit in memory: {listed}, together {_gigabytes(needed)}, and there are "
+            f"{_gigabytes(there)}: {advice}."
+        )
+
+
+def scenario_bytes(scenario: Scenario) -> dict[str, float]:
+    """Return what the twin of a scenario keeps in memory, in words with its numbers, and its size [bytes]."""
+    states = prod(len(factor.levels) for factor in scenario.state)
+    controls, sensors = len(scenario.control), scenario.observation.count
+    steps, ahead = scenario.mission.steps, scenario.mission.prediction_steps
+    draws = 1 if scenario.calibration.source == "fixed" else scenario.calibration.draws
+    transitions, belief = transition_bytes(states, controls), NUMBER * (states + sensors)
+    predictions = NUMBER * draws * states * controls * sensors
+    return {
+        f"the transitions of {states} states under {controls} controls": TRANSITION_COPIES * transitions,
+        f"{draws} draws of {sensors} sensors in each of them": _PREDICTION_COPIES * predictions,
+        f"the beliefs of {steps} steps and {ahead} ahead": _HISTORY_COPIES * belief * (steps + ahead),
+    }
+
+
+def check_scenario_fits(scenario: Scenario) -> None:
+    """Check that the twin of a scenario fits in memory, before anything of it is built.
+
+    Raises
+    ------
+    InvalidModelError
+        It does not.
+    """
+    check_fits(scenario_bytes(scenario), "take fewer levels, state factors, draws or steps")
+
+
+def _gigabytes(size: float) -> str:
+    return f"{size / 1e9:.3g} GB"
+
+
+def transition_bytes(states: int, controls: int) -> float:
+    """Return the size of one array of transitions (U, S, S) [bytes]."""
+    return float(NUMBER * controls * states * states)

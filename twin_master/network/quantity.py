@@ -1,0 +1,195 @@
+"""Quantities of interest: what a belief about the state says about what the sensors would show without noise.
+
+The quantity depends on the state, the control and the uncertain parameters of the asset, of which there are
+draws. Given a belief, its distribution is a mixture of point values, so that mean, standard deviation and
+quantiles are exact: Kapteyn et al. 2021, eqs. (3) and (37).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fe.compilation import compiled
+from twin_master.errors import InvalidModelError
+from twin_master.network.distributions import distribution
+
+__all__ = ["QuantityModel"]
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+TIE = 1e-12
+"""A cumulative probability reaches a level when it misses it by no more than this (rounding of the sum)."""
+
+
+@compiled
+def _quantiles(
+    weight: Float, order: Index, owner: Index, point_weight: Float, value: Float, levels: Float, result: Float
+) -> None:
+    """Fill result (B, P, G): for each belief and sensor walk up the sorted points until each level is met."""
+    for sensor in range(order.shape[0]):
+        for belief in range(weight.shape[0]):
+            reached = 0.0
+            level = 0
+            last = value[sensor, 0]
+            for k in range(order.shape[1]):
+                share = weight[belief, owner[sensor, k]]
+                if share > 0.0:
+                    reached += share * point_weight[sensor, k]
+                    last = value[sensor, k]
+                    while level < len(levels) and reached >= levels[level]:
+                        result[belief, level, sensor] = last
+                        level += 1
+                    if level == len(levels):
+                        break
+            while level < len(levels):  # a level of one, and a sum that rounds below it
+                result[belief, level, sensor] = last
+                level += 1
+
+
+class QuantityModel:
+    """Noise-free sensor values for every draw, state and control.
+
+    Parameters
+    ----------
+    value_per_draw : (E, S, U, G)
+        One value for each of E draws of the uncertain parameters, S states, U controls and G sensors, SI.
+    draw_weight : (E,), optional
+        Probability of each draw; equal by default.
+
+    Raises
+    ------
+    InvalidModelError, InvalidDistributionError
+        If the array has another rank, is empty or not finite, or the weights are no distribution.
+    """
+
+    def __init__(self, value_per_draw: ArrayLike, draw_weight: ArrayLike | None = None) -> None:
+        values = np.array(value_per_draw, dtype=np.float64, order="C")
+        if values.ndim != 4 or values.size == 0:
+            raise InvalidModelError(
+                f"expected values of shape (draws, states, controls, sensors), got {values.shape}"
+            )
+        if not np.all(np.isfinite(values)):
+            where = tuple(int(i) for i in np.argwhere(~np.isfinite(values))[0])
+            raise InvalidModelError(
+                f"value at (draw, state, control, sensor) {where} is {values[where]}; expected finite values"
+            )
+        values.setflags(write=False)
+        draws = len(values)
+        weight = np.full(draws, 1.0 / draws) if draw_weight is None else draw_weight
+        self._value_per_draw: Float = values
+        self._draw_weight = distribution(weight, size=draws, name="draw weights")
+
+    @property
+    def value_per_draw(self) -> Float:
+        """Values (E, S, U, G), SI, read-only."""
+        return self._value_per_draw
+
+    @property
+    def draw_weight(self) -> Float:
+        """Probability of each draw (E,), read-only."""
+        return self._draw_weight
+
+    @property
+    def draw_count(self) -> int:
+        """Number E of draws."""
+        return int(self._value_per_draw.shape[0])
+
+    @property
+    def state_count(self) -> int:
+        """Number S of states."""
+        return int(self._value_per_draw.shape[1])
+
+    @property
+    def control_count(self) -> int:
+        """Number U of controls."""
+        return int(self._value_per_draw.shape[2])
+
+    @property
+    def sensor_count(self) -> int:
+        """Number G of sensors."""
+        return int(self._value_per_draw.shape[3])
+
+    @cached_property
+    def mean(self) -> Float:
+        """Mean over the draws (S, U, G)."""
+        result: Float = np.tensordot(self._draw_weight, self._value_per_draw, axes=1)
+        return result
+
+    @cached_property
+    def variance(self) -> Float:
+        """Variance over the draws (S, U, G)."""
+        result: Float = np.tensordot(self._draw_weight, (self._value_per_draw - self.mean) ** 2, axes=1)
+        return result
+
+    @cached_property
+    def _sorted(self) -> tuple[Index, Index, Float, Float]:
+        """Order (G, N) of all N = S * U * E points of each sensor, their owner, weight and value."""
+        points = self._value_per_draw.transpose(3, 1, 2, 0).reshape(self.sensor_count, -1)
+        order = np.argsort(points, axis=1, kind="stable").astype(np.int64)
+        owner, draw = np.divmod(order, self.draw_count)
+        return order, owner, self._draw_weight[draw], np.take_along_axis(points, order, axis=1)
+
+    def _weights(self, joint: ArrayLike) -> Float:
+        """Return the checked joint (..., S, U)."""
+        joint = np.asarray(joint, dtype=np.float64)
+        if joint.shape[-2:] != (self.state_count, self.control_count):
+            raise InvalidModelError(
+                f"expected a joint belief of shape (..., {self.state_count}, {self.control_count}) over "
+                f"states and controls, got {joint.shape}; use `known_control` where the control is known"
+            )
+        return joint
+
+    def moments(self, joint: ArrayLike) -> tuple[Float, Float]:
+        """Return mean and standard deviation of each sensor's noise-free value.
+
+        Parameters
+        ----------
+        joint : (..., S, U)
+            p(D, U), each summing to one.
+
+        Returns
+        -------
+        tuple of two (..., G)
+            In the unit of the values.
+        """
+        weights = self._weights(joint)
+        flat = weights.reshape(-1, self.state_count * self.control_count)
+        mean_table = self.mean.reshape(-1, self.sensor_count)
+        mean = flat @ mean_table
+        # Centred, so that a certain belief gives the spread of the draws and no cancellation.
+        variance = flat @ self.variance.reshape(-1, self.sensor_count)
+        for row in range(len(flat)):
+            variance[row] += flat[row] @ (mean_table - mean[row]) ** 2
+        shape = (*weights.shape[:-2], self.sensor_count)
+        return mean.reshape(shape), np.sqrt(variance).reshape(shape)
+
+    def quantiles(self, joint: ArrayLike, levels: ArrayLike) -> Float:
+        """Return exact quantiles of each sensor's noise-free value.
+
+        The quantile at level p is the smallest value whose cumulative probability is at least p.
+
+        Parameters
+        ----------
+        joint : (..., S, U)
+            p(D, U), each summing to one.
+        levels : (P,)
+            Increasing, in (0, 1].
+
+        Returns
+        -------
+        (..., P, G)
+            In the unit of the values.
+        """
+        weights = self._weights(joint)
+        chosen = np.array(levels, dtype=np.float64)
+        if chosen.ndim != 1 or np.any(np.diff(chosen) < 0) or not np.all((chosen > 0.0) & (chosen <= 1.0)):
+            raise InvalidModelError(f"expected increasing quantile levels in (0, 1], got {chosen}")
+        flat = np.require(weights.reshape(-1, self.state_count * self.control_count), np.float64, ["C", "W"])
+        result = np.empty((len(flat), len(chosen), self.sensor_count))
+        order, owner, point_weight, value = self._sorted
+        _quantiles(flat, order, owner, point_weight, value, chosen - TIE, result)
+        return result.reshape(*weights.shape[:-2], len(chosen), self.sensor_count)

@@ -1,0 +1,224 @@
+"""Rewards for health, control and error with their uncertainty: Kapteyn et al. 2021, eqs. (9)-(11).
+
+What counts as a limit, what a control is worth and how an error is scaled comes from the scenario.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twin_master.errors import InvalidModelError
+from twin_master.network.quantity import QuantityModel
+from twin_master.scenario.schema import REWARD_NAMES
+
+__all__ = [
+    "REWARD_NAMES",
+    "RewardExpectation",
+    "RewardModel",
+    "RewardSettings",
+    "error_reward",
+    "health_reward",
+]
+
+Float = NDArray[np.float64]
+
+
+def health_reward(value: ArrayLike, limit: ArrayLike) -> Float:
+    """Return the health reward of sensor values (..., G): one minus the largest share of the limit.
+
+    One without load, zero where a sensor reaches its limit, one or (G,), and negative beyond.
+    """
+    # As a share first: rounding is monotonic, so that for one limit the result is that of the largest value.
+    result: Float = 1.0 - (np.asarray(value, dtype=np.float64) / np.asarray(limit)).max(axis=-1)
+    return result
+
+
+def error_reward(
+    observation: ArrayLike, value: ArrayLike, scale: ArrayLike, normaliser: ArrayLike = 1.0
+) -> Float:
+    """Return the error reward: minus the mean distance of observation and model over the sensors.
+
+    Parameters
+    ----------
+    observation, value : (..., G)
+        What the sensors show and what the model says, SI; NaN for a lost sensor, which is left out.
+    scale : float or (G,)
+        The distance, after normalisation, that costs one.
+    normaliser : (...)
+        Both are divided by it first (for a structure: the load factor).
+
+    Returns
+    -------
+    (...)
+        NaN where every sensor is lost.
+    """
+    distance = np.abs(np.asarray(observation, dtype=np.float64) - np.asarray(value, dtype=np.float64))
+    if np.ndim(scale):
+        distance, scale = distance / np.asarray(scale), 1.0
+    seen = ~np.isnan(distance)
+    count = seen.sum(axis=-1)
+    total = np.where(seen, distance, 0.0).sum(axis=-1)
+    result: Float = np.where(
+        count > 0, -total / np.maximum(count, 1) / (np.asarray(scale) * np.asarray(normaliser)), np.nan
+    )
+    return result
+
+
+@dataclass(frozen=True)
+class RewardSettings:
+    """What the scenario says about rewards.
+
+    Attributes
+    ----------
+    limit : float or tuple of float
+        Sensor value at which the health reward is zero, in its unit, positive; one, or one for each of the
+        sensors that count.
+    control_reward : tuple of float
+        One for each control.
+    error_scale : float or tuple of float
+        Normalised error that costs one, in its unit, positive; one, or one for each sensor.
+    control_normaliser : tuple of float or None
+        For each control the figure by which observation and model are divided before their distance is
+        taken (the load factor); None for ones.
+    health_sensors : tuple of int or None
+        Indices of the sensors that count for the health reward; None for all.
+    """
+
+    limit: float | tuple[float, ...]
+    control_reward: tuple[float, ...]
+    error_scale: float | tuple[float, ...]
+    control_normaliser: tuple[float, ...] | None = None
+    health_sensors: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("limit", "error_scale"):
+            value = getattr(self, name)
+            if not np.all(np.isfinite(value) & (np.asarray(value) > 0.0)):
+                raise InvalidModelError(f"reward setting {name!r} must be finite and positive, got {value}")
+        if not np.all(np.isfinite(self.control_reward)):
+            raise InvalidModelError(f"control rewards must be finite, got {self.control_reward}")
+        if self.control_normaliser is not None and not all(
+            np.isfinite(value) and value > 0.0 for value in self.control_normaliser
+        ):
+            raise InvalidModelError(
+                f"the normalisers of the controls must be finite and positive, got {self.control_normaliser}"
+            )
+
+
+@dataclass(frozen=True)
+class RewardExpectation:
+    """Rewards under a belief.
+
+    Attributes
+    ----------
+    mean, standard_deviation : (..., 3)
+        Of the rewards in the order of `REWARD_NAMES`. The error reward is NaN where nothing was observed.
+    """
+
+    mean: Float
+    standard_deviation: Float
+
+
+class RewardModel:
+    """The three rewards of an asset, and their expectation under a belief.
+
+    Parameters
+    ----------
+    quantity : QuantityModel
+        What the sensors would show without noise, for each draw, state and control.
+    settings : RewardSettings
+
+    Raises
+    ------
+    InvalidModelError
+        If the settings are for another number of controls.
+    """
+
+    def __init__(self, quantity: QuantityModel, settings: RewardSettings) -> None:
+        normaliser = settings.control_normaliser or (1.0,) * len(settings.control_reward)
+        if not len(settings.control_reward) == len(normaliser) == quantity.control_count:
+            raise InvalidModelError(
+                f"expected a control reward and a normaliser for each of {quantity.control_count} controls, "
+                f"got {len(settings.control_reward)} and {len(normaliser)}"
+            )
+        self.quantity = quantity
+        self.settings = settings
+        self._normaliser = np.array(normaliser, dtype=np.float64)
+        self._control_reward = np.array(settings.control_reward, dtype=np.float64)
+
+    @cached_property
+    def health_per_draw(self) -> Float:
+        """Health reward of each draw, state and control (E, S, U)."""
+        values, chosen = self.quantity.value_per_draw, self.settings.health_sensors
+        return health_reward(values if chosen is None else values[..., list(chosen)], self.settings.limit)
+
+    @cached_property
+    def _health_moments(self) -> tuple[Float, Float]:
+        """Mean and variance of the health reward over the draws, each (S, U)."""
+        mean = np.tensordot(self.quantity.draw_weight, self.health_per_draw, axes=1)
+        variance = np.tensordot(self.quantity.draw_weight, (self.health_per_draw - mean) ** 2, axes=1)
+        return mean, variance
+
+    def planning_reward(self, health_weight: float, control_weight: float) -> Float:
+        """Return the expected reward of each state and control for planning, eq. (36): (S, U)."""
+        result: Float = health_weight * self._health_moments[0] + control_weight * self._control_reward
+        return result
+
+    def expectation(self, joint: ArrayLike, observation: ArrayLike | None = None) -> RewardExpectation:
+        """Return mean and standard deviation of each reward.
+
+        Parameters
+        ----------
+        joint : (..., S, U)
+            p(D, U); use `known_control` for a control that is known.
+        observation : (..., G), optional
+            SI, NaN for a lost sensor; without it (prediction) the error reward is NaN.
+
+        Raises
+        ------
+        InvalidModelError
+            If shapes do not fit.
+        """
+        quantity = self.quantity
+        joint = np.asarray(joint, dtype=np.float64)
+        if joint.shape[-2:] != (quantity.state_count, quantity.control_count):
+            raise InvalidModelError(
+                f"expected a joint belief of shape (..., {quantity.state_count}, {quantity.control_count}), "
+                f"got {joint.shape}"
+            )
+        lead = joint.shape[:-2]
+        flat = joint.reshape(-1, quantity.state_count, quantity.control_count)
+        mean = np.full((len(flat), 3), np.nan)
+        variance = np.full((len(flat), 3), np.nan)
+        health, health_variance = self._health_moments
+        mean[:, 0] = np.einsum("bsu,su->b", flat, health)
+        spread = health - mean[:, 0, None, None]  # (B, S, U), the largest array of a long mission
+        spread **= 2
+        spread += health_variance
+        variance[:, 0] = np.einsum("bsu,bsu->b", flat, spread)
+        control = flat.sum(axis=1)
+        mean[:, 1] = control @ self._control_reward
+        variance[:, 1] = np.einsum("bu,bu->b", control, (self._control_reward - mean[:, 1, None]) ** 2)
+        if observation is not None:
+            observation = np.asarray(observation, dtype=np.float64)
+            if observation.shape != (*lead, quantity.sensor_count):
+                raise InvalidModelError(
+                    f"expected observations of shape {(*lead, quantity.sensor_count)}, "
+                    f"got {observation.shape}"
+                )
+            for row, seen in enumerate(observation.reshape(-1, quantity.sensor_count)):
+                mean[row, 2], variance[row, 2] = self._error_moments(flat[row], seen)
+        return RewardExpectation(mean.reshape(*lead, 3), np.sqrt(variance).reshape(*lead, 3))
+
+    def _error_moments(self, weight: Float, observation: Float) -> tuple[float, float]:
+        """Return mean and variance of the error reward under one joint belief (S, U)."""
+        state, control = np.nonzero(weight)
+        value = self.quantity.value_per_draw[:, state, control]
+        reward = error_reward(observation, value, self.settings.error_scale, self._normaliser[control])
+        share = self.quantity.draw_weight[:, None] * weight[state, control]
+        mean = float((share * reward).sum())
+        return mean, float((share * (reward - mean) ** 2).sum())

@@ -1,0 +1,357 @@
+"""Gaussian sensors: likelihood of what they show, residuals, and the posterior predictive check.
+
+Kapteyn et al. 2021, eqs. (30) and (32).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
+
+from fe.compilation import compiled
+from twin_master.errors import InvalidModelError, InvalidObservationError
+from twin_master.network.quantity import QuantityModel
+
+__all__ = ["GaussianSensorModel", "PredictiveCheck", "check_noise"]
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+LOG_ROOT_TWO_PI = 0.5 * float(np.log(2.0 * np.pi))
+
+
+@compiled
+def _log_mean_exp(exponent: Float, log_weight: Float) -> float:
+    """Return log sum_e exp(log_weight_e + exponent_e)."""
+    largest = -np.inf
+    for e in range(len(exponent)):
+        exponent[e] += log_weight[e]
+        largest = max(largest, exponent[e])
+    if largest == -np.inf:
+        return largest
+    total = 0.0
+    for e in range(len(exponent)):
+        total += np.exp(exponent[e] - largest)
+    return float(largest + np.log(total))
+
+
+@compiled
+def _log_likelihood(
+    observation: Float,
+    control: Index,
+    value: Float,
+    inverse_deviation: Float,
+    log_scale: Float,
+    log_weight: Float,
+    inside: bool,
+    result: Float,
+) -> None:
+    """Fill result (T, S); value is (U, S, G, E) so that the loop over the draws is contiguous.
+
+    inverse_deviation and log_scale = log inverse_deviation are (U, S, G).
+    """
+    steps, sensors = observation.shape
+    states, draws = value.shape[1], value.shape[3]
+    exponent = np.empty(draws)
+    for t in range(steps):
+        u = control[t]
+        observed = 0
+        for g in range(sensors):
+            if not np.isnan(observation[t, g]):
+                observed += 1
+        for s in range(states):
+            if observed == 0:
+                result[t, s] = 0.0
+                continue
+            total = 0.0
+            exponent[:] = 0.0
+            for g in range(sensors):
+                seen = observation[t, g]
+                if np.isnan(seen):
+                    continue
+                scale = inverse_deviation[u, s, g]
+                total += log_scale[u, s, g] - LOG_ROOT_TWO_PI
+                for e in range(draws):
+                    residual = (seen - value[u, s, g, e]) * scale
+                    exponent[e] -= 0.5 * residual * residual
+                if inside:
+                    total += _log_mean_exp(exponent, log_weight)
+                    exponent[:] = 0.0
+            if not inside:
+                total += _log_mean_exp(exponent, log_weight)
+            result[t, s] = total
+
+
+@dataclass(frozen=True)
+class PredictiveCheck:
+    """What a belief says about an observation, beside the observation.
+
+    Attributes
+    ----------
+    mean, standard_deviation : (..., G)
+        Of p(o_g), sensor noise and model error included, SI.
+    residual : (..., G) dimensionless
+        (observation - mean) / standard deviation; NaN where the sensor is lost.
+    probability_integral_transform : (..., G) dimensionless
+        p(o_g <= observation): uniform in [0, 1] if the model holds; NaN where the sensor is lost.
+    """
+
+    mean: Float
+    standard_deviation: Float
+    residual: Float
+    probability_integral_transform: Float
+
+    def coverage(self, probability: float = 0.95) -> Float:
+        """Return for each sensor the share of observations inside the central interval: (..., G) -> (G,).
+
+        A sensor that never reports gets NaN.
+        """
+        transform = self.probability_integral_transform.reshape(-1, self.mean.shape[-1])
+        seen = ~np.isnan(transform)
+        inside = np.abs(transform - 0.5) <= 0.5 * probability
+        count = seen.sum(axis=0)
+        result: Float = np.where(count > 0, inside.sum(axis=0) / np.maximum(count, 1), np.nan)
+        return result
+
+
+class GaussianSensorModel(QuantityModel):
+    """Sensors that show a value plus independent Gaussian noise.
+
+    Where the twin doubts its model, an error of the model is added to the noise in quadrature for each
+    state, control and sensor: sqrt(standard_deviation² + (model_error * mean)²), the mean over the draws. It
+    is an error that is drawn anew for each sensor and step; a real one stays the same from step to step, so
+    that the term is a safeguard and no description of it.
+
+    Parameters
+    ----------
+    strain_per_draw : (E, S, U, G)
+        Noise-free value for each draw e of the uncertain parameters, state, control and sensor, SI.
+    standard_deviation : float or (G,)
+        Of the noise that the twin assumes, SI, positive.
+    draw_weight : (E,), optional
+        Probability of each draw; equal by default.
+    average : {"outside", "inside"}
+        Where the average over the draws stands. "outside", the default, is the integral (30):
+        mean over e of the product over sensors. "inside" is eq. (32) as printed: the product over sensors of
+        the mean over e, as if each sensor had parameters of its own.
+    model_error : float or (G,) dimensionless
+        Standard deviation of the predicted value as a share of it; none by default.
+
+    Raises
+    ------
+    InvalidModelError, InvalidDistributionError
+        If shapes do not fit, a value is not finite, a standard deviation not positive or an error negative.
+    """
+
+    def __init__(
+        self,
+        strain_per_draw: ArrayLike,
+        standard_deviation: ArrayLike,
+        draw_weight: ArrayLike | None = None,
+        average: Literal["outside", "inside"] = "outside",
+        model_error: ArrayLike = 0.0,
+    ) -> None:
+        super().__init__(strain_per_draw, draw_weight)
+        deviation = np.array(standard_deviation, dtype=np.float64)
+        if deviation.shape not in ((), (self.sensor_count,)) or not np.all(
+            np.isfinite(deviation) & (deviation > 0.0)
+        ):
+            raise InvalidModelError(
+                f"expected one positive noise standard deviation, or one for each of {self.sensor_count} "
+                f"sensors, got {deviation}"
+            )
+        error = np.array(model_error, dtype=np.float64)
+        if error.shape not in ((), (self.sensor_count,)) or not np.all(np.isfinite(error) & (error >= 0.0)):
+            raise InvalidModelError(
+                f"expected one relative model error that is not negative, or one for each of "
+                f"{self.sensor_count} sensors, got {error}"
+            )
+        if average not in ("outside", "inside"):
+            raise InvalidModelError(f"expected average 'outside' or 'inside', got {average!r}")
+        self._deviation: Float = np.broadcast_to(deviation, (self.sensor_count,)).copy()
+        self._model_error: Float = np.broadcast_to(error, (self.sensor_count,)).copy()
+        # Through the root only where there is an error: x is not always sqrt(x²) to the last bit.
+        total = np.where(
+            self._model_error > 0.0, np.hypot(self._deviation, self._model_error * self.mean), self._deviation
+        )
+        total.setflags(write=False)
+        self._total_deviation: Float = total
+        by_control = np.ascontiguousarray(1.0 / total.transpose(1, 0, 2))
+        self._inverse_deviation, self._log_scale = by_control, np.log(by_control)
+        self._inside = average == "inside"
+        with np.errstate(divide="ignore"):
+            self._log_weight: Float = np.log(self.draw_weight)
+        self._by_control = np.ascontiguousarray(self.value_per_draw.transpose(2, 1, 3, 0))
+
+    @property
+    def standard_deviation(self) -> Float:
+        """Noise standard deviation of each sensor (G,), SI."""
+        return self._deviation.copy()
+
+    @property
+    def model_error(self) -> Float:
+        """Relative standard deviation of the predicted value of each sensor (G,), dimensionless."""
+        return self._model_error.copy()
+
+    @property
+    def total_standard_deviation(self) -> Float:
+        """Noise and model error of each state, control and sensor (S, U, G), SI, read-only."""
+        return self._total_deviation
+
+    def _checked(self, observation: ArrayLike) -> Float:
+        """Return observations (..., G) in which NaN stands for a lost sensor."""
+        observation = np.array(observation, dtype=np.float64, order="C")
+        if observation.ndim == 0 or observation.shape[-1] != self.sensor_count:
+            raise InvalidObservationError(
+                f"expected {self.sensor_count} sensor values, got an array of shape {observation.shape}"
+            )
+        if np.any(np.isinf(observation)):
+            where = tuple(int(i) for i in np.argwhere(np.isinf(observation))[0])
+            raise InvalidObservationError(
+                f"sensor value at {where} is infinite; expected a number, or NaN for a lost sensor"
+            )
+        return observation
+
+    def log_likelihood(self, observation: ArrayLike, control_index: int) -> Float:
+        """Return log p(o | D, u) for each state, eq. (30) or (32).
+
+        Parameters
+        ----------
+        observation : (G,)
+            SI; NaN where the sensor is lost. If all are lost the result is zero: see `observed_count`.
+        control_index : int
+            Control in force.
+
+        Returns
+        -------
+        (S,)
+            Density in SI.
+
+        Raises
+        ------
+        InvalidObservationError, InvalidModelError
+            If the shape is another one or a value is infinite; if there is no such control.
+        """
+        rows = self.log_likelihood_sequence(self._checked(observation)[None], [control_index])
+        result: Float = rows[0]
+        return result
+
+    def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
+        """Return log p(o_t | D_t, u_t) for a sequence: (T, G) and (T,) -> (T, S).
+
+        Raises
+        ------
+        InvalidObservationError, InvalidModelError
+            As `log_likelihood`.
+        """
+        observations = self._checked(observations)
+        control = np.array(control_index, dtype=np.int64)
+        if observations.ndim != 2 or control.shape != observations.shape[:1]:
+            raise InvalidModelError(
+                "expected observations of shape (steps, sensors) and controls of shape (steps,), "
+                f"got {observations.shape} and {control.shape}"
+            )
+        if control.size and (control.min() < 0 or control.max() >= self.control_count):
+            raise InvalidModelError(f"expected control indices between 0 and {self.control_count - 1}")
+        result = np.empty((len(observations), self.state_count))
+        _log_likelihood(
+            observations,
+            control,
+            self._by_control,
+            self._inverse_deviation,
+            self._log_scale,
+            self._log_weight,
+            self._inside,
+            result,
+        )
+        return result
+
+    def noise(self, joint: ArrayLike) -> Float:
+        """Return the standard deviation (..., G) of noise and model error under beliefs (..., S, U), SI."""
+        return np.asarray(np.sqrt(np.tensordot(self._weights(joint), self._total_deviation**2, axes=2)))
+
+    def observed_count(self, observations: ArrayLike) -> Index:
+        """Return how many sensors report: (..., G) -> (...). Zero flags a step that follows the dynamics."""
+        result: Index = np.sum(~np.isnan(self._checked(observations)), axis=-1)
+        return result
+
+    def predictive_check(self, joint: ArrayLike, observation: ArrayLike) -> PredictiveCheck:
+        """Compare observations with what beliefs predict for them.
+
+        Parameters
+        ----------
+        joint : (..., S, U)
+            p(D, U); for an honest check the belief before the observation (`forecast`).
+        observation : (..., G)
+            SI; NaN where the sensor is lost.
+        """
+        observation = self._checked(observation)
+        mean, spread = self.moments(joint)
+        if mean.shape != observation.shape:
+            raise InvalidModelError(
+                f"expected one belief for each observation, "
+                f"got {mean.shape[:-1]} and {observation.shape[:-1]}"
+            )
+        weights = self._weights(joint).reshape(-1, self.state_count, self.control_count)
+        deviation = np.sqrt(spread**2 + self.noise(joint) ** 2)
+        rows = observation.reshape(-1, self.sensor_count)
+        transform = np.empty_like(rows)
+        for row, (weight, seen) in enumerate(zip(weights, rows, strict=True)):
+            state, control = np.nonzero(weight)
+            below = ndtr(
+                (seen - self.value_per_draw[:, state, control]) / self._total_deviation[state, control]
+            )
+            transform[row] = np.einsum("e,p,epg->g", self.draw_weight, weight[state, control], below)
+        return PredictiveCheck(
+            mean=mean,
+            standard_deviation=deviation,
+            residual=(observation - mean) / deviation,
+            probability_integral_transform=transform.reshape(observation.shape),
+        )
+
+
+def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequence[str]) -> None:
+    """Check that the noise of no sensor hides all that the sensors of its unit can show.
+
+    Such a noise is a unit that was forgotten. The sensors of a unit are taken together, because a single one
+    may well be insensitive to everything.
+
+    Parameters
+    ----------
+    key : str
+        Where the noise stands in the scenario.
+    deviation : float or (G,)
+        Its standard deviation, SI.
+    predicted : (E, S, U, G)
+        What the sensors show without noise, SI.
+    units : (G,)
+        Unit of each sensor.
+
+    Raises
+    ------
+    InvalidModelError
+        It does; the sentence names the sensor, what it can show, and the likely unit.
+    """
+    noise = np.broadcast_to(np.asarray(deviation, dtype=np.float64), len(units))
+    low, high = predicted.min(axis=(0, 1, 2)), predicted.max(axis=(0, 1, 2))
+    for sensor, (unit, given) in enumerate(zip(units, noise.tolist(), strict=True)):
+        alike = [index for index, other in enumerate(units) if other == unit]
+        least, largest = float(low[alike].min()), float(high[alike].max())
+        reach = max(largest - least, abs(least), abs(largest))
+        if given <= reach:
+            continue
+        advice = f"give it in {unit}, the unit of the sensor"
+        if unit == "1":
+            advice = "give it as a strain, without unit"
+            if given * 1e-6 <= reach:
+                advice = f"it is likely meant in microstrain: write `{key}_microstrain = {given:g}`"
+        raise InvalidModelError(
+            f"`{key}` is {given:g} for sensor {sensor + 1}, and all that sensors of its unit ({unit}) can "
+            f"show by the twin's model lies between {least:.3g} and {largest:.3g}: such a sensor tells "
+            f"nothing; {advice}."
+        )

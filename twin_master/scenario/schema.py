@@ -1,0 +1,379 @@
+"""The schema of a scenario file: states, controls, sensors, rewards, truth and asset, checked strictly.
+
+A key of the file may carry its unit (`levels_percent`, `gain_percent`, `standard_deviation_microstrain`);
+what is kept here, and in `config.json` of a run, is in SI. Nothing here knows a wing: another asset is
+another scenario file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import Field, SerializeAsAny, model_validator
+
+from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
+from twin_master.scenario.section import (
+    Count,
+    Name,
+    NotNegative,
+    Number,
+    PerSensor,
+    Probability,
+    Section,
+    Seed,
+    check_one_or_each,
+    short,
+)
+from twin_master.scenario.truth import TruthSection
+
+ROW_SUM_TOLERANCE = 1e-12
+"""Largest departure of the sum of probabilities from one, as the graphical model has it."""
+REWARD_NAMES = ("health", "control", "error")
+"""The rewards (9)-(11)."""
+FALLBACK_FIGURES = (
+    "policy_switch_damage",
+    "damage_step",
+    "fallback_step",
+    "fallback_delay",
+    "early_fallback_step",
+)
+"""Figures of the summary that say when the control left that of the first turn."""
+MISFIT_FIGURES = ("model_misfit_rms", "model_misfit_largest")
+"""Figures of the summary that say by how much asset and twin's model differ."""
+
+
+class Mission(Section):
+    """What is flown, and for how long."""
+
+    name: Name
+    title: str = ""
+    description: str = ""
+    steps: Count
+    prediction_steps: Count = 10
+    first_control: Name
+    seed: Seed = 0
+    step_name: Name = "turn"
+    """What a step of the mission is called in the report."""
+
+
+class StateFactor(Section):
+    """One factor of the hidden state with its levels and the belief before the first observation."""
+
+    units: ClassVar[Mapping[str, str]] = {"levels": "percent"}
+    name: Name
+    title: str = ""
+    unit: str = "1"
+    """Unit of the levels; a dimensionless level is a fraction, printed in percent."""
+    levels: Annotated[tuple[Number, ...], Field(min_length=1)]
+    prior: Annotated[tuple[Probability, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if any(b <= a for a, b in zip(self.levels, self.levels[1:], strict=False)):
+            raise ValueError(f"`levels` of state `{self.name}` must increase, and {short(self.levels)} came")
+        if len(self.prior) != len(self.levels):
+            raise ValueError(
+                f"`prior` of state `{self.name}` must hold one probability for each of its "
+                f"{len(self.levels)} levels, and {len(self.prior)} came"
+            )
+        if abs(sum(self.prior) - 1.0) > ROW_SUM_TOLERANCE:
+            raise ValueError(
+                f"`prior` of state `{self.name}` must sum to 1, and sums to {sum(self.prior):.12g}"
+            )
+        return self
+
+
+class Control(Section):
+    """One choice that the twin has, and the value of each control input of the asset under it (SI)."""
+
+    name: Name
+    title: str = ""
+    values: Annotated[dict[str, Number], Field(min_length=1)]
+
+
+class ObservationSection(Section):
+    """What is observed (a role of the binding) and the sensor noise that the twin assumes."""
+
+    units: ClassVar[Mapping[str, str]] = {"standard_deviation": "microstrain", "model_error": "percent"}
+    role: Name = "strain"
+    count: Count
+    titles: tuple[str, ...] = ()
+    """What each sensor is called in the report; without them they have numbers."""
+    unit: str | tuple[str, ...] = "1"
+    """Unit of the observed values, one for all sensors or one for each; a strain without unit is printed in
+    microstrain."""
+    standard_deviation: PerSensor
+    """Of the noise that the twin assumes, one for all sensors or one for each."""
+    model_error: NotNegative | tuple[NotNegative, ...] = 0.0
+    """Standard deviation of the predicted value as a share of it, one for all sensors or one for each; added
+    to the noise in quadrature."""
+    average_over_draws: Literal["outside", "inside"] = "outside"
+    """Where the average over the draws of the parameter stands: outside the product over the sensors as in
+    the integral (30), or inside it as eq. (32) is printed."""
+
+    @property
+    def sensor_units(self) -> tuple[str, ...]:
+        """Unit of each sensor."""
+        return (self.unit,) * self.count if isinstance(self.unit, str) else self.unit
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for key, value in (("unit", self.unit), ("standard_deviation", self.standard_deviation)):
+            check_one_or_each(f"observation.{key}", value, self.count)
+        if self.titles:
+            check_one_or_each("observation.titles", self.titles, self.count)
+        return self
+
+
+class Transition(Section):
+    """How the state moves in one step under each control; factors move independently given the control."""
+
+    kind: Literal["independent_worsening", "independent_tables"]
+    probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
+    """`independent_worsening`: probability of one level up, for each control (or control and state)."""
+    tables: dict[str, dict[str, tuple[tuple[Probability, ...], ...]]] = Field(default_factory=dict)
+    """`independent_tables`: for each control and state a square table, rows from, columns to."""
+
+
+class Rewards(Section):
+    """Figures of the rewards, eqs. (9)-(11), and their weights in planning."""
+
+    units: ClassVar[Mapping[str, str]] = {"health_limit": "microstrain", "error_scale": "microstrain"}
+    health_limit: PerSensor
+    """Value at which the health reward is zero, one for all sensors that count for it or one for each."""
+    health_sensors: Literal["all"] | Annotated[tuple[Count, ...], Field(min_length=1)] = "all"
+    """Sensors, numbered from 1, that have a limit and so count for the health reward."""
+    health_weight: Number = 1.0
+    control_weight: Number = 1.0
+    error_scale: PerSensor
+    """Distance of observation and model that costs one, one for all sensors or one for each."""
+    normalise_error_by: Name | None = None
+    control: dict[str, Number]
+
+
+class Planner(Section):
+    """Value iteration, eq. (36)."""
+
+    gamma: Annotated[float, Field(strict=True, ge=0.0, lt=1.0)]
+    decide_on: Literal["filtered", "predicted"] = "filtered"
+    """Which belief the next control is the most probable one of: D_t, or D_{t+1} as predicted."""
+
+
+class Reference(Section):
+    """What a figure of the summary is printed beside, and where that comes from."""
+
+    figure: Name
+    value: Number | str
+    source: str
+
+
+CALIBRATION_COPY = "asset/calibration.nc"
+"""The calibration file inside a run folder."""
+
+
+class Calibration(FileSection):
+    """The uncertain parameter of the model and where its distribution comes from."""
+
+    parameter: Name
+    source: Literal["static_test", "normal", "fixed", "file"]
+    file: str | None = None
+    """The calibration of a wing (`calibration.nc`), for the source `file`."""
+    method: Literal["particle_filter", "exact"] = "exact"
+    curve: Literal["published", "design"] = "published"
+    draws: Count = 100
+    mean: Number | None = None
+    standard_deviation: NotNegative | None = None
+
+    def copies(self) -> Mapping[str, str]:
+        """Return where the copy of the calibration file stands in a run folder."""
+        return {"file": CALIBRATION_COPY}
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.source == "file") != bool(self.file):
+            raise ValueError(
+                "calibration source `file` needs `file`, the path of a calibration.nc"
+                if self.source == "file"
+                else f"`file` belongs to the calibration source `file`, and the source is `{self.source}`"
+            )
+        if self.source in ("normal", "fixed") and self.mean is None:
+            raise ValueError(f"calibration source `{self.source}` needs `mean`")
+        if self.source == "normal" and self.standard_deviation is None:
+            raise ValueError("calibration source `normal` needs `standard_deviation`")
+        return self
+
+
+class Scenario(Section):
+    """A whole scenario, in SI."""
+
+    format: Literal[2]
+    mission: Mission
+    state: Annotated[tuple[StateFactor, ...], Field(min_length=1)]
+    control: Annotated[tuple[Control, ...], Field(min_length=1)]
+    observation: ObservationSection
+    transition: Transition
+    rewards: Rewards
+    planner: Planner
+    asset: SerializeAsAny[AssetSection]
+    belief: SerializeAsAny[BeliefSection]
+    calibration: Calibration
+    truth: TruthSection
+    reference: tuple[Reference, ...] = ()
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the state factors, the outermost first."""
+        return tuple(factor.name for factor in self.state)
+
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        """Names of the controls in their order."""
+        return tuple(control.name for control in self.control)
+
+    @property
+    def figure_names(self) -> tuple[str, ...]:
+        """Names of all figures that the summary of this scenario can give, and a reference can name."""
+        names = [*FALLBACK_FIGURES]
+        names += [f"filtered_rms_error_{name}" for name in self.state_names]
+        names += [f"mean_reward_{name}" for name in REWARD_NAMES]
+        names += [f"{self.calibration.parameter}_{moment}" for moment in ("mean", "standard_deviation")]
+        names += ["log_evidence"]
+        if self.truth.received or any(fault.kind == "dropout" for fault in self.truth.sensor_faults):
+            names += ["lost_observations", "blind_steps"]
+        if self.another_model:
+            names += [*MISFIT_FIGURES]
+        if set(self.observation.sensor_units) == {"1"}:
+            names += ["strain_error_bound"]
+        return tuple(names)
+
+    @property
+    def another_model(self) -> bool:
+        """Whether what is flown is known to be another model than the one that the twin believes."""
+        return self.asset.differs_from(self.belief)
+
+    def moved(self, folder: Path) -> Self:
+        """Return the scenario with its relative paths from a folder."""
+        return self.model_copy(update={name: part.moved(folder) for name, part in self._files().items()})
+
+    def portable(self) -> Self:
+        """Return the scenario with the paths of the copies inside a run folder."""
+        return self.model_copy(update={name: part.portable() for name, part in self._files().items()})
+
+    def _files(self) -> dict[str, FileSection]:
+        return {"asset": self.asset, "belief": self.belief, "calibration": self.calibration}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the scenario as plain data in SI; `Scenario.model_validate` reads it back."""
+        return self.model_dump(mode="json")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        states, controls = self.state_names, self.control_names
+        for what, names in (("state", states), ("control", controls)):
+            if len(set(names)) != len(names):
+                raise ValueError(f"each {what} needs a name of its own, and the names are {short(names)}")
+        roles = set(self.control[0].values)
+        for control in self.control:
+            if set(control.values) != roles:
+                raise ValueError(
+                    f"every control must give a value to the same inputs: `{controls[0]}` gives "
+                    f"{short(sorted(roles))} and `{control.name}` gives {short(sorted(control.values))}"
+                )
+        _known(self.mission.first_control, controls, "mission.first_control", "control")
+        _same(self.rewards.control, controls, "rewards.control", "control")
+        norm = self.rewards.normalise_error_by
+        if norm is not None:
+            _known(norm, tuple(sorted(roles)), "rewards.normalise_error_by", "control input")
+            if any(control.values[norm] <= 0.0 for control in self.control):
+                raise ValueError(
+                    f"`rewards.normalise_error_by` divides by `{norm}`, which must be positive in every "
+                    "control"
+                )
+        self._check_transition()
+        referred = [entry.figure for entry in self.reference]
+        for name in referred:
+            _known(name, self.figure_names, "reference.figure", "figure of the summary")
+            if referred.count(name) > 1:
+                raise ValueError(f"`reference` gives `{name}` more than once: keep one of them")
+        if self.truth.kind == "asset":
+            if not self.asset.is_fmu:
+                raise ValueError(
+                    f"`truth.kind` `asset` needs an FMU, and the kind of the asset is `{self.asset.kind}`"
+                )
+            _same(self.truth.state, states, "truth.state", "state")
+        if self.truth.kind == "random_growth" and self.truth.gains:
+            raise ValueError("`truth.gains` belongs to the kind `scripted`, and the kind is `random_growth`")
+        for gain in self.truth.gains:
+            _known(gain.state, states, "truth.gains.state", "state")
+        self._check_model_error()
+        self._check_sensors()
+        for fault in self.truth.sensor_faults:
+            if fault.sensors != "all" and max(fault.sensors) > self.observation.count:
+                raise ValueError(
+                    f"`truth.sensor_faults.sensors` counts from 1 to {self.observation.count}, "
+                    f"and {max(fault.sensors)} came"
+                )
+        return self
+
+    def _check_model_error(self) -> None:
+        error = self.observation.model_error
+        if isinstance(error, tuple) and len(error) != self.observation.count:
+            raise ValueError(
+                f"`observation.model_error_percent` must be one number or one for each of the "
+                f"{self.observation.count} sensors, and {len(error)} came"
+            )
+
+    def _check_sensors(self) -> None:
+        count, chosen = self.observation.count, self.rewards.health_sensors
+        if chosen != "all" and (max(chosen) > count or len(set(chosen)) != len(chosen)):
+            raise ValueError(
+                f"`rewards.health_sensors` must name different sensors from 1 to {count}, and "
+                f"{short(chosen)} came"
+            )
+        limited = count if chosen == "all" else len(chosen)
+        check_one_or_each("rewards.health_limit", self.rewards.health_limit, limited)
+        check_one_or_each("rewards.error_scale", self.rewards.error_scale, count)
+        check_one_or_each("truth.noise.standard_deviation", self.truth.noise.standard_deviation, count)
+
+    def _check_transition(self) -> None:
+        transition = self.transition
+        if transition.kind == "independent_worsening":
+            if transition.tables:
+                raise ValueError("`transition.tables` belongs to the kind `independent_tables`")
+            _same(transition.probability, self.control_names, "transition.probability", "control")
+            for name, entry in transition.probability.items():
+                if isinstance(entry, dict):
+                    _same(entry, self.state_names, f"transition.probability.{name}", "state")
+            return
+        if transition.probability:
+            raise ValueError("`transition.probability` belongs to the kind `independent_worsening`")
+        _same(transition.tables, self.control_names, "transition.tables", "control")
+        for name, tables in transition.tables.items():
+            _same(tables, self.state_names, f"transition.tables.{name}", "state")
+            for factor in self.state:
+                size = len(factor.levels)
+                table = tables[factor.name]
+                if len(table) != size or any(len(row) != size for row in table):
+                    raise ValueError(
+                        f"`transition.tables.{name}.{factor.name}` must be {size} rows of {size} "
+                        "probabilities"
+                    )
+                worst = max(abs(sum(row) - 1.0) for row in table)
+                if worst > ROW_SUM_TOLERANCE:
+                    raise ValueError(
+                        f"each row of `transition.tables.{name}.{factor.name}` must sum to 1, "
+                        f"one misses it by {worst:.3g}"
+                    )
+
+
+def _known(name: str, names: tuple[str, ...], where: str, what: str) -> None:
+    if name not in names:
+        raise ValueError(f"`{where}` must name a {what} ({short(names)}), and `{name}` came")
+
+
+def _same(table: Mapping[str, object], names: tuple[str, ...], where: str, what: str) -> None:
+    if set(table) != set(names):
+        came = short(list(table)) or "none"
+        raise ValueError(f"`{where}` must have one entry for each {what} ({short(names)}), and has {came}")

@@ -1,0 +1,113 @@
+"""A table of a scenario file: what all tables have in common, and the kinds of values that they hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+_SHOWN_LENGTH = 60
+UNIT_DIVISOR = {"percent": 100.0, "microstrain": 1.0e6, "microstrain_per_step": 1.0e6}
+
+LARGEST_COUNT = 1_000_000
+"""Of steps, draws, sensors: more of them make arrays that no machine has room for."""
+LARGEST_SEED = 2**63 - 1
+"""What the files of a run can hold."""
+
+
+def _at_most(limit: int, why: str) -> AfterValidator:
+    def check(value: int) -> int:
+        if value > limit:
+            raise ValueError(f"a number of at most {limit} is expected, {why}, and {shown(value)} came")
+        return value
+
+    return AfterValidator(check)
+
+
+def shown(value: object) -> str:
+    """Return a value for a sentence, cut where it is long."""
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of thousands of digits
+        return "a number of thousands of digits"
+    return text if len(text) <= _SHOWN_LENGTH else text[: _SHOWN_LENGTH - 3] + "..."
+
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
+PerSensor = Positive | tuple[Positive, ...]
+"""One positive number for all sensors, or one for each."""
+Probability = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=1.0)]
+_COUNTED = _at_most(LARGEST_COUNT, "for the twin holds arrays of that length")
+Count = Annotated[int, Field(strict=True, ge=1), _COUNTED]
+Step = Annotated[int, Field(strict=True, ge=0), _COUNTED]
+Seed = Annotated[
+    int, Field(strict=True, ge=0), _at_most(LARGEST_SEED, "for the files of a run hold no larger integer")
+]
+Flag = Annotated[bool, Field(strict=True)]
+Name = Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_.\-]+$")]
+
+
+def _in_si(value: object, divisor: float) -> object:
+    if isinstance(value, bool) or not isinstance(value, int | float | list | tuple):
+        return value
+    if isinstance(value, list | tuple):
+        return [_in_si(item, divisor) for item in value]
+    try:
+        return value / divisor
+    except OverflowError:
+        return float("inf")  # which no key takes
+
+
+def _check_percent(key: object, value: object) -> None:
+    for item in value if isinstance(value, list | tuple) else [value]:
+        if isinstance(item, int | float) and not isinstance(item, bool) and not -100 <= item <= 100:
+            raise ValueError(f"`{key}` is in percent, at most 100, and {shown(item)} came")
+
+
+def check_one_or_each(key: str, value: object, count: int) -> None:
+    """Check that what may be given for each sensor is given once, or once for each of `count` of them."""
+    if isinstance(value, tuple) and len(value) != count:
+        raise ValueError(
+            f"`{key}` must be one value, or one for each of the {count} sensors, and {len(value)} came"
+        )
+
+
+class Section(BaseModel):
+    """A table of the file: unknown keys are refused, and a unit in a key's name is honoured."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    units: ClassVar[Mapping[str, str]] = {}
+    """The unit that each key may carry in its name."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _convert_units(cls, table: object) -> object:
+        if not isinstance(table, Mapping):
+            return table
+        converted: dict[object, object] = {}
+        for key, value in table.items():
+            base, unit = cls.split_unit(str(key))
+            if base in table and unit:
+                raise ValueError(f"`{base}` and `{key}` were both given: keep one of them")
+            if unit == "percent":
+                _check_percent(key, value)
+            converted[base] = _in_si(value, UNIT_DIVISOR[unit]) if unit else value
+        return converted
+
+    @classmethod
+    def split_unit(cls, key: str) -> tuple[str, str]:
+        """Return the key without its unit, and the unit (empty without one)."""
+        for base, unit in cls.units.items():
+            if key == f"{base}_{unit}":
+                return base, unit
+        return key, ""
+
+
+def short(values: object) -> str:
+    """Return values for a sentence."""
+    if isinstance(values, list | tuple):
+        return ", ".join(str(value) for value in values)
+    return str(values)

@@ -1,0 +1,337 @@
+"""A flown mission as labelled arrays: what was observed, believed, predicted, decided, and true."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from twin_master.mission.loop import Flight
+from twin_master.mission.truth import SensorStatus, Truth
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.inference import known_control
+from twin_master.network.planner import PlannedPolicy
+from twin_master.network.rewards import REWARD_NAMES, RewardModel
+from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.scenario.schema import Scenario
+
+Float = NDArray[np.float64]
+
+SEVERAL_UNITS = "see sensor_unit"
+"""Unit of a variable over sensors of different units."""
+
+
+@dataclass(frozen=True)
+class MissionResult:
+    """Everything that a mission made, before it is stored.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        What was flown.
+    model : GraphicalModel
+        S states, U controls.
+    sensor_model : GaussianSensorModel
+        The twin's predicted observations for each draw of the parameter, and their noise.
+    draws : (E,)
+        Draws of the uncertain parameter.
+    rewards : RewardModel
+        Rewards by state and control.
+    plan : PlannedPolicy
+        Value iteration.
+    truth : Truth
+        What the sensors really did.
+    flight : Flight
+        The mission.
+    units : dict of str to str
+        Units of control inputs, monitors and parameters; those that are missing are dimensionless.
+    """
+
+    scenario: Scenario
+    model: GraphicalModel
+    sensor_model: GaussianSensorModel
+    draws: Float
+    rewards: RewardModel
+    plan: PlannedPolicy
+    truth: Truth
+    flight: Flight
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def state_unit(self) -> str:
+        """Unit of the state factors; a list where they have several."""
+        return ", ".join(dict.fromkeys(factor.unit for factor in self.scenario.state))
+
+    @property
+    def observation_unit(self) -> str:
+        """Unit of the observed values; where they have several, each sensor has its own, `sensor_unit`."""
+        units = dict.fromkeys(self.scenario.observation.sensor_units)
+        return next(iter(units)) if len(units) == 1 else SEVERAL_UNITS
+
+    @property
+    def parameter_unit(self) -> str:
+        """Unit of the uncertain parameter."""
+        return self.units.get(self.scenario.calibration.parameter, "1")
+
+
+def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.DataTree:
+    """Return the groups of `run.nc`; every variable carries its unit and a description.
+
+    Parameters
+    ----------
+    result
+        The mission.
+    attributes
+        Attributes of the root: seed, versions, hashes.
+    """
+    labels = _Labels(result)
+    groups = {
+        "observed": _observed(result, labels),
+        "filtered": _filtered(result, labels),
+        "smoothed": _smoothed(result, labels),
+        "predicted": _predicted(result, labels),
+        "policy": _policy(result, labels),
+        "calibration": labels.dataset(
+            {
+                "draw_value": (
+                    ("draw",),
+                    result.draws,
+                    result.parameter_unit,
+                    "draws of the uncertain parameter, equally weighted",
+                )
+            }
+        ).assign_attrs(parameter=result.scenario.calibration.parameter),
+        "truth": _truth(result, labels),
+    }
+    return xr.DataTree.from_dict({"/": xr.Dataset(attrs=dict(attributes)), **groups})
+
+
+Variable = tuple[tuple[str, ...], NDArray[Any], str, str]
+
+
+class _Labels:
+    """Coordinates of every dimension, and datasets that carry those which they use."""
+
+    def __init__(self, result: MissionResult) -> None:
+        scenario, model = result.scenario, result.model
+        names = scenario.state_names
+        self.coordinates: dict[str, xr.Variable] = {
+            "step": xr.Variable(
+                "step", np.arange(scenario.mission.steps), {"long_name": "step", "units": "1"}
+            ),
+            "sensor": xr.Variable(
+                "sensor", np.arange(1, scenario.observation.count + 1), {"long_name": "sensor", "units": "1"}
+            ),
+            "region": xr.Variable("region", np.array(names), {"long_name": "factor of the state"}),
+            "control": xr.Variable("control", np.array(scenario.control_names), {"long_name": "control"}),
+            "horizon": xr.Variable(
+                "horizon",
+                np.arange(1, scenario.mission.prediction_steps + 1),
+                {"long_name": "steps ahead", "units": "1"},
+            ),
+            "reward": xr.Variable("reward", np.array(REWARD_NAMES), {"long_name": "reward"}),
+            "draw": xr.Variable(
+                "draw", np.arange(len(result.draws)), {"long_name": "draw of the parameter", "units": "1"}
+            ),
+        }
+        observation = scenario.observation
+        self.sensors: dict[str, xr.Variable] = {}
+        if result.observation_unit == SEVERAL_UNITS:
+            unit = np.array(observation.sensor_units)
+            self.sensors["sensor_unit"] = xr.Variable("sensor", unit, {"long_name": "unit of each sensor"})
+        if observation.titles:
+            title = np.array(observation.titles)
+            self.sensors["sensor_title"] = xr.Variable("sensor", title, {"long_name": "name of each sensor"})
+        self.states = {
+            factor.name: xr.Variable(
+                "state", model.states.coordinates[:, index], {"long_name": factor.name, "units": factor.unit}
+            )
+            for index, factor in enumerate(scenario.state)
+        }
+
+    def dataset(self, variables: Mapping[str, Variable]) -> xr.Dataset:
+        dimensions = {name for variable in variables.values() for name in variable[0]}
+        coordinates: dict[str, xr.Variable] = {
+            name: variable for name, variable in self.coordinates.items() if name in dimensions
+        }
+        if "state" in dimensions:
+            coordinates |= self.states
+        if "sensor" in dimensions:
+            coordinates |= self.sensors
+        return xr.Dataset(
+            {
+                name: (dims, values, {"units": unit, "long_name": text})
+                for name, (dims, values, unit, text) in variables.items()
+            },
+            coords=coordinates,
+        )
+
+
+def _observed(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    flight, scenario = result.flight, result.scenario
+    role, unit = scenario.observation.role, result.observation_unit
+    variables: dict[str, Variable] = {
+        role: (("step", "sensor"), flight.observed, unit, f"{role} as received; NaN where a sensor is lost"),
+        "control_index": (("step",), flight.control_index, "1", "control in force"),
+    }
+    for name in sorted(scenario.control[0].values):  # config.json does not keep their order
+        values = np.array([control.values[name] for control in scenario.control])[flight.control_index]
+        variables[name] = (("step",), values, result.units.get(name, "1"), f"{name} in force")
+    return labels.dataset(variables)
+
+
+def _belief(
+    result: MissionResult, lead: tuple[str, ...], probability: Float, joint: Float, given: str
+) -> dict[str, Variable]:
+    """Return belief, its moments and the quantities of interest; `given` says what the belief is given."""
+    states = result.model.states
+    mean, deviation = result.sensor_model.moments(joint)
+    quantiles = result.sensor_model.quantiles(joint, (0.025, 0.975))
+    role, unit = result.scenario.observation.role, result.observation_unit
+    sensor = (*lead, "sensor")
+    return {
+        "probability": ((*lead, "state"), probability, "1", f"p(state | {given})"),
+        "mean": (
+            (*lead, "region"),
+            states.mean(probability),
+            result.state_unit,
+            f"mean of each factor given {given}",
+        ),
+        "standard_deviation": (
+            (*lead, "region"),
+            states.standard_deviation(probability),
+            result.state_unit,
+            f"standard deviation of each factor given {given}",
+        ),
+        "quantity_mean": (sensor, mean, unit, f"mean of the noise-free {role} given {given}"),
+        "quantity_standard_deviation": (
+            sensor,
+            deviation,
+            unit,
+            f"standard deviation of the noise-free {role} given {given}",
+        ),
+        "quantity_lower": (sensor, quantiles[..., 0, :], unit, f"2.5 % quantile of the noise-free {role}"),
+        "quantity_upper": (sensor, quantiles[..., 1, :], unit, f"97.5 % quantile of the noise-free {role}"),
+    }
+
+
+def _rewards(
+    result: MissionResult, lead: tuple[str, ...], joint: Float, observed: Float | None
+) -> dict[str, Variable]:
+    expected = result.rewards.expectation(joint, observed)
+    dims = (*lead, "reward")
+    return {
+        "reward_mean": (dims, expected.mean, "1", "mean of each reward, eqs. (9)-(11)"),
+        "reward_standard_deviation": (
+            dims,
+            expected.standard_deviation,
+            "1",
+            "standard deviation of each reward",
+        ),
+    }
+
+
+_DECIDED_ON = {
+    "filtered": "the filtered belief of the step",
+    "predicted": "the belief predicted for the next step",
+}
+
+
+def _filtered(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    flight = result.flight
+    joint = known_control(flight.filtered, flight.control_index, len(result.model.controls))
+    variables = _belief(result, ("step",), flight.filtered, joint, "observations up to the step")
+    variables |= _rewards(result, ("step",), joint, flight.observed)
+    residual = (flight.observed - variables["quantity_mean"][1]) / result.sensor_model.noise(joint)
+    variables |= {
+        "decision_probability": (
+            ("step", "control"),
+            flight.decision_probability,
+            "1",
+            f"policy averaged over {_DECIDED_ON[result.scenario.planner.decide_on]}; "
+            "its mode is the control of the next step",
+        ),
+        "log_evidence": (("step",), flight.log_evidence, "1", "log p(observation | earlier observations)"),
+        "residual": (
+            ("step", "sensor"),
+            residual,
+            "1",
+            "observation less its filtered mean, in the standard deviations that the twin assumes",
+        ),
+        "sensors_received": (
+            ("step",),
+            np.isfinite(flight.observed).sum(axis=1),
+            "1",
+            "sensors received; with none the belief follows the dynamics",
+        ),
+    }
+    return labels.dataset(variables)
+
+
+def _smoothed(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    flight = result.flight
+    joint = known_control(flight.smoothed, flight.control_index, len(result.model.controls))
+    variables = _belief(result, ("step",), flight.smoothed, joint, "all observations")
+    variables |= _rewards(result, ("step",), joint, flight.observed)
+    return labels.dataset(variables)
+
+
+def _predicted(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    flight = result.flight
+    lead = ("step", "horizon")
+    joint = flight.predicted[..., :, None] * result.plan.policy  # (T, H, S, U), eqs. (37)-(39)
+    given = "observations up to the step, through the policy"
+    variables = _belief(result, lead, flight.predicted, joint, given)
+    variables |= _rewards(result, lead, joint, None)
+    variables["control_probability"] = (
+        (*lead, "control"),
+        joint.sum(axis=-2),
+        "1",
+        "p(control | observations up to the step): what the policy asks for in the state predicted",
+    )
+    return labels.dataset(variables)
+
+
+def _policy(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    plan = result.plan
+    return labels.dataset(
+        {
+            "control_index": (("state",), plan.control_index, "1", "control of the policy in each state"),
+            "action_value": (("state", "control"), plan.action_value, "1", "Q of value iteration, eq. (36)"),
+            "value": (("state",), plan.value, "1", "value of each state"),
+        }
+    )
+
+
+def _truth(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    record, role = result.flight.truth, result.scenario.observation.role
+    status = result.truth.status
+    if result.truth.in_asset:
+        status = np.where(np.isnan(result.flight.observed), SensorStatus.LOST, status).astype(status.dtype)
+    variables: dict[str, Variable] = {
+        "state": (
+            ("step", "region"),
+            record.state,
+            result.state_unit,
+            "true value of each factor of the state",
+        ),
+        role: (
+            ("step", "sensor"),
+            record.observation,
+            result.observation_unit,
+            f"true {role}, without noise and faults",
+        ),
+        "sensor_status": (
+            ("step", "sensor"),
+            status,
+            "1",
+            "what each sensor really does: 0 healthy, 1 lost, 2 drifting",
+        ),
+    }
+    for name, values in sorted(record.monitors.items()):  # a checkpoint does not keep their order
+        variables[name] = (("step",), values, result.units.get(name, "1"), f"{name}, as the asset reports it")
+    return labels.dataset(variables)

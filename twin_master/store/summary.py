@@ -1,0 +1,280 @@
+"""The figures of a mission, each beside the one that the scenario gives as its reference."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin_master.assets.mismatch import Misfit
+from twin_master.assets.parameter import ParameterDraws
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.rewards import REWARD_NAMES
+from twin_master.scenario.schema import FALLBACK_FIGURES, MISFIT_FIGURES, Reference
+from twin_master.store.results import MissionResult
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_TOLERANCE = 1e-9
+_CHANGES_SAID = 3
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of a mission.
+
+    Attributes
+    ----------
+    key : str
+        Name for programs.
+    title : str
+        Name for people.
+    value : float, int, str or None
+        The figure; None where the mission gave none.
+    unit : str
+        Unit of `value` and `reference`, as printed.
+    reference : float, str or None
+        What the scenario gives to compare it with.
+    reference_source : str
+        Where that comes from.
+    """
+
+    key: str
+    title: str
+    value: float | int | str | None
+    unit: str = ""
+    reference: float | str | None = None
+    reference_source: str = ""
+
+
+@dataclass(frozen=True)
+class Fallback:
+    """How the control fell back to the gentler one.
+
+    Attributes
+    ----------
+    switch_state : str or None
+        The state factor on which alone the policy depends; None if it depends on several or none.
+    switch_level : float or None
+        Level of that factor from which the policy leaves the control of the first turn, SI.
+    called_for_step : int or None
+        First step at which the truth reaches that level.
+    fallback_step : int or None
+        First step from `called_for_step` on at which another control than that of the first turn is in force.
+    early_step : int or None
+        First step before `called_for_step` with another control.
+    """
+
+    switch_state: str | None
+    switch_level: float | None
+    called_for_step: int | None
+    fallback_step: int | None
+    early_step: int | None
+
+    @property
+    def delay(self) -> int | None:
+        """Steps from the damage that calls for it to the fallback."""
+        if self.fallback_step is None or self.called_for_step is None:
+            return None
+        return self.fallback_step - self.called_for_step
+
+
+def find_fallback(
+    model: GraphicalModel, policy_index: Index, first_control: int, control_index: Index, true_state: Float
+) -> Fallback:
+    """Return how the control fell back.
+
+    Parameters
+    ----------
+    model : GraphicalModel
+        S states with F factors.
+    policy_index : (S,)
+        Control of the policy in each state.
+    first_control : int
+        Control of the first turn.
+    control_index : (T,)
+        Controls flown.
+    true_state : (T, F)
+        True state, SI.
+    """
+    table = (policy_index != first_control).reshape(model.states.shape)
+    for axis, factor in enumerate(model.states.factors):
+        others = tuple(index for index in range(table.ndim) if index != axis)
+        any_of, all_of = table.any(axis=others), table.all(axis=others)
+        switched = np.flatnonzero(all_of)
+        if np.array_equal(any_of, all_of) and len(switched) and all_of[switched[0] :].all():
+            level = factor.levels[switched[0]]
+            return _fallback_of(factor.name, level, first_control, control_index, true_state[:, axis])
+    return Fallback(None, None, None, None, None)
+
+
+def _fallback_of(name: str, level: float, first_control: int, control_index: Index, truth: Float) -> Fallback:
+    reached = np.flatnonzero(truth >= level - _TOLERANCE)
+    other = np.flatnonzero(control_index != first_control)
+    called = int(reached[0]) if len(reached) else None
+    before = other[other < called] if called is not None else other
+    after = other[other >= called] if called is not None else other[:0]
+    return Fallback(
+        switch_state=name,
+        switch_level=float(level),
+        called_for_step=called,
+        fallback_step=int(after[0]) if len(after) else None,
+        early_step=int(before[0]) if len(before) else None,
+    )
+
+
+def filtered_rms_error(model: GraphicalModel, filtered: Float, true_state: Float) -> Float:
+    """Return the root mean square error of the filtered mean of each factor over the steps: (F,), SI."""
+    error = model.states.mean(filtered) - true_state
+    return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
+
+
+def summarise(
+    result: MissionResult, draws: ParameterDraws, reward_mean: Float, misfit: Misfit | None = None
+) -> tuple[Figure, ...]:
+    """Return the figures of a mission; all of them are the same for the same seed.
+
+    Parameters
+    ----------
+    result
+        The mission.
+    draws
+        The calibrated parameter.
+    reward_mean : (T, R)
+        Mean rewards under the filtered belief.
+    misfit
+        Of the twin's model, where the asset is known to be another one.
+    """
+    scenario, flight, model = result.scenario, result.flight, result.model
+    first = scenario.control_names.index(scenario.mission.first_control)
+    fallback = find_fallback(
+        model, result.plan.control_index, first, flight.control_index, flight.truth.state
+    )
+    units = {factor.name: factor.unit for factor in scenario.state}
+    figures = _fallback_figures(fallback, units, scenario.mission.step_name)
+    errors = filtered_rms_error(model, flight.filtered, flight.truth.state)
+    for factor, error in zip(scenario.state, errors, strict=True):
+        name, fraction = factor.name, factor.unit == "1"
+        figures.append(
+            Figure(
+                f"filtered_rms_error_{name}",
+                f"filtered rms error of {name}",
+                (100.0 if fraction else 1.0) * float(error),
+                "points" if fraction else factor.unit,
+            )
+        )
+    for index, name in enumerate(REWARD_NAMES):
+        known = reward_mean[np.isfinite(reward_mean[:, index]), index]
+        mean = float(known.mean()) if len(known) else None
+        figures.append(Figure(f"mean_reward_{name}", f"mean reward for {name}", mean))
+    label = draws.name.replace("_", " ")
+    for key, title, value in (
+        ("mean", "posterior mean", draws.mean),
+        ("standard_deviation", "posterior standard deviation", draws.standard_deviation),
+    ):
+        figures.append(Figure(f"{draws.name}_{key}", f"{title} of the {label}", value))
+    figures.append(
+        Figure("log_evidence", "log evidence of all observations", float(flight.log_evidence.sum()))
+    )
+    figures += _sensor_figures(flight.observed, scenario.mission.step_name)
+    if misfit is not None:
+        figures += _misfit_figures(misfit)
+    bound = flight.truth.monitors.get("strain_error_bound")
+    if bound is not None and set(scenario.observation.sensor_units) == {"1"}:
+        figures.append(
+            Figure(
+                "strain_error_bound", "worst certified strain error", 1e6 * float(bound.max()), "microstrain"
+            )
+        )
+    references = {entry.figure: entry for entry in scenario.reference}
+    return tuple(_beside(figure, references.get(figure.key)) for figure in figures)
+
+
+def control_changes(controls: Sequence[str], control_index: Index, step_name: str) -> str:
+    """Return in words when which control was left for which: ``left 3g for 2g at turn 31``.
+
+    Parameters
+    ----------
+    controls : (U,)
+        Names of the controls.
+    control_index : (T,)
+        Controls flown.
+    step_name : str
+        What a step is called.
+    """
+    steps = (np.flatnonzero(np.diff(control_index)) + 1).tolist()
+    if not steps:
+        return f"{controls[int(control_index[0])]} at every {step_name}"
+    changes = [
+        f"left {controls[int(control_index[step - 1])]} for {controls[int(control_index[step])]} "
+        f"at {step_name} {step}"
+        for step in steps[:_CHANGES_SAID]
+    ]
+    more = len(steps) - len(changes)
+    return ", ".join(changes) + (f", and {more} more change{'s' if more > 1 else ''}" if more else "")
+
+
+def _beside(figure: Figure, reference: Reference | None) -> Figure:
+    if reference is None:
+        return figure
+    return replace(figure, reference=reference.value, reference_source=reference.source)
+
+
+def _fallback_figures(fallback: Fallback, units: Mapping[str, str], step_name: str) -> list[Figure]:
+    level, name = fallback.switch_level, fallback.switch_state
+    unit = units.get(name or "", "")
+    if level is not None and unit == "1":
+        level, unit = 100.0 * level, "%"
+    switch_damage, damage_step, fallback_step, fallback_delay, early_step = FALLBACK_FIGURES
+    one = fallback.delay == 1
+    switch = Figure(
+        switch_damage,
+        f"policy leaves the first control from {name}" if name else "policy leaves the first control",
+        level if level is not None else "nowhere, or by several states",
+        unit,
+    )
+    if name is None:
+        return [switch]
+    return [
+        switch,
+        Figure(damage_step, f"{step_name} of the damage that calls for it", fallback.called_for_step),
+        Figure(fallback_step, f"{step_name} of the fallback", fallback.fallback_step),
+        Figure(
+            fallback_delay, "delay of the fallback", fallback.delay, step_name if one else f"{step_name}s"
+        ),
+        Figure(early_step, f"{step_name} of a fallback before the damage", fallback.early_step),
+    ]
+
+
+def _sensor_figures(observed: Float, step_name: str) -> list[Figure]:
+    received = np.isfinite(observed)
+    blind = np.flatnonzero(~received.any(axis=1))
+    if received.all():
+        return []
+    figures = [Figure("lost_observations", "observations lost", 100.0 * float(1.0 - received.mean()), "%")]
+    if len(blind):
+        steps = ", ".join(str(step) for step in blind)
+        figures.append(
+            Figure(
+                "blind_steps", f"{step_name}s without any observation (belief follows the dynamics)", steps
+            )
+        )
+    return figures
+
+
+def _misfit_figures(misfit: Misfit) -> list[Figure]:
+    rms, largest = MISFIT_FIGURES
+    value, sensor = misfit.largest
+    return [
+        Figure(rms, "misfit of the twin's model, rms over sensors and states", 100 * misfit.rms, "%"),
+        Figure(largest, f"largest misfit, at sensor {sensor + 1}", 100.0 * value, "%"),
+    ]
+
+
+def to_record(figures: Sequence[Figure], heading: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of `summary.json`: the heading, and each figure beside its reference."""
+    return {**heading, "figures": [asdict(figure) for figure in figures]}
