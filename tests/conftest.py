@@ -26,6 +26,24 @@ settings.register_profile("developer", deadline=None)
 settings.load_profile("ci" if os.environ.get("CI") else "developer")
 
 
+LONGEST_COMPARED = 10_000
+"""Items of a sequence; pytest looks for hours for the differences of two files of a megabyte."""
+
+
+def pytest_assertrepr_compare(op: str, left: object, right: object) -> list[str] | None:
+    """Say where two long sequences begin to differ, and no more."""
+    for kind in (bytes, str, list, tuple):
+        if op == "==" and isinstance(left, kind) and isinstance(right, kind):
+            if max(len(left), len(right)) <= LONGEST_COMPARED:
+                return None
+            same = next(
+                (k for k, (one, other) in enumerate(zip(left, right, strict=False)) if one != other),
+                min(len(left), len(right)),
+            )
+            return [f"{len(left)} and {len(right)} items of {kind.__name__} differ from item {same} on"]
+    return None
+
+
 def synthetic_library() -> dict[str, object]:
     """A strain library in the published format, of a wing that never was: 24 gauges, 5 draws of e."""
     row = np.linspace(2910.0, 450.0, 16)

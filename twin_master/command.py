@@ -153,6 +153,7 @@ def show_outcome(outcome: RunOutcome) -> None:
             table.add_row(f"{part}, per {outcome.step_name}", f"{median:.3g} ms (largest {largest:.3g} ms)")
     table.add_row("whole run", f"{outcome.timing['total_seconds']:.3g} s")
     console.print(table)
+    console.print(f"The twin {outcome.control}.", soft_wrap=True)
     if outcome.origin.differ:
         console.print(
             f"Asset and twin's model differ: flown was the {outcome.origin.asset}, and the twin believes the "

@@ -47,9 +47,9 @@ from twin_master.run_folder import (
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import check_seed
-from twin_master.store.outcome import RunOutcome, finished_run
+from twin_master.store.outcome import RunOutcome, finished_run, read_outcome
 from twin_master.store.results import MissionResult
-from twin_master.store.summary import Figure, control_changes, summarise
+from twin_master.store.summary import control_changes, summarise
 from twin_master.store.writing import (
     store_mission,
     values_of,
@@ -204,14 +204,13 @@ def _run(
         hashes = dict(source.prepare(folder, progress))
         policy = _given_policy(folder, hashes)
     config = with_inputs(folder, config, hashes)
-    figures, timing = _fly_and_store(folder, config, scenario, source, policy, clock, progress)
-    page: Path | None = None
+    timing = _fly_and_store(folder, config, scenario, source, policy, clock, progress)
     if report:
         with clock.stage("report"), progress.stage("Writing the report"), _kept(folder):
-            page = _report(folder)
+            _report(folder)
     timing |= {"stages_seconds": dict(clock.stages), "total_seconds": time.perf_counter() - clock.begin}
     write_timing(folder, timing)
-    return RunOutcome(folder, page, figures, timing, source.origin, scenario.mission.step_name)
+    return read_outcome(folder)
 
 
 def _fly_and_store(
@@ -222,8 +221,8 @@ def _fly_and_store(
     policy: NDArray[np.float64] | None,
     clock: _Clock,
     progress: Progress,
-) -> tuple[tuple[Figure, ...], dict[str, Any]]:
-    """Return summary and timing of the turns; twin and mission are let go of before the report is drawn."""
+) -> dict[str, Any]:
+    """Return the timing of the turns; twin and mission are let go of before the report is drawn."""
     with (
         _unflown(folder),
         clock.stage("calibration"),
@@ -241,8 +240,8 @@ def _fly_and_store(
     with clock.stage("mission"), _kept(folder):
         result = _fly(folder, config, knowledge, source, progress)
     with clock.stage("store"), progress.stage("Storing"), _kept(folder):
-        figures = _store(folder, config, knowledge, source, result)
-    return figures, _timing(result.flight)
+        _store(folder, config, knowledge, source, result)
+    return _timing(result.flight)
 
 
 def _given_policy(folder: Path, hashes: dict[str, str]) -> NDArray[np.float64] | None:
@@ -334,7 +333,7 @@ def _fly(
 
 def _store(
     folder: Path, config: Mapping[str, Any], knowledge: Knowledge, source: AssetSource, result: MissionResult
-) -> tuple[Figure, ...]:
+) -> None:
     provenance, mission = config["provenance"], knowledge.scenario.mission
     attributes = {
         "title": mission.title or mission.name,
@@ -359,7 +358,6 @@ def _store(
     said = {"control": control_changes(controls, result.flight.control_index, mission.step_name)}
     origin = {"asset": source.origin.asset, "twin_model": source.origin.model}
     write_summary(folder, figures, heading | said | origin | {"asset_and_model_differ": source.origin.differ})
-    return figures
 
 
 def _misfit(knowledge: Knowledge, source: AssetSource) -> Misfit | None:
@@ -404,7 +402,7 @@ def _timing(flight: Flight) -> dict[str, Any]:
     return record
 
 
-def _report(folder: Path) -> Path:
+def _report(folder: Path) -> None:
     from twin_master.report.page import write_report
 
-    return write_report(folder)
+    write_report(folder)

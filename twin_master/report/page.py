@@ -207,7 +207,7 @@ def _summary_figures(record: RunRecord) -> list[Mapping[str, Any]]:
 
 def _add_outcome(page: Page, record: RunRecord) -> None:
     said = control_changes(record.controls, record.control_index, record.step_word)
-    page.add_paragraph(f"The twin {said}." if said.startswith("left") else f"The twin flew {said}.")
+    page.add_paragraph(f"The twin {said}.")
     page.add_highlights(_highlights(record))
     for text in _notices(record):
         page.add_notice(text)

@@ -36,6 +36,8 @@ class RunOutcome:
         What was flown and what the twin believed, in words.
     step_name : str
         What a step is called.
+    control : str
+        When which control was left for which, in words.
     """
 
     folder: Path
@@ -43,21 +45,39 @@ class RunOutcome:
     figures: tuple[Figure, ...]
     timing: Mapping[str, Any]
     origin: FlownAndBelieved
-    step_name: str = "turn"
+    step_name: str
+    control: str
+
+
+def read_outcome(folder: Path) -> RunOutcome:
+    """Return what came of the run in a folder.
+
+    Raises
+    ------
+    OSError, ValueError, KeyError, TypeError, DamagedFileError
+        A result is missing or damaged.
+    """
+    report = folder / REPORT_NAME
+    timing, summary = (
+        json.loads((folder / name).read_text(encoding="utf-8")) for name in (TIMING_NAME, SUMMARY_NAME)
+    )
+    return RunOutcome(
+        folder,
+        report if report.is_file() else None,
+        tuple(Figure(**figure) for figure in summary["figures"]),
+        timing,
+        FlownAndBelieved(
+            str(summary["asset"]), str(summary["twin_model"]), bool(summary["asset_and_model_differ"])
+        ),
+        str(read_config(folder)["scenario"]["mission"]["step_name"]),
+        str(summary["control"]),
+    )
 
 
 def finished_run(folder: Path) -> RunOutcome | None:
     """Return the outcome of a run that is finished; None where its results are missing or damaged."""
-    report = folder / REPORT_NAME
     try:
-        timing, summary = (
-            json.loads((folder / name).read_text(encoding="utf-8")) for name in (TIMING_NAME, SUMMARY_NAME)
-        )
         read_run(folder)
-        figures = tuple(Figure(**figure) for figure in summary["figures"])
-        differ = bool(summary["asset_and_model_differ"])
-        origin = FlownAndBelieved(str(summary["asset"]), str(summary["twin_model"]), differ)
-        step_name = str(read_config(folder)["scenario"]["mission"]["step_name"])
+        return read_outcome(folder)
     except (OSError, ValueError, KeyError, TypeError, DamagedFileError):
         return None
-    return RunOutcome(folder, report if report.is_file() else None, figures, timing, origin, step_name)

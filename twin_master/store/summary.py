@@ -208,7 +208,7 @@ def control_changes(controls: Sequence[str], control_index: Index, step_name: st
     """
     steps = (np.flatnonzero(np.diff(control_index)) + 1).tolist()
     if not steps:
-        return f"{controls[int(control_index[0])]} at every {step_name}"
+        return f"flew {controls[int(control_index[0])]} at every {step_name}"
     changes = [
         f"left {controls[int(control_index[step - 1])]} for {controls[int(control_index[step])]} "
         f"at {step_name} {step}"

@@ -56,7 +56,9 @@ def test_the_response_is_linear_in_the_loads(coarse_operators, load_factor, tip_
     turn = solve_static(coarse_operators, load_factor=1.0).strain
     tip = solve_static(coarse_operators, load_factor=0.0, tip_force=1.0).strain
     both = solve_static(coarse_operators, load_factor=load_factor, tip_force=tip_force).strain
-    assert both == pytest.approx(load_factor * turn + tip_force * tip, rel=1e-5, abs=1e-9)
+    # thin cells: about 1e-6 of the largest is what double precision reaches, whatever cancels
+    parts = abs(load_factor) * np.abs(turn).max() + abs(tip_force) * np.abs(tip).max()
+    assert both == pytest.approx(load_factor * turn + tip_force * tip, rel=0.0, abs=1e-5 * parts)
 
 
 @settings(max_examples=3, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

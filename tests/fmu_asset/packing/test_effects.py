@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -352,6 +353,7 @@ def command(*words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "uav_twin", "fmu", *map(str, words)],
         cwd=ROOT,
+        env=dict(os.environ),  # without COLUMNS, which readline sets for children beside Python's own record
         capture_output=True,
         text=True,
         check=False,

@@ -320,7 +320,8 @@ def test_the_shipped_scenario_in_process_in_workers_and_resumed(
     resume_run(tmp_path / "part")
     for name in ("run.nc", "config.json", "summary.json", "checkpoint.jsonl"):
         assert (tmp_path / "part" / name).read_bytes() == (whole / name).read_bytes(), name
-    drawn = [asset_source(resolve_scenario(loaded, Overrides(seed=seed))).parameters() for seed in (7, 8)]
+    scenarios = [resolve_scenario(loaded, Overrides(seed=seed)) for seed in (7, 8)]
+    drawn = [scenario.asset.source(scenario).parameters() for scenario in scenarios]
     assert all(drawn[0][name] != drawn[1][name] for name in ("damage_seed", "gauge_seed"))
     received = np.genfromtxt(whole / "csv" / "observed.csv", delimiter=",", skip_header=1)[:, 6]
     assert np.flatnonzero(np.isnan(received)).tolist() == [20, 21, 22, 23]  # the sixth gauge is lost

@@ -148,8 +148,10 @@ def test_what_is_flown_and_what_is_believed_has_its_name(tmp_path: Path) -> None
 def mission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
 
-    def fly(name: str, lines: str = "", parameters: str = "") -> tuple[RunOutcome, dict[str, np.ndarray]]:
-        loaded = load_scenario(write_scenario(tmp_path / "scenario", lines, parameters))
+    def fly(
+        name: str, lines: str = "", parameters: str = "", belief: str = ""
+    ) -> tuple[RunOutcome, dict[str, np.ndarray]]:
+        loaded = load_scenario(write_scenario(tmp_path / "scenario", lines, parameters, belief))
         outcome = new_run(loaded, tmp_path / name, Overrides(in_process=True))
         with xr.open_datatree(outcome.folder / "run.nc", engine="h5netcdf") as tree:
             shown = {

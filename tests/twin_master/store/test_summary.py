@@ -113,7 +113,7 @@ def test_figures_stand_beside_the_references_of_the_scenario(
 
 def test_a_change_of_control_is_said_in_words() -> None:
     names = ("2g", "3g", "rest")
-    assert control_changes(names, np.array([1, 1, 1]), "turn") == "3g at every turn"
+    assert control_changes(names, np.array([1, 1, 1]), "turn") == "flew 3g at every turn"
     assert control_changes(names, np.array([1, 1, 0, 0]), "turn") == "left 3g for 2g at turn 2"
     several = control_changes(names, np.array([1, 0, 1, 2, 0, 1]), "shift")
     assert several == (
