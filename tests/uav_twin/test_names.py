@@ -63,7 +63,7 @@ def test_the_import_is_lazy_and_an_unknown_name_is_refused(tmp_path: Path) -> No
     "use", ["import uav_twin; uav_twin.load_design()", "from uav_twin import load_design; load_design()"]
 )
 def test_a_file_that_hides_a_package_is_named(hidden: str, use: str, tmp_path: Path) -> None:
-    """A folder without `__init__.py` hides ours in an editable install only; elsewhere it is left in peace."""
+    """A folder without `__init__.py` hides ours in editable installs only; else it is left in peace."""
     if hidden.endswith(".py"):
         (tmp_path / hidden).parent.mkdir(exist_ok=True)
         (tmp_path / hidden).write_text("", encoding="utf-8")
