@@ -68,7 +68,7 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
     """
     file = Path(path)
     size, sha256 = _size_and_hash(file)
-    names = _check_archive(file, size)
+    names = check_archive(file, size)
     if "modelDescription.xml" not in names:
         raise FmuFileError(f"{file} is an archive without modelDescription.xml, so it is not an FMU.")
     root = _model_description(file)
@@ -174,8 +174,14 @@ def _size_and_hash(file: Path) -> tuple[int, str]:
         raise FmuFileError(f"{file} cannot be read ({error.strerror}).") from error
 
 
-def _check_archive(file: Path, size: int) -> set[str]:
-    """Check structure, checksums, names and sizes of the archive; return the names of its files."""
+def check_archive(file: Path, size: int, what: str = "FMU", again: str = "build") -> set[str]:
+    """Check structure, checksums, names and sizes of an archive; return the names of its files.
+
+    Raises
+    ------
+    FmuFileError
+        If it is damaged or unsafe; the sentence says `what` it should be and how to get it `again`.
+    """
     try:
         with zipfile.ZipFile(file) as archive:
             entries = archive.infolist()
@@ -185,15 +191,13 @@ def _check_archive(file: Path, size: int) -> set[str]:
             if len(entries) > _MOST_ENTRIES or len({*names}) < len(names):
                 raise FmuFileError(
                     f"{file} holds {len(entries)} entries, too many or some twice; no tool exports that, "
-                    "and it "
-                    "was refused."
+                    "and it was refused."
                 )
             extracted = sum(entry.file_size for entry in entries)
             if extracted > min(LARGEST_EXTRACTED_BYTES, max(_SMALL_ENOUGH, _LARGEST_RATIO * size)):
                 raise FmuFileError(
                     f"{file} has {size / 1024**2:.3g} MiB and would extract to {extracted / 1024**2:.0f} "
-                    "MiB, "
-                    "which looks like an archive made to fill the disk; it was refused."
+                    "MiB, which looks like an archive made to fill the disk; it was refused."
                 )
             broken = archive.testzip()
             if broken is not None:
@@ -201,7 +205,7 @@ def _check_archive(file: Path, size: int) -> set[str]:
             return {*names}
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError) as error:
         raise FmuFileError(
-            f"{file} is not a sound FMU archive ({error}); fetch or build it again."
+            f"{file} is not a sound {what} archive ({error}); fetch or {again} it again."
         ) from error
 
 

@@ -41,13 +41,10 @@ from .contents import (
     tag_of,
 )
 from .patch_file import PatchFile
-from .patched_runtime import output_channels, patched_members, plain_effects
+from .patched_runtime import MODE_COUNT, output_channels, patched_members, plain_effects
 
 FmuKind = Literal["python", "compiled", "source"]
 """Run by Python, compiled for this machine, or the sources of the compiled one alone."""
-
-MODE_COUNT = 6
-"""Number of modes of which frequency and damping ratio are outputs, if the model has as many."""
 
 DESCRIPTION = (
     "Structure of a UAV half-wing: strains, tip displacement and modes from a reduced finite element model "
@@ -67,17 +64,11 @@ class UavWing_0_content_0_(WingSlave, Fmi2Slave):
     content_tag = "0_content_0_"
 '''
 
-_ENTRY = '''"""Joins the slave, the reduced model and pythonfmu's base class."""
+_ENTRY = '''"""Joins the slave, its contents and pythonfmu's base class."""
 import ctypes
-import json
 
-from .fe.damping import rayleigh_damping_ratio
-from .fe.reduced import ReducedModel
-from .fe.transient import ModalIntegrator, TransientState
 from .pythonfmu.fmi2slave import Fmi2Slave
-from .slaves.base import Contents
-from .slaves.behaviour import Physics, WingBehaviour
-from .slaves.variables import variable_table
+from .slaves.wing_contents import load_contents
 from .slaves.wing_slave import WingSlave as _WingSlave
 
 __all__ = ["Fmi2Slave", "WingSlave", "keep_alive"]
@@ -90,26 +81,17 @@ def keep_alive(thing):
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(thing))
 
 
-def load_contents(resources):
-    """Read the model once in a process: this package's name is a hash of its content."""
+def load_once(resources):
+    """Read the contents once in a process: this package's name is a hash of them."""
     if not _contents:
-        model = ReducedModel.load(resources / "reduced_model.npz")
-        setting = json.loads((resources / "start.json").read_text(encoding="utf-8"))
-        table = variable_table(
-            gauge_count=model.gauge_count,
-            mode_count=setting["mode_count"],
-            validity=model.validity,
-            start=setting["start"],
-        )
-        physics = Physics(model, ModalIntegrator, TransientState, rayleigh_damping_ratio)
-        _contents.append(Contents(table, lambda: WingBehaviour(physics, setting["mode_count"])))
+        _contents.append(load_contents(resources))
     return _contents[0]
 
 
 class WingSlave(_WingSlave):
     """The slave with its resources."""
 
-    load_contents = staticmethod(load_contents)
+    load_contents = staticmethod(load_once)
 '''
 
 
@@ -239,7 +221,7 @@ def fmu_bytes(
     if kind == "python":
         template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start}, description)
         if effects:
-            template |= patched_members(f"resources/uav_wing_{PLACEHOLDER}_runtime", model, effects, arrays)
+            template |= patched_members(model, effects, arrays)
     else:
         template = compiled_members(
             model,

@@ -1,20 +1,16 @@
 """The SSP archive: checked before it is used, packed to the same bytes, its XML valid by the schemas."""
 
-from __future__ import annotations
-
-import io
 import os
 import posixpath
 import zipfile
 import zlib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from lxml import etree
 
-from fmu_asset.archive.fmu_file import LARGEST_EXTRACTED_BYTES, _check_entry
+from fmu_asset.archive.fmu_file import check_archive
 from fmu_asset.errors import FmuFileError, SspError
 
 SSD_NAME = "SystemStructure.ssd"
@@ -33,7 +29,6 @@ _SCHEMAS = {
     "ssv": "SystemStructureParameterValues.xsd",
     "ssm": "SystemStructureParameterMapping.xsd",
 }
-_DATE = (1980, 1, 1, 0, 0, 0)
 
 
 class SspPackage:
@@ -57,35 +52,9 @@ class SspPackage:
                 f"There is no SSP file {self.path}; check the path, or write it with `uav-twin ssp export`."
             )
         try:
-            with zipfile.ZipFile(self.path) as archive:
-                entries = archive.infolist()
-                for entry in entries:
-                    _check_entry(self.path, entry)
-                if sum(entry.file_size for entry in entries) > LARGEST_EXTRACTED_BYTES:
-                    raise SspError(
-                        f"{self.path} would extract to more than {LARGEST_EXTRACTED_BYTES // 1024**3} GiB."
-                    )
-                broken = archive.testzip()
-                if broken is not None:
-                    raise SspError(
-                        f"{self.path} is damaged: the checksum of {broken} is wrong; fetch it again."
-                    )
-                self.names = {entry.filename for entry in entries if not entry.is_dir()}
+            self.names = check_archive(self.path, self.path.stat().st_size, "SSP", "export")
         except FmuFileError as error:
             raise SspError(error.sentence) from error
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            NotImplementedError,
-            RuntimeError,
-            OSError,
-        ) as error:
-            if isinstance(error, SspError):
-                raise
-            raise SspError(
-                f"{self.path} is not a sound SSP archive ({error}); fetch or export it again."
-            ) from error
         if SSD_NAME not in self.names:
             raise SspError(f"{self.path} is an archive without {SSD_NAME}, so it is no SSP file.")
 
@@ -178,15 +147,3 @@ def validate(root: Any, kind: str, where: str) -> None:
 def tag(kind: str, name: str) -> str:
     """Return a tag with its namespace."""
     return f"{{{NAMESPACES[kind]}}}{name}"
-
-
-def pack(members: Mapping[str, bytes]) -> bytes:
-    """Return an archive with fixed dates and order; stored, since compression differs between versions."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name in sorted(members, key=lambda name: (name != SSD_NAME, name)):
-            entry = zipfile.ZipInfo(name, date_time=_DATE)
-            entry.create_system = 3
-            entry.external_attr = 0o644 << 16
-            archive.writestr(entry, members[name])
-    return buffer.getvalue()

@@ -13,9 +13,10 @@ from fmu_asset.coupling.structure import Component, Connection, Endpoint, Settin
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.description import number
 from fmu_asset.errors import SspError
+from fmu_asset.packing.contents import archive_bytes
 from reporting.files import atomic_write_bytes
 
-from .package import NAMESPACES, OWN_ANNOTATION, OWN_NAMESPACE, SSD_NAME, pack, parse_xml, tag, validate
+from .package import NAMESPACES, OWN_ANNOTATION, OWN_NAMESPACE, SSD_NAME, parse_xml, tag, validate
 
 SSV_NAME = "resources/parameters.ssv"
 SSM_NAME = "resources/parameters.ssm"
@@ -76,7 +77,7 @@ def ssp_bytes(
         validate(parse_xml(members[name], name), kind, name)
     for component in wiring.structure.components:
         members[_resource(component)] = component.fmu.read_bytes()
-    return pack(members)
+    return archive_bytes(members, SSD_NAME)
 
 
 def _resource(component: Component) -> str:
