@@ -1,7 +1,5 @@
 """Tables of files as checked records: strict sections, and one sentence for what is wrong with them."""
 
-from __future__ import annotations
-
 import re
 from typing import TypeVar
 

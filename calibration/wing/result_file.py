@@ -4,8 +4,6 @@ Groups `prior`, `posterior`, `geometry`, `quantity_of_interest` and `measured` h
 units; the root's attributes hold the name of the wing, the tailored design, the steps and the provenance.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -128,11 +128,6 @@ def field_basis(operators: "AffineOperators", reduction: "Reduction") -> FieldBa
         The full model.
     reduction : Reduction
         What was made of it.
-
-    Returns
-    -------
-    FieldBasis
-        The bases on nodes and cells.
     """
     from skfem import ElementHexS2
 
@@ -181,10 +176,8 @@ def write_wing_vtu(
         The file; an existing one is replaced.
     wing : WingFields
         The wing, from `fe.reduction.model_cache.wing_fields`.
-    young_modulus_factor : float
-        e [1].
-    stiffness_loss : tuple of float
-        (z1, z2), fractions.
+    young_modulus_factor, stiffness_loss
+        As of `fe.runtime.state.DigitalState`.
     load_factor : float
         Load factor [1].
     tip_force : float
@@ -237,12 +230,8 @@ def write_modes_vtu(
         The file; an existing one is replaced.
     wing : WingFields
         The wing, from `fe.reduction.model_cache.wing_fields`.
-    young_modulus_factor : float
-        e [1].
-    stiffness_loss : tuple of float
-        (z1, z2), fractions.
-    servo_mass, pitot_mass : float
-        Masses [kg].
+    young_modulus_factor, stiffness_loss, servo_mass, pitot_mass
+        As of `fe.runtime.state.DigitalState`.
 
     Raises
     ------

@@ -154,11 +154,6 @@ def reduce_modes(
     advance : callable
         Called after each sampled state.
 
-    Returns
-    -------
-    ModalData
-        Basis and projected terms.
-
     Raises
     ------
     ReductionError

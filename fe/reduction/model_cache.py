@@ -73,11 +73,6 @@ def reduced_model(
     settings : ReductionSettings, optional
         Where and how well the model is to hold.
 
-    Returns
-    -------
-    ReducedModel
-        The model.
-
     Raises
     ------
     FiniteElementError

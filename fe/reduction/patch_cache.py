@@ -31,11 +31,6 @@ def patch_arrays(
     settings : PatchSettings, optional
         How far changes may go and how well they are held.
 
-    Returns
-    -------
-    PatchArrays
-        For `fe.runtime.patched_wing.PatchedWing`.
-
     Raises
     ------
     FiniteElementError

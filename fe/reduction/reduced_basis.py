@@ -267,11 +267,6 @@ def reduce_model(
     progress : Progress, optional
         Where to report.
 
-    Returns
-    -------
-    Reduction
-        The model and its bases.
-
     Raises
     ------
     ReductionError

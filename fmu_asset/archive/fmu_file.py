@@ -1,7 +1,5 @@
 """An FMU file from outside: sound, safe to extract, of a kind that can be flown, and what it declares."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re
@@ -53,11 +51,6 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
     interface : {"co-simulation", "model-exchange"}, optional
         How it is to be run; co-simulation where it offers that.
 
-    Returns
-    -------
-    FmuDescription
-        What it declares.
-
     Raises
     ------
     FmuFileError
@@ -93,9 +86,8 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
         raise FmuFileError(f"The model description of {file} cannot be read ({why}).") from error
     if not _IDENTIFIER.fullmatch(description.model_identifier):
         raise FmuFileError(
-            f"The model identifier of {file}, {description.model_identifier!r}, is no name of a C "
-            "function; the "
-            "FMU is damaged or unsafe."
+            f"The model identifier of {file}, {description.model_identifier!r}, is no name of a C function; "
+            "the FMU is damaged or unsafe."
         )
     here = platform_tuple if description.major_version == 3 else fmi_platform
     binary = f"binaries/{here}/{description.model_identifier}{sharedLibraryExtension}"
@@ -249,9 +241,8 @@ def _model_description(file: Path) -> Element:
         with zipfile.ZipFile(file) as archive:
             if archive.getinfo("modelDescription.xml").file_size > _LARGEST_DESCRIPTION:
                 raise FmuFileError(
-                    f"The model description of {file} is larger than {_LARGEST_DESCRIPTION // 1024**2} "
-                    "MiB; it "
-                    "was refused."
+                    f"The model description of {file} is larger than {_LARGEST_DESCRIPTION // 1024**2} MiB; "
+                    "it was refused."
                 )
             text = archive.read("modelDescription.xml")
         parser = XMLParser(target=_WithoutDocumentType())

@@ -1,7 +1,5 @@
 """Packing the companions of the wing as FMUs, by the machinery that packs it; equal input, equal bytes."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Mapping

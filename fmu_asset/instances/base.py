@@ -5,8 +5,6 @@ blocks of doubles that are allocated once: `request` is time, step size, then al
 outputs. Integers and Booleans are doubles in the blocks.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys

@@ -1,7 +1,5 @@
 """Co-simulation of FMI 1.0, 2.0 and 3.0 through fmpy's slaves."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Model exchange of FMI 1.0, 2.0 and 3.0 as if it were co-simulation: fmpy's models and CVODE."""
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 from collections.abc import Callable
@@ -128,8 +126,7 @@ class ModelExchange(FmuInstance):
                 self._lost = True
                 raise FmuCallError(
                     f"The solver could not integrate the FMU in the step from t = {time:g} s ({error}); "
-                    "reset "
-                    "the asset, and try a smaller step_size or another tolerance in the binding.",
+                    "reset the asset, and try a smaller step_size or another tolerance in the binding.",
                     self._texts(),
                 ) from error
         if not event and abs(time - end) <= close:

@@ -4,8 +4,6 @@ The files of an FMU are first written with a placeholder wherever its content ha
 GUID, module names). The hash is taken over them, and then fills the places.
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import io

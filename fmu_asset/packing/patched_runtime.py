@@ -1,7 +1,5 @@
 """What a wing that carries missing effects needs beside the plain one: effects, arrays, behaviour."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

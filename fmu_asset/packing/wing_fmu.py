@@ -5,8 +5,6 @@ pythonfmu's; the archive is packed here and not by its builder, which stamps tim
 names that two FMUs in one process would share.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import zipfile
@@ -159,11 +157,6 @@ def build_fmu(
     replace : bool
         Whether an existing file may be replaced.
 
-    Returns
-    -------
-    FmuInfo
-        What was built.
-
     Raises
     ------
     FmuBuildError
@@ -269,11 +262,6 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
 
     The two differ when the file was changed after it was built. A compiled binary is not part of the content,
     since every compiler makes another one of the same sources.
-
-    Parameters
-    ----------
-    path : path-like
-        A wing FMU.
 
     Returns
     -------

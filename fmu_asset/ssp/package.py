@@ -34,11 +34,6 @@ _SCHEMAS = {
 class SspPackage:
     """An SSP file that was checked: sound, safe, and with a system structure in it.
 
-    Parameters
-    ----------
-    path : path-like
-        The file.
-
     Raises
     ------
     SspError
@@ -80,8 +75,7 @@ class SspPackage:
         if outside or not parts.path or name.startswith(("/", "..")) or "\\" in name:
             raise SspError(
                 f"{what} in {self.path} names the source {source!r}, which lies outside the archive; only "
-                "files "
-                "inside it are used."
+                "files inside it are used."
             )
         if name not in self.names:
             raise SspError(f"{what} in {self.path} names the source {source!r}, which is not in the archive.")

@@ -1,7 +1,5 @@
 """Writing a system of FMUs as an SSP file: SSD, SSV, SSM and the FMUs; equal systems give equal bytes."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from importlib.metadata import version

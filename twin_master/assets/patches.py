@@ -1,7 +1,5 @@
 """Missing effects in a mission: in the asset that flies, and in the model that the twin believes."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

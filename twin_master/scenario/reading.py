@@ -1,7 +1,5 @@
 """Reading scenario files: TOML in, a checked `Scenario` out, and one clear sentence for whatever is wrong."""
 
-from __future__ import annotations
-
 import hashlib
 import typing
 from collections.abc import Mapping, Sequence

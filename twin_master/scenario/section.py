@@ -1,7 +1,5 @@
 """A table of a scenario file: what all tables have in common, and the kinds of values that they hold."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
