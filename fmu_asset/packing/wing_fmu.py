@@ -10,7 +10,6 @@ import os
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
@@ -18,10 +17,9 @@ from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import STIFFNESS_LOSS_NAMES, DigitalState
 from fmu_asset.compiled.package import DATA_FILE, binary_of, compiled_members
-from fmu_asset.description import documentation_page, model_description
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.slaves.effect_variables import effect_rows, switch_of, units_of
-from fmu_asset.slaves.variables import UNITS, FmuVariable, variable_table
+from fmu_asset.slaves.variables import UNITS, variable_table
 from reporting.files import atomic_write_bytes
 
 from .contents import (
@@ -33,13 +31,12 @@ from .contents import (
     emptied,
     filled,
     guid_of,
-    pythonfmu_members,
-    pythonfmu_version,
     room_members,
     tag_of,
 )
 from .patch_file import PatchFile
 from .patched_runtime import MODE_COUNT, output_channels, patched_members, plain_effects
+from .python_fmu import python_members
 
 FmuKind = Literal["python", "compiled", "source"]
 """Run by Python, compiled for this machine, or the sources of the compiled one alone."""
@@ -49,48 +46,9 @@ DESCRIPTION = (
     "under load factor and tip force, with two regions that can lose stiffness."
 )
 
-_SCRIPT = '''"""Loaded by the FMI wrapper; everything is in the package beside it."""
-from uav_wing_0_content_0__runtime.entry import Fmi2Slave, WingSlave, keep_alive
-
-# The wrapper runs this file once for each instance and drops one reference to its globals too many.
-keep_alive(globals())
-
-
-class UavWing_0_content_0_(WingSlave, Fmi2Slave):
-    """The wing."""
-
-    content_tag = "0_content_0_"
-'''
-
-_ENTRY = '''"""Joins the slave, its contents and pythonfmu's base class."""
-import ctypes
-
-from .pythonfmu.fmi2slave import Fmi2Slave
-from .slaves.wing_contents import load_contents
-from .slaves.wing_slave import WingSlave as _WingSlave
-
-__all__ = ["Fmi2Slave", "WingSlave", "keep_alive"]
-
-_contents = []
-
-
-def keep_alive(thing):
-    """Hold one more reference for ever, also while the interpreter shuts down and clears this module."""
-    ctypes.pythonapi.Py_IncRef(ctypes.py_object(thing))
-
-
-def load_once(resources):
-    """Read the contents once in a process: this package's name is a hash of them."""
-    if not _contents:
-        _contents.append(load_contents(resources))
-    return _contents[0]
-
-
-class WingSlave(_WingSlave):
-    """The slave with its resources."""
-
-    load_contents = staticmethod(load_once)
-'''
+_IMPORTS = """from .slaves.wing_contents import load_contents
+from .slaves.wing_slave import WingSlave as _Slave
+"""
 
 
 @dataclass(frozen=True)
@@ -212,7 +170,19 @@ def fmu_bytes(
         check_start(table)
     description = f"{DESCRIPTION} {note}".strip()
     if kind == "python":
-        template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start}, description)
+        setting = {"mode_count": mode_count, "start": start}
+        template = python_members(
+            "uav_wing",
+            "UavWing_",
+            imports=_IMPORTS,
+            table=table,
+            description=description,
+            resources={
+                "reduced_model.npz": model.to_bytes(),
+                "start.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode(),
+            },
+            units=UNITS + units_of(table),
+        ) | room_members("fe.runtime", f"resources/uav_wing_{PLACEHOLDER}_runtime/fe")
         if effects:
             template |= patched_members(model, effects, arrays)
     else:
@@ -279,34 +249,3 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
         tag = members["resources/slavemodule.txt"].decode("ascii").strip().removeprefix("uav_wing_")
     declared = root.split('guid="', 1)[1].split('"', 1)[0]
     return declared, guid_of(content_hash_of(emptied(members, tag, declared)))
-
-
-def _members(
-    model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str, object], description: str
-) -> dict[str, bytes]:
-    """Return the files of the archive, with the placeholder wherever the content hash will stand."""
-    installed = pythonfmu_version()
-    module = f"uav_wing_{PLACEHOLDER}"
-    runtime = f"resources/{module}_runtime"
-    members = {
-        "modelDescription.xml": model_description(
-            identifier=module,
-            guid=PLACEHOLDER,
-            table=table,
-            description=description,
-            version=version("uav-twin"),
-            generation_tool=f"uav-twin with PythonFMU {installed}",
-            units=UNITS + units_of(table),
-        ),
-        "documentation/index.html": documentation_page(table, description),
-        "resources/reduced_model.npz": model,
-        "resources/start.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode(),
-        f"resources/{module}.py": _SCRIPT.encode(),
-        f"{runtime}/__init__.py": b'"""The wing FMU."""\n',
-        f"{runtime}/entry.py": _ENTRY.encode(),
-        f"{runtime}/pythonfmu/__init__.py": b'"""The base class of pythonfmu."""\n',
-    }
-    members |= room_members("fmu_asset.slaves", f"{runtime}/slaves") | room_members(
-        "fe.runtime", f"{runtime}/fe"
-    )
-    return members | pythonfmu_members(module, f"{runtime}/pythonfmu", ["fmi2slave.py"])

@@ -13,8 +13,9 @@ from typing import Any, ClassVar, Self
 
 from pydantic import ModelWrapValidatorHandler, model_validator
 
+from reporting.section import shown
 from scenarios import asset_scripts, binding_files
-from twin_master.scenario.section import Section, short, shown
+from twin_master.scenario.section import Section, short
 
 SHIPPED_DESIGN_NAME = "uav_wing"
 CALIBRATED_DESIGN_NAME = "calibration"
