@@ -1,7 +1,5 @@
 """Calibration step 1: the planform of the real wing from its design tolerance and a measurement."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The layout of a laboratory's folder, which is that of the paper's authors."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The strain library of the authors' model, `UAVconfig.json`, as arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

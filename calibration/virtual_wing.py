@@ -5,8 +5,6 @@ its truth, `twin_master.assets.virtual_experiments` has the FMU behind the same 
 `measure_...` do the experiments of the paper on a bench, with reading errors and a seed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -110,7 +108,7 @@ class VirtualWing:
     frequency_error: tuple[float, float] = (0.0, 0.0)
     gauge: int = RECORDED_GAUGE
     sensitivity: float = SENSITIVITY
-    _modal: _FreeVibration = field(init=False, repr=False)
+    _modal: "_FreeVibration" = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not 1 <= self.gauge <= self.model.gauge_count:

@@ -11,35 +11,9 @@ from typing import Annotated, Any
 from pydantic import PlainValidator, WithJsonSchema
 
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.laws import LAWS
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
 
-CHANNEL_UNIT = "channel's unit"
-
-PRIMITIVE_UNITS: dict[str, dict[str, str]] = {
-    "point_mass": {"mass": "kg", "station": "m"},
-    "root_compliance": {"compliance": "rad/(N m)"},
-    "local_stiffness_loss": {"loss": "1", "start": "m", "length": "m"},
-    "modulus_temperature": {"coefficient": "1/K"},
-    "stiffness_drift": {"rate": "1/s"},
-    **{law.kind: law.units for law in LAWS},
-    "load_place": {"along_span": "m", "along_chord": "m"},
-    "load_gain": {"gain": "1", "tare": "N"},
-    "washout": {"coefficient": "1", "exponent": "1"},
-    "inertia_relief": {"fraction": "1"},
-    "sensor_gain": {"gain": "1"},
-    "sensor_drift": {"amplitude": CHANNEL_UNIT, "time": "s", "exponent": "1"},
-    "sensor_rotation": {"angle": "rad"},
-    "thermal_strain": {"coefficient": "1/K"},
-    "high_pass": {"time_constant": "s", "order": "1"},
-    "clock": {"rate": "1", "zero": "s"},
-    "line": {"frequency": "Hz", "cosine": CHANNEL_UNIT, "sine": CHANNEL_UNIT},
-    "decaying_line": {
-        "frequency": "Hz", "damping_ratio": "1",
-        "cosine": f"{CHANNEL_UNIT} per release amplitude", "sine": f"{CHANNEL_UNIT} per release amplitude",
-    },
-    "run_offset": {"offset": CHANNEL_UNIT},
-}  # fmt: skip
+PRIMITIVE_UNITS: dict[str, dict[str, str]] = {kind: item.units for kind, item in PRIMITIVES.items()}
 """Unit of every real parameter of every primitive (translational or rotational port: the first or second)."""
 
 _WORDS = {None: nan, "Infinity": inf, "-Infinity": -inf}

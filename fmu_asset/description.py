@@ -1,7 +1,5 @@
 """The model description (modelDescription.xml) and the documentation page, from the table of variables."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from xml.etree.ElementTree import Element, SubElement, indent, tostring

@@ -1,7 +1,5 @@
 """Errors of the FMUs and of their one door, named by cause."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 _CONTROLS = {code: f"\\x{code:02x}" for code in (*range(9), *range(11, 32), *range(127, 160))}
@@ -27,7 +25,7 @@ class FmuError(Exception):
         log = "".join(f"\n  the FMU says: {message}" for message in self.messages)
         super().__init__(sentence + log)
 
-    def __reduce__(self) -> tuple[type[FmuError], tuple[str, tuple[str, ...]]]:
+    def __reduce__(self) -> "tuple[type[FmuError], tuple[str, tuple[str, ...]]]":
         """Pickle as the sentence and the messages."""
         return type(self), (self.sentence, self.messages)
 

@@ -1,7 +1,5 @@
 """Folders for extracted FMUs and their workers: where they are made, and how they are removed."""
 
-from __future__ import annotations
-
 import os
 import re
 import tempfile

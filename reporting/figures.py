@@ -7,8 +7,6 @@ Figures are made with `new_figure` inside ``with publication_style():`` and neve
 nothing global is left behind. Equal data give equal bytes: ids are salted, dates and program names left out.
 """
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Folders that one process holds, and that take the place of another in steps that a kill cannot spoil."""
 
-from __future__ import annotations
-
 import glob
 import os
 import shutil

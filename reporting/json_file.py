@@ -1,7 +1,5 @@
 """The one reader of JSON: whatever is wrong with a file becomes one sentence of the caller's exception."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

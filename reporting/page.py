@@ -3,8 +3,6 @@
 No script, no request to any server; light, and fit to be printed. All text is escaped.
 """
 
-from __future__ import annotations
-
 import html
 import re
 from collections.abc import Sequence

@@ -8,8 +8,6 @@ Library code takes a `Progress` and never asks what it is::
             stage.advance()
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -63,7 +61,7 @@ class SilentProgress:
 
 
 class _BarStage:
-    def __init__(self, bars: RichBars, task: TaskID) -> None:
+    def __init__(self, bars: "RichBars", task: "TaskID") -> None:
         self._bars = bars
         self._task = task
 
@@ -111,7 +109,7 @@ class RichProgress:
         Show lines on a terminal too.
     """
 
-    def __init__(self, console: Console | None = None, *, lines: bool = False) -> None:
+    def __init__(self, console: "Console | None" = None, *, lines: bool = False) -> None:
         from rich.console import Console
 
         self.console = console if console is not None else Console(stderr=True, highlight=False)
@@ -146,7 +144,7 @@ class RichProgress:
         console = self._bars.console if self._bars is not None else self.console
         console.print(message, markup=False, highlight=False, soft_wrap=True)
 
-    def _start(self) -> RichBars:
+    def _start(self) -> "RichBars":
         if self._bars is None:
             from rich import progress as rich
 

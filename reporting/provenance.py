@@ -4,8 +4,6 @@ Nothing here names a user, a machine or an absolute path, and nothing depends on
 equal runs carry equal provenance.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Tables of files as checked records: strict sections, and one sentence for what is wrong with them."""
 
-from __future__ import annotations
-
 import re
 from typing import TypeVar
 
@@ -74,7 +72,10 @@ def checked(
 
 def shown(value: object) -> str:
     """Return a value as it can stand in a sentence, shortened if it is long."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of thousands of digits
+        return "a number of thousands of digits"
     return text if len(text) <= _SHOWN_LENGTH else f"{text[: _SHOWN_LENGTH - 3]}..."
 
 

@@ -5,8 +5,6 @@ first of them is wrong without a word. So every row has as many cells as the hea
 and a number is written with the digits 0 to 9 and a point.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence

@@ -4,8 +4,6 @@ Results go to the output stream, progress to the error stream. A command asks he
 progress, and takes no option for them: `with_common_options` gives every command the same two.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import math
@@ -46,7 +44,7 @@ loudness = Loudness()
 """Of the command that runs."""
 
 
-def console(*, silent: bool = False) -> Console:
+def console(*, silent: bool = False) -> "Console":
     """Return the console for results; with `--quiet`, or where `silent`, it prints nothing.
 
     In a pipe or a file nothing is cut or wrapped, unless COLUMNS says how wide it is.
@@ -63,7 +61,7 @@ def say(text: str) -> None:
         typer.echo(text)
 
 
-def progress() -> Progress:
+def progress() -> "Progress":
     """Return where the stages of a command are shown."""
     from reporting.progress import RichProgress, SilentProgress
 

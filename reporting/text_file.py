@@ -1,7 +1,5 @@
 """Text files of users: UTF-8 with or without a byte order mark, and one sentence for what is none."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 DEEPEST_NESTING = 32

@@ -1,7 +1,5 @@
 """The one reader of TOML: whatever is wrong with a file becomes one sentence of the caller's exception."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The command that flies a scenario: `uav-twin run`, and `python -m twin_master` as the master script."""
 
-from __future__ import annotations
-
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -110,7 +108,7 @@ def run(
         show_outcome(outcome)
 
 
-def _record(outcome: RunOutcome) -> dict[str, Any]:
+def _record(outcome: "RunOutcome") -> dict[str, Any]:
     """Return the content of `summary.json` with the places of run and report."""
     import json
 
@@ -121,7 +119,7 @@ def _record(outcome: RunOutcome) -> dict[str, Any]:
     return {"folder": str(outcome.folder), "report": report} | record
 
 
-def _interruptible(fly: Callable[[], RunOutcome], folder: Path) -> RunOutcome:
+def _interruptible(fly: "Callable[[], RunOutcome]", folder: Path) -> "RunOutcome":
     try:
         return fly()
     except KeyboardInterrupt:
@@ -131,7 +129,7 @@ def _interruptible(fly: Callable[[], RunOutcome], folder: Path) -> RunOutcome:
         raise typer.Exit(terminal.INTERRUPTED) from None
 
 
-def show_outcome(outcome: RunOutcome) -> None:
+def show_outcome(outcome: "RunOutcome") -> None:
     """Print the figures of a run beside their references, and where the report is."""
     from rich import box
     from rich.table import Table

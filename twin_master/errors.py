@@ -1,7 +1,5 @@
 """What can go wrong in the twin, by cause."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 __all__ = [
@@ -77,7 +75,7 @@ class ImpossibleObservation(TwinMasterError, RuntimeError):  # noqa: N818 - the 
             "check these sensors, or the transitions and the prior that rule out the true state"
         )
 
-    def __reduce__(self) -> tuple[type[ImpossibleObservation], tuple[str, int, dict[str, float]]]:
+    def __reduce__(self) -> "tuple[type[ImpossibleObservation], tuple[str, int, dict[str, float]]]":
         return type(self), (self.twin, self.step, self.worst_residuals)
 
 

@@ -3,8 +3,6 @@
 Layout: see `docs/run_folder.md`.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -4,8 +4,6 @@ Only the scenario and the small files beside it are read, so that the answer com
 FMU or the model of the wing is checked when the run begins.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import prod

@@ -1,7 +1,5 @@
 """The same mission under many seeds, without run folders, to see how reliably the twin steers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The whole chain: design -> reduced model -> FMU -> calibration -> mission -> store -> report."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -46,7 +44,6 @@ from twin_master.run_folder import (
 )
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.seeds import check_seed
 from twin_master.store.outcome import RunOutcome, finished_run, read_outcome
 from twin_master.store.results import MissionResult
 from twin_master.store.summary import control_changes, summarise
@@ -115,7 +112,6 @@ def new_run(
     """
     loaded = scenario if isinstance(scenario, LoadedScenario) else load_scenario(scenario)
     resolved = resolve_scenario(loaded, given_overrides(overrides))
-    check_seed(resolved.mission.seed)
     folder = Path("runs") / resolved.mission.name if folder is None else Path(folder)
     config = {
         "kind": KIND,

@@ -4,8 +4,6 @@ Each name below comes from the package that holds it, and is imported when it is
 shows all of them at work; the command line is `uav-twin`.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

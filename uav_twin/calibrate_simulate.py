@@ -1,7 +1,5 @@
 """`uav-twin calibrate simulate`: a laboratory folder of a virtual wing whose truth is known."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -96,9 +94,9 @@ def calibrate_simulate(
 
 
 def _measure(
-    bench: TestBench,
-    truth: DigitalState,
-    designed: Geometry | None,
+    bench: "TestBench",
+    truth: "DigitalState",
+    designed: "Geometry | None",
     out: Path,
     seed: int,
     recorder: Mapping[str, Any],
@@ -124,7 +122,7 @@ def _write_truth(path: Path, record: Mapping[str, Any]) -> None:
     atomic_write_text(path, json.dumps(record, indent=2) + "\n")
 
 
-def _truth(truth: DigitalState) -> dict[str, object]:
+def _truth(truth: "DigitalState") -> dict[str, object]:
     geometry = truth.geometry
     return {
         "semi_span": geometry.semi_span,

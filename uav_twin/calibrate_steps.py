@@ -1,7 +1,5 @@
 """`uav-twin calibrate geometry`, `ringdown` and `dynamics`: steps 1 and 3 of the calibration."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -125,7 +123,7 @@ def calibrate_dynamics(
         summary.write_figure(masses_figure(result, authors), out / "figures" / "dynamics")
 
 
-def _show(rows: list[SummaryRow]) -> None:
+def _show(rows: "list[SummaryRow]") -> None:
     from rich.table import Table
 
     table = Table("figure", "found", "paper", "unit")

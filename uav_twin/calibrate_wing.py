@@ -1,7 +1,5 @@
 """`uav-twin calibrate`: all three steps in order, from the lab folder to the file of a tailored twin."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -106,7 +104,7 @@ def calibrate_wing(
         terminal.say(f"Report: {paths.report}")
 
 
-def _show(calibration: WingCalibration) -> None:
+def _show(calibration: "WingCalibration") -> None:
     from rich import box
     from rich.table import Table
 

@@ -1,7 +1,5 @@
 """The command line `uav-twin`."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """Tables on the terminal that can still be read at 80 columns."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
@@ -17,7 +15,7 @@ LONGEST_NAME, LONGEST_WORD = 20, 14
 """Letters of a word that stay on one line in a narrower terminal, in the first column and in the others."""
 
 
-def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> Table:
+def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> "Table":
     """Return a table without the columns that are empty, whose long words break at underscores and hyphens.
 
     Parameters

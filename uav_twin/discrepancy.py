@@ -1,7 +1,5 @@
 """`uav-twin discrepancy ...`: what a model lacks beside measured data."""
 
-from __future__ import annotations
-
 import typer
 
 from uav_twin.discrepancy_catalogue import convert, effects, example

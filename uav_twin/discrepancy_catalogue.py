@@ -1,7 +1,5 @@
 """`uav-twin discrepancy effects` and `example`: the catalogue, and a campaign to try."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -42,7 +40,7 @@ def effects(
     console.print(f"{counted(len(catalogue), 'effect')}; --show ID tells everything about one.")
 
 
-def _show(effect: Effect, console: object) -> None:
+def _show(effect: "Effect", console: object) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -92,8 +90,7 @@ def example(
         typer.Option(
             metavar="ID[@PLACE][:NAME=VALUE,...]",
             help="Hide an effect; values of its parameters in the catalogue's order, else their prior "
-            "medians. May "
-            "be given several times.",
+            "medians. May be given several times.",
         ),
     ] = None,
 ) -> None:
@@ -123,7 +120,7 @@ def example(
     terminal.say(f"Then: uav-twin discrepancy run {shlex.quote(str(out))}{named}")
 
 
-def _plan(choice: ModelChoice) -> ExamplePlan:
+def _plan(choice: "ModelChoice") -> "ExamplePlan":
     """Return what an example measures: gauges and tip of a wing, every output of a lumped model."""
     from discrepancy.models.lumped import LumpedModel
     from discrepancy.sources.examples import plan_for, wing_plan
@@ -135,13 +132,13 @@ def _plan(choice: ModelChoice) -> ExamplePlan:
     return plan_for(choice.model, outputs, description.input[0].name)
 
 
-def _bare(model: Model, kind: str, seed: int, plan: ExamplePlan) -> Campaign:
+def _bare(model: "Model", kind: str, seed: int, plan: "ExamplePlan") -> "Campaign":
     from discrepancy.sources.examples import example_campaign
 
     return example_campaign(model, kind, seed, plan)  # type: ignore[arg-type]
 
 
-def _hidden(text: str, model: Model, campaign: Campaign) -> ModelPatch:
+def _hidden(text: str, model: "Model", campaign: "Campaign") -> "ModelPatch":
     """Return the patch of ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,..; raises `CatalogueError`."""
     from discrepancy.catalogue.entry import Setting
     from discrepancy.catalogue.library import effect_by_identifier, load_catalogue

@@ -1,7 +1,5 @@
 """`uav-twin discrepancy check`: what a campaign can decide, before anything is fitted."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -57,7 +55,7 @@ def check(
 
 
 def _record(
-    data: Campaign, model: str, faults: Sequence[DataFault], able: Separability | None
+    data: "Campaign", model: str, faults: "Sequence[DataFault]", able: "Separability | None"
 ) -> dict[str, Any]:
     """Return faults and what the campaign can decide as plain data; a size that is never seen is null."""
     return {
@@ -82,11 +80,11 @@ def _record(
 
 
 def _show(
-    data: Campaign,
+    data: "Campaign",
     model: str,
-    faults: Sequence[DataFault],
-    able: Separability | None,
-    catalogue: Sequence[Effect],
+    faults: "Sequence[DataFault]",
+    able: "Separability | None",
+    catalogue: "Sequence[Effect]",
 ) -> None:
     from discrepancy.report.check_tables import (
         HEADINGS,

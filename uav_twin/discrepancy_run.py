@@ -1,7 +1,5 @@
 """`uav-twin discrepancy run`: from a campaign to a verdict, with report, patch and patched FMU."""
 
-from __future__ import annotations
-
 import shlex
 from math import isfinite
 from pathlib import Path
@@ -35,8 +33,7 @@ Model = Annotated[
     str | None,
     typer.Option(
         help="A calibration.nc, a wing design, a lumped model or a description of an FMU (.toml), or "
-        "the name of a shipped "
-        "lumped model.",
+        "the name of a shipped lumped model.",
         show_default="the shipped wing",
     ),
 ]
@@ -108,7 +105,9 @@ def run(
     _conclude(found, tried, folder, f"{'Verdict' if no_report else 'Report'}: {place}", silent=json)
 
 
-def _origin(data: Campaign, choice: ModelChoice, command: str, seed: int, effects: list[Path]) -> Origin:
+def _origin(
+    data: "Campaign", choice: "ModelChoice", command: str, seed: int, effects: list[Path]
+) -> "Origin":
     from discrepancy.files.document import Origin
     from reporting.provenance import collect_provenance
 
@@ -133,7 +132,7 @@ def _record(folder: Path, report: Path | None) -> dict[str, Any]:
 
 
 def _conclude(
-    found: Investigation, tried: SelfCalibration | None, folder: Path, place: str, *, silent: bool
+    found: "Investigation", tried: "SelfCalibration | None", folder: Path, place: str, *, silent: bool
 ) -> None:
     """Print the conclusion; data at fault end the command with 1."""
     from discrepancy.verdict import VerdictKind
@@ -152,13 +151,13 @@ def _conclude(
 
 
 def _calibrated(
-    found: Investigation,
-    choice: ModelChoice,
+    found: "Investigation",
+    choice: "ModelChoice",
     catalogue: tuple[object, ...],
     count: int,
     seed: int,
-    progress: Progress,
-) -> SelfCalibration:
+    progress: "Progress",
+) -> "SelfCalibration":
     from discrepancy.model_choice import ModelKind
     from discrepancy.self_calibration import self_calibrate
 
@@ -184,14 +183,14 @@ def _command(
     return shlex.join(words)
 
 
-def _inputs(data_hash: str, choice: ModelChoice, effects: list[Path]) -> dict[str, str]:
+def _inputs(data_hash: str, choice: "ModelChoice", effects: list[Path]) -> dict[str, str]:
     from reporting.provenance import hash_file
 
     found = {"campaign": data_hash, "model": choice.source_hash}
     return found | {f"effects {path.name}": hash_file(path) for path in effects}
 
 
-def _packing(choice: ModelChoice, progress: Progress) -> Pack:
+def _packing(choice: "ModelChoice", progress: "Progress") -> "Pack":
     """Return what makes the FMU of a wing that carries a patch, its effects off."""
 
     def pack(patch_file: Path, target: Path) -> str:
@@ -221,7 +220,7 @@ def _packing(choice: ModelChoice, progress: Progress) -> Pack:
 # ---------------------------------------------------------------- summary
 
 
-def _show(found: Investigation, folder: Path, console: Console) -> None:
+def _show(found: "Investigation", folder: Path, console: "Console") -> None:
     from discrepancy.files.patch import PATCH_NAME, read_patch
     from discrepancy.report.sizes import size_sentence
     from discrepancy.report.text import (
@@ -267,7 +266,7 @@ def _show(found: Investigation, folder: Path, console: Console) -> None:
             console.print(f"Note: {remark}", soft_wrap=True)
 
 
-def _show_proof(proof: Proof, campaign: Campaign, console: Console) -> None:
+def _show_proof(proof: "Proof", campaign: "Campaign", console: "Console") -> None:
     from discrepancy.report.text import number, percent
 
     first, second, where = proof.fitted_before, proof.fitted_after, "fitted trials (none is held out)"
@@ -283,7 +282,7 @@ def _show_proof(proof: Proof, campaign: Campaign, console: Console) -> None:
     console.print(scores if isfinite(first.chi_square_per_dof) else proof.remaining, soft_wrap=True)
 
 
-def _show_trials(tried: SelfCalibration, console: Console) -> None:
+def _show_trials(tried: "SelfCalibration", console: "Console") -> None:
     from reporting.words import counted
 
     right, wrong = tried.share("right"), tried.share("wrong")

@@ -1,7 +1,5 @@
 """`uav-twin fmu ...`."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Annotated, Literal

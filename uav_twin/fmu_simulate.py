@@ -1,7 +1,5 @@
 """`uav-twin fmu simulate`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

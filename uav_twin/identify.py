@@ -1,7 +1,5 @@
 """`uav-twin wing identify`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -58,7 +56,7 @@ def identify(
         raise typer.Exit(1)
 
 
-def _show(result: Identification, console: object) -> None:
+def _show(result: "Identification", console: object) -> None:
     from rich.console import Console
     from rich.table import Table
 

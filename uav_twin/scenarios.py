@@ -1,7 +1,5 @@
 """`uav-twin scenarios` and `uav-twin scenario check`."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """Files of the user that hide a package of this project, because Python finds them first."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`uav-twin wing verify`."""
 
-from __future__ import annotations
-
 import json
 import math
 import tempfile
@@ -99,7 +97,7 @@ def verify(
         raise typer.Exit(1)
 
 
-def write_record(folder: Path, design: WingDesign, checks: Sequence[Check]) -> Path:
+def write_record(folder: Path, design: "WingDesign", checks: Sequence[Check]) -> Path:
     """Write `verification.json`: each check with its value and limit."""
     from reporting.files import atomic_write_text
 
@@ -112,7 +110,7 @@ def write_record(folder: Path, design: WingDesign, checks: Sequence[Check]) -> P
     return atomic_write_text(folder / "verification.json", json.dumps(record, indent=2) + "\n")
 
 
-def all_checks(design: WingDesign, jobs: Path, progress: Progress, *, quick: bool = False) -> list[Check]:
+def all_checks(design: "WingDesign", jobs: Path, progress: "Progress", *, quick: bool = False) -> list[Check]:
     """Return every check of a design; those against CalculiX where it is installed.
 
     Parameters
@@ -175,7 +173,7 @@ def element_checks() -> Iterator[Check]:
             yield Check("MacNeal-Harder", name, abs(found - value), 6e-4, f"({found:.4f}, {value:.3f})")
 
 
-def balance_checks(operators: AffineOperators) -> Iterator[Check]:
+def balance_checks(operators: "AffineOperators") -> Iterator[Check]:
     """Yield the sums that must agree for the wing at the load factor of its lift."""
     from fe.verification.known_answers import rigid_body_residual, wing_balance
 
@@ -191,7 +189,7 @@ def balance_checks(operators: AffineOperators) -> Iterator[Check]:
 
 
 def convergence_checks(
-    design: WingDesign, refinements: tuple[float, ...], *, limited: bool = True
+    design: "WingDesign", refinements: tuple[float, ...], *, limited: bool = True
 ) -> Iterator[Check]:
     """Yield the change between the two finest meshes and the observed order of every result.
 
@@ -230,7 +228,7 @@ def convergence_checks(
     yield Check(group, "unknowns of the finest mesh", rows[-1].unknowns)
 
 
-def plate_checks(operators: AffineOperators, *, limited: bool = True) -> Iterator[Check]:
+def plate_checks(operators: "AffineOperators", *, limited: bool = True) -> Iterator[Check]:
     """Yield the closed forms of the sandwich plate, and its differences to the box of the same design.
 
     Gauges whose patch comes near an edge of a defect count in the rms of all gauges; they are told apart,
@@ -294,7 +292,7 @@ def plate_checks(operators: AffineOperators, *, limited: bool = True) -> Iterato
         yield Check(group, "unknowns, over those of the box", found.plate.unknowns / found.box.unknowns)
 
 
-def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:
+def calculix_checks(operators: "AffineOperators", jobs: Path) -> Iterator[Check]:
     """Yield the differences to CalculiX on the identical mesh: statics and six modes."""
     from fe.runtime.state import DigitalState
     from fe.verification.calculix_comparison import modal_agreement, static_agreement
@@ -309,7 +307,7 @@ def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:
         yield Check(group, f"frequencies 1 to {len(modes.ours)}", modes.relative, 1e-5)
 
 
-def ring_down_checks(operators: AffineOperators, jobs: Path, periods: float) -> Iterator[Check]:
+def ring_down_checks(operators: "AffineOperators", jobs: Path, periods: float) -> Iterator[Check]:
     """Yield the difference of a ring-down to direct integration by CalculiX."""
     from fe.runtime.state import DigitalState
     from fe.verification.calculix_comparison import ring_down_agreement

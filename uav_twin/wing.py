@@ -1,7 +1,5 @@
 """`uav-twin wing`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -67,7 +65,7 @@ def wing(
         console.print(f"Wrote {path}", soft_wrap=True)
 
 
-def wing_record(design: WingDesign, model: ReducedModel) -> dict[str, Any]:
+def wing_record(design: "WingDesign", model: "ReducedModel") -> dict[str, Any]:
     """Return mass [kg], stiffness [N/m] and frequencies [Hz] of the undamaged wing by name."""
     from fe.runtime.state import DigitalState
 
@@ -88,13 +86,13 @@ def wing_record(design: WingDesign, model: ReducedModel) -> dict[str, Any]:
     }
 
 
-def mode_name(modes: Modes, index: int) -> str:
+def mode_name(modes: "Modes", index: int) -> str:
     """Return the name of a mode that is followed by its shape, or nothing."""
     names = ("first flapwise bending", "second flapwise bending")
     return dict(zip(modes.flapwise, names, strict=True)).get(index, "")
 
 
-def structural_mass(design: WingDesign) -> float:
+def structural_mass(design: "WingDesign") -> float:
     """Return the mass of the structure without its point masses, from the volumes of the cells [kg]."""
     import numpy as np
 
@@ -109,7 +107,7 @@ def structural_mass(design: WingDesign) -> float:
     return float((determinant.mean(axis=1) * cell_density(mesh)).sum())
 
 
-def write_fields(design: WingDesign, path: Path) -> tuple[Path, Path]:
+def write_fields(design: "WingDesign", path: Path) -> tuple[Path, Path]:
     """Write the undamaged wing in a 3g turn, and its modes in a file beside it; return both paths."""
     from fe.reduction.fields import write_modes_vtu, write_wing_vtu
     from fe.reduction.model_cache import wing_fields

@@ -1,7 +1,5 @@
 """A sum of damped cosines, an offset and a drift: Kapteyn et al. 2021, eq. (22)."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ highest points are the signal's extremes within the column, but for the width of
 keeps more of a fast mode that dies away within a few columns.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

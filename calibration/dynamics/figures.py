@@ -1,7 +1,5 @@
 """Figures of calibration step 3: ring-down, spectrum, dependence on the amplitude, posterior of step 3."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure

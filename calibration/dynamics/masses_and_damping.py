@@ -5,8 +5,6 @@ the measured ones, under the weighed total; eq. (25): the Rayleigh coefficients 
 measured damping ratios through eq. (18).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

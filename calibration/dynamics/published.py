@@ -1,7 +1,5 @@
 """Published results of step 3: samples of e, and the authors' fitted masses and frequencies."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

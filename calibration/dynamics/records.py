@@ -1,7 +1,5 @@
 """Ring-down records: the strain signal after the tip is let go, raw or read off the published plots."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

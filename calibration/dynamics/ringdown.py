@@ -4,8 +4,6 @@ Kapteyn et al. 2021, eq. (22): the signal is a sum of two damped cosines; eqs. (
 frequency and decay rate into natural frequency and damping ratio.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import Enum

@@ -1,7 +1,5 @@
 """The figures of calibration steps 1 and 3 beside the paper's, and their files."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Several ring-down trials together: averages, and how frequency and damping change with the amplitude."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

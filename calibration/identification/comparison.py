@@ -1,7 +1,5 @@
 """The identified wing beside the published model, row by row, fitted and held out apart."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A wing design as a TOML file with its sources, as a user would write it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

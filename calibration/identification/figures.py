@@ -1,7 +1,5 @@
 """Figures of the identification: residuals by gauge, singular values, widths, profiles."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ the idealisation's misfit (`targets.Weights`), so that widths are to be compared
 prior, and are no probabilities of the real wing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

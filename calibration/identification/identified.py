@@ -1,7 +1,5 @@
 """An identified wing design with everything that is reported of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

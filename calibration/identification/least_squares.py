@@ -5,8 +5,6 @@ prior means in prior standard deviations: the maximum of the posterior density i
 deviations of independent normal errors, which they are not (see `targets.Weights`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

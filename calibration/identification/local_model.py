@@ -5,8 +5,6 @@ all gauges; the healthy one also gives the static test, the modes, and the deriv
 the basis that they span, the model answers as the full model does, with the same first derivatives.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

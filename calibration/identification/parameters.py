@@ -5,8 +5,6 @@ Most are a path, and one number may stand at several places (all webs). The plac
 a few numbers: two straight rows, the second of two clusters.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

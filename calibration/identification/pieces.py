@@ -4,8 +4,6 @@ The difference of the operators of two designs with the same cells is projected 
 alone: a number of the design usually changes few of them, and no global matrix is assembled.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -61,11 +59,11 @@ class ReducedTerms(NamedTuple):
     modal_stiffness: FloatArray
     modal_mass: FloatArray
 
-    def combined(self, other: ReducedTerms, factor: float) -> ReducedTerms:
+    def combined(self, other: "ReducedTerms", factor: float) -> "ReducedTerms":
         """Return self + factor * other."""
         return ReducedTerms(*(mine + factor * its for mine, its in zip(self, other, strict=True)))
 
-    def scaled(self, factor: float) -> ReducedTerms:
+    def scaled(self, factor: float) -> "ReducedTerms":
         """Return factor * self."""
         return ReducedTerms(*(factor * mine for mine in self))
 

@@ -1,7 +1,5 @@
 """The report of an identification: one self-contained page."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from reporting.figures import to_svg

@@ -1,7 +1,5 @@
 """Residuals of the fitted outputs in units of their weights, with derivatives and a label each."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

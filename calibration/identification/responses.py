@@ -5,8 +5,6 @@ solutions of its gauges, and the modal basis the modes, values and first derivat
 model.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -38,7 +36,7 @@ class Value:
         self.value = value
         self.gradient = gradient
 
-    def log(self) -> Value:
+    def log(self) -> "Value":
         """Return the natural logarithm; raises `IdentificationError` where a value is not positive."""
         if not np.all(self.value > 0.0):
             raise IdentificationError(
@@ -47,7 +45,7 @@ class Value:
             )
         return Value(np.log(self.value), self.gradient / self.value[..., None])
 
-    def over(self, other: Value) -> Value:
+    def over(self, other: "Value") -> "Value":
         """Return self / other."""
         ratio = self.value / other.value
         return Value(ratio, (self.gradient - ratio[..., None] * other.gradient) / other.value[..., None])
@@ -71,7 +69,7 @@ class ReducedWing:
     derivatives: ReducedTerms
     bending: FloatArray
 
-    def at(self, step: FloatArray) -> ReducedWing:
+    def at(self, step: FloatArray) -> "ReducedWing":
         """Return the wing after a step (P,) of the parameters: exact in those that enter affinely."""
         moved = ReducedTerms(
             *(
@@ -85,7 +83,7 @@ class ReducedWing:
     def _parameter_count(self) -> int:
         return len(self.derivatives.lift)
 
-    def _solution(self, factor: float, loss: tuple[float, float]) -> _State:
+    def _solution(self, factor: float, loss: tuple[float, float]) -> "_State":
         theta = AffineOperators.theta(factor, loss)
         matrix = np.tensordot(theta, self.terms.stiffness, axes=1)
         try:

@@ -5,8 +5,6 @@ the tip stiffness and its slope, and every second of the 100 rows of step 3. Eve
 published folders hold is held out and only reported.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path

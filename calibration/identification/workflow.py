@@ -1,7 +1,5 @@
 """Identification from the two published folders to a design file, a record and a report."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import asdict

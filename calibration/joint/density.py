@@ -20,8 +20,6 @@ What is left is a density in three quantities, e, s and t = 2 s + p; t takes the
 density), because the weighed total makes s and p nearly one quantity.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

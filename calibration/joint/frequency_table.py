@@ -1,7 +1,5 @@
 """The two flapwise frequencies as a polynomial of e and the masses, so that many states cost little."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

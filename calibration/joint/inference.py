@@ -1,7 +1,5 @@
 """The joint posterior of the digital state, by importance sampling from Laplace's approximation."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

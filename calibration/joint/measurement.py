@@ -1,7 +1,5 @@
 """What the ring-down says of the two flapwise modes, with all that makes it uncertain."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

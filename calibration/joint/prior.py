@@ -1,7 +1,5 @@
 """What is known before the ring-down: priors of the five quantities, weighed masses, error of the model."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The joint posterior as a record of equally weighted samples."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Laplace's approximation and importance sampling of a smooth density of a few quantities."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple

@@ -26,8 +26,6 @@ A zero offset c_r ~ N(0, R_0) that all displacements of one loading run share ca
 the residuals of a run then have the covariance S I + k^2 R_0 1 1'.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The static load experiment: tip loads and tip displacements, published or read from the authors' folder."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Figures of calibration step 2: the panels of Kapteyn et al. 2021, Fig. 5, and what they leave open."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure

@@ -1,7 +1,5 @@
 """Gaussian kernel density of very many samples, binned on a fine grid."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -73,7 +71,7 @@ class BinnedKernelDensity:
         weights: NDArray[np.float64] | None = None,
         bandwidth: float | None = None,
         window: tuple[float, float] = (-math.inf, math.inf),
-    ) -> BinnedKernelDensity:
+    ) -> "BinnedKernelDensity":
         """Spread each sample over the two grid points beside it, then convolve with the kernel.
 
         Parameters

@@ -1,7 +1,5 @@
 """The paper's particle filter for the Young's modulus factor: Kapteyn et al. 2021, calibration step 2."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Densities of one unknown: the Gaussian prior, and a posterior given on a grid."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

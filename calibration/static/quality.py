@@ -1,7 +1,5 @@
 """How well one stiffness explains the measured pairs, run by run."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

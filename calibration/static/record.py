@@ -1,21 +1,20 @@
 """The record of calibration step 2, with its way to plain data and back."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError, CalibrationRecordError
+from reporting.record_json import plain, record_of
 
 from .experiments import LoadDisplacementData
 from .particle_filter import ParticlePosterior
 from .posterior import GaussianPrior, ScalarPosterior, Seed
-from .quality import FitQuality, RunFit
+from .quality import FitQuality
 from .stiffness_curve import LinearStiffnessCurve, StiffnessCurve, TabulatedStiffnessCurve
 
 SCHEMA = "uav-twin static calibration 1"
@@ -126,38 +125,20 @@ class StaticCalibration:
                 "displacement_standard_deviation_m": self.data.displacement_standard_deviation,
             },
             "stiffness_curve": _curve_to_dict(self.curve),
-            "prior": asdict(self.prior),
-            "particle": {
-                "posterior": _posterior_to_dict(self.particle.posterior),
-                "effective_sample_size": self.particle.effective_sample_size.tolist(),
-                "particle_count": self.particle.particle_count,
-                "bandwidth": self.particle.bandwidth.tolist(),
-                "likelihood_grid": self.particle.likelihood_grid.tolist(),
-                "likelihood": self.particle.likelihood.tolist(),
-                "stiffness_mean": self.particle.stiffness_mean,
-                "stiffness_standard_deviation": self.particle.stiffness_standard_deviation,
-            },
+            "prior": plain(self.prior),
+            "particle": {**plain(self.particle), "posterior": _posterior_to_dict(self.particle.posterior)},
             "exact": _posterior_to_dict(self.exact),
             "tip_stiffness_prior": _posterior_to_dict(self.tip_stiffness_prior),
             "tip_stiffness_particle": _posterior_to_dict(self.tip_stiffness_particle),
             "tip_stiffness_exact": _posterior_to_dict(self.tip_stiffness_exact),
             "pair_likelihood": self.pair_likelihood.tolist(),
-            "alternatives": [asdict(alternative) for alternative in self.alternatives],
-            "quality": {
-                "stiffness": self.quality.stiffness,
-                "displacement_residual": self.quality.displacement_residual.tolist(),
-                "standardised_residual": self.quality.standardised_residual.tolist(),
-                "chi_square": self.quality.chi_square,
-                "degrees_of_freedom": self.quality.degrees_of_freedom,
-                "tail_probability": _number_or_none(self.quality.tail_probability),
-                "runs": [asdict(run) for run in self.quality.runs],
-                "remarks": list(self.quality.remarks),
-            },
-            "reward": asdict(self.reward),
+            "alternatives": plain(self.alternatives),
+            "quality": plain(self.quality),
+            "reward": plain(self.reward),
         }
 
     @classmethod
-    def from_dict(cls, record: Mapping[str, Any]) -> StaticCalibration:
+    def from_dict(cls, record: Mapping[str, Any]) -> "StaticCalibration":
         """Return the calibration that `to_dict` described.
 
         Raises
@@ -184,9 +165,8 @@ class StaticCalibration:
         return calibration
 
     @classmethod
-    def _from_parts(cls, record: Mapping[str, Any]) -> StaticCalibration:
-        data, particle, quality = record["data"], record["particle"], record["quality"]
-        tail = quality["tail_probability"]
+    def _from_parts(cls, record: Mapping[str, Any]) -> "StaticCalibration":
+        data = record["data"]
         return cls(
             data=LoadDisplacementData(
                 load=data["load_N"],
@@ -197,34 +177,16 @@ class StaticCalibration:
                 source=data["source"],
             ),
             curve=_curve_from_dict(record["stiffness_curve"]),
-            prior=GaussianPrior(**record["prior"]),
-            particle=ParticlePosterior(
-                posterior=_posterior_from_dict(particle["posterior"]),
-                effective_sample_size=np.array(particle["effective_sample_size"]),
-                particle_count=int(particle["particle_count"]),
-                bandwidth=np.array(particle["bandwidth"]),
-                likelihood_grid=np.array(particle["likelihood_grid"]),
-                likelihood=np.array(particle["likelihood"]),
-                stiffness_mean=float(particle["stiffness_mean"]),
-                stiffness_standard_deviation=float(particle["stiffness_standard_deviation"]),
-            ),
-            exact=_posterior_from_dict(record["exact"]),
-            tip_stiffness_prior=_posterior_from_dict(record["tip_stiffness_prior"]),
-            tip_stiffness_particle=_posterior_from_dict(record["tip_stiffness_particle"]),
-            tip_stiffness_exact=_posterior_from_dict(record["tip_stiffness_exact"]),
+            prior=record_of(GaussianPrior, record["prior"]),
+            particle=record_of(ParticlePosterior, record["particle"]),
+            exact=record_of(ScalarPosterior, record["exact"]),
+            tip_stiffness_prior=record_of(ScalarPosterior, record["tip_stiffness_prior"]),
+            tip_stiffness_particle=record_of(ScalarPosterior, record["tip_stiffness_particle"]),
+            tip_stiffness_exact=record_of(ScalarPosterior, record["tip_stiffness_exact"]),
             pair_likelihood=np.array(record["pair_likelihood"]),
-            alternatives=tuple(Alternative(**alternative) for alternative in record["alternatives"]),
-            quality=FitQuality(
-                stiffness=float(quality["stiffness"]),
-                displacement_residual=np.array(quality["displacement_residual"]),
-                standardised_residual=np.array(quality["standardised_residual"]),
-                chi_square=float(quality["chi_square"]),
-                degrees_of_freedom=int(quality["degrees_of_freedom"]),
-                tail_probability=math.nan if tail is None else float(tail),
-                runs=tuple(RunFit(**run) for run in quality["runs"]),
-                remarks=tuple(quality["remarks"]),
-            ),
-            reward=CalibrationReward(**record["reward"]),
+            alternatives=tuple(record_of(Alternative, entry) for entry in record["alternatives"]),
+            quality=record_of(FitQuality, record["quality"]),
+            reward=record_of(CalibrationReward, record["reward"]),
             seed=int(record["seed"]),
             provenance=record["provenance"],
         )
@@ -243,16 +205,6 @@ def _posterior_to_dict(posterior: ScalarPosterior) -> dict[str, Any]:
         "grid": posterior.grid.tolist(),
         "density": posterior.density.tolist(),
     }
-
-
-def _posterior_from_dict(record: Mapping[str, Any]) -> ScalarPosterior:
-    return ScalarPosterior(
-        grid=np.array(record["grid"]),
-        density=np.array(record["density"]),
-        unit=record["unit"],
-        mean=float(record["mean"]),
-        standard_deviation=float(record["standard_deviation"]),
-    )
 
 
 def _curve_to_dict(curve: StiffnessCurve) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """The report of calibration step 2: one self-contained page."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from reporting.figures import to_png, to_svg
@@ -100,12 +98,11 @@ def _add_fit(page: Page, result: StaticCalibration, drawing: bytes) -> None:
         page.add_notice(remark)
     page.add_figure(
         drawing,
-        "(a) Displacement less load over calibrated stiffness, with 95 % intervals of the readings; "
-        "the broken lines are the means of the runs. (b) Mean and 95 % interval of e: in the paper, by the "
-        "particle filter, and exactly; exactly with a prior flat in the true load instead of the "
-        "true displacement; with "
-        "the density of the ratio, which the paper's filter takes for the likelihood; and with a zero offset "
-        "that all readings of a run share, by which they tell less.",
+        "(a) Displacement less load over calibrated stiffness, with 95 % intervals of the readings; the "
+        "broken lines are the means of the runs. (b) Mean and 95 % interval of e: in the paper, by the "
+        "particle filter, and exactly; exactly with a prior flat in the true load instead of the true "
+        "displacement; with the density of the ratio, which the paper's filter takes for the likelihood; "
+        "and with a zero offset that all readings of a run share, by which they tell less.",
         title="Residuals, and the posterior under other assumptions",
     )
     page.add_paragraph(
@@ -116,12 +113,10 @@ def _add_fit(page: Page, result: StaticCalibration, drawing: bytes) -> None:
             else ". "
         )
         + f"The experiment took {100.0 * result.reward.uncertainty_reduction:.0f} % of the prior's "
-        "standard deviation "
-        f"away and brought {result.reward.information_gain:.2f} nat of information. The mean absolute error "
-        "of the displacement, in half-widths of its 95 % interval, was "
-        f"{-result.reward.prior_error:.2f} at the prior mean and is "
-        f"{-result.reward.posterior_error:.2f} at the posterior mean, which weighs "
-        "squared errors."
+        f"standard deviation away and brought {result.reward.information_gain:.2f} nat of information. The "
+        "mean absolute error of the displacement, in half-widths of its 95 % interval, was "
+        f"{-result.reward.prior_error:.2f} at the prior mean and is {-result.reward.posterior_error:.2f} at "
+        "the posterior mean, which weighs squared errors."
     )
 
 

@@ -3,8 +3,6 @@
 This is the room's front door; what it names is written in the modules beside it.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tip stiffness as a function of the Young's modulus factor: Kapteyn et al. 2021, eq. (14)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The figures of calibration step 2 beside the paper's."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from .record import StaticCalibration

@@ -1,7 +1,5 @@
 """Calibration step 2 from a folder of measurements to a folder of results."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """What of the measurements the calibrated wing does not meet, and by how much."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -86,8 +84,7 @@ def disagreements(calibration: WingCalibration) -> list[str]:
             if miss.name == "frequency_2" and _is_the_papers_wing(calibration):
                 authors = (
                     f" The authors' own model, too, has {AUTHORS_SECOND_FREQUENCY:.2f} Hz after its "
-                    "calibration, "
-                    "4.5 % below what they measured."
+                    "calibration, 4.5 % below what they measured."
                 )
             found.append(
                 f"{shown.title}: measured {printed(miss.name, *miss.measured)} "
@@ -110,8 +107,7 @@ def _of_the_ring_down(calibration: WingCalibration) -> list[str]:
         found.append(
             f"The damping ratio of the second mode is {100 * second:.2f} % in these records and "
             f"{100 * published:.2f} % in the paper ({_percent(second / published - 1.0)}); it depends on "
-            "where "
-            "a record begins, see the documentation."
+            "where a record begins, see the documentation."
         )
     points = sorted(
         (point for fit in trials.fits for point in amplitude_dependence(fit)),

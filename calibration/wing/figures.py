@@ -1,7 +1,5 @@
 """Figures of the calibration of a wing as a whole: correlations, quantities of interest, mode shapes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

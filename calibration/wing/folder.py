@@ -1,7 +1,5 @@
 """The folder that a calibration leaves."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple

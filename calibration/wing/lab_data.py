@@ -1,7 +1,5 @@
 """What a lab folder holds for the three steps of the calibration, and what is published instead."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple

@@ -1,7 +1,5 @@
 """A laboratory folder in the layout that the paper's authors published, written from measurements."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The report of a whole calibration: one self-contained page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np
@@ -293,8 +291,7 @@ def _add_reward(page: Page, step: CalibrationStep) -> None:
     if reward.prior_error is not None and reward.posterior_error is not None:
         text += (
             "the mean error of the quantities of interest, in half-widths of the measurements' 95 % "
-            "intervals, "
-            f"was {-reward.prior_error:.2f} before and is {-reward.posterior_error:.2f} after; "
+            f"intervals, was {-reward.prior_error:.2f} before and is {-reward.posterior_error:.2f} after; "
         )
     text += f"{100.0 * reward.uncertainty_reduction:.0f} % of the prior standard deviation was taken away"
     if reward.information_gain is not None:

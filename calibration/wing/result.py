@@ -1,7 +1,5 @@
 """The calibration of one wing: what its twin is tailored with, in one record."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -4,11 +4,10 @@ Groups `prior`, `posterior`, `geometry`, `quantity_of_interest` and `measured` h
 units; the root's attributes hold the name of the wing, the tailored design, the steps and the provenance.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from fe.wing.design import parse_design
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
 from reporting.netcdf import read_groups
+from reporting.record_json import record_of
 
 from .result import QUANTITIES, STATE, CalibratedFigure, CalibrationResult
 from .steps import CalibrationStep
@@ -124,7 +124,7 @@ def _tree(result: CalibrationResult) -> xr.DataTree:
         "geometry_source": result.geometry.source,
         "load_test_source": result.pairs.source,
         "ring_down_source": result.modal.source,
-        "steps": _json([step.to_dict() for step in result.steps]),
+        "steps": _json([asdict(step) for step in result.steps]),
         "provenance": _json(dict(result.provenance)),
     }
     root["content_sha256"] = _content_hash(groups, root)
@@ -268,7 +268,7 @@ def _result(groups: Mapping[str, xr.Dataset], root: Mapping[str, Any]) -> Calibr
             damping_ratio_standard_deviation=_pair(measured["damping_ratio_standard_deviation"]),
             source=str(root["ring_down_source"]),
         ),
-        steps=tuple(CalibrationStep.from_dict(step) for step in json.loads(root["steps"])),
+        steps=tuple(record_of(CalibrationStep, step) for step in json.loads(root["steps"])),
         seed=int(root["seed"]),
         provenance=json.loads(root["provenance"]),
     )

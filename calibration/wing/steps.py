@@ -5,12 +5,9 @@ digital state D is updated, the quantity of interest Q follows from it, and the 
 experiment was worth: Kapteyn et al. 2021, eqs. (1)-(4), Fig. 4.
 """
 
-from __future__ import annotations
-
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,23 +99,6 @@ class CalibrationStep:
     state: tuple[Update, ...]
     quantities: tuple[Update, ...]
     reward: StepReward
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain data, ready for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, record: Mapping[str, Any]) -> CalibrationStep:
-        """Return the step that `to_dict` described."""
-        return cls(
-            number=int(record["number"]),
-            title=str(record["title"]),
-            procedure=str(record["procedure"]),
-            source=str(record["source"]),
-            state=tuple(Update(**entry) for entry in record["state"]),
-            quantities=tuple(Update(**entry) for entry in record["quantities"]),
-            reward=StepReward(**record["reward"]),
-        )
 
 
 def update_of_samples(

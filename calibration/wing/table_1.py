@@ -1,7 +1,5 @@
 """Table 1 of the paper with our figures beside it: prior and posterior of the whole digital state."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The design of a wing brought to the lengths that were measured on it."""
 
-from __future__ import annotations
-
 from calibration.errors import ExperimentDataError
 from calibration.geometry import LENGTH_NAMES, GeometryCalibration
 from fe.runtime.errors import InvalidDesignError
@@ -32,13 +30,6 @@ def tailored_design(design: WingDesign, lengths: GeometryCalibration) -> WingDes
     and bands of the skin along the span, and everything along the chord. What it places by a distance stays
     where it is on the wing: gauges and defect regions from the root, the test load from the tip. The
     net load of a turn, skin and web thicknesses, and the largest cell stay.
-
-    Parameters
-    ----------
-    design : WingDesign
-        The design to tailor.
-    lengths : GeometryCalibration
-        The measured lengths.
 
     Raises
     ------

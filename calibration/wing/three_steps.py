@@ -1,7 +1,5 @@
 """The three steps of the calibration in order: from the measurements of a wing to what tailors its twin."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A wing as its calibration describes it: what its FMU carries, and the record of a run."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass

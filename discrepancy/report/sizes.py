@@ -7,7 +7,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.campaign.units import UNITS
-from discrepancy.document_types import CHANNEL_UNIT, PRIMITIVE_UNITS
+from discrepancy.document_types import PRIMITIVE_UNITS
 from discrepancy.files.patch import PrimitiveInterval
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
@@ -15,7 +15,7 @@ from discrepancy.models.wing import WingModel
 from discrepancy.report.text import rounded, unit_text
 from discrepancy.verdict import NamedEffect, VerdictKind
 from discrepancy.workflow import Investigation
-from fe.runtime.patch import ModelPatch, Primitive
+from fe.runtime.patch import CHANNEL_UNIT, ModelPatch, Primitive
 
 BESIDE = ("reference_velocity", "reference_displacement", "time", "start", "length", "station")
 """Where or at what a size holds; no sizes themselves."""

@@ -152,11 +152,6 @@ def separator_tree(graph: sparse.csr_array, weight: FloatArray, leaf_weight: flo
         Weight of the vertices.
     leaf_weight : float
         Parts up to this weight are not cut.
-
-    Returns
-    -------
-    SeparatorTree
-        Where every vertex is.
     """
     size = graph.shape[0]
     edges = graph.tocoo()

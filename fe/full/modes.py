@@ -132,12 +132,8 @@ def eigenmodes(
     ----------
     operators : AffineOperators
         The model.
-    young_modulus_factor : float
-        e [1].
-    stiffness_loss : tuple of float
-        (z1, z2), fractions.
-    servo_mass, pitot_mass : float
-        Masses of one servo and of the pitot [kg].
+    young_modulus_factor, stiffness_loss, servo_mass, pitot_mass
+        As of `fe.runtime.state.DigitalState`.
     count : int
         Number of modes, at least 3.
 

@@ -16,6 +16,7 @@ from fe.wing.design import WingDesign
 from fe.wing.mesh import DEFECT_1, DEFECT_2, SKIN, SurfacePoint, WingMesh, build_mesh
 from fe.wing.parts import PointMassPlace
 
+from .affine import AffineSystem
 from .assembly import (
     Discretisation,
     cell_axes,
@@ -37,71 +38,19 @@ ROOT_UNKNOWNS = 3
 
 
 @dataclass(frozen=True)
-class AffineOperators:
+class AffineOperators(AffineSystem):
     """Affine finite element model of the wing on its n free unknowns (held motions are eliminated).
 
     Attributes
     ----------
-    stiffness_terms : tuple of csr (n, n)
-        Skin without defects, defect 1, defect 2, and the rest with the root springs [N/m].
-    mass_terms : tuple of csr (n, n)
-        Structure [kg]; 1 kg in each servo; 1 kg in the pitot [1].
-    load_lift : (n,) N
-        Load of a turn at load factor 1.
-    load_tip : (n,) 1
-        Upward load of 1 N at the place of the static test.
-    gauge_output : csr (gauges, n) 1/m
-        Strain of each gauge, positive in compression (upper skin under positive lift), dimensionless.
-    displacement_output : (n,) 1
-        Upward displacement at the place of the static test; equal to `load_tip`.
-    tip_displacement_output : (n,) 1
-        Upward displacement at the tip, on the chord line of the static test.
-    expansion : csr (full, n)
-        Free unknowns to the displacements of all nodes of `discretisation` (3 node + component).
     discretisation : Discretisation
-        Nodes and cells of the full mesh.
+        Nodes and cells of the full mesh; `expansion` gives their displacements (3 node + component).
     wing_mesh : WingMesh
         Mesh with its named regions.
-    design_hash : str
-        Hash of the design.
     """
 
-    stiffness_terms: tuple[sparse.csr_array, ...]
-    mass_terms: tuple[sparse.csr_array, ...]
-    load_lift: FloatArray
-    load_tip: FloatArray
-    gauge_output: sparse.csr_array
-    displacement_output: FloatArray
-    tip_displacement_output: FloatArray
-    expansion: sparse.csr_array
     discretisation: Discretisation
     wing_mesh: WingMesh
-    design_hash: str
-
-    @property
-    def unknowns(self) -> int:
-        """Number n of free unknowns."""
-        return len(self.load_lift)
-
-    @staticmethod
-    def theta(young_modulus_factor: float, stiffness_loss: tuple[float, float]) -> FloatArray:
-        """Coefficients (4,) of the stiffness terms at e and (z1, z2)."""
-        return np.array([young_modulus_factor, 1.0 - stiffness_loss[0], 1.0 - stiffness_loss[1], 1.0])
-
-    @staticmethod
-    def mass_theta(servo_mass: float, pitot_mass: float) -> FloatArray:
-        """Coefficients (3,) of the mass terms at masses [kg] of one servo and of the pitot."""
-        return np.array([1.0, servo_mass, pitot_mass])
-
-    def stiffness(
-        self, young_modulus_factor: float = 1.0, stiffness_loss: tuple[float, float] = (0.0, 0.0)
-    ) -> sparse.csr_array:
-        """Stiffness (n, n) [N/m] at e and (z1, z2)."""
-        return _combined(self.theta(young_modulus_factor, stiffness_loss), self.stiffness_terms)
-
-    def mass(self, servo_mass: float, pitot_mass: float) -> sparse.csr_array:
-        """Mass (n, n) [kg] at the masses [kg] of one servo and of the pitot."""
-        return _combined(self.mass_theta(servo_mass, pitot_mass), self.mass_terms)
 
     def load(self, load_factor: float, tip_force: float = 0.0) -> FloatArray:
         """Load (n,) [N] at a load factor and an upward tip force [N]."""
@@ -110,13 +59,6 @@ class AffineOperators:
     def full_displacement(self, free: FloatArray) -> FloatArray:
         """Displacements (nodes, 3) of all nodes from free unknowns (n,)."""
         return np.asarray(self.expansion @ free).reshape(-1, 3)
-
-
-def _combined(theta: FloatArray, terms: tuple[sparse.csr_array, ...]) -> sparse.csr_array:
-    total = theta[0] * terms[0]
-    for factor, term in zip(theta[1:], terms[1:], strict=True):
-        total = total + factor * term
-    return total.tocsr()
 
 
 def cell_elasticity(mesh: WingMesh) -> FloatArray:
@@ -335,7 +277,6 @@ def assemble(design: WingDesign) -> AffineOperators:
         load_lift=np.asarray(restriction @ lift),
         load_tip=at_load_free,
         gauge_output=(gauge_output(mesh, discretisation) @ expansion).tocsr(),
-        displacement_output=at_load_free.copy(),
         tip_displacement_output=np.asarray(restriction @ at_tip),
         expansion=expansion,
         discretisation=discretisation,

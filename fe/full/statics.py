@@ -114,10 +114,8 @@ def solve_static(
     ----------
     operators : AffineOperators
         The model.
-    young_modulus_factor : float
-        e [1].
-    stiffness_loss : tuple of float
-        (z1, z2), fractions.
+    young_modulus_factor, stiffness_loss
+        As of `fe.runtime.state.DigitalState`.
     load_factor : float
         Load factor of the turn [1].
     tip_force : float

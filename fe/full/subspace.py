@@ -1,6 +1,6 @@
 """Tools of the offline reduction: one factorised stiffness, its norm, and bases orthonormal in it."""
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,47 +13,6 @@ FloatArray = npt.NDArray[np.float64]
 
 NEARLY_DEPENDENT = 0.1
 """Where less than this fraction of a vector is new, the pair is made to fit together again."""
-
-
-class AffineSystem(Protocol):
-    """What a reduction needs of a full model; `fe.full.operators.AffineOperators` has it."""
-
-    @property
-    def stiffness_terms(self) -> tuple[Any, ...]:
-        """Four sparse matrices (n, n): skin, first defect, second defect, base; semi-definite [N/m]."""
-
-    @property
-    def mass_terms(self) -> tuple[Any, ...]:
-        """Three sparse matrices (n, n): structure [kg], servos and pitot of 1 kg [1]."""
-
-    @property
-    def load_lift(self) -> FloatArray:
-        """Load (n,) of load factor 1 [N]."""
-
-    @property
-    def load_tip(self) -> FloatArray:
-        """Load (n,) of a tip force of 1 N [1]."""
-
-    @property
-    def gauge_output(self) -> Any:
-        """Strains of the gauges, sparse (G, n) [1/m]."""
-
-    @property
-    def tip_displacement_output(self) -> FloatArray:
-        """Upward displacement of the tip, (n,) [1]."""
-
-    @property
-    def design_hash(self) -> str:
-        """Hash of the design."""
-
-
-def affine_sum(coefficients: npt.ArrayLike, terms: tuple[Any, ...]) -> Any:
-    """Return the sparse matrix sum of `coefficients` times `terms`."""
-    factors = np.asarray(coefficients, dtype=np.float64)
-    total = factors[0] * terms[0]
-    for factor, term in zip(factors[1:], terms[1:], strict=True):
-        total = total + factor * term
-    return total.tocsr()
 
 
 class Norm:

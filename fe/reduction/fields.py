@@ -5,15 +5,15 @@ basis, which takes milliseconds.
 """
 
 import tempfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from fe.runtime.archive import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
+from fe.runtime.kept_arrays import KeptArrays
 from fe.runtime.reduced import ReducedModel
 
 if TYPE_CHECKING:
@@ -44,14 +44,12 @@ def _order(wanted: FloatArray, given: FloatArray) -> list[int]:
 _MIRRORED = _order(_VTK_NODES * [1.0, 1.0, -1.0] + [0.0, 0.0, 1.0], _VTK_NODES)
 
 
-@dataclass(frozen=True)
-class FieldBasis:
+@dataclass(frozen=True, repr=False)
+class FieldBasis(KeptArrays):
     """The bases of a reduced model on the nodes and cells of the mesh.
 
     Attributes
     ----------
-    design_hash : str
-        Hash of the design.
     points : (P, 3) ndarray
         Nodes [m].
     cells : (C, 20) ndarray
@@ -66,7 +64,9 @@ class FieldBasis:
         Modal basis vectors.
     """
 
-    design_hash: str
+    what = "a field basis"
+    kinds: ClassVar = {"cells": np.int64, "region": np.int64}
+
     points: FloatArray
     cells: IntArray
     region: IntArray
@@ -75,9 +75,16 @@ class FieldBasis:
     modal_displacement: FloatArray
 
     def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.cells.min() < 0 or self.cells.max() >= len(self.points):
+            raise ReducedModelFileError(
+                "The cells of a field basis have nodes that are not there; build the basis anew."
+            )
+
+    def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
         points, cells = self.points.shape[:1], self.cells.shape[:1]
         static, modal = self.static_displacement.shape[2:3], self.modal_displacement.shape[2:3]
-        expected = {
+        return {
             "points": (*points, 3),
             "cells": (*cells, 20),
             "region": cells,
@@ -85,48 +92,6 @@ class FieldBasis:
             "static_strain": (*cells, 6, *static),
             "modal_displacement": (*points, 3, *modal),
         }
-        for name, shape in expected.items():
-            array = getattr(self, name)
-            kind = "i" if name in ("cells", "region") else "f"
-            if array.shape != shape or array.dtype.kind != kind or not array.size:
-                raise ReducedModelFileError(
-                    f"The array {name} of a field basis has the shape {array.shape} and the type "
-                    f"{array.dtype}, which does not fit the others; build the basis anew."
-                )
-        if self.cells.min() < 0 or self.cells.max() >= len(self.points):
-            raise ReducedModelFileError(
-                "The cells of a field basis have nodes that are not there; build the basis anew."
-            )
-
-    def to_bytes(self) -> bytes:
-        """Return the basis as the bytes of an `.npz` file; equal bases give equal bytes."""
-        return arrays_to_bytes({item.name: np.array(getattr(self, item.name)) for item in fields(self)})
-
-    @classmethod
-    def from_bytes(cls, content: bytes, where: str) -> "FieldBasis":
-        """Return the basis that `to_bytes` packed.
-
-        Parameters
-        ----------
-        content : bytes
-            An `.npz` archive.
-        where : str
-            What is being read, for the error message.
-
-        Returns
-        -------
-        FieldBasis
-            The basis.
-
-        Raises
-        ------
-        ReducedModelFileError
-            If the archive is damaged or incomplete.
-        """
-        names = [item.name for item in fields(cls)]
-        arrays = arrays_from_bytes(content, where, names)
-        values: dict[str, Any] = {name: arrays[name] for name in names}
-        return cls(**{**values, "design_hash": str(arrays["design_hash"])})
 
 
 @dataclass(frozen=True)
@@ -163,11 +128,6 @@ def field_basis(operators: "AffineOperators", reduction: "Reduction") -> FieldBa
         The full model.
     reduction : Reduction
         What was made of it.
-
-    Returns
-    -------
-    FieldBasis
-        The bases on nodes and cells.
     """
     from skfem import ElementHexS2
 
@@ -216,10 +176,8 @@ def write_wing_vtu(
         The file; an existing one is replaced.
     wing : WingFields
         The wing, from `fe.reduction.model_cache.wing_fields`.
-    young_modulus_factor : float
-        e [1].
-    stiffness_loss : tuple of float
-        (z1, z2), fractions.
+    young_modulus_factor, stiffness_loss
+        As of `fe.runtime.state.DigitalState`.
     load_factor : float
         Load factor [1].
     tip_force : float
@@ -272,12 +230,8 @@ def write_modes_vtu(
         The file; an existing one is replaced.
     wing : WingFields
         The wing, from `fe.reduction.model_cache.wing_fields`.
-    young_modulus_factor : float
-        e [1].
-    stiffness_loss : tuple of float
-        (z1, z2), fractions.
-    servo_mass, pitot_mass : float
-        Masses [kg].
+    young_modulus_factor, stiffness_loss, servo_mass, pitot_mass
+        As of `fe.runtime.state.DigitalState`.
 
     Raises
     ------

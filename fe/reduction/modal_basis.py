@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import eigh
 
-from fe.full.subspace import AffineSystem, Norm, OrthonormalBasis, affine_sum
+from fe.full.affine import AffineSystem, affine_sum
+from fe.full.subspace import Norm, OrthonormalBasis
 from fe.runtime.errors import ReductionError
 
 FloatArray = npt.NDArray[np.float64]
@@ -152,11 +153,6 @@ def reduce_modes(
         Accuracy.
     advance : callable
         Called after each sampled state.
-
-    Returns
-    -------
-    ModalData
-        Basis and projected terms.
 
     Raises
     ------

@@ -1,6 +1,8 @@
 """Reduced models kept between runs: an unchanged design is built once, a changed one is built anew."""
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,8 +15,10 @@ from .built_once import built_once, cache_folder, kept
 from .fields import FieldBasis, WingFields, field_basis
 
 if TYPE_CHECKING:
+    from fe.full.operators import AffineOperators
     from fe.wing.design import WingDesign
 
+    from .patch_basis import PatchSettings
     from .reduced_basis import Progress
     from .settings import ReductionSettings
 
@@ -34,7 +38,7 @@ def modelling_hash() -> str:
     return digest.hexdigest()
 
 
-def cache_key(design: "WingDesign", settings: "ReductionSettings | None" = None) -> str:
+def cache_key(design: "WingDesign", settings: "ReductionSettings | PatchSettings | None" = None) -> str:
     """Return the name of a cache entry: a hash of design, reduction settings and modelling code."""
     content = f"{design.hash} {settings!r} {modelling_hash()}"
     return hashlib.sha256(content.encode()).hexdigest()[:32]
@@ -69,11 +73,6 @@ def reduced_model(
     settings : ReductionSettings, optional
         Where and how well the model is to hold.
 
-    Returns
-    -------
-    ReducedModel
-        The model.
-
     Raises
     ------
     FiniteElementError
@@ -91,24 +90,7 @@ def wing_fields(
 ) -> WingFields:
     """Return the reduced model of a design with its field basis, from the cache if both are there.
 
-    Parameters
-    ----------
-    design : WingDesign, optional
-        The wing; the shipped one if left out.
-    progress : Progress, optional
-        Where a build reports.
-    settings : ReductionSettings, optional
-        Where and how well the model is to hold.
-
-    Returns
-    -------
-    WingFields
-        Model and field basis.
-
-    Raises
-    ------
-    FiniteElementError
-        If the design cannot be modelled or reduced.
+    Parameters and errors as of `reduced_model`.
     """
     wing = given_or_shipped(design)
     entry = _entry(wing, settings)
@@ -162,33 +144,25 @@ def build(
     It works in one thread, because sums over several threads depend on their number: a design gives the
     same bytes on a machine whatever its cores do.
 
-    Parameters
-    ----------
-    design : WingDesign
-        The wing.
-    progress : Progress, optional
-        Where to report.
-    settings : ReductionSettings, optional
-        Where and how well the model is to hold.
-
-    Returns
-    -------
-    WingFields
-        Model and field basis.
-
-    Raises
-    ------
-    FiniteElementError
-        If the design cannot be modelled or reduced.
+    Parameters and errors as of `reduced_model`.
     """
+    from .reduced_basis import reduce_model
+
+    with assembled(design, progress) as operators:
+        reduction = reduce_model(operators, settings, progress)
+        return WingFields(reduction.model, field_basis(operators, reduction))
+
+
+@contextmanager
+def assembled(design: "WingDesign", progress: "Progress | None") -> "Iterator[AffineOperators]":
+    """Give the full model of a design, and hold the process to one thread meanwhile."""
     from threadpoolctl import threadpool_limits
 
     from fe.full.operators import assemble
 
-    from .reduced_basis import reduce_model, stage_of
+    from .reduced_basis import stage_of
 
     with threadpool_limits(1):
         with stage_of(progress, "Meshing and assembling the wing"):
             operators = assemble(design)
-        reduction = reduce_model(operators, settings, progress)
-        return WingFields(reduction.model, field_basis(operators, reduction))
+        yield operators

@@ -6,7 +6,7 @@ presence squares the error of a strain). In it, many patched states are solved; 
 their solutions and modes, weighed by what is looked at most, are the basis that is kept.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -261,7 +261,7 @@ def projected(arrays: PatchArrays, directions: FloatArray, settings: PatchSettin
         small = directions.T @ terms @ directions
         return np.asarray(0.5 * (small + small.transpose(0, 2, 1)))
 
-    values = {name: getattr(arrays, name) for name in arrays.__dataclass_fields__}
+    values = {item.name: getattr(arrays, item.name) for item in fields(arrays)}
     for name in (
         "flap_row", "line_rows", "load_tip", "load_lift", "lift_rows", "weight", "strain_rows", "tip_row"
     ):  # fmt: skip

@@ -1,25 +1,18 @@
 """Wings for patches kept between runs, beside the reduced models and like them."""
 
-import hashlib
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.patch_arrays import PatchArrays
 
 from .built_once import built_once, cache_folder, kept
-from .model_cache import given_or_shipped, modelling_hash
+from .model_cache import assembled, cache_key, given_or_shipped
 
 if TYPE_CHECKING:
     from fe.wing.design import WingDesign
 
     from .patch_basis import PatchSettings
     from .reduced_basis import Progress
-
-
-def patch_cache_key(design: "WingDesign", settings: "PatchSettings | None" = None) -> str:
-    """Return the name of a cache entry: a hash of design, settings and modelling code."""
-    return hashlib.sha256(f"patches {design.hash} {settings!r} {modelling_hash()}".encode()).hexdigest()[:32]
 
 
 def patch_arrays(
@@ -38,21 +31,19 @@ def patch_arrays(
     settings : PatchSettings, optional
         How far changes may go and how well they are held.
 
-    Returns
-    -------
-    PatchArrays
-        For `fe.runtime.patched_wing.PatchedWing`.
-
     Raises
     ------
     FiniteElementError
         If the design cannot be modelled or reduced.
     """
     wing = given_or_shipped(design)
-    path = cache_folder() / f"wing-{patch_cache_key(wing, settings)}-patches.npz"
+    path = cache_folder() / f"wing-{cache_key(wing, settings)}-patches.npz"
 
     def load() -> PatchArrays:
-        return _checked(path, wing)
+        arrays = PatchArrays.load(path)
+        if arrays.design_hash != wing.hash:
+            raise ReducedModelFileError(f"{path} holds the wing of another design; delete it.")
+        return arrays
 
     return kept(load) or built_once(
         path,
@@ -62,13 +53,6 @@ def patch_arrays(
     )
 
 
-def _checked(path: Path, design: "WingDesign") -> PatchArrays:
-    arrays = PatchArrays.load(path)
-    if arrays.design_hash != design.hash:
-        raise ReducedModelFileError(f"{path} holds the wing of another design; delete it.")
-    return arrays
-
-
 def build_patch_arrays(
     design: "WingDesign", progress: "Progress | None" = None, settings: "PatchSettings | None" = None
 ) -> PatchArrays:
@@ -76,14 +60,7 @@ def build_patch_arrays(
 
     Parameters and errors as of `patch_arrays`.
     """
-    from threadpoolctl import threadpool_limits
-
-    from fe.full.operators import assemble
-
     from .patch_basis import reduce_patches
-    from .reduced_basis import stage_of
 
-    with threadpool_limits(1):
-        with stage_of(progress, "Meshing and assembling the wing"):
-            operators = assemble(design)
+    with assembled(design, progress) as operators:
         return reduce_patches(operators, settings, progress)

@@ -15,11 +15,10 @@ from pymor.algorithms.greedy import WeakGreedySurrogate, weak_greedy
 from pymor.core.exceptions import ExtensionError
 from pymor.core.logger import set_log_levels
 
+from fe.full.affine import AffineSystem, affine_sum
 from fe.full.subspace import (
-    AffineSystem,
     Norm,
     OrthonormalBasis,
-    affine_sum,
     conjugate_gradients,
     triangular_factors,
 )
@@ -267,11 +266,6 @@ def reduce_model(
         Where and how well it is to hold.
     progress : Progress, optional
         Where to report.
-
-    Returns
-    -------
-    Reduction
-        The model and its bases.
 
     Raises
     ------

@@ -113,11 +113,6 @@ def laws_of(patch: ModelPatch, ports: Collection[str]) -> Laws:
     ports : collection of str
         Ports that the model has.
 
-    Returns
-    -------
-    Laws
-        For `simulate`.
-
     Raises
     ------
     InvalidPatchError
@@ -131,9 +126,8 @@ def laws_of(patch: ModelPatch, ports: Collection[str]) -> Laws:
         if item.port not in ports:
             known = f"it has {', '.join(ports)}" if ports else "it has none"
             raise InvalidPatchError(
-                f"The primitive {item.kind!r} acts on the port {item.port!r}, which this model "
-                f"does not have; "
-                f"{known}."
+                f"The primitive {item.kind!r} acts on the port {item.port!r}, which this model does not "
+                f"have; {known}."
             )
         if item.magnitude == 0.0:
             continue

@@ -23,6 +23,9 @@ from .primitive import Primitive as Primitive
 
 EVERY_CHANNEL = "*"
 """Name that stands for every channel of the primitive's quantity."""
+CHANNEL_UNIT = "channel's unit"
+PER_RELEASE = f"{CHANNEL_UNIT} per release amplitude"
+"""Units of numbers that are shown by a channel."""
 
 
 # ---------------------------------------------------------------- mass and stiffness
@@ -33,6 +36,7 @@ class PointMass(Primitive):
     """A mass [kg] on the elastic line at `station` [m] from the root (lumped model: at a named place)."""
 
     kind: ClassVar[str] = "point_mass"
+    units: ClassVar[dict[str, str]] = {"mass": "kg", "station": "m"}
     mass: float
     station: float
 
@@ -42,6 +46,7 @@ class RootCompliance(Primitive):
     """A rotational spring in series with the root: `compliance` [rad/(N m)] about the flapping axis."""
 
     kind: ClassVar[str] = "root_compliance"
+    units: ClassVar[dict[str, str]] = {"compliance": "rad/(N m)"}
     compliance: float
 
 
@@ -50,6 +55,7 @@ class LocalStiffnessLoss(Primitive):
     """The skin between `start` and `start + length` [m] from the root keeps 1 - `loss` of its stiffness."""
 
     kind: ClassVar[str] = "local_stiffness_loss"
+    units: ClassVar[dict[str, str]] = {"loss": "1", "start": "m", "length": "m"}
     loss: float
     start: float
     length: float
@@ -60,6 +66,7 @@ class ModulusTemperature(Primitive):
     """Young's modulus falls with temperature: E (1 - `coefficient` (T - T_ref)), `coefficient` [1/K]."""
 
     kind: ClassVar[str] = "modulus_temperature"
+    units: ClassVar[dict[str, str]] = {"coefficient": "1/K"}
     coefficient: float
 
 
@@ -68,6 +75,7 @@ class StiffnessDrift(Primitive):
     """The whole stiffness changes with time within a record: K (1 + `rate` t), `rate` [1/s]."""
 
     kind: ClassVar[str] = "stiffness_drift"
+    units: ClassVar[dict[str, str]] = {"rate": "1/s"}
     rate: float
 
 
@@ -88,6 +96,7 @@ class LoadPlace(Primitive):
     """Applied forces act `along_span` [m] further outboard, `along_chord` [m] further aft than recorded."""
 
     kind: ClassVar[str] = "load_place"
+    units: ClassVar[dict[str, str]] = {"along_span": "m", "along_chord": "m"}
     along_span: float
     along_chord: float
 
@@ -97,6 +106,7 @@ class LoadGain(Primitive):
     """The force that acts is (1 + `gain`) times the recorded one plus `tare` [N], while one is applied."""
 
     kind: ClassVar[str] = "load_gain"
+    units: ClassVar[dict[str, str]] = {"gain": "1", "tare": "N"}
     gain: float
     tare: float
 
@@ -106,6 +116,7 @@ class Washout(Primitive):
     """Lift in flight is l (1 - `coefficient` n eta^`exponent`), eta = y / semi-span, n the load factor."""
 
     kind: ClassVar[str] = "washout"
+    units: ClassVar[dict[str, str]] = {"coefficient": "1", "exponent": "1"}
     coefficient: float
     exponent: float
 
@@ -115,6 +126,7 @@ class InertiaRelief(Primitive):
     """In flight the structure's weight times n relieves the lift by this `fraction` more than modelled."""
 
     kind: ClassVar[str] = "inertia_relief"
+    units: ClassVar[dict[str, str]] = {"fraction": "1"}
     fraction: float
 
 
@@ -128,6 +140,7 @@ class SensorGain(Primitive):
     """A channel shows (1 + `gain`) times what it should."""
 
     kind: ClassVar[str] = "sensor_gain"
+    units: ClassVar[dict[str, str]] = {"gain": "1"}
     channel: str
     gain: float
     quantity: str = ""
@@ -138,6 +151,7 @@ class SensorDrift(Primitive):
     """A channel's zero moves by `amplitude` (t / `time`)^`exponent`, t since the campaign's start [s]."""
 
     kind: ClassVar[str] = "sensor_drift"
+    units: ClassVar[dict[str, str]] = {"amplitude": CHANNEL_UNIT, "time": "s", "exponent": "1"}
     channel: str
     amplitude: float
     time: float
@@ -150,6 +164,7 @@ class SensorRotation(Primitive):
     """A strain gauge is turned by `angle` [rad] in the skin, from spanwise towards the tip's rear."""
 
     kind: ClassVar[str] = "sensor_rotation"
+    units: ClassVar[dict[str, str]] = {"angle": "rad"}
     channel: str
     angle: float
 
@@ -159,6 +174,7 @@ class ThermalStrain(Primitive):
     """Strain channels show `coefficient` [1/K] times (T - T_ref) more."""
 
     kind: ClassVar[str] = "thermal_strain"
+    units: ClassVar[dict[str, str]] = {"coefficient": "1/K"}
     channel: str
     coefficient: float
 
@@ -171,6 +187,7 @@ class HighPass(Primitive):
     """
 
     kind: ClassVar[str] = "high_pass"
+    units: ClassVar[dict[str, str]] = {"time_constant": "s", "order": "1"}
     channel: str
     time_constant: float
     order: float = 1.0
@@ -182,6 +199,7 @@ class Clock(Primitive):
     """A sample that is stamped t was taken at (1 + `rate`) t + `zero` [s]."""
 
     kind: ClassVar[str] = "clock"
+    units: ClassVar[dict[str, str]] = {"rate": "1", "zero": "s"}
     rate: float
     zero: float
 
@@ -194,6 +212,7 @@ class Line(Primitive):
     """
 
     kind: ClassVar[str] = "line"
+    units: ClassVar[dict[str, str]] = {"frequency": "Hz", "cosine": CHANNEL_UNIT, "sine": CHANNEL_UNIT}
     channel: str
     frequency: float
     cosine: float
@@ -209,6 +228,9 @@ class DecayingLine(Primitive):
     """
 
     kind: ClassVar[str] = "decaying_line"
+    units: ClassVar[dict[str, str]] = {
+        "frequency": "Hz", "damping_ratio": "1", "cosine": PER_RELEASE, "sine": PER_RELEASE
+    }  # fmt: skip
     channel: str
     frequency: float
     damping_ratio: float
@@ -222,6 +244,7 @@ class RunOffset(Primitive):
     """Static readings of the trials labelled `run` have this `offset` (channel's unit): seating of a run."""
 
     kind: ClassVar[str] = "run_offset"
+    units: ClassVar[dict[str, str]] = {"offset": CHANNEL_UNIT}
     run: str
     offset: float
     channel: str = EVERY_CHANNEL

@@ -3,22 +3,18 @@
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from math import isfinite
-from pathlib import Path
-from typing import Any, Self
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from .archive import arrays_from_bytes, arrays_to_bytes, write_bytes_atomically
 from .errors import ReducedModelFileError
+from .kept_arrays import KeptArrays
 from .reduced_arrays import PARAMETER_NAMES
 
 FloatArray = npt.NDArray[np.float64]
-
-PATCH_FORMAT = 1
-"""Version of the array layout in the file."""
 
 SCALARS = (
     "flap_spring",
@@ -33,13 +29,11 @@ SCALARS = (
 
 
 @dataclass(frozen=True, repr=False)
-class PatchArrays:
+class PatchArrays(KeptArrays):
     """Dense matrices and rows of a wing in a basis of n vectors, made for changes of `fe.runtime.patch`.
 
     Attributes
     ----------
-    design_hash : str
-        Hash of the design that these arrays were made of.
     validity_box : (7, 2) ndarray
         Least and largest value of each of `fe.runtime.reduced_arrays.PARAMETER_NAMES`, SI units.
     largest_loss, largest_compliance, largest_mass : float
@@ -93,7 +87,10 @@ class PatchArrays:
         Modes of the wing as it was, from which the modes of a patched one are iterated.
     """
 
-    design_hash: str
+    what = "a wing for patches"
+    layout = ("patch_format", 1)
+    kinds: ClassVar = {"strip_stiffness": np.float32, "strip_of": np.int64, "term_of": np.int64}
+
     validity_box: FloatArray
     largest_loss: float
     largest_compliance: float
@@ -126,17 +123,7 @@ class PatchArrays:
     start_shapes: FloatArray
 
     def __post_init__(self) -> None:
-        kinds: dict[str, type[Any]] = {
-            "strip_stiffness": np.float32, "strip_of": np.int64, "term_of": np.int64
-        }  # fmt: skip
-        for name, expected in self._expected_shapes().items():
-            array = getattr(self, name)
-            kind = kinds.get(name, np.float64)
-            if array.shape != expected or array.dtype != kind or not np.isfinite(array).all():
-                raise ReducedModelFileError(
-                    f"The array {name} of a wing for patches must hold finite numbers in the shape "
-                    f"{expected}, but it has shape {array.shape} and type {array.dtype}; build it anew."
-                )
+        super().__post_init__()
         for name in SCALARS:
             value = getattr(self, name)
             if not (isfinite(value) and value > 0.0):
@@ -195,53 +182,3 @@ class PatchArrays:
             f"PatchArrays(design_hash={self.design_hash!r}, basis={len(self.load_tip)}, "
             f"strips={len(self.strip_lines) - 1}, gauges={self.strain_rows.shape[1]})"
         )
-
-    def to_bytes(self) -> bytes:
-        """Return the arrays as the bytes of an `.npz` file; the same arrays give the same bytes."""
-        arrays: dict[str, npt.NDArray[Any]] = {"patch_format": np.array(PATCH_FORMAT)}
-        for item in fields(self):
-            arrays[item.name] = np.array(getattr(self, item.name))
-        return arrays_to_bytes(arrays)
-
-    @classmethod
-    def from_bytes(cls, content: bytes, where: str = "The wing for patches") -> Self:
-        """Return the arrays that `to_bytes` packed, equal to the last bit.
-
-        Parameters
-        ----------
-        content : bytes
-            An `.npz` archive.
-        where : str
-            What is being read, for the error message.
-
-        Raises
-        ------
-        ReducedModelFileError
-            If the archive is damaged, incomplete or of another format.
-        """
-        names = [item.name for item in fields(cls)]
-        arrays = arrays_from_bytes(content, where, ("patch_format", *names))
-        if arrays["patch_format"].tolist() != PATCH_FORMAT:
-            raise ReducedModelFileError(
-                f"{where} has the format {arrays['patch_format']}, but this version reads {PATCH_FORMAT}; "
-                "build it anew."
-            )
-        values: dict[str, Any] = {name: arrays[name] for name in names}
-        try:
-            values["design_hash"] = str(arrays["design_hash"])
-            for name in (*SCALARS, "straight_chord_line", "gauge_length"):
-                values[name] = float(arrays[name])
-            return cls(**values)
-        except (TypeError, ValueError, IndexError) as cause:
-            raise ReducedModelFileError(
-                f"{where} does not hold the arrays of a wing for patches ({cause}); build it anew."
-            ) from cause
-
-    def save(self, path: str | Path) -> None:
-        """Write the arrays to one `.npz` file, whole or not at all; `OSError` if that fails."""
-        write_bytes_atomically(Path(path), self.to_bytes())
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read what `save` wrote; raises `FileNotFoundError` or `ReducedModelFileError`."""
-        return cls.from_bytes(Path(path).read_bytes(), str(path))

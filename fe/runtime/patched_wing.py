@@ -100,12 +100,8 @@ class PatchedWing:
 
         Parameters
         ----------
-        young_modulus_factor : float
-            e [1].
-        stiffness_loss : tuple of float
-            (z1, z2), fractions.
-        servo_mass, pitot_mass : float
-            Masses [kg].
+        young_modulus_factor, stiffness_loss, servo_mass, pitot_mass
+            As of `fe.runtime.state.DigitalState`.
         patch : ModelPatch
             Its point masses, root compliances, local losses and temperature coefficients act.
         temperature_difference : float

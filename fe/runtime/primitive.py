@@ -15,6 +15,8 @@ class Primitive:
     """One primitive change; `kind` names its class in a file. All values SI; zero magnitude is no change."""
 
     kind: ClassVar[str] = ""
+    units: ClassVar[dict[str, str]] = {}
+    """Unit of each real number; at a port, "of one that is displaced or one that turns"."""
 
     def __post_init__(self) -> None:
         for item in fields(self):

@@ -104,19 +104,12 @@ class ReducedModel(ReducedArrays):
 
         Parameters
         ----------
-        young_modulus_factor : float
-            e, the factor on Young's modulus of the skin [1].
-        stiffness_loss : tuple of float
-            (z1, z2), fractions of stiffness lost [1].
+        young_modulus_factor, stiffness_loss
+            As of `fe.runtime.state.DigitalState`.
         load_factor : float
             Load factor of the manoeuvre [1].
         tip_force : float
             Force 5 cm from the tip [N], upwards positive.
-
-        Returns
-        -------
-        StaticResponse
-            Strain, tip displacement, their error bounds, reduced coordinates.
 
         Raises
         ------
@@ -232,10 +225,8 @@ class ReducedModel(ReducedArrays):
 
         Parameters
         ----------
-        young_modulus_factor : float
-            e [1].
-        stiffness_loss : tuple of float
-            (z1, z2), fractions.
+        young_modulus_factor, stiffness_loss
+            As of `fe.runtime.state.DigitalState`.
 
         Returns
         -------
@@ -261,17 +252,8 @@ class ReducedModel(ReducedArrays):
 
         Parameters
         ----------
-        young_modulus_factor : float
-            e [1].
-        stiffness_loss : tuple of float
-            (z1, z2), fractions.
-        servo_mass, pitot_mass : float
-            Mass of each servo and of the pitot tube [kg].
-
-        Returns
-        -------
-        Modes
-            Frequencies, shapes, outputs, participations, indices of the flapwise bending modes.
+        young_modulus_factor, stiffness_loss, servo_mass, pitot_mass
+            As of `fe.runtime.state.DigitalState`.
 
         Raises
         ------

@@ -3,28 +3,23 @@
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from math import isfinite
-from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from .archive import arrays_from_bytes, arrays_to_bytes, write_bytes_atomically
 from .errors import ReducedModelFileError
+from .kept_arrays import KeptArrays
 
 FloatArray = npt.NDArray[np.float64]
 
 PARAMETER_NAMES = ("young_modulus_factor", "z1", "z2", "load_factor", "tip_force", "servo_mass", "pitot_mass")
 """The rows of `ReducedModel.validity_box`, in this order."""
 
-FORMAT = 1
-"""Version of the array layout in the file."""
-
 
 @dataclass(frozen=True, repr=False)
-class ReducedArrays:
+class ReducedArrays(KeptArrays):
     """Affine dense matrices, outputs, modal data, error bound and validity of a reduced wing.
 
     Terms of the stiffness, in this order: skin (times e), first defect region (times 1 - z1), second defect
@@ -34,8 +29,6 @@ class ReducedArrays:
 
     Attributes
     ----------
-    design_hash : str
-        Hash of the design that this model was made of.
     validity_box : (7, 2) ndarray
         Least and largest value of each of `PARAMETER_NAMES`, SI units.
     static_stiffness : (4, N, N) ndarray
@@ -77,7 +70,9 @@ class ReducedArrays:
         Number of modes M that `modes` returns.
     """
 
-    design_hash: str
+    what = "a reduced model"
+    layout = ("format", 1)
+
     validity_box: FloatArray
     static_stiffness: FloatArray
     static_load: FloatArray
@@ -100,13 +95,7 @@ class ReducedArrays:
     mode_count: int
 
     def __post_init__(self) -> None:
-        for name, expected in self._expected_shapes().items():
-            array = getattr(self, name)
-            if array.shape != expected or array.dtype != np.float64 or not np.isfinite(array).all():
-                raise ReducedModelFileError(
-                    f"The array {name} of a reduced model must hold finite numbers in the shape {expected}, "
-                    f"but it has shape {array.shape} and type {array.dtype}; build the model anew."
-                )
+        super().__post_init__()
         if not 1 <= self.mode_count <= self.modal_stiffness.shape[1]:
             raise ReducedModelFileError(
                 f"A reduced model with {self.modal_stiffness.shape[1]} modal basis vectors cannot have "
@@ -145,88 +134,3 @@ class ReducedArrays:
             "cross_mass": (3, m, n),
             "flapwise_reference": (2, m),
         }
-
-    def to_bytes(self) -> bytes:
-        """Return the model as the bytes of an `.npz` file; the same model gives the same bytes."""
-        arrays: dict[str, npt.NDArray[Any]] = {"format": np.array(FORMAT)}
-        for item in fields(self):
-            if item.init:
-                arrays[item.name] = np.array(getattr(self, item.name))
-        return arrays_to_bytes(arrays)
-
-    @classmethod
-    def from_bytes(cls, content: bytes, where: str = "The reduced model") -> Self:
-        """Return the model that `to_bytes` packed.
-
-        Parameters
-        ----------
-        content : bytes
-            An `.npz` archive.
-        where : str
-            What is being read, for the error message.
-
-        Returns
-        -------
-        ReducedModel
-            The model, equal to the last bit.
-
-        Raises
-        ------
-        ReducedModelFileError
-            If the archive is damaged, incomplete or of another format.
-        """
-        names = [item.name for item in fields(cls) if item.init]
-        arrays = arrays_from_bytes(content, where, ("format", *names))
-        if arrays["format"].tolist() != FORMAT:
-            raise ReducedModelFileError(
-                f"{where} has the format {arrays['format']}, but this version reads {FORMAT}; build it anew."
-            )
-        values: dict[str, Any] = {name: arrays[name] for name in names}
-        values["design_hash"] = str(arrays["design_hash"])
-        try:
-            for name in ("residual_allowance", "rounding_allowance"):
-                values[name] = float(arrays[name])
-            values["mode_count"] = int(arrays["mode_count"])
-            return cls(**values)
-        except (TypeError, ValueError, IndexError) as cause:
-            raise ReducedModelFileError(
-                f"{where} does not hold the arrays of a reduced model ({cause}); build it anew."
-            ) from cause
-
-    def save(self, path: str | Path) -> None:
-        """Write the model to one `.npz` file, whole or not at all.
-
-        Parameters
-        ----------
-        path : str or Path
-            The file.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written.
-        """
-        write_bytes_atomically(Path(path), self.to_bytes())
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read a model that `save` wrote.
-
-        Parameters
-        ----------
-        path : str or Path
-            The file.
-
-        Returns
-        -------
-        ReducedModel
-            The model, equal to the last bit.
-
-        Raises
-        ------
-        FileNotFoundError
-            If there is no such file.
-        ReducedModelFileError
-            If it is damaged, incomplete or of another format.
-        """
-        return cls.from_bytes(Path(path).read_bytes(), str(path))

@@ -47,17 +47,7 @@ class TransientState:
 
     @classmethod
     def from_list(cls, values: Sequence[float]) -> "TransientState":
-        """Return the state that `to_list` wrote.
-
-        Parameters
-        ----------
-        values : sequence of float
-            2 M + 2 numbers.
-
-        Returns
-        -------
-        TransientState
-            The state.
+        """Return the state that `to_list` wrote, 2 M + 2 numbers.
 
         Raises
         ------
@@ -107,11 +97,6 @@ def free_propagator(angular_frequency: FloatArray, damping_ratio: FloatArray, du
         Damping ratios, zero or positive [1].
     duration : float
         Time [s], zero or positive.
-
-    Returns
-    -------
-    Propagator
-        The four factors of each mode.
     """
     omega, zeta = angular_frequency, damping_ratio
     decay = zeta * omega
@@ -147,14 +132,8 @@ class ModalIntegrator:
     ----------
     model : ReducedModel
         The wing.
-    young_modulus_factor : float
-        e [1].
-    stiffness_loss : tuple of float
-        (z1, z2), fractions.
-    servo_mass, pitot_mass : float
-        Masses [kg].
-    damping_alpha, damping_beta : float
-        Rayleigh coefficients [1/s], [s], Kapteyn et al. 2021, eq. (17).
+    young_modulus_factor, stiffness_loss, servo_mass, pitot_mass, damping_alpha, damping_beta
+        As of `fe.runtime.state.DigitalState`.
 
     Attributes
     ----------
@@ -211,38 +190,12 @@ class ModalIntegrator:
         self._cached: tuple[float, Propagator] | None = None
 
     def static_response(self, load_factor: float, tip_force: float = 0.0) -> TransientResponse:
-        """Return the response that the wing has after resting under a load.
-
-        Parameters
-        ----------
-        load_factor : float
-            Load factor [1].
-        tip_force : float
-            Tip force [N].
-
-        Returns
-        -------
-        TransientResponse
-            Strain, tip displacement, no velocity.
-        """
+        """Return the response, without velocity, after resting under a load factor [1] and tip force [N]."""
         output = self._static_output @ np.array((load_factor, tip_force))
         return TransientResponse(output[:-1], float(output[-1]), 0.0)
 
     def at_rest(self, load_factor: float, tip_force: float = 0.0) -> TransientState:
-        """Return the state of equilibrium under a load.
-
-        Parameters
-        ----------
-        load_factor : float
-            Load factor [1].
-        tip_force : float
-            Tip force [N].
-
-        Returns
-        -------
-        TransientState
-            Static shape, no velocity.
-        """
+        """Return the state of equilibrium under a load factor [1] and tip force [N]."""
         load = np.array((load_factor, tip_force), dtype=np.float64)
         return TransientState(self._modal_static @ load, np.zeros_like(self._omega), load)
 
@@ -257,11 +210,6 @@ class ModalIntegrator:
             How far the holding force had moved the tip from its equilibrium under the other loads [m].
         load_factor, tip_force : float
             The loads that stay [1], [N].
-
-        Returns
-        -------
-        TransientState
-            Static shape under loads and holding force, no velocity, the holding force gone.
         """
         rest = self.at_rest(load_factor, tip_force)
         holding_force = initial_tip_displacement / self._static[1].tip_displacement
@@ -282,11 +230,6 @@ class ModalIntegrator:
             Time [s], positive.
         load : (2,) array_like
             Load factor [1] and tip force [N].
-
-        Returns
-        -------
-        TransientState
-            The state after, with `load`.
 
         Raises
         ------
@@ -314,51 +257,21 @@ class ModalIntegrator:
         )
 
     def response(self, state: TransientState) -> TransientResponse:
-        """Return the outputs at a state; the modes that are not kept follow its load at once.
-
-        Parameters
-        ----------
-        state : TransientState
-            The state.
-
-        Returns
-        -------
-        TransientResponse
-            Strain, tip displacement, tip velocity (of the kept modes).
-        """
+        """Return the outputs at a state; the modes that are not kept follow its load at once."""
         output = self._modal_output @ state.displacement + self._correction @ state.load
         return TransientResponse(
             output[:-1], float(output[-1]), float(self.modes.tip_displacement @ state.velocity)
         )
 
     def load_point_displacement(self, state: TransientState) -> float:
-        """Return the displacement of the point where the tip force acts, 5 cm from the tip.
-
-        Parameters
-        ----------
-        state : TransientState
-            The state.
-
-        Returns
-        -------
-        float
-            Displacement, upwards positive [m].
-        """
+        """Return the upward displacement of the point where the tip force acts, 5 cm from the tip [m]."""
         kept = self.modes.tip_participation @ state.displacement
         return float(kept + self._load_point_correction @ state.load)
 
     def energy(self, state: TransientState) -> float:
-        """Return the mechanical energy of the kept modes about the equilibrium under the state's load [J].
+        """Return kinetic plus strain energy of the kept modes about the equilibrium under the load [J].
 
-        Parameters
-        ----------
-        state : TransientState
-            The state.
-
-        Returns
-        -------
-        float
-            Kinetic plus strain energy [J]; it never grows while the load stays.
+        It never grows while the load stays.
         """
         deviation = self._omega * (state.displacement - self._modal_static @ state.load)
         return float(0.5 * (state.velocity @ state.velocity + deviation @ deviation))
@@ -370,17 +283,7 @@ class ModalIntegrator:
         with the new mass matrix (exactly, in reduced coordinates). The part that the new modes cannot hold
         follows the load without delay, as always.
 
-        Parameters
-        ----------
-        state : TransientState
-            The state, in the modes of `before`.
-        before : ModalIntegrator
-            The integrator of the state, of the same model.
-
-        Returns
-        -------
-        TransientState
-            The state in the modes of this integrator, under the same load.
+        `state` is in the modes of `before`, the integrator of the same model that it belongs to.
         """
         from_modal, from_static = self.model.modal_projection(self.modes, *self.masses)
         deviation = state.displacement - before._modal_static @ state.load

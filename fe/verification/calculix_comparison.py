@@ -71,10 +71,8 @@ def static_agreement(
         The model.
     folder : Path
         Where CalculiX works.
-    young_modulus_factor : float
-        e [1].
-    stiffness_loss : tuple of float
-        (z1, z2), fractions.
+    young_modulus_factor, stiffness_loss
+        As of `fe.runtime.state.DigitalState`.
 
     Raises
     ------

@@ -43,14 +43,8 @@ class CalculixModel:
     ----------
     operators : AffineOperators
         Mesh and free unknowns.
-    young_modulus_factor : float
-        e [1].
-    stiffness_loss : tuple of float
-        (z1, z2), fractions.
-    servo_mass, pitot_mass : float
-        Masses of one servo and of the pitot [kg].
-    damping_alpha, damping_beta : float
-        Rayleigh coefficients [1/s], [s].
+    young_modulus_factor, stiffness_loss, servo_mass, pitot_mass, damping_alpha, damping_beta
+        As of `fe.runtime.state.DigitalState`.
     """
 
     operators: AffineOperators

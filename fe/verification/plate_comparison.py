@@ -1,11 +1,11 @@
 """The box and the sandwich plate side by side: two idealisations of one design, nothing fitted to either."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fe.full.affine import AffineSystem
 from fe.full.modes import cantilever_bending, cantilever_bending_shapes, lowest_eigenpairs, track
 from fe.full.operators import AffineOperators, assemble
 from fe.full.statics import Factorisation
@@ -21,38 +21,6 @@ DAMAGE = 0.8
 """Stiffness loss of either defect at which its effect is compared."""
 MODES = 6
 """Number of modes compared."""
-
-
-class WingModel(Protocol):
-    """What both models of a wing have."""
-
-    @property
-    def unknowns(self) -> int:
-        """Number n of free unknowns."""
-
-    @property
-    def stiffness_terms(self) -> tuple[Any, ...]:
-        """Four matrices, csr (n, n) [N/m]; e scales the first."""
-
-    @property
-    def load_lift(self) -> FloatArray:
-        """Load (n,) of load factor 1 [N]."""
-
-    @property
-    def load_tip(self) -> FloatArray:
-        """Load (n,) of 1 N at the place of the static test, and the displacement there [1]."""
-
-    @property
-    def gauge_output(self) -> Any:
-        """Strains of the gauges, csr (gauges, n) [1/m]."""
-
-    def stiffness(
-        self, young_modulus_factor: float = 1.0, stiffness_loss: tuple[float, float] = (0.0, 0.0)
-    ) -> Any:
-        """Stiffness, csr (n, n) [N/m]."""
-
-    def mass(self, servo_mass: float, pitot_mass: float) -> Any:
-        """Mass, csr (n, n) [kg]."""
 
 
 @dataclass(frozen=True)
@@ -206,12 +174,12 @@ def gauges_at_edges(design: WingDesign) -> BoolArray:
     return found
 
 
-def wing_results(model: WingModel, design: WingDesign, bending_shapes: FloatArray) -> WingResults:
+def wing_results(model: AffineSystem, design: WingDesign, bending_shapes: FloatArray) -> WingResults:
     """Evaluate a model.
 
     Parameters
     ----------
-    model : WingModel
+    model : AffineSystem
         Box or plate.
     design : WingDesign
         The wing, for its load factor and masses.

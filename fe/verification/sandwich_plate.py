@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from fe.full.affine import AffineSystem
 from fe.full.gauges import patch_pieces
-from fe.full.operators import ROOT_UNKNOWNS, AffineOperators
-from fe.full.subspace import affine_sum
+from fe.full.operators import ROOT_UNKNOWNS
 from fe.full.turn_load import STANDARD_GRAVITY
 from fe.wing.design import WingDesign
 from fe.wing.lift import DISTRIBUTIONS
@@ -29,25 +29,11 @@ BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class PlateOperators:
-    """Affine plate model of the wing on its n free unknowns.
+class PlateOperators(AffineSystem):
+    """Affine plate model of the wing on its n free unknowns; `expansion` gives the five fields of all nodes.
 
     Attributes
     ----------
-    stiffness_terms : tuple of csr (n, n)
-        Skin without defects, defect 1, defect 2, and the rest with the root springs [N/m].
-    mass_terms : tuple of csr (n, n)
-        Structure [kg]; 1 kg in each servo; 1 kg in the pitot [1].
-    load_lift : (n,) N
-        Load of a turn at load factor 1.
-    load_tip : (n,) 1
-        Upward load of 1 N at the place of the static test.
-    gauge_output : csr (gauges, n) 1/m
-        Strain of each gauge, positive in compression, dimensionless.
-    tip_displacement_output : (n,) 1
-        Upward displacement at the tip, on the chord line of the static test.
-    expansion : csr (5 N, n)
-        Free unknowns to the five fields of all nodes.
     kept : (n - 3,)
         Place among the five fields of all nodes of each free unknown before the three of the root.
     plate : Plate
@@ -56,43 +42,9 @@ class PlateOperators:
         The design.
     """
 
-    stiffness_terms: tuple[sparse.csr_array, ...]
-    mass_terms: tuple[sparse.csr_array, ...]
-    load_lift: FloatArray
-    load_tip: FloatArray
-    gauge_output: sparse.csr_array
-    tip_displacement_output: FloatArray
-    expansion: sparse.csr_array
     kept: NDArray[np.int64]
     plate: Plate
     design: WingDesign
-
-    @property
-    def unknowns(self) -> int:
-        """Number n of free unknowns."""
-        return len(self.load_lift)
-
-    @property
-    def displacement_output(self) -> FloatArray:
-        """Upward displacement (n,) at the place of the static test [1]."""
-        return self.load_tip
-
-    @property
-    def design_hash(self) -> str:
-        """Hash of the design."""
-        return self.design.hash
-
-    def stiffness(
-        self, young_modulus_factor: float = 1.0, stiffness_loss: tuple[float, float] = (0.0, 0.0)
-    ) -> sparse.csr_array:
-        """Stiffness (n, n) [N/m] at e and (z1, z2)."""
-        theta = AffineOperators.theta(young_modulus_factor, stiffness_loss)
-        return sparse.csr_array(affine_sum(theta, self.stiffness_terms))
-
-    def mass(self, servo_mass: float, pitot_mass: float) -> sparse.csr_array:
-        """Mass (n, n) [kg] at the masses [kg] of one servo and of the pitot."""
-        theta = AffineOperators.mass_theta(servo_mass, pitot_mass)
-        return sparse.csr_array(affine_sum(theta, self.mass_terms))
 
     def fields(self, free: FloatArray) -> FloatArray:
         """Fields u, v, a, b, w (5, N) of all nodes from free unknowns (n,)."""
@@ -144,6 +96,7 @@ def assemble_plate(design: WingDesign, *, straight_section: bool = False) -> Pla
         gauge_output=(_gauge_output(layout) @ expansion).tocsr(),
         tip_displacement_output=np.asarray(tip),
         expansion=expansion,
+        design_hash=design.hash,
         kept=kept,
         plate=plate,
         design=design,

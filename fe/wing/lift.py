@@ -23,11 +23,6 @@ Distribution = Callable[[ArrayLike], FloatArray]
 def schrenk(planform: Planform) -> Distribution:
     """Mean of the chord and of the elliptic distribution of the same area.
 
-    Parameters
-    ----------
-    planform : Planform
-        The half-wing.
-
     Returns
     -------
     callable

@@ -1,7 +1,5 @@
 """What an FMU declares in its model description, as plain records for all FMI versions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """The extracted FMU: once for an asset and all that were made from it, removed with the last of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from fmu_asset.folders import remove_folder
@@ -12,11 +10,6 @@ from .fmu_file import extract_fmu
 
 class Extraction:
     """An extracted FMU with the number of its users.
-
-    Parameters
-    ----------
-    description : FmuDescription
-        The FMU.
 
     Attributes
     ----------

@@ -1,7 +1,5 @@
 """An FMU file from outside: sound, safe to extract, of a kind that can be flown, and what it declares."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re
@@ -53,11 +51,6 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
     interface : {"co-simulation", "model-exchange"}, optional
         How it is to be run; co-simulation where it offers that.
 
-    Returns
-    -------
-    FmuDescription
-        What it declares.
-
     Raises
     ------
     FmuFileError
@@ -68,7 +61,7 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
     """
     file = Path(path)
     size, sha256 = _size_and_hash(file)
-    names = _check_archive(file, size)
+    names = check_archive(file, size)
     if "modelDescription.xml" not in names:
         raise FmuFileError(f"{file} is an archive without modelDescription.xml, so it is not an FMU.")
     root = _model_description(file)
@@ -93,9 +86,8 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
         raise FmuFileError(f"The model description of {file} cannot be read ({why}).") from error
     if not _IDENTIFIER.fullmatch(description.model_identifier):
         raise FmuFileError(
-            f"The model identifier of {file}, {description.model_identifier!r}, is no name of a C "
-            "function; the "
-            "FMU is damaged or unsafe."
+            f"The model identifier of {file}, {description.model_identifier!r}, is no name of a C function; "
+            "the FMU is damaged or unsafe."
         )
     here = platform_tuple if description.major_version == 3 else fmi_platform
     binary = f"binaries/{here}/{description.model_identifier}{sharedLibraryExtension}"
@@ -174,8 +166,14 @@ def _size_and_hash(file: Path) -> tuple[int, str]:
         raise FmuFileError(f"{file} cannot be read ({error.strerror}).") from error
 
 
-def _check_archive(file: Path, size: int) -> set[str]:
-    """Check structure, checksums, names and sizes of the archive; return the names of its files."""
+def check_archive(file: Path, size: int, what: str = "FMU", again: str = "build") -> set[str]:
+    """Check structure, checksums, names and sizes of an archive; return the names of its files.
+
+    Raises
+    ------
+    FmuFileError
+        If it is damaged or unsafe; the sentence says `what` it should be and how to get it `again`.
+    """
     try:
         with zipfile.ZipFile(file) as archive:
             entries = archive.infolist()
@@ -185,15 +183,13 @@ def _check_archive(file: Path, size: int) -> set[str]:
             if len(entries) > _MOST_ENTRIES or len({*names}) < len(names):
                 raise FmuFileError(
                     f"{file} holds {len(entries)} entries, too many or some twice; no tool exports that, "
-                    "and it "
-                    "was refused."
+                    "and it was refused."
                 )
             extracted = sum(entry.file_size for entry in entries)
             if extracted > min(LARGEST_EXTRACTED_BYTES, max(_SMALL_ENOUGH, _LARGEST_RATIO * size)):
                 raise FmuFileError(
                     f"{file} has {size / 1024**2:.3g} MiB and would extract to {extracted / 1024**2:.0f} "
-                    "MiB, "
-                    "which looks like an archive made to fill the disk; it was refused."
+                    "MiB, which looks like an archive made to fill the disk; it was refused."
                 )
             broken = archive.testzip()
             if broken is not None:
@@ -201,7 +197,7 @@ def _check_archive(file: Path, size: int) -> set[str]:
             return {*names}
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError) as error:
         raise FmuFileError(
-            f"{file} is not a sound FMU archive ({error}); fetch or build it again."
+            f"{file} is not a sound {what} archive ({error}); fetch or {again} it again."
         ) from error
 
 
@@ -245,9 +241,8 @@ def _model_description(file: Path) -> Element:
         with zipfile.ZipFile(file) as archive:
             if archive.getinfo("modelDescription.xml").file_size > _LARGEST_DESCRIPTION:
                 raise FmuFileError(
-                    f"The model description of {file} is larger than {_LARGEST_DESCRIPTION // 1024**2} "
-                    "MiB; it "
-                    "was refused."
+                    f"The model description of {file} is larger than {_LARGEST_DESCRIPTION // 1024**2} MiB; "
+                    "it was refused."
                 )
             text = archive.read("modelDescription.xml")
         parser = XMLParser(target=_WithoutDocumentType())

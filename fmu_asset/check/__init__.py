@@ -1,7 +1,5 @@
 """Checks of an FMU beyond what flying it shows: the standard's rules, the house's rules, its behaviour."""
 
-from __future__ import annotations
-
 import os
 
 from fmu_asset.archive.fmu_file import read_fmu
@@ -43,11 +41,6 @@ def check_fmu(
         Limits of the workers, as in `FmiAsset`.
     progress : Progress, optional
         Shows the stages.
-
-    Returns
-    -------
-    FmuCheck
-        The findings.
 
     Raises
     ------

@@ -1,7 +1,5 @@
 """What the file itself tells: the standard's rules, its content, its units and ranges."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Iterator
 

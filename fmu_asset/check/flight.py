@@ -1,7 +1,5 @@
 """What an FMU does when it is flown: the same twice, finite, resumable, at other steps, again and again."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -138,9 +136,8 @@ class Flights:
             yield Finding(
                 "determinism",
                 "problem",
-                f"Two flights with the same inputs differ ({_difference(self._series, again)}): runs of "
-                "it are "
-                "not reproducible, and a state cannot be replayed.",
+                f"Two flights with the same inputs differ ({_difference(self._series, again)}): runs of it "
+                "are not reproducible, and a state cannot be replayed.",
             )
 
     def _state(self) -> Iterator[Finding]:
@@ -168,8 +165,7 @@ class Flights:
                 "state",
                 "problem",
                 "A flight that goes on from a saved state in a new process differs from the one that was "
-                "not "
-                f"interrupted ({_difference(expected, found)}): {hint}.",
+                f"not interrupted ({_difference(expected, found)}): {hint}.",
             )
         elif method == "serialised":
             yield Finding(
@@ -180,8 +176,7 @@ class Flights:
                 "state",
                 "warning",
                 "Its state cannot be serialised; a mission is resumed by replaying the inputs, which is "
-                "equal "
-                "to the bit here.",
+                "equal to the bit here.",
             )
 
     def _step_size(self) -> Iterator[Finding]:

@@ -1,7 +1,5 @@
 """What checks of an FMU found."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal

@@ -1,17 +1,13 @@
 """Packing the companions of the wing as FMUs, by the machinery that packs it; equal input, equal bytes."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from fmu_asset.description import documentation_page, model_description
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.contents import (
     PLACEHOLDER,
@@ -21,10 +17,8 @@ from fmu_asset.packing.contents import (
     content_hash_of,
     filled,
     guid_of,
-    pythonfmu_members,
-    pythonfmu_version,
-    room_members,
 )
+from fmu_asset.packing.python_fmu import python_members
 from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable, Unit
 from reporting.files import atomic_write_bytes
 
@@ -38,48 +32,14 @@ _UNITS = (
     Unit("1/s", (("s", -1),), (("microstrain/s", 1e6),)),
 )
 
-_SCRIPT = '''"""Loaded by the FMI wrapper; everything is in the package beside it."""
-from {module}_runtime.entry import CompanionSlave, Fmi2Slave, keep_alive
-
-# The wrapper runs this file once for each instance and drops one reference to its globals too many.
-keep_alive(globals())
-
-
-class Companion{tag}(CompanionSlave, Fmi2Slave):
-    """The FMU."""
-
-    content_tag = "{tag}"
-'''
-
-_ENTRY = '''"""Joins the slave, the behaviour and pythonfmu's base class."""
-import json
+_IMPORTS = """from functools import partial
 
 from .companions import {name} as companion
-from .companions.slave import CompanionSlave as _CompanionSlave
-from .pythonfmu.fmi2slave import Fmi2Slave
-from .slaves.base import Contents
+from .companions.slave import CompanionSlave as _Slave
+from .companions.slave import contents_of
 
-__all__ = ["CompanionSlave", "Fmi2Slave", "keep_alive"]
-
-_kept = []
-
-
-def keep_alive(thing):
-    """Hold one more reference for ever."""
-    _kept.append(thing)
-
-
-def load_contents(resources):
-    """Read the setting that was packed."""
-    setting = json.loads((resources / "setting.json").read_text(encoding="utf-8"))
-    return Contents(companion.variable_table(setting), lambda: companion.behaviour(setting))
-
-
-class CompanionSlave(_CompanionSlave):
-    """The slave with its resources."""
-
-    load_contents = staticmethod(load_contents)
-'''
+load_contents = partial(contents_of, companion)
+"""
 
 
 @dataclass(frozen=True)
@@ -179,37 +139,21 @@ def _members(
     companion: Companion, table: tuple[FmuVariable, ...], setting: Mapping[str, Any]
 ) -> dict[str, bytes]:
     """Return the files of the archive, with the placeholder wherever the content hash will stand."""
-    installed = pythonfmu_version()
     own = files("fmu_asset.companions")
-    module = f"{companion.name}_{PLACEHOLDER}"
-    runtime = f"resources/{module}_runtime"
-    host = "It runs in any Python host; the standard library is enough."
-    members = {
-        "modelDescription.xml": model_description(
-            identifier=module,
-            guid=PLACEHOLDER,
-            table=table,
-            description=companion.description,
-            version=version("uav-twin"),
-            generation_tool=f"uav-twin with PythonFMU {installed}",
-            model_name=companion.name,
-            units=_UNITS,
-            enumerations=_STATUS,
-            dependencies=companion.dependencies(setting),
-        ),
-        "documentation/index.html": documentation_page(
-            table, companion.description, model_name=companion.name, enumerations=_STATUS, host=host
-        ),
-        "resources/setting.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode(),
-        f"resources/{module}.py": _SCRIPT.format(module=module, tag=PLACEHOLDER).encode(),
-        f"{runtime}/__init__.py": b'"""An FMU of uav-twin."""\n',
-        f"{runtime}/entry.py": _ENTRY.format(name=companion.name).encode(),
-        **room_members("fmu_asset.slaves", f"{runtime}/slaves"),
-        f"{runtime}/companions/__init__.py": b'"""What the FMU does."""\n',
-        f"{runtime}/pythonfmu/__init__.py": b'"""The base class of pythonfmu."""\n',
-    }
-    members |= {
-        f"{runtime}/companions/{name}": (own / name).read_bytes()
-        for name in (*_OWN_FILES, f"{companion.name}.py")
-    }
-    return members | pythonfmu_members(module, f"{runtime}/pythonfmu", ["fmi2slave.py"])
+    folder = f"resources/{companion.name}_{PLACEHOLDER}_runtime/companions"
+    members = python_members(
+        companion.name,
+        "Companion",
+        imports=_IMPORTS.format(name=companion.name),
+        table=table,
+        description=companion.description,
+        resources={"setting.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode()},
+        units=_UNITS,
+        enumerations=_STATUS,
+        dependencies=companion.dependencies(setting),
+        host="It runs in any Python host; the standard library is enough.",
+    )
+    members[f"{folder}/__init__.py"] = b'"""What the FMU does."""\n'
+    for name in (*_OWN_FILES, f"{companion.name}.py"):
+        members[f"{folder}/{name}"] = (own / name).read_bytes()
+    return members

@@ -6,11 +6,13 @@ This file is copied into the FMU: standard library and relative imports only. Wh
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-from ..slaves.base import INITIALISING, READY, TERMINATED, BaseSlave
+from ..slaves.base import INITIALISING, READY, TERMINATED, BaseSlave, Contents
 from ..slaves.variables import STATUS_BAD_CALL, STATUS_BAD_STATE, STATUS_INTERNAL, STATUS_OK
 
 
@@ -31,6 +33,12 @@ class Behaviour(Protocol):
 
     def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
         """Take back what `state` returned."""
+
+
+def contents_of(companion: Any, resources: Path) -> Contents:
+    """Return table and behaviour of a companion, a file of this folder, by the setting that was packed."""
+    setting = json.loads((resources / "setting.json").read_text(encoding="utf-8"))
+    return Contents(companion.variable_table(setting), lambda: companion.behaviour(setting))
 
 
 class CompanionSlave(BaseSlave):

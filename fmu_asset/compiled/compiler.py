@@ -1,7 +1,5 @@
 """Making a shared library of C sources with the compiler at hand."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import shutil

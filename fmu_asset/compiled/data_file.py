@@ -1,7 +1,5 @@
 """The data file of the compiled FMU: arrays of a reduced model, in the layout of `sources/wing_data.h`."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """What goes into the compiled FMU: description, sources, FMI headers, data file."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from importlib.metadata import distribution, version

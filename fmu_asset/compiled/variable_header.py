@@ -1,7 +1,5 @@
 """The variables of the wing as C: value references, ranges and start values, from the one table."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """`CoupledAsset`: several FMUs flown as one, with the face of `FmiAsset`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from types import TracebackType
@@ -385,8 +383,7 @@ class CoupledAsset:
         if self._phase == "broken":
             raise FmuStateError(
                 "A step or a restoration failed, and the FMUs no longer stand at the same time; reset the "
-                "asset or "
-                "restore a state."
+                "asset or restore a state."
             )
         if self._phase == "closed":
             raise FmuStateError("The asset is closed; reset it to start anew.")
@@ -420,8 +417,7 @@ class CoupledAsset:
             if self._assets[index].state_method != "serialised":
                 raise CouplingError(
                     f"The component {self._layout.names[index]!r} cannot save and restore its state, which "
-                    "iterations "
-                    "need; allow one iteration only, or delay a connection."
+                    "iterations need; allow one iteration only, or delay a connection."
                 )
 
     def describe(self) -> dict[str, Any]:

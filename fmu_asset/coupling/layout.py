@@ -1,7 +1,5 @@
 """The numbers behind the names of a system: who reads what from whom, and each component's own binding."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from operator import itemgetter
 from typing import NamedTuple

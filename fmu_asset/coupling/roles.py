@@ -1,7 +1,5 @@
 """A binding resolved against a system of FMUs: which ends its roles stand for, and in which units."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from fmu_asset.archive.fmu_file import UnitInfo
@@ -116,8 +114,7 @@ def _source(wiring: Wiring, name: str, unit: str, where: str) -> ConnectedVariab
         if port is None:
             raise BindingError(
                 f"{where} names {name!r}, which is no output of the system that something is connected to; "
-                "its "
-                f"outputs are {listed(wiring.outward)}."
+                f"its outputs are {listed(wiring.outward)}."
             )
         own = _unit(unit, wiring.units[name], wiring, Endpoint("", name), where, outward=True)
         return port._replace(conversion=composed(port.conversion, own))
@@ -143,8 +140,7 @@ def _unit(
     if found is None:
         raise BindingError(
             f"{where} is in {unit!r}, but the system has {str(end)!r} in {other!r}, and there is no "
-            "conversion "
-            f"between the two; state the value in {other!r}."
+            f"conversion between the two; state the value in {other!r}."
         )
     return found
 

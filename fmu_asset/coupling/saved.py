@@ -1,7 +1,5 @@
 """The state of coupled FMUs as bytes: the states of the components, and what they had exchanged."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct

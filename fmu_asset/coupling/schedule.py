@@ -6,8 +6,6 @@ of the same FMU; a circle in it is an algebraic loop. A circle of components alo
 stands a state, whose value at the beginning of the step can be used.
 """
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -206,9 +204,8 @@ def loop_sentence(loops: Sequence[Sequence[Endpoint]]) -> str:
     shown = "; ".join(" -> ".join(str(end) for end in loop) for loop in loops[:3])
     more = f" and {len(loops) - 3} more" if len(loops) > 3 else ""
     return (
-        f"The connections close "
-        f"{'an algebraic loop' if len(loops) == 1 else f'{len(loops)} algebraic loops'} "
-        f"({shown}{more}): every value in it depends on itself at the same moment; delay one of its "
-        "connections, or "
-        "allow iterations."
+        "The connections close "
+        f"{'an algebraic loop' if len(loops) == 1 else f'{len(loops)} algebraic loops'} ({shown}{more}): "
+        "every value in it depends on itself at the same moment; delay one of its connections, or allow "
+        "iterations."
     )

@@ -1,7 +1,5 @@
 """A system of FMUs as data: components, connectors of the system, connections; no file is opened here."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -154,8 +152,7 @@ class SystemStructure:
             return Endpoint(owner, text[len(owner) + 1 :])
         raise CouplingError(
             f"The system {self.name} has no connector {text!r} and no component that {text!r} begins with; "
-            "its "
-            f"connectors are {listed(c.name for c in self.connectors)}, its components "
+            f"its connectors are {listed(c.name for c in self.connectors)}, its components "
             f"{listed(c.name for c in self.components)}."
         )
 
@@ -182,8 +179,7 @@ def parse_endpoint(text: str, components: Sequence[str]) -> Endpoint:
     if "." in text:
         raise CouplingError(
             f"The connection end {text!r} begins with no component; the components are "
-            f"{listed(components)}. A "
-            "connector of the system itself is written without a dot."
+            f"{listed(components)}. A connector of the system itself is written without a dot."
         )
     return Endpoint("", text)
 
@@ -211,8 +207,7 @@ def expand_connection(
     if len(sources) != len(targets):
         raise CouplingError(
             f"The connection from {source!r} to {target!r} joins {len(sources)} ends to {len(targets)}; the "
-            "two "
-            "patterns must stand for equally many."
+            "two patterns must stand for equally many."
         )
     return tuple(
         Connection(

@@ -1,7 +1,5 @@
 """A system of FMUs checked against the FMUs themselves: every end exists, fits, and has one source."""
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Mapping
@@ -46,11 +44,6 @@ class ConnectedVariable(NamedTuple):
 
 class Wiring:
     """A system whose connections were checked.
-
-    Parameters
-    ----------
-    structure : SystemStructure
-        The system.
 
     Attributes
     ----------
@@ -150,8 +143,7 @@ class Wiring:
         if connector.kind not in kinds:
             raise CouplingError(
                 f"The connector {end.variable!r} of the system is of the kind {connector.kind} and cannot "
-                f"be {verb} "
-                "of a connection."
+                f"be {verb} of a connection."
             )
         return connector
 
@@ -173,8 +165,7 @@ class Wiring:
         else:
             raise CouplingError(
                 f"The connection from {source} to {target} joins two connectors of the system; one end must "
-                "be a "
-                "component."
+                "be a component."
             )
 
     def _join(self, connection: Connection) -> None:
@@ -207,8 +198,7 @@ class Wiring:
         if variable.causality not in READABLE or variable.kind == "String":
             raise CouplingError(
                 f"{end} cannot be the source of a connection: it is declared as {variable.causality} of the "
-                "type "
-                f"{variable.kind}, and a numeric output is needed."
+                f"type {variable.kind}, and a numeric output is needed."
             )
         return variable
 
@@ -217,8 +207,7 @@ class Wiring:
         if variable.causality not in causalities or variable.kind == "String":
             raise CouplingError(
                 f"{end} cannot be the target of this connection: it is declared as {variable.causality} of "
-                "the type "
-                f"{variable.kind}, and a numeric {' or '.join(causalities)} is needed."
+                f"the type {variable.kind}, and a numeric {' or '.join(causalities)} is needed."
             )
         return variable
 
@@ -226,8 +215,7 @@ class Wiring:
         if target.kind not in _FITS[source.kind]:
             raise CouplingError(
                 f"{connection.source} is of the type {source.kind} and cannot feed {connection.target}, "
-                "which is of "
-                f"the type {target.kind}."
+                f"which is of the type {target.kind}."
             )
         scaled = (connection.factor, connection.offset) != (1.0, 0.0)
         if scaled and target.kind != "Real":
@@ -247,8 +235,7 @@ class Wiring:
         if unit is None:
             raise CouplingError(
                 f"{connection.source} is in {source!r} and {connection.target} in {target!r}, and there is "
-                "no "
-                "conversion between the two; correct the connection, or suppress the conversion of units."
+                "no conversion between the two; correct the connection, or suppress the conversion of units."
             )
         return composed(own, unit)
 
@@ -303,8 +290,7 @@ class Wiring:
         if conversion is None:
             raise CouplingError(
                 f"{end} is given in {setting.unit!r}, but it is in {variable.unit!r}, and there is no "
-                "conversion "
-                "between the two."
+                "conversion between the two."
             )
         return conversion.to_fmu(float(value))
 

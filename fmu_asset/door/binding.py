@@ -22,17 +22,16 @@ displacement and velocity where another FMU can be coupled). `[record]` names va
 FMU's own units, and `[limits]` says what the FMU's worker may take.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import Interface
+from reporting.section import Section, checked
 from reporting.toml_file import read_toml
 
 from .unit_symbols import same_dimension
@@ -51,11 +50,7 @@ _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
-
-class Scalar(_Record):
+class Scalar(Section):
     """One variable: its name in the FMU and the unit in which the caller gives or takes it.
 
     The name is that of a scalar, of one element of an FMI 3 array (`p[3]`, `a[2,1]`; from 1), or of a whole
@@ -73,7 +68,7 @@ class Input(Scalar):
     maximum: _Number | None = None
 
     @model_validator(mode="after")
-    def _ordered(self) -> Input:
+    def _ordered(self) -> "Input":
         if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
             raise ValueError(f"minimum {self.minimum:g} is larger than maximum {self.maximum:g}")
         return self
@@ -85,7 +80,7 @@ class Parameter(Input):
     value: _Number | None = None
 
 
-class Vector(_Record):
+class Vector(Section):
     """Several variables in order; a text with `{a..b}` stands for all numbers from a to b.
 
     `unit` is one for all variables, or one for each.
@@ -126,7 +121,7 @@ class Vector(_Record):
         return names
 
 
-class Port(_Record):
+class Port(Section):
     """A mechanical port: where another FMU can be coupled.
 
     Force goes one way and motion the other: an FMU takes the force and gives displacement or velocity, or the
@@ -139,7 +134,7 @@ class Port(_Record):
     velocity: Vector | None = None
 
     @model_validator(mode="after")
-    def _complete(self) -> Port:
+    def _complete(self) -> "Port":
         if self.displacement is None and self.velocity is None:
             raise ValueError("a port needs a displacement or a velocity beside its force")
         for name, vector in self.quantities.items():
@@ -159,7 +154,7 @@ class Port(_Record):
         return {name: vector for name, vector in given.items() if vector is not None}
 
 
-class Record(_Record):
+class Record(Section):
     """The table `[record]`: further variables to be recorded, in the FMU's own units."""
 
     variables: tuple[_Text, ...] = ()
@@ -170,7 +165,7 @@ class Record(_Record):
         return _expanded(given)
 
 
-class WorkerLimits(_Record):
+class WorkerLimits(Section):
     """The table `[limits]`: what the FMU's worker may take; what is not said is the default.
 
     Attributes
@@ -186,7 +181,7 @@ class WorkerLimits(_Record):
     memory: _Positive | None = None
 
 
-class Header(_Record):
+class Header(Section):
     """The table `[binding]`.
 
     Attributes
@@ -223,7 +218,7 @@ class Header(_Record):
     description: str = ""
 
 
-class Binding(_Record):
+class Binding(Section):
     """A whole binding file.
 
     Attributes
@@ -299,7 +294,7 @@ class Binding(_Record):
             f"The binding {self.name} has no observation {name!r}; it has {_listed(self.observation)}."
         )
 
-    def with_arrays(self, elements: Callable[[str], Sequence[str]]) -> Binding:
+    def with_arrays(self, elements: Callable[[str], Sequence[str]]) -> "Binding":
         """Return the binding with every array that is observed or recorded as its elements.
 
         Parameters
@@ -378,16 +373,6 @@ def expand(pattern: str) -> tuple[str, ...]:
 def load_binding(path: str | os.PathLike[str]) -> Binding:
     """Read and check a binding file.
 
-    Parameters
-    ----------
-    path : path-like
-        The TOML file.
-
-    Returns
-    -------
-    Binding
-        The binding.
-
     Raises
     ------
     BindingError
@@ -400,10 +385,7 @@ def load_binding(path: str | os.PathLike[str]) -> Binding:
 
 def parse_binding(content: Mapping[str, Any], *, where: str = "the binding") -> Binding:
     """Check a binding that was read from elsewhere; see `load_binding`."""
-    try:
-        parsed = Binding.model_validate(dict(content))
-    except ValidationError as error:
-        raise BindingError(f"In {where}, {_first_problem(error)}.") from error
+    parsed = checked(Binding, dict(content), where, BindingError, what="a binding")
     if not parsed.observation:
         raise BindingError(f"In {where}, there is no [observation.<name>] table; say what is measured.")
     taken: dict[str, str] = {}
@@ -418,17 +400,6 @@ def parse_binding(content: Mapping[str, Any], *, where: str = "the binding") -> 
                 )
             taken[scalar.variable] = here
     return parsed
-
-
-def _first_problem(error: ValidationError) -> str:
-    problem = error.errors()[0]
-    place = ".".join(str(part) for part in problem["loc"])
-    if problem["type"] == "extra_forbidden":
-        return f"the key {place!r} is unknown; remove it or correct its spelling"
-    if problem["type"] == "missing":
-        return f"the key {place!r} is missing"
-    message = problem["msg"].removeprefix("Value error, ")
-    return f"{place} is wrong: {message[:1].lower()}{message[1:]} (it is {problem['input']!r})"
 
 
 def _listed(names: Mapping[str, object]) -> str:

@@ -1,7 +1,5 @@
 """A first binding for an FMU nobody has bound yet: roles guessed from causality, names and units."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """A binding resolved against an FMU: what is sent and read, where it stands in the blocks, in which units."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -35,13 +33,6 @@ def plain_values(values: Values) -> dict[str, float | list[float]]:
 
 class Exchange:
     """What an asset exchanges with its FMU.
-
-    Parameters
-    ----------
-    description : FmuDescription
-        The FMU.
-    binding : Binding
-        The binding.
 
     Attributes
     ----------
@@ -107,8 +98,7 @@ class Exchange:
                 if len(vector.variables) != len(port.force.variables):
                     raise BindingError(
                         f"{label} of the binding {self._binding.name} has {len(vector.variables)} values "
-                        "and the "
-                        f"force {len(port.force.variables)}; give as many."
+                        f"and the force {len(port.force.variables)}; give as many."
                     )
                 causalities = {self._causality(variable) == "input" for variable in vector.variables}
                 if len(causalities) > 1:
@@ -121,8 +111,7 @@ class Exchange:
                 way = "outputs" if own["force"] else "inputs"
                 raise BindingError(
                     f"In port.{name} of the binding {self._binding.name}, force and motion are both {way} "
-                    "of the "
-                    "FMU; at a port one is given for the other."
+                    "of the FMU; at a port one is given for the other."
                 )
         return reads
 
@@ -163,15 +152,13 @@ class Exchange:
             if len({(place.variable.unit, place.variable.kind) for place in found}) > 1:
                 raise BindingError(
                     f"The variables of {role}.{name} of the binding {self._binding.name} have different "
-                    "units or "
-                    "types in the FMU; make one port of each."
+                    "units or types in the FMU; make one port of each."
                 )
             for position in positions:
                 if position in taken:
                     raise BindingError(
-                        f"In the binding {self._binding.name}, {role}.{name} and {taken[position]} set "
-                        "the same "
-                        f"value of {found[0].variable.name!r}; keep one."
+                        f"In the binding {self._binding.name}, {role}.{name} and {taken[position]} set the "
+                        f"same value of {found[0].variable.name!r}; keep one."
                     )
                 taken[position] = f"{role}.{name}"
             self._slots[role][name] = self._slot(

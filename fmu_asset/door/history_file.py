@@ -1,7 +1,5 @@
 """Files of a simulation: the input histories as CSV, the outputs as CSV or NetCDF."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
@@ -56,11 +54,6 @@ def read_histories(path: Path, binding: Binding) -> InputHistories:
         The file.
     binding : Binding
         Whose inputs and units these are.
-
-    Returns
-    -------
-    InputHistories
-        The inputs that have columns.
 
     Raises
     ------

@@ -1,7 +1,5 @@
 """Names of a binding found in an FMU, and where their values stand in a block."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Mapping, Sequence
@@ -100,8 +98,7 @@ def _element(description: FmuDescription, name: str, label: str) -> tuple[Variab
     if not fits:
         raise BindingError(
             f"{label} names {name!r}, but {variable.name!r} has {' x '.join(map(str, variable.shape))} "
-            "elements, "
-            "counted from 1."
+            "elements, counted from 1."
         )
     flat = 0
     for i, length in zip(index, variable.shape, strict=True):

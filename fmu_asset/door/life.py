@@ -1,7 +1,5 @@
 """The life of an asset: what it is, how it is opened, started again and closed, and what its failures say."""
 
-from __future__ import annotations
-
 import os
 from collections import deque
 from types import TracebackType
@@ -299,10 +297,9 @@ class OpenedFmu:
         if bad:
             more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
             raise FmuOutputError(
-                f"The FMU {self._description.path} gave values that are not finite at "
-                f"t = {self.time:g} s: {', '.join(bad[:5])}{more}. Its inputs or its step size are "
-                "probably beyond what it can compute; reset the asset or restore a state to go on."
-                f"{which}",
+                f"The FMU {self._description.path} gave values that are not finite at t = {self.time:g} s: "
+                f"{', '.join(bad[:5])}{more}. Its inputs or its step size are probably beyond what it can "
+                f"compute; reset the asset or restore a state to go on.{which}",
                 [text for _, text in self.log[-5:]],
             )
 

@@ -1,7 +1,5 @@
 """What comes out of one communication step."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where the instance of an asset lives: the extracted FMU, and the worker process or this one."""
 
-from __future__ import annotations
-
 import math
 import weakref
 from collections.abc import Callable
@@ -50,7 +48,7 @@ class Housing:
         self.instance: Instance | None = None
         self.reset_trial = ResetTrial()
 
-    def sibling(self) -> Housing:
+    def sibling(self) -> "Housing":
         """Return an empty housing beside this one, which shares the extracted FMU as long as it is in use."""
         other = Housing(self._description, self._plan, self._limits, isolated=self._isolated)
         other._extraction, other.reset_trial = self._extraction, self.reset_trial

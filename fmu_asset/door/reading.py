@@ -1,7 +1,5 @@
 """Values picked from blocks of outputs, in the units of a binding."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, cast

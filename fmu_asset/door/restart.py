@@ -4,8 +4,6 @@ Some FMUs return OK from their reset and go on from where they were. What an ins
 reset is therefore compared with what another one shows at the same start.
 """
 
-from __future__ import annotations
-
 import logging
 from array import array
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The state of an asset as bytes: what a mission's checkpoint keeps of an FMU."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable, Mapping

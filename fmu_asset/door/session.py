@@ -1,7 +1,5 @@
 """`FmiAsset`: the only door to an FMU. It knows FMI and roles, not wings."""
 
-from __future__ import annotations
-
 from typing import Self
 
 import numpy as np
@@ -67,11 +65,6 @@ class FmiAsset(OpenedFmu):
         control, health, load, port : mapping of str to float, or to a sequence for an array
             Inputs of this step; those of a port are called `<port>.<quantity>`.
 
-        Returns
-        -------
-        Observation
-            What was observed at the end of the step.
-
         Raises
         ------
         FmuInputError
@@ -126,11 +119,6 @@ class FmiAsset(OpenedFmu):
             Number of steps N; that of the histories if absent.
         progress : Progress, optional
             Where progress is shown.
-
-        Returns
-        -------
-        ObservationHistory
-            What was observed at the end of each step.
 
         Raises
         ------
@@ -232,11 +220,6 @@ class FmiAsset(OpenedFmu):
 
     def restore_state(self, content: bytes) -> None:
         """Bring the asset to a state that `save_state` returned, in this or an earlier process.
-
-        Parameters
-        ----------
-        content : bytes
-            The state.
 
         Raises
         ------

@@ -1,7 +1,5 @@
 """Many steps under prescribed inputs: the histories checked as a whole, and what comes out of them."""
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -44,7 +42,7 @@ class ObservationHistory:
     @classmethod
     def of(
         cls, table: OutputTable, time: npt.NDArray[np.float64], replies: npt.NDArray[np.float64]
-    ) -> ObservationHistory:
+    ) -> "ObservationHistory":
         """Return what the reply blocks of N steps hold.
 
         Parameters

@@ -1,7 +1,5 @@
 """One input of a binding: where its values go, and which of them are refused."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """What unit texts such as `N.m`, `kg/m3` or `W/(m2.K)` mean in SI."""
 
-from __future__ import annotations
-
 import math
 import re
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Units of a binding against the units that an FMU declares: checked, and converted where they differ."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -49,11 +47,6 @@ def conversion(
     where : str
         Place in the binding, for the error.
 
-    Returns
-    -------
-    Conversion
-        Factor and offset.
-
     Raises
     ------
     BindingError
@@ -93,8 +86,7 @@ def contradictions(definitions: Sequence[UnitInfo]) -> list[str]:
         ):
             found.append(
                 f"The unit {definition.name!r} is defined with the factor {definition.factor:g} and the "
-                "offset "
-                f"{definition.offset:g}; usual are {common.factor:g} and {common.offset:g}."
+                f"offset {definition.offset:g}; usual are {common.factor:g} and {common.offset:g}."
             )
     return found
 

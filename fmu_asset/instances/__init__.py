@@ -1,7 +1,5 @@
 """One instance of an FMU in this process, for each FMI version and interface."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from .plan import Plan
@@ -10,7 +8,7 @@ if TYPE_CHECKING:
     from .base import FmuInstance
 
 
-def open_instance(plan: Plan) -> FmuInstance:
+def open_instance(plan: Plan) -> "FmuInstance":
     """Return a new instance of the plan's FMI version and interface.
 
     Raises

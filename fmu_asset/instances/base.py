@@ -5,8 +5,6 @@ blocks of doubles that are allocated once: `request` is time, step size, then al
 outputs. Integers and Booleans are doubles in the blocks.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys
@@ -14,14 +12,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from fmpy.fmi1 import FMICallException
 
 from fmu_asset.errors import FmuCallError, FmuError, FmuStateError, FmuWorkerError
 
 from .block import Block
-from .messages import Mailbox
+from .messages import Mailbox, callbacks
 from .plan import Group, Plan, Settings
 from .prepared import prepared
 from .series import Series, run
@@ -80,19 +78,55 @@ class FmuInstance(ABC):
         self._set = self._blocks("Set", plan.inputs, self.request, 2)
         self._get = self._blocks("Get", plan.outputs, self.reply, 0)
 
+    _fmpy_class: ClassVar[type[Any]]
+    """fmpy's class for the FMI version and interface."""
+
     # ------------------------------------------------------------------ what an FMI version says
 
-    @abstractmethod
+    def _made(self, plan: Plan, name: str) -> Any:
+        """Return fmpy's object, not yet instantiated."""
+        return self._fmpy_class(
+            guid=plan.guid,
+            modelIdentifier=plan.model_identifier,
+            unzipDirectory=plan.folder,
+            instanceName=name,
+        )
+
     def _instantiate(self, plan: Plan, mailbox: Mailbox) -> Any:
         """Return fmpy's object, instantiated."""
+        fmu = self._made(plan, mailbox.name)
+        if plan.fmi_version == 3:
+            fmu.instantiate(loggingOn=True, logMessage=mailbox.log)
+        else:
+            given = {"functions" if plan.fmi_version == 1 else "callbacks": callbacks(plan.fmi_version)}
+            fmu.instantiate(loggingOn=True, **given)
+        return fmu
 
-    @abstractmethod
-    def _function(self, name: str) -> Callable[..., int]:
+    def _c_name(self, name: str) -> str:
+        """Return what the standard calls a C function such as SetReal."""
+        return f"fmi{name}" if self._plan.fmi_version == 1 else f"fmi{self._plan.fmi_version}{name}"
+
+    def _function(self, name: str, fmu: Any = None) -> Callable[..., int]:
         """Return a C function such as SetReal, with the types that fmpy has given it."""
+        before = f"{self._plan.model_identifier}_" if self._plan.fmi_version == 1 else ""
+        function: Callable[..., int] = getattr((fmu or self._fmu).dll, before + self._c_name(name))
+        return function
 
-    @abstractmethod
     def _initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
         """Bring the instance to its first communication point."""
+        self._start(start_time, parameters, with_inputs=with_inputs)
+
+    def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
+        """Initialise, as far as versions 2 and 3 do it alike whatever the interface."""
+        fmu, tolerance = self._fmu, self._plan.tolerance
+        experiment = {"startTime": start_time, "tolerance": tolerance}
+        if self._plan.fmi_version == 2:
+            fmu.setupExperiment(**experiment)
+        self._apply(parameters)
+        fmu.enterInitializationMode(**(experiment if self._plan.fmi_version == 3 else {}))
+        if with_inputs:
+            FmuInstance._send(self)
+        fmu.exitInitializationMode()
 
     @abstractmethod
     def _advance(self) -> None:

@@ -1,7 +1,5 @@
 """A part of a block of doubles that is exchanged with an FMU in one call of one base type."""
 
-from __future__ import annotations
-
 import ctypes
 from typing import Any
 

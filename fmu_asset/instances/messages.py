@@ -1,7 +1,5 @@
 """What FMUs log: every message reaches the instance whose name it carries."""
 
-from __future__ import annotations
-
 import ctypes
 import itertools
 import os
@@ -28,7 +26,7 @@ from fmu_asset.errors import visible
 _LONGEST_LOG = 1000
 
 # fmpy's native proxy, which formats the messages of C FMUs, knows one logger in a process.
-_mailboxes: dict[bytes, Mailbox] = {}
+_mailboxes: "dict[bytes, Mailbox]" = {}
 _instance_numbers = itertools.count(1)
 _ERROR, _FATAL = 3, 4
 

@@ -1,9 +1,6 @@
 """Model exchange of FMI 1.0, 2.0 and 3.0 as if it were co-simulation: fmpy's models and CVODE."""
 
-from __future__ import annotations
-
 import math
-from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -15,9 +12,7 @@ from fmpy.fmi3 import FMU3Model
 from fmu_asset.errors import FmuCallError
 
 from .base import FmuInstance
-from .co_simulation import slave_arguments
-from .messages import Mailbox, callbacks
-from .plan import Plan, Settings
+from .plan import Settings
 from .solver import Solver
 
 _MOST_EVENT_ITERATIONS = 100
@@ -37,16 +32,14 @@ class ModelExchange(FmuInstance):
     # What fmpy calls these depends on the FMI version.
     _derivatives = "getDerivatives"
     _nominals = "getNominalsOfContinuousStates"
+    _update = "newDiscreteStates"
 
     # ------------------------------------------------------------------ what an FMI version says
 
-    @abstractmethod
-    def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
-        """Initialise until the first event iteration."""
-
-    @abstractmethod
     def _update_once(self) -> tuple[bool, bool, float | None]:
         """Iterate once over an event: whether more is needed, whether to end, next time event."""
+        more, finished, _, _, due, time = getattr(self._fmu, self._update)()
+        return more, finished, time if due else None
 
     def _enter_event_mode(self) -> None:
         self._fmu.enterEventMode()
@@ -128,8 +121,7 @@ class ModelExchange(FmuInstance):
                 self._lost = True
                 raise FmuCallError(
                     f"The solver could not integrate the FMU in the step from t = {time:g} s ({error}); "
-                    "reset "
-                    "the asset, and try a smaller step_size or another tolerance in the binding.",
+                    "reset the asset, and try a smaller step_size or another tolerance in the binding.",
                     self._texts(),
                 ) from error
         if not event and abs(time - end) <= close:
@@ -188,16 +180,8 @@ class ModelExchange(FmuInstance):
 class ModelExchange1(ModelExchange):
     """FMI 1.0 model exchange; it has no modes."""
 
+    _fmpy_class = FMU1Model
     _nominals = "getNominalContinuousStates"
-
-    def _instantiate(self, plan: Plan, mailbox: Mailbox) -> Any:
-        fmu = FMU1Model(**slave_arguments(plan, mailbox))
-        fmu.instantiate(functions=callbacks(1), loggingOn=True)
-        return fmu
-
-    def _function(self, name: str) -> Callable[..., int]:
-        function: Callable[..., int] = getattr(self._fmu.dll, f"{self._plan.model_identifier}_fmi{name}")
-        return function
 
     def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
         self._fmu.setTime(start_time)
@@ -243,53 +227,15 @@ class ModelExchange1(ModelExchange):
 class ModelExchange2(ModelExchange):
     """FMI 2.0 model exchange."""
 
-    def _instantiate(self, plan: Plan, mailbox: Mailbox) -> Any:
-        fmu = FMU2Model(**slave_arguments(plan, mailbox))
-        fmu.instantiate(callbacks=callbacks(2), loggingOn=True)
-        return fmu
-
-    def _function(self, name: str) -> Callable[..., int]:
-        function: Callable[..., int] = getattr(self._fmu.dll, f"fmi2{name}")
-        return function
-
-    def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
-        fmu = self._fmu
-        fmu.setupExperiment(startTime=start_time, tolerance=self._plan.tolerance)
-        self._apply(parameters)
-        fmu.enterInitializationMode()
-        if with_inputs:
-            FmuInstance._send(self)
-        fmu.exitInitializationMode()
-
-    def _update_once(self) -> tuple[bool, bool, float | None]:
-        more, finished, _, _, due, time = self._fmu.newDiscreteStates()
-        return more, finished, time if due else None
+    _fmpy_class = FMU2Model
 
 
 class ModelExchange3(ModelExchange):
     """FMI 3.0 model exchange."""
 
+    _fmpy_class = FMU3Model
     _derivatives = "getContinuousStateDerivatives"
-
-    def _instantiate(self, plan: Plan, mailbox: Mailbox) -> Any:
-        fmu = FMU3Model(**slave_arguments(plan, mailbox))
-        fmu.instantiate(loggingOn=True, logMessage=mailbox.log)
-        return fmu
-
-    def _function(self, name: str) -> Callable[..., int]:
-        function: Callable[..., int] = getattr(self._fmu.dll, f"fmi3{name}")
-        return function
-
-    def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
-        self._apply(parameters)
-        self._fmu.enterInitializationMode(tolerance=self._plan.tolerance, startTime=start_time)
-        if with_inputs:
-            FmuInstance._send(self)
-        self._fmu.exitInitializationMode()
-
-    def _update_once(self) -> tuple[bool, bool, float | None]:
-        more, finished, _, _, due, time = self._fmu.updateDiscreteStates()
-        return more, finished, time if due else None
+    _update = "updateDiscreteStates"
 
 
 MODEL_EXCHANGE: dict[int, type[ModelExchange]] = {1: ModelExchange1, 2: ModelExchange2, 3: ModelExchange3}

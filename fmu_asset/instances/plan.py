@@ -1,7 +1,5 @@
 """What an instance exchanges with its FMU: plain values, sent to a worker as JSON."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass
 from typing import Literal, Self

@@ -1,7 +1,5 @@
 """C functions of an FMU with their arguments converted once, not at every call."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Many steps in one go: their requests and replies, row by row."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

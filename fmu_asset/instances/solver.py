@@ -1,7 +1,5 @@
 """SUNDIALS CVODE through fmpy, with the failures and the memory that fmpy's wrapper lets slip."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable
 from typing import Any

@@ -4,8 +4,6 @@ The files of an FMU are first written with a placeholder wherever its content ha
 GUID, module names). The hash is taken over them, and then fills the places.
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import io
@@ -122,13 +120,16 @@ def room_members(room: str, folder: str) -> dict[str, bytes]:
     Parameters
     ----------
     room : str
-        A package that imports nothing of the project but itself, and rooms packed beside it by `..`.
+        A package that imports nothing of the project but itself, rooms packed beside it by `..`, and
+        `fe.runtime`, which is packed beside it as `fe`.
     folder : str
         Where it goes.
     """
     top = Path(str(files(room)))
     return {
-        f"{folder}/{path.relative_to(top).as_posix()}": path.read_bytes()
+        f"{folder}/{path.relative_to(top).as_posix()}": path.read_bytes().replace(
+            b"from fe.runtime", b"from ..fe"
+        )
         for path in sorted(top.rglob("*.py"))
     }
 
@@ -205,11 +206,11 @@ def _exchanged(name: str, data: bytes, guids: tuple[str, str], tags: tuple[str, 
     return data.replace(tags[0].encode(), tags[1].encode())
 
 
-def archive_bytes(members: Mapping[str, bytes]) -> bytes:
+def archive_bytes(members: Mapping[str, bytes], first: str = "modelDescription.xml") -> bytes:
     """Return a zip archive with fixed dates and order; stored, since compression differs between versions."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name in sorted(members, key=lambda name: (name != "modelDescription.xml", name)):
+        for name in sorted(members, key=lambda name: (name != first, name)):
             entry = zipfile.ZipInfo(name, date_time=_DATE)
             entry.create_system = 3
             entry.external_attr = 0o644 << 16

@@ -1,9 +1,7 @@
-"""What an FMU that carries missing effects holds beside the plain wing: runtime, arrays, effects."""
-
-from __future__ import annotations
+"""What a wing that carries missing effects needs beside the plain one: effects, arrays, behaviour."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +14,8 @@ from fe.runtime.reduced import ReducedModel
 from fe.runtime.sensor_stream import needs_structure
 from fe.runtime.state import DigitalState
 from fmu_asset.errors import PatchFileError
+from fmu_asset.slaves.effect_variables import effect_rows, switch_of
+from fmu_asset.slaves.patched_behaviour import PatchedBehaviour
 
 from .patch_file import Effect
 
@@ -32,84 +32,8 @@ PLAIN_STATE: dict[str, Any] = {
 
 ARRAYS_FILE = "resources/patch_arrays.npz"
 
-ENTRY = '''"""Joins the slave, the reduced model, missing effects and pythonfmu's base class."""
-import ctypes
-import functools
-import json
-
-import numpy as np
-
-from .fe.damping import rayleigh_damping_ratio
-from .fe.errors import FiniteElementError
-from .fe.patch import ModelPatch
-from .fe.reduced import ReducedModel
-from .fe.sensor_stream import Sample, SensorStream, needs_structure
-from .fe.transient import ModalIntegrator, TransientState
-from .pythonfmu.fmi2slave import Fmi2Slave
-from .slaves.base import Contents
-from .slaves.behaviour import Physics
-from .slaves.effect_variables import effect_rows
-from .slaves.patched_behaviour import PatchedBehaviour, PatchedPhysics
-from .slaves.variables import variable_table
-from .slaves.wing_slave import WingSlave as _WingSlave
-
-__all__ = ["Fmi2Slave", "WingSlave", "keep_alive"]
-
-_contents = []
-
-
-def keep_alive(thing):
-    """Hold one more reference for ever, also while the interpreter shuts down and clears this module."""
-    ctypes.pythonapi.Py_IncRef(ctypes.py_object(thing))
-
-
-def load_contents(resources):
-    """Read the model once in a process: this package's name is a hash of its content."""
-    if not _contents:
-        model = ReducedModel.load(resources / "reduced_model.npz")
-        setting = json.loads((resources / "start.json").read_text(encoding="utf-8"))
-        record = json.loads((resources / "effects.json").read_text(encoding="utf-8"))
-        table = variable_table(
-            gauge_count=model.gauge_count,
-            mode_count=setting["mode_count"],
-            validity=model.validity,
-            start=setting["start"],
-        )
-        table += effect_rows(record["effects"], len(table), setting["start"])
-        physics = Physics(model, ModalIntegrator, TransientState, rayleigh_damping_ratio)
-        patched = PatchedPhysics(
-            ModelPatch.from_list,
-            needs_structure,
-            SensorStream,
-            Sample,
-            load_steps(resources, model),
-            FiniteElementError,
-            np.append,
-        )
-        channels = tuple((name, quantity) for name, quantity in record["channels"])
-        given = (physics, setting["mode_count"], patched, record["effects"], channels)
-        _contents.append(Contents(table, lambda: PatchedBehaviour(*given)))
-    return _contents[0]
-
-
-def load_steps(resources, model):
-    """Return what makes the wing of a patch, if there are arrays for it."""
-    path = resources / "patch_arrays.npz"
-    if not path.is_file():
-        return None
-    from .fe.patch_arrays import PatchArrays
-    from .fe.patched_steps import PatchedSteps
-    from .fe.patched_wing import PatchedWing
-
-    return functools.partial(PatchedSteps, model, PatchedWing(PatchArrays.load(path)))
-
-
-class WingSlave(_WingSlave):
-    """The slave with its resources."""
-
-    load_contents = staticmethod(load_contents)
-'''
-"""Takes the place of `entry.py` of the plain wing."""
+MODE_COUNT = 6
+"""Number of modes of which frequency and damping ratio are outputs, if the model has as many."""
 
 
 def output_channels(gauge_count: int) -> tuple[tuple[str, str], ...]:
@@ -124,7 +48,6 @@ def plain_effects(effects: Sequence[Effect]) -> list[dict[str, Any]]:
 
 
 def patched_members(
-    runtime: str,
     model: ReducedModel,
     effects: Sequence[dict[str, Any]],
     arrays: PatchArrays | None,
@@ -133,8 +56,6 @@ def patched_members(
 
     Parameters
     ----------
-    runtime : str
-        Folder of the runtime package.
     model : ReducedModel
         The wing.
     effects : sequence of dict
@@ -150,10 +71,7 @@ def patched_members(
     record = {"channels": output_channels(model.gauge_count), "effects": effects}
     # The order of keys is that of the variables.
     text = json.dumps(record, indent=1, allow_nan=False)
-    members = {
-        "resources/effects.json": f"{text}\n".encode(),
-        f"{runtime}/entry.py": ENTRY.encode(),
-    }
+    members = {"resources/effects.json": f"{text}\n".encode()}
     patch = whole_patch(effects)
     if needs_structure(patch):
         if arrays is None:
@@ -194,3 +112,27 @@ def without_strips(arrays: PatchArrays) -> PatchArrays:
         strip_of=arrays.strip_of[:0],
         term_of=arrays.term_of[:0],
     )
+
+
+def patched_behaviour(
+    model: ReducedModel, effects: Sequence[Mapping[str, Any]], steps: Callable[..., PatchedSteps] | None
+) -> PatchedBehaviour:
+    """Return the behaviour of a wing with effects in this process, without an FMU.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        The wing.
+    effects : sequence of mapping
+        As `plain_effects` returns them.
+    steps : callable or None
+        Makes the `PatchedSteps`; needed for effects of structure and loads.
+    """
+    channels = output_channels(model.gauge_count)
+    return PatchedBehaviour(model, min(MODE_COUNT, model.mode_count), effects, channels, steps)
+
+
+def effect_values(effects: Sequence[Mapping[str, Any]], *, active: bool) -> dict[str, float]:
+    """Return the start values of the variables of effects by name, all switched on or all off."""
+    start = {switch_of(effect): float(active) for effect in effects}
+    return {row.name: float(row.start or 0.0) for row in effect_rows(effects, 0, start)}

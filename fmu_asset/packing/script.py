@@ -11,8 +11,6 @@ two class attributes, both optional:
 The script runs once in this process, to be asked for its variables.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import sys

@@ -5,14 +5,11 @@ pythonfmu's; the archive is packed here and not by its builder, which stamps tim
 names that two FMUs in one process would share.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
@@ -20,10 +17,9 @@ from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import STIFFNESS_LOSS_NAMES, DigitalState
 from fmu_asset.compiled.package import DATA_FILE, binary_of, compiled_members
-from fmu_asset.description import documentation_page, model_description
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.slaves.effect_variables import effect_rows, switch_of, units_of
-from fmu_asset.slaves.variables import UNITS, FmuVariable, variable_table
+from fmu_asset.slaves.variables import UNITS, variable_table
 from reporting.files import atomic_write_bytes
 
 from .contents import (
@@ -35,82 +31,24 @@ from .contents import (
     emptied,
     filled,
     guid_of,
-    pythonfmu_members,
-    pythonfmu_version,
     room_members,
     tag_of,
 )
 from .patch_file import PatchFile
-from .patched_runtime import output_channels, patched_members, plain_effects
+from .patched_runtime import MODE_COUNT, output_channels, patched_members, plain_effects
+from .python_fmu import python_members
 
 FmuKind = Literal["python", "compiled", "source"]
 """Run by Python, compiled for this machine, or the sources of the compiled one alone."""
-
-MODE_COUNT = 6
-"""Number of modes of which frequency and damping ratio are outputs, if the model has as many."""
 
 DESCRIPTION = (
     "Structure of a UAV half-wing: strains, tip displacement and modes from a reduced finite element model "
     "under load factor and tip force, with two regions that can lose stiffness."
 )
 
-_SCRIPT = '''"""Loaded by the FMI wrapper; everything is in the package beside it."""
-from uav_wing_0_content_0__runtime.entry import Fmi2Slave, WingSlave, keep_alive
-
-# The wrapper runs this file once for each instance and drops one reference to its globals too many.
-keep_alive(globals())
-
-
-class UavWing_0_content_0_(WingSlave, Fmi2Slave):
-    """The wing."""
-
-    content_tag = "0_content_0_"
-'''
-
-_ENTRY = '''"""Joins the slave, the reduced model and pythonfmu's base class."""
-import ctypes
-import json
-
-from .fe.damping import rayleigh_damping_ratio
-from .fe.reduced import ReducedModel
-from .fe.transient import ModalIntegrator, TransientState
-from .pythonfmu.fmi2slave import Fmi2Slave
-from .slaves.base import Contents
-from .slaves.behaviour import Physics, WingBehaviour
-from .slaves.variables import variable_table
-from .slaves.wing_slave import WingSlave as _WingSlave
-
-__all__ = ["Fmi2Slave", "WingSlave", "keep_alive"]
-
-_contents = []
-
-
-def keep_alive(thing):
-    """Hold one more reference for ever, also while the interpreter shuts down and clears this module."""
-    ctypes.pythonapi.Py_IncRef(ctypes.py_object(thing))
-
-
-def load_contents(resources):
-    """Read the model once in a process: this package's name is a hash of its content."""
-    if not _contents:
-        model = ReducedModel.load(resources / "reduced_model.npz")
-        setting = json.loads((resources / "start.json").read_text(encoding="utf-8"))
-        table = variable_table(
-            gauge_count=model.gauge_count,
-            mode_count=setting["mode_count"],
-            validity=model.validity,
-            start=setting["start"],
-        )
-        physics = Physics(model, ModalIntegrator, TransientState, rayleigh_damping_ratio)
-        _contents.append(Contents(table, lambda: WingBehaviour(physics, setting["mode_count"])))
-    return _contents[0]
-
-
-class WingSlave(_WingSlave):
-    """The slave with its resources."""
-
-    load_contents = staticmethod(load_contents)
-'''
+_IMPORTS = """from .slaves.wing_contents import load_contents
+from .slaves.wing_slave import WingSlave as _Slave
+"""
 
 
 @dataclass(frozen=True)
@@ -177,11 +115,6 @@ def build_fmu(
     replace : bool
         Whether an existing file may be replaced.
 
-    Returns
-    -------
-    FmuInfo
-        What was built.
-
     Raises
     ------
     FmuBuildError
@@ -237,9 +170,21 @@ def fmu_bytes(
         check_start(table)
     description = f"{DESCRIPTION} {note}".strip()
     if kind == "python":
-        template = _members(model.to_bytes(), table, {"mode_count": mode_count, "start": start}, description)
+        setting = {"mode_count": mode_count, "start": start}
+        template = python_members(
+            "uav_wing",
+            "UavWing_",
+            imports=_IMPORTS,
+            table=table,
+            description=description,
+            resources={
+                "reduced_model.npz": model.to_bytes(),
+                "start.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode(),
+            },
+            units=UNITS + units_of(table),
+        ) | room_members("fe.runtime", f"resources/uav_wing_{PLACEHOLDER}_runtime/fe")
         if effects:
-            template |= patched_members(f"resources/uav_wing_{PLACEHOLDER}_runtime", model, effects, arrays)
+            template |= patched_members(model, effects, arrays)
     else:
         template = compiled_members(
             model,
@@ -288,11 +233,6 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
     The two differ when the file was changed after it was built. A compiled binary is not part of the content,
     since every compiler makes another one of the same sources.
 
-    Parameters
-    ----------
-    path : path-like
-        A wing FMU.
-
     Returns
     -------
     declared, actual : str
@@ -309,34 +249,3 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
         tag = members["resources/slavemodule.txt"].decode("ascii").strip().removeprefix("uav_wing_")
     declared = root.split('guid="', 1)[1].split('"', 1)[0]
     return declared, guid_of(content_hash_of(emptied(members, tag, declared)))
-
-
-def _members(
-    model: bytes, table: tuple[FmuVariable, ...], setting: Mapping[str, object], description: str
-) -> dict[str, bytes]:
-    """Return the files of the archive, with the placeholder wherever the content hash will stand."""
-    installed = pythonfmu_version()
-    module = f"uav_wing_{PLACEHOLDER}"
-    runtime = f"resources/{module}_runtime"
-    members = {
-        "modelDescription.xml": model_description(
-            identifier=module,
-            guid=PLACEHOLDER,
-            table=table,
-            description=description,
-            version=version("uav-twin"),
-            generation_tool=f"uav-twin with PythonFMU {installed}",
-            units=UNITS + units_of(table),
-        ),
-        "documentation/index.html": documentation_page(table, description),
-        "resources/reduced_model.npz": model,
-        "resources/start.json": (json.dumps(setting, sort_keys=True, indent=1) + "\n").encode(),
-        f"resources/{module}.py": _SCRIPT.encode(),
-        f"{runtime}/__init__.py": b'"""The wing FMU."""\n',
-        f"{runtime}/entry.py": _ENTRY.encode(),
-        f"{runtime}/pythonfmu/__init__.py": b'"""The base class of pythonfmu."""\n',
-    }
-    members |= room_members("fmu_asset.slaves", f"{runtime}/slaves") | room_members(
-        "fe.runtime", f"{runtime}/fe"
-    )
-    return members | pythonfmu_members(module, f"{runtime}/pythonfmu", ["fmi2slave.py"])

@@ -1,7 +1,5 @@
 """The one way from a wing design to its FMU: reduced, tailored to a calibration, with missing effects."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from typing import Protocol

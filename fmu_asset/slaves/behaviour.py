@@ -1,36 +1,24 @@
 """What the wing does in one communication step: the steady turn, or the modes integrated in time.
 
-This file is copied into the FMU. It imports nothing of `fe` at run time: what it needs of the reduced model
-is handed to it, so that the same code runs on the project's modules and on the copies inside an FMU.
+This file is copied into the FMU, where `fe.runtime` is the folder `fe` beside it.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fe.runtime.damping import rayleigh_damping_ratio
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.transient import ModalIntegrator, TransientState
 
 from .variables import TRANSIENT
-
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from fe.runtime.reduced import ReducedModel
-    from fe.runtime.transient import ModalIntegrator, TransientState
 
 
 class UnacceptableEffectError(ValueError):
     """The values of missing effects are none that the wing can have; one sentence with its full stop."""
-
-
-class Physics(NamedTuple):
-    """The reduced model and the classes that come with it (from `fe`, or from their copies in the FMU)."""
-
-    model: ReducedModel
-    integrator: type[ModalIntegrator]
-    transient_state: type[TransientState]
-    rayleigh_damping_ratio: Callable[..., Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,14 +65,14 @@ class WingBehaviour:
 
     Parameters
     ----------
-    physics : Physics
-        The model and its classes.
+    model : ReducedModel
+        The wing.
     mode_count : int
         Number of modes whose data `modal_data` returns.
     """
 
-    def __init__(self, physics: Physics, mode_count: int) -> None:
-        self._physics = physics
+    def __init__(self, model: ReducedModel, mode_count: int) -> None:
+        self._model = model
         self._mode_count = mode_count
         self._parameters: WingParameters | None = None
         self._inputs: tuple[float, ...] = ()
@@ -97,19 +85,7 @@ class WingBehaviour:
     ) -> Response:
         """Find the initial state: equilibrium, and for the transient the tip displaced and just let go.
 
-        Parameters
-        ----------
-        parameters : WingParameters
-            The parameters, within the validity box.
-        inputs : sequence of float
-            The inputs at the start.
-        moment : Moment, optional
-            Nothing here depends on it.
-
-        Returns
-        -------
-        Response
-            The outputs at the start.
+        Parameters and inputs lie within the validity box; nothing here depends on `moment`.
         """
         if parameters.response != TRANSIENT:
             response = self._equilibrium(parameters, inputs)
@@ -124,22 +100,7 @@ class WingBehaviour:
         return response
 
     def advance(self, inputs: Sequence[float], duration: float, moment: Moment | None = None) -> Response:
-        """Advance by one step with the inputs held.
-
-        Parameters
-        ----------
-        inputs : sequence of float
-            The inputs of this step, within the validity box.
-        duration : float
-            Step size [s].
-        moment : Moment, optional
-            Nothing here depends on it.
-
-        Returns
-        -------
-        Response
-            The outputs at the end of the step.
-        """
+        """Advance by one step of `duration` [s] with the inputs held, within the validity box, as `start`."""
         parameters, before = self._parameters, self._integrator
         if parameters is None:
             raise RuntimeError("the wing was not initialised")
@@ -172,11 +133,10 @@ class WingBehaviour:
         if self._integrator is not None and self._transient is not None:
             return self._integrator.load_point_displacement(self._transient)
         load_factor, z1, z2, tip_force = self._inputs
-        model = self._physics.model
-        static = model.static_response(
+        static = self._model.static_response(
             self._parameters.young_modulus_factor, (z1, z2), load_factor, tip_force
         )
-        return float(model.static_load[1] @ static.coordinates)
+        return float(self._model.static_load[1] @ static.coordinates)
 
     def modal_data(self) -> tuple[list[float], list[float]]:
         """Return natural frequencies [Hz] and damping ratios [1] under the last inputs."""
@@ -187,13 +147,11 @@ class WingBehaviour:
             frequency, ratio = self._integrator.modes.frequency, self._integrator.damping_ratio
         else:
             _, z1, z2, _ = self._inputs
-            modes = self._physics.model.modes(
+            modes = self._model.modes(
                 parameters.young_modulus_factor, (z1, z2), parameters.servo_mass, parameters.pitot_mass
             )
             frequency = modes.frequency
-            ratio = self._physics.rayleigh_damping_ratio(
-                parameters.damping_alpha, parameters.damping_beta, frequency
-            )
+            ratio = rayleigh_damping_ratio(parameters.damping_alpha, parameters.damping_beta, frequency)
         return frequency[: self._mode_count].tolist(), ratio[: self._mode_count].tolist()
 
     def state(self) -> list[float]:
@@ -203,36 +161,28 @@ class WingBehaviour:
         return [*head, *inputs, *([] if self._transient is None else self._transient.to_list())]
 
     def restore(self, parameters: WingParameters, values: Sequence[float]) -> None:
-        """Take back what `state` returned.
-
-        Parameters
-        ----------
-        parameters : WingParameters
-            The parameters of that moment.
-        values : sequence of float
-            The remembered values.
-        """
+        """Take back what `state` returned; `parameters` are those of that moment."""
         started, moving = values[0] != 0.0, values[1] != 0.0
         inputs = tuple(values[2:6])
         integrator, transient = None, None
         if moving:
             integrator = self._make_integrator(parameters, inputs)
-            transient = self._physics.transient_state.from_list(values[6:])
+            transient = TransientState.from_list(values[6:])
         self._parameters = parameters if started else None
         self._inputs = inputs if started else ()
         self._integrator, self._transient, self._bound = integrator, transient, None
 
     def _equilibrium(self, parameters: WingParameters, inputs: Sequence[float]) -> Response:
         load_factor, z1, z2, tip_force = inputs
-        static = self._physics.model.static_response(
+        static = self._model.static_response(
             parameters.young_modulus_factor, (z1, z2), load_factor, tip_force
         )
         self._bound = static.strain_error_bound
         return Response(static.strain, static.tip_displacement)
 
     def _make_integrator(self, parameters: WingParameters, inputs: Sequence[float]) -> ModalIntegrator:
-        return self._physics.integrator(
-            self._physics.model,
+        return ModalIntegrator(
+            self._model,
             young_modulus_factor=parameters.young_modulus_factor,
             stiffness_loss=(inputs[1], inputs[2]),
             servo_mass=parameters.servo_mass,

@@ -1,7 +1,7 @@
 """Missing effects as variables of the wing FMU: which there are, and the patch that their values make.
 
 An effect has a switch and every number of its primitives as tunable parameters; they stand at the end of the
-table, so that value references before them stay. Standard library only: the file is copied into the FMU.
+table, so that value references before them stay. This file is copied into the FMU, as `behaviour`.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+from fe.runtime.patch import CHANNEL_UNIT, PER_RELEASE, PRIMITIVES
 
 from .variables import FmuVariable, Unit
 
@@ -35,32 +37,6 @@ UNITS = (
     Unit("rad/(N.m)", (("rad", 1), ("kg", -1), ("m", -2), ("s", 2))),
 )
 """Units of effects beside those of `variables`."""
-
-_MOTION, _SPEED, _FORCE, _STIFFNESS = ("m", "rad"), ("m/s", "rad/s"), ("N", "N.m"), ("N/m", "N.m/rad")
-_SHOWN, _SHOWN_PER_RELEASE = "of the channel", "of the channel per metre"
-_UNIT_OF: Mapping[str, Mapping[str, str | tuple[str, str]]] = {
-    "point_mass": {"mass": "kg", "station": "m"},
-    "root_compliance": {"compliance": "rad/(N.m)"},
-    "local_stiffness_loss": {"start": "m", "length": "m"},
-    "modulus_temperature": {"coefficient": "1/K"},
-    "stiffness_drift": {"rate": "1/s"},
-    "power_damping": {
-        "coefficient": _FORCE, "reference_velocity": _SPEED, "reference_displacement": _MOTION,
-    },
-    "power_stiffness": {"coefficient": _FORCE, "reference_displacement": _MOTION},
-    "free_play": {"stiffness": _STIFFNESS, "half_width": _MOTION},
-    "micro_slip": {"slip_force": _FORCE, "stiffness": _STIFFNESS},
-    "bouc_wen": {"stiffness": _STIFFNESS, "yield_displacement": _MOTION},
-    "load_place": {"along_span": "m", "along_chord": "m"},
-    "load_gain": {"tare": "N"},
-    "sensor_drift": {"amplitude": _SHOWN, "time": "s"},
-    "sensor_rotation": {"angle": "rad"},
-    "thermal_strain": {"coefficient": "1/K"},
-    "high_pass": {"time_constant": "s"},
-    "line": {"frequency": "Hz", "cosine": _SHOWN, "sine": _SHOWN},
-    "decaying_line": {"frequency": "Hz", "cosine": _SHOWN_PER_RELEASE, "sine": _SHOWN_PER_RELEASE},
-}  # fmt: skip
-"""Units of a primitive's numbers; others have none. Pairs: of a moving and of a turning port."""
 
 
 @dataclass(frozen=True)
@@ -107,16 +83,16 @@ def numbers_of(effect: Mapping[str, Any]) -> tuple[Number, ...]:
 
 
 def _unit(primitive: Mapping[str, Any], key: str) -> str:
-    unit = _UNIT_OF.get(str(primitive["kind"]), {}).get(key, "1")
-    if isinstance(unit, tuple):
-        return unit[primitive.get("port") == ROTATING_PORT]
-    if unit in (_SHOWN, _SHOWN_PER_RELEASE):
+    """Return the unit of a primitive's number in the spelling of FMI, "1" for none."""
+    unit = PRIMITIVES[str(primitive["kind"])].units.get(key, "1")
+    if unit in (CHANNEL_UNIT, PER_RELEASE):
         channel = str(primitive["channel"])
         displacement = channel.endswith("displacement") or primitive.get("quantity") == "displacement"
-        if unit == _SHOWN:
+        if unit == CHANNEL_UNIT:
             return "m" if displacement else "1"
         return "1" if displacement else "1/m"
-    return unit
+    moving, _, turning = unit.partition(" or ")
+    return (turning if turning and primitive.get("port") == ROTATING_PORT else moving).replace(" ", ".")
 
 
 def needs_temperature(effects: Sequence[Mapping[str, Any]]) -> bool:

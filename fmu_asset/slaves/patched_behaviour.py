@@ -4,56 +4,24 @@ While no effect is switched on, everything is `WingBehaviour`, to the last bit. 
 gives; effects of structure and loads have a wing of their own (`fe.runtime.patched_steps`), which takes the
 motion over.
 
-This file is copied into the FMU; what it needs of `fe` is handed to it, as in `behaviour`.
+This file is copied into the FMU, as `behaviour`.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
-from .behaviour import Moment, Physics, Response, UnacceptableEffectError, WingBehaviour, WingParameters
+import numpy as np
+
+from fe.runtime.errors import FiniteElementError
+from fe.runtime.patch import ModelPatch
+from fe.runtime.patched_steps import PatchedSteps
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.sensor_stream import Sample, SensorStream, needs_structure
+
+from .behaviour import Moment, Response, UnacceptableEffectError, WingBehaviour, WingParameters
 from .effect_variables import TEMPERATURE, active_primitives, effect_rows
 from .variables import TRANSIENT
-
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from fe.runtime.patch import ModelPatch
-    from fe.runtime.patched_steps import PatchedSteps
-    from fe.runtime.sensor_stream import Sample, SensorStream
-
-    Floats = npt.NDArray[np.float64]
-
-
-class PatchedPhysics(NamedTuple):
-    """What carries a patch (from `fe`, or from its copies in the FMU).
-
-    Attributes
-    ----------
-    patch_of : callable
-        `ModelPatch.from_list`.
-    needs_structure : callable
-        Whether a patch needs a wing of its own.
-    stream, sample : type
-        `SensorStream` and `Sample`.
-    steps : callable or None
-        Makes `PatchedSteps`; None in an FMU whose effects are of sensors alone.
-    error : type of Exception
-        What those raise when a patch cannot be carried.
-    join : callable
-        `numpy.append`.
-    """
-
-    patch_of: Callable[[list[dict[str, Any]]], ModelPatch]
-    needs_structure: Callable[[ModelPatch], bool]
-    stream: type[SensorStream]
-    sample: type[Sample]
-    steps: Callable[..., PatchedSteps] | None
-    error: type[Exception]
-    join: Callable[..., Floats]
 
 
 class PatchedBehaviour(WingBehaviour):
@@ -61,28 +29,26 @@ class PatchedBehaviour(WingBehaviour):
 
     Parameters
     ----------
-    physics : Physics
-        The model and its classes.
-    mode_count : int
+    model, mode_count
         As of `WingBehaviour`.
-    patched : PatchedPhysics
-        What carries a patch.
     effects : sequence of mapping
         `id` and `primitives` of each effect.
     channels : tuple of (str, str)
         Outputs that sensors show, with their quantities: strains, tip displacement, load point displacement.
+    steps : callable, optional
+        Makes `PatchedSteps`; None where the effects are of sensors alone.
     """
 
     def __init__(
         self,
-        physics: Physics,
+        model: ReducedModel,
         mode_count: int,
-        patched: PatchedPhysics,
         effects: Sequence[Mapping[str, Any]],
         channels: tuple[tuple[str, str], ...],
+        steps: Callable[..., PatchedSteps] | None = None,
     ) -> None:
-        super().__init__(physics, mode_count)
-        self._patched = patched
+        super().__init__(model, mode_count)
+        self._steps_of = steps
         self._effects = effects
         self._channels = channels
         self._names = tuple(row.name for row in effect_rows(effects, 0, {}))
@@ -167,7 +133,7 @@ class PatchedBehaviour(WingBehaviour):
         before = dict(self.__dict__)
         try:
             return act()
-        except self._patched.error as error:
+        except FiniteElementError as error:
             self.__dict__.update(before)
             sentence = str(error)
             raise UnacceptableEffectError(sentence if sentence.endswith(".") else f"{sentence}.") from error
@@ -247,22 +213,20 @@ class PatchedBehaviour(WingBehaviour):
         across = shear = None
         if response is not None:
             point = super().load_point_displacement()
-            values = self._patched.join(response.strain, (response.tip_displacement, point))
+            values = np.append(response.strain, (response.tip_displacement, point))
         elif self._steps is not None:
             values, across, shear = self._steps.read(self._motion, moving=parameters.response == TRANSIENT)
         else:
             raise RuntimeError("there is nothing to show")
         transient = parameters.response == TRANSIENT
-        stream = self._patched.stream(
+        stream = SensorStream(
             patch=patch,
             channels=self._channels,
             dynamic=transient,
             start=self._start,
             release=parameters.initial_tip_displacement if transient else 0.0,
         )
-        sample = self._patched.sample(
-            values, moment.time, float(moment.values.get(TEMPERATURE, 0.0)), across, shear
-        )
+        sample = Sample(values, moment.time, float(moment.values.get(TEMPERATURE, 0.0)), across, shear)
         shown, self._filters = stream.read(sample, self._filters, duration)
         self._shown = shown.tolist()
         if not math.isfinite(sum(self._shown)):
@@ -273,10 +237,10 @@ class PatchedBehaviour(WingBehaviour):
 
     def _patch_of(self, applied: Sequence[float]) -> ModelPatch:
         value = dict(zip(self._names, applied, strict=True))
-        return self._patched.patch_of(active_primitives(self._effects, value))
+        return ModelPatch.from_list(active_primitives(self._effects, value))
 
     def _needs_steps(self, patch: ModelPatch) -> bool:
-        return len(patch) > 0 and self._patched.needs_structure(patch)
+        return len(patch) > 0 and needs_structure(patch)
 
     def _make_steps(
         self,
@@ -285,13 +249,13 @@ class PatchedBehaviour(WingBehaviour):
         patch: ModelPatch,
         applied: Sequence[float],
     ) -> PatchedSteps:
-        if self._patched.steps is None:
+        if self._steps_of is None:
             raise RuntimeError("this FMU holds no arrays for effects of structure and loads")
         key = (parameters, inputs[1], inputs[2], tuple(applied))
         if self._made is not None and self._made[0] == key:
             return self._made[1]
         value = dict(zip(self._names, applied, strict=True))
-        steps = self._patched.steps(
+        steps = self._steps_of(
             young_modulus_factor=parameters.young_modulus_factor,
             stiffness_loss=(inputs[1], inputs[2]),
             servo_mass=parameters.servo_mass,

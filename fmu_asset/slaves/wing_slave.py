@@ -1,6 +1,6 @@
 """The wing as an FMI slave: its values, outputs that are computed when they are read, its state.
 
-This file is copied into the FMU: standard library and relative imports only. The physics is in `behaviour`,
+This file is copied into the FMU, as `behaviour`, where the physics is;
 the names, units and ranges are in `variables`, and what all slaves do alike is in `base`.
 """
 

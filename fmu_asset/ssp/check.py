@@ -1,7 +1,5 @@
 """An SSP file against its own FMUs: joined, and tried for one step."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from dataclasses import dataclass
@@ -90,19 +88,13 @@ def join_ssp(system: SspSystem) -> Wiring:
         if declared.unit is not None and declared.unit != variable.unit:
             raise SspError(
                 f"The connector {end} is declared in {declared.unit!r} and its FMU has it in "
-                f"{variable.unit!r}; connectors "
-                "of components must have the unit of the FMU."
+                f"{variable.unit!r}; connectors of components must have the unit of the FMU."
             )
     return wiring
 
 
 def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
     """Check an SSP file: archive, schemas, connections against the FMUs, and one step of 1 s in workers.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
 
     Raises
     ------

@@ -1,7 +1,5 @@
 """Nested systems made flat: connections traced through them, values of their connectors passed on."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 from fmu_asset.coupling.structure import Connection, Endpoint, Setting

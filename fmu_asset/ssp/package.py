@@ -1,20 +1,16 @@
 """The SSP archive: checked before it is used, packed to the same bytes, its XML valid by the schemas."""
 
-from __future__ import annotations
-
-import io
 import os
 import posixpath
 import zipfile
 import zlib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from lxml import etree
 
-from fmu_asset.archive.fmu_file import LARGEST_EXTRACTED_BYTES, _check_entry
+from fmu_asset.archive.fmu_file import check_archive
 from fmu_asset.errors import FmuFileError, SspError
 
 SSD_NAME = "SystemStructure.ssd"
@@ -33,16 +29,10 @@ _SCHEMAS = {
     "ssv": "SystemStructureParameterValues.xsd",
     "ssm": "SystemStructureParameterMapping.xsd",
 }
-_DATE = (1980, 1, 1, 0, 0, 0)
 
 
 class SspPackage:
     """An SSP file that was checked: sound, safe, and with a system structure in it.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
 
     Raises
     ------
@@ -57,35 +47,9 @@ class SspPackage:
                 f"There is no SSP file {self.path}; check the path, or write it with `uav-twin ssp export`."
             )
         try:
-            with zipfile.ZipFile(self.path) as archive:
-                entries = archive.infolist()
-                for entry in entries:
-                    _check_entry(self.path, entry)
-                if sum(entry.file_size for entry in entries) > LARGEST_EXTRACTED_BYTES:
-                    raise SspError(
-                        f"{self.path} would extract to more than {LARGEST_EXTRACTED_BYTES // 1024**3} GiB."
-                    )
-                broken = archive.testzip()
-                if broken is not None:
-                    raise SspError(
-                        f"{self.path} is damaged: the checksum of {broken} is wrong; fetch it again."
-                    )
-                self.names = {entry.filename for entry in entries if not entry.is_dir()}
+            self.names = check_archive(self.path, self.path.stat().st_size, "SSP", "export")
         except FmuFileError as error:
             raise SspError(error.sentence) from error
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            NotImplementedError,
-            RuntimeError,
-            OSError,
-        ) as error:
-            if isinstance(error, SspError):
-                raise
-            raise SspError(
-                f"{self.path} is not a sound SSP archive ({error}); fetch or export it again."
-            ) from error
         if SSD_NAME not in self.names:
             raise SspError(f"{self.path} is an archive without {SSD_NAME}, so it is no SSP file.")
 
@@ -111,8 +75,7 @@ class SspPackage:
         if outside or not parts.path or name.startswith(("/", "..")) or "\\" in name:
             raise SspError(
                 f"{what} in {self.path} names the source {source!r}, which lies outside the archive; only "
-                "files "
-                "inside it are used."
+                "files inside it are used."
             )
         if name not in self.names:
             raise SspError(f"{what} in {self.path} names the source {source!r}, which is not in the archive.")
@@ -178,15 +141,3 @@ def validate(root: Any, kind: str, where: str) -> None:
 def tag(kind: str, name: str) -> str:
     """Return a tag with its namespace."""
     return f"{{{NAMESPACES[kind]}}}{name}"
-
-
-def pack(members: Mapping[str, bytes]) -> bytes:
-    """Return an archive with fixed dates and order; stored, since compression differs between versions."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name in sorted(members, key=lambda name: (name != SSD_NAME, name)):
-            entry = zipfile.ZipInfo(name, date_time=_DATE)
-            entry.create_system = 3
-            entry.external_attr = 0o644 << 16
-            archive.writestr(entry, members[name])
-    return buffer.getvalue()

@@ -1,7 +1,5 @@
 """Parameter sets (SSV) and mappings (SSM): read into plain values by target name."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 

@@ -4,8 +4,6 @@ What SSP 1.0 allows and is not read is refused in a sentence: signal dictionarie
 of their own files, model exchange, mappings of Booleans, integers and enumerations, texts and binary values.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from dataclasses import dataclass
@@ -143,8 +141,7 @@ def _system(tree: Tree, element: Any, path: ElementPath) -> None:
         else:
             raise tree.error(
                 f"the system {name!r} refers to the signal dictionary {own!r}, which is not supported; "
-                "connect "
-                "directly."
+                "connect directly."
             )
     for connection in element.findall("ssd:Connections/ssd:Connection", NAMESPACES):
         _connection(tree, connection, path, children)
@@ -204,16 +201,14 @@ def _connection(tree: Tree, element: Any, path: ElementPath, children: set[str])
         if gives != (side == "start"):
             raise tree.error(
                 f"a connection {'begins' if side == 'start' else 'ends'} at {str(node)!r}, which is of the "
-                "kind "
-                f"{declared.kind}; connections go from outputs to inputs."
+                f"kind {declared.kind}; connections go from outputs to inputs."
             )
         ends.append(node)
     source, target = ends
     if target in tree.edges:
         raise tree.error(
             f"{str(target)!r} has two sources, {str(tree.edges[target].source)!r} and {str(source)!r}; keep "
-            "one of "
-            "the two connections."
+            "one of the two connections."
         )
     factor, offset = read_transformation(element, f"the connection from {source} to {target}")
     convert = not flag(element, "suppressUnitConversion")

@@ -1,7 +1,5 @@
 """A system structure as it is written: elements in systems, connectors, connections, values."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Writing a system of FMUs as an SSP file: SSD, SSV, SSM and the FMUs; equal systems give equal bytes."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -13,9 +11,10 @@ from fmu_asset.coupling.structure import Component, Connection, Endpoint, Settin
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.description import number
 from fmu_asset.errors import SspError
+from fmu_asset.packing.contents import archive_bytes
 from reporting.files import atomic_write_bytes
 
-from .package import NAMESPACES, OWN_ANNOTATION, OWN_NAMESPACE, SSD_NAME, pack, parse_xml, tag, validate
+from .package import NAMESPACES, OWN_ANNOTATION, OWN_NAMESPACE, SSD_NAME, parse_xml, tag, validate
 
 SSV_NAME = "resources/parameters.ssv"
 SSM_NAME = "resources/parameters.ssm"
@@ -76,7 +75,7 @@ def ssp_bytes(
         validate(parse_xml(members[name], name), kind, name)
     for component in wiring.structure.components:
         members[_resource(component)] = component.fmu.read_bytes()
-    return pack(members)
+    return archive_bytes(members, SSD_NAME)
 
 
 def _resource(component: Component) -> str:

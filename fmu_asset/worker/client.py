@@ -1,7 +1,5 @@
 """The twin's side: the calls of an instance, answered by a worker process."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import json

@@ -6,8 +6,6 @@ never use it (Java, .NET, CUDA, the stacks of threads); under either resource li
 the FMU, which then crashes somewhere, and nobody could say why.
 """
 
-from __future__ import annotations
-
 import resource
 import signal
 

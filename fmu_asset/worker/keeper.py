@@ -7,8 +7,6 @@ whatever process group or session it hides. (`PR_SET_PDEATHSIG` alone would leav
 and from the twin it goes off when the thread that started the worker ends, not the process.)
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import resource

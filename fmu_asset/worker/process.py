@@ -1,7 +1,5 @@
 """A worker process as the twin starts, watches and ends it."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

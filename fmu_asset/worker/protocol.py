@@ -9,8 +9,6 @@ their reply blocks come back in parts while it goes on, so that the twin sees ho
 step that takes too long.
 """
 
-from __future__ import annotations
-
 import os
 import select
 import struct

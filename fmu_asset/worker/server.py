@@ -1,7 +1,5 @@
 """The worker's side: it imports fmpy, and of the project `errors`, `instances` and this folder only."""
 
-from __future__ import annotations
-
 import errno
 import faulthandler
 import os

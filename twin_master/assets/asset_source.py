@@ -4,8 +4,6 @@ A mission knows a source only by its protocol. What a user may name stands in th
 names end in `_source`: each holds the tables of its kinds and what is made of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module

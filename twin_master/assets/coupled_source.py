@@ -1,7 +1,5 @@
 """Several FMUs as the asset of a mission: joined in the scenario, or read from an SSP file."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -91,7 +89,7 @@ class SspSection(SeveralSection):
         """Return where the copies of binding and SSP file stand in a run folder."""
         return {"binding": BINDING_COPY, "file": SSP_COPY}
 
-    def source(self, scenario: Scenario) -> SspSource:
+    def source(self, scenario: Scenario) -> "SspSource":
         """Return the system of the file."""
         return SspSource(scenario, self)
 
@@ -120,7 +118,7 @@ class CoupledSection(SeveralSection):
         components = tuple(component.portable() for component in self.component)
         return super().portable().model_copy(update={"component": components})
 
-    def source(self, scenario: Scenario) -> CoupledSource:
+    def source(self, scenario: Scenario) -> "CoupledSource":
         """Return the FMUs together."""
         return CoupledSource(scenario, self)
 
@@ -147,7 +145,7 @@ class SeveralSource(FmuSource):
         super().__init__(scenario, section)
         self._several = section
 
-    def wiring(self) -> Wiring:
+    def wiring(self) -> "Wiring":
         """Return the system as it is flown, once prepared."""
         raise NotImplementedError
 
@@ -174,10 +172,10 @@ class SeveralSource(FmuSource):
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
-    def _check_system(self, binding: Binding, folder: Path) -> None:
+    def _check_system(self, binding: "Binding", folder: Path) -> None:
         raise NotImplementedError
 
-    def _join(self, wiring: Wiring, binding: Binding) -> CoupledAsset:
+    def _join(self, wiring: "Wiring", binding: "Binding") -> "CoupledAsset":
         several = self._several
         from fmu_asset.coupling.asset import CoupledAsset
 
@@ -192,7 +190,7 @@ class SeveralSource(FmuSource):
             parameters=self.parameters(),
         )
 
-    def _session(self) -> Session:
+    def _session(self) -> "Session":
         return self._join(self.wiring(), self.binding())
 
 
@@ -204,14 +202,14 @@ class SspSource(SeveralSource):
         """The system, twice."""
         return FlownAndBelieved("system of an SSP file", "system of an SSP file")
 
-    def wiring(self) -> Wiring:
+    def wiring(self) -> "Wiring":
         """Return the system as it is flown, once prepared."""
         from fmu_asset.ssp.check import join_ssp
         from fmu_asset.ssp.reader import read_ssp
 
         return join_ssp(read_ssp(self._path(SSP_COPY), self._path(COMPONENT_FOLDER)))
 
-    def _check_system(self, binding: Binding, folder: Path) -> None:
+    def _check_system(self, binding: "Binding", folder: Path) -> None:
         from fmu_asset.ssp.check import join_ssp
         from fmu_asset.ssp.reader import read_ssp
 
@@ -235,7 +233,7 @@ class CoupledSource(SeveralSource):
         words = f"{len(self._coupled.component)} coupled FMUs"
         return FlownAndBelieved(words, words)
 
-    def _check_system(self, binding: Binding, folder: Path) -> None:
+    def _check_system(self, binding: "Binding", folder: Path) -> None:
         from fe.wing.design import load_design
         from fmu_asset.coupling.wiring import Wiring
 
@@ -278,14 +276,14 @@ class CoupledSource(SeveralSource):
             pack_wing(design, target, replace=True, progress=progress)
         return target
 
-    def wiring(self) -> Wiring:
+    def wiring(self) -> "Wiring":
         """Return the system as it is flown, once prepared."""
         from fmu_asset.coupling.wiring import Wiring
 
         files = {component.name: component.copies()["fmu"] for component in self._coupled.component}
         return Wiring(self._structure({name: self._path(copy) for name, copy in files.items()}))
 
-    def _structure(self, fmus: Mapping[str, Path]) -> SystemStructure:
+    def _structure(self, fmus: Mapping[str, Path]) -> "SystemStructure":
         """Return the system of the scenario's components and connections."""
         from fmu_asset.coupling.structure import Component, Connector, SystemStructure, expand_connection
 
@@ -323,7 +321,7 @@ def _given_fmu(component: ComponentSection, folder: Path) -> Path:
     return atomic_write_bytes(folder / f"{component.name}.fmu", content)
 
 
-def _settings(component: ComponentSection) -> dict[str, Setting]:
+def _settings(component: ComponentSection) -> "dict[str, Setting]":
     from fmu_asset.coupling.structure import Setting
     from fmu_asset.door.binding import expand
 

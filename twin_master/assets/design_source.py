@@ -1,7 +1,5 @@
 """A wing: its design, or the design inside a calibration file, packed as the asset or believed as a model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -57,7 +55,7 @@ class DesignSection(FmuSection):
         """Return whether the asset has hidden effects, or the twin believes in some."""
         return self.patch is not None or belief.departs
 
-    def source(self, scenario: Scenario) -> WingFmuSource:
+    def source(self, scenario: Scenario) -> "WingFmuSource":
         """Return the FMU of the wing."""
         return WingFmuSource(scenario, self)
 
@@ -86,7 +84,7 @@ class DesignBelief(BeliefSection):
         """Whether effects were added to the model."""
         return self.patch is not None
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> DesignSource:
+    def source(self, scenario: Scenario, flown: AssetSource) -> "DesignSource":
         """Return the model of the wing."""
         return DesignSource(scenario, self)
 
@@ -120,7 +118,7 @@ class _Wing:
         hashed = {"calibration": CALIBRATION_COPY, "patch": PATCH_COPY, "model_patch": MODEL_PATCH_COPY}
         return {name: hash_file(folder / copy) for name, copy in hashed.items() if copy in self.places}
 
-    def calibration(self) -> CalibrationResult | None:
+    def calibration(self) -> "CalibrationResult | None":
         """Return the calibration that the wing is tailored to; None for a design of its own.
 
         Raises
@@ -136,7 +134,7 @@ class _Wing:
             raise MissionInputError("the design of a calibration is asked for, and there is no such file.")
         return load_calibration(self.places[CALIBRATION_COPY])
 
-    def design(self) -> WingDesign:
+    def design(self) -> "WingDesign":
         """Return the design.
 
         Raises
@@ -176,7 +174,7 @@ class WingFmuSource(FmuSource):
         return FlownAndBelieved(words, words)
 
     @property
-    def wing(self) -> ReducedModel | None:
+    def wing(self) -> "ReducedModel | None":
         """The reduced model that was packed, once prepared."""
         return self._wing
 
@@ -268,7 +266,7 @@ class DesignSource:
         return FlownAndBelieved(model, model)
 
     @property
-    def _model(self) -> ReducedModel:
+    def _model(self) -> "ReducedModel":
         if self._wing is None:
             raise MissionInputError("the model was not prepared: call `prepare` first.")
         return self._wing
@@ -355,7 +353,7 @@ def _model_of(name: str) -> str:
 def write_design_field(
     path: Path,
     scenario: Scenario,
-    design: WingDesign,
+    design: "WingDesign",
     mean: float,
     state: Mapping[str, float],
     control: Mapping[str, float],

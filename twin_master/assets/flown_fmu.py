@@ -1,7 +1,5 @@
 """An FMU, or several coupled ones, as the mission flies them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -58,7 +56,7 @@ class FmuAsset:
 
     def __init__(
         self,
-        session: Session,
+        session: "Session",
         observation: slice,
         load: Mapping[str, float],
         inner: InnerRoles | None = None,

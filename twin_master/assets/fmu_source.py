@@ -1,7 +1,5 @@
 """An FMU as the asset of a mission: any FMU with a binding, given or packed of a model script."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -86,7 +84,7 @@ class FmuFileSection(FmuSection):
         """Return where the copies of binding and FMU stand in a run folder."""
         return {"binding": BINDING_COPY, "file": FMU_COPY}
 
-    def source(self, scenario: Scenario) -> FmuSource:
+    def source(self, scenario: Scenario) -> "FmuSource":
         """Return the FMU."""
         return FmuSource(scenario, self)
 
@@ -107,7 +105,7 @@ class ScriptSection(FmuSection):
         binding = super().portable().model_dump()["binding"]
         return FmuFileSection.model_validate(common | {"binding": binding, "file": FMU_COPY})
 
-    def source(self, scenario: Scenario) -> ScriptSource:
+    def source(self, scenario: Scenario) -> "ScriptSource":
         """Return the FMU of the script."""
         return ScriptSource(scenario, self)
 
@@ -134,7 +132,7 @@ class FmuSource:
         return FlownAndBelieved("FMU", "FMU")
 
     @property
-    def wing(self) -> ReducedModel | None:
+    def wing(self) -> "ReducedModel | None":
         """The reduced model of the wing that was packed, once prepared; None for any other FMU."""
         return None
 
@@ -143,7 +141,7 @@ class FmuSource:
         """Wall-clock limit of a step [s], where the scenario sets one."""
         return self._section.step_timeout
 
-    def binding(self) -> Binding:
+    def binding(self) -> "Binding":
         """Return the binding, once prepared."""
         from fmu_asset.door.binding import load_binding
 
@@ -181,7 +179,7 @@ class FmuSource:
         self._observed(binding)
         self._inner_roles(binding)
 
-    def _fitted(self, binding: Binding, folder: Path) -> Binding:
+    def _fitted(self, binding: "Binding", folder: Path) -> "Binding":
         """Return the binding as the FMU fits it: only with that it is known how many values an array has."""
         from fmu_asset.door.session import FmiAsset
 
@@ -198,7 +196,7 @@ class FmuSource:
         """
         return read_files(named_files(self._scenario, self._section))
 
-    def _check_names(self, binding: Binding, effects: tuple[str, ...] = ()) -> None:
+    def _check_names(self, binding: "Binding", effects: tuple[str, ...] = ()) -> None:
         """Check the scenario's names against the binding; `effects` are parameters by the FMU's own names."""
         scenario, section = self._scenario, self._section
         for what, names, known in (
@@ -258,11 +256,11 @@ class FmuSource:
                         table[row, state, index] = reading.values[chosen]
         return table
 
-    def _observed(self, binding: Binding) -> slice:
+    def _observed(self, binding: "Binding") -> slice:
         """Return where the observed quantity stands among the observations of the binding."""
         return self._slice(binding, self._scenario.observation.role)
 
-    def _slice(self, binding: Binding, role: str) -> slice:
+    def _slice(self, binding: "Binding", role: str) -> slice:
         expected = self._scenario.observation.count
         chosen = binding.observation_slice(role)
         if chosen.stop - chosen.start != expected:
@@ -272,7 +270,7 @@ class FmuSource:
             )
         return chosen
 
-    def _inner_roles(self, binding: Binding) -> InnerRoles | None:
+    def _inner_roles(self, binding: "Binding") -> "InnerRoles | None":
         """Return where the asset tells of its own damage and sensors; None where the truth is the scenario's.
 
         Raises
@@ -310,7 +308,7 @@ class FmuSource:
             name: float(value) for name, value in zip(section.seeds, drawn, strict=True)
         }
 
-    def _session(self) -> Session:
+    def _session(self) -> "Session":
         from fmu_asset.door.session import FmiAsset
 
         return FmiAsset(
@@ -366,7 +364,7 @@ class ScriptSource(FmuSource):
         script = given.pop(FMU_COPY)
         return {**read_files(given), FMU_COPY: script_fmu(script)[0]}
 
-    def _fitted(self, binding: Binding, folder: Path) -> Binding:
+    def _fitted(self, binding: "Binding", folder: Path) -> "Binding":
         from fmu_asset.door.session import FmiAsset
 
         packed = folder / "asset.fmu"

@@ -4,8 +4,6 @@ An asset is told the control and its true health, and returns the noise-free obs
 and sensors of its own, and tells of them beside. It is driven by the `Plant`; the twin never meets it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol

@@ -1,7 +1,5 @@
 """An observation library, sampled from an FMU beforehand, as what the twin believes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -43,7 +41,7 @@ class LibraryBelief(BeliefSection):
         """Return where the copies of library and design stand in a run folder."""
         return {"file": OBSERVATIONS_COPY, "design": DESIGN_COPY}
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> LibrarySource:
+    def source(self, scenario: Scenario, flown: AssetSource) -> "LibrarySource":
         """Return the library.
 
         Raises
@@ -155,12 +153,12 @@ class LibrarySource:
         """Write the field of the model."""
         return self._model.write_field(path, state, control)
 
-    def _places(self, library: ObservationLibrary, model: GraphicalModel) -> tuple[list[int], list[int]]:
+    def _places(self, library: "ObservationLibrary", model: GraphicalModel) -> tuple[list[int], list[int]]:
         rows = library.rows_of(self._scenario.state_names, model.states.coordinates)
         controls = [library.control_of(control.name, control.values) for control in self._scenario.control]
         return rows, controls
 
-    def _read(self) -> ObservationLibrary:
+    def _read(self) -> "ObservationLibrary":
         from fmu_asset.door.binding import load_binding
         from twin_master.assets.observation_library import load_observation_library
         from twin_master.network.twin import build_graphical_model

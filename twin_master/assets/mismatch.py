@@ -3,8 +3,6 @@
 A `Misfit` says what the difference does to an estimate.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Draws of the uncertain parameter of the model, from a calibration."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +45,7 @@ class ParameterDraws:
 
 
 def draw_parameter(
-    calibration: Calibration, seed: int, model: TipStiffnessModel | None = None
+    calibration: Calibration, seed: int, model: "TipStiffnessModel | None" = None
 ) -> ParameterDraws:
     """Return draws of the calibrated parameter: Kapteyn et al. 2021, calibration step 2.
 

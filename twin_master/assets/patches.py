@@ -1,7 +1,5 @@
 """Missing effects in a mission: in the asset that flies, and in the model that the twin believes."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 
@@ -15,8 +13,12 @@ from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from fmu_asset.packing.patch_file import PatchFile, load_patch
-from fmu_asset.packing.patched_model import effect_values, patched_behaviour
-from fmu_asset.packing.patched_runtime import output_channels, plain_effects
+from fmu_asset.packing.patched_runtime import (
+    effect_values,
+    output_channels,
+    patched_behaviour,
+    plain_effects,
+)
 from fmu_asset.packing.wing_packing import arrays_for
 from fmu_asset.slaves.behaviour import Moment, UnacceptableEffectError, WingParameters
 from fmu_asset.slaves.variables import QUASI_STATIC

@@ -1,7 +1,5 @@
 """What is flown: the scenario with the command line's overrides, and where its asset comes from."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path

@@ -5,8 +5,6 @@ states, two controls and thirty draws of Young's modulus. It serves as an observ
 whose state may lie between the levels of the grid.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The strain library of the authors of Kapteyn et al. 2021 as what is flown and what the twin believes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -42,7 +40,7 @@ class StrainLibrarySection(AssetSection):
         """Return whether the twin believes something else."""
         return not isinstance(belief, AssetBelief)
 
-    def source(self, scenario: Scenario) -> StrainLibrarySource:
+    def source(self, scenario: Scenario) -> "StrainLibrarySource":
         """Return the library, read.
 
         Raises
@@ -79,7 +77,7 @@ class StrainLibraryBelief(BeliefSection):
         """An FMU is no strain library."""
         return True
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> StrainLibrarySource:
+    def source(self, scenario: Scenario, flown: AssetSource) -> "StrainLibrarySource":
         """Return the library, read.
 
         Raises
@@ -97,7 +95,7 @@ class StrainLibraryBelief(BeliefSection):
         return _read(scenario, Path(self.file))
 
 
-def _read(scenario: Scenario, path: Path) -> StrainLibrarySource:
+def _read(scenario: Scenario, path: Path) -> "StrainLibrarySource":
     return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)
 
 

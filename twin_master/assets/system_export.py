@@ -1,7 +1,5 @@
 """A scenario's asset, or a wing design, as an SSP file."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Iterator, Mapping

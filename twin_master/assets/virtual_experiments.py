@@ -1,7 +1,5 @@
 """The wing FMU on the test bench: the laboratory experiments of the calibration, flown through FMI."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import TracebackType
 from typing import Self

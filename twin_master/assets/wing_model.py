@@ -1,7 +1,5 @@
 """The reduced model of a wing as it meets a scenario: what it predicts, and itself as an asset."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,7 +22,7 @@ Float = NDArray[np.float64]
 
 
 def wing_observation_table(
-    wing: ReducedModel, scenario: Scenario, draws: ParameterDraws, model: GraphicalModel
+    wing: "ReducedModel", scenario: Scenario, draws: ParameterDraws, model: GraphicalModel
 ) -> Float:
     """Return the strains (E, S, U, G) of a wing for each draw of e, state and control: eqs. (13), (15).
 
@@ -74,7 +72,7 @@ def _names(values: set[str] | set[int]) -> str:
     return ", ".join(sorted(str(value) for value in values))
 
 
-def wing_asset(wing: ReducedModel, scenario: Scenario) -> StatelessAsset:
+def wing_asset(wing: "ReducedModel", scenario: Scenario) -> StatelessAsset:
     """Return the reduced model itself as an asset, with the parameters of the scenario's true wing."""
     e = scenario.asset.true_parameters.get("young_modulus_factor", 1.0)
     force = scenario.asset.constant_load.get("tip_force", 0.0)
@@ -89,7 +87,7 @@ def wing_asset(wing: ReducedModel, scenario: Scenario) -> StatelessAsset:
 class ReducedModelSource:
     """The reduced model of a wing, flown without an FMU."""
 
-    def __init__(self, scenario: Scenario, wing: ReducedModel) -> None:
+    def __init__(self, scenario: Scenario, wing: "ReducedModel") -> None:
         self._scenario = scenario
         self._wing = wing
 

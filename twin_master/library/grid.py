@@ -1,7 +1,5 @@
 """The grid over which an FMU is sampled, and one process's way through a block of it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -98,7 +96,7 @@ class SamplingGrid:
         return json.dumps(asdict(self))
 
     @classmethod
-    def from_json(cls, text: str) -> SamplingGrid:
+    def from_json(cls, text: str) -> "SamplingGrid":
         """Return the grid of a text."""
         record: dict[str, Any] = json.loads(text)
         record["draws"] = tuple(record["draws"])

@@ -1,7 +1,5 @@
 """What a user asks to be sampled: a scenario, or an FMU with values for its inputs."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

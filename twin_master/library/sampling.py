@@ -1,7 +1,5 @@
 """Sampling an FMU over a grid into an observation library: in several processes, resumable after a kill."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

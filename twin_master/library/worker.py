@@ -1,7 +1,5 @@
 """Processes that sample blocks of a grid: each holds an FMU of its own, so that one crash is one sentence."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

@@ -8,8 +8,6 @@ The file only grows: a turn is one line, its JSON behind the SHA-256 of it. A li
 ends without a line feed, and is flown again; any other line that does not have its hash was changed.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import json

@@ -1,7 +1,5 @@
 """The mission loop: control, asset, observation, assimilate, predict, decide, control; at its end, smooth."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field

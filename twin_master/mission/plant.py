@@ -1,7 +1,5 @@
 """The flown asset with its truth; the mission loop shows the twin its observations and nothing else."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

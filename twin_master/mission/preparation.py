@@ -1,7 +1,5 @@
 """A twin, its plan and its plant, put together from a scenario, a source of assets and a seed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ The truth belongs to the scenario and drives the asset. The twin is never handed
 only in the run store, for scoring.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from enum import IntEnum
 

@@ -1,7 +1,5 @@
 """Probability distributions and stochastic matrices, checked once where they come in."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -4,8 +4,6 @@ The factors (2)-(4) and (28)-(29) of Kapteyn et al. 2021 as arrays. Every stocha
 passes `stochastic_matrix`, which checks it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -182,7 +180,7 @@ class SparseTransition:
     log_probability: Float
 
     @classmethod
-    def from_matrix(cls, matrix: Float) -> SparseTransition:
+    def from_matrix(cls, matrix: Float) -> "SparseTransition":
         """Build the lists from a transition array (U, S, S)."""
         rows = matrix.transpose(0, 2, 1).reshape(-1, matrix.shape[2])
         row, source = np.nonzero(rows)
@@ -213,7 +211,7 @@ class TransitionModel:
         object.__setattr__(self, "matrix", matrix)
 
     @classmethod
-    def from_factors(cls, tables: Sequence[Sequence[ArrayLike]]) -> TransitionModel:
+    def from_factors(cls, tables: Sequence[Sequence[ArrayLike]]) -> "TransitionModel":
         """Build the joint transition of factors that change independently, given the control.
 
         Parameters
@@ -303,7 +301,7 @@ class GraphicalModel:
         levels: Mapping[str, Sequence[float]],
         tables: Mapping[str, Mapping[str, ArrayLike]],
         prior: Mapping[str, ArrayLike] | None = None,
-    ) -> GraphicalModel:
+    ) -> "GraphicalModel":
         """Return the model of factors that move independently given the control, as plain tables say it.
 
         Kapteyn et al. 2021, eqs. (28)-(29).

@@ -7,8 +7,6 @@ The order of one turn t: control u_t is in force, the state is D_t, the observat
 Hence D_t follows D_{t-1} through u_{t-1}, and the first state follows the prior.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor

@@ -5,8 +5,6 @@ at least `SAFE`: what underflowed then weighs less than one part in 1e27 of it, 
 the sum is formed in the log domain. The result is that of the log domain at a third of its cost.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """What a twin needs in memory, told before it is built."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from math import prod

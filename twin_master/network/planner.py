@@ -1,7 +1,5 @@
 """Planning: value iteration on the Bellman equation, Kapteyn et al. 2021, eq. (36)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ draws. Given a belief, its distribution is a mixture of point values, so that me
 quantiles are exact: Kapteyn et al. 2021, eqs. (3) and (37).
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -3,8 +3,6 @@
 What counts as a limit, what a control is worth and how an error is scaled comes from the scenario.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

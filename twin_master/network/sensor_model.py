@@ -3,8 +3,6 @@
 Kapteyn et al. 2021, eqs. (30) and (32).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -3,8 +3,6 @@
 It holds no asset and no truth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal

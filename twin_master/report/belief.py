@@ -1,7 +1,5 @@
 """The belief over the joint states turn by turn, and the policy over the states."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the twin was told about the uncertain parameter of its model before it flew."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The posterior predictive check: whether the observations look as the twin expects them to look."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The stored run as the report sees it: plain arrays with checked shapes, missing parts as None."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

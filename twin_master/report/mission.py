@@ -1,7 +1,5 @@
 """The course of a mission as seen at one turn: past, present and prediction (Kapteyn et al. 2021, Fig. 6)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The dynamic decision network for a few steps (Kapteyn et al. 2021, Fig. 2 and eqs. (1)-(4), (37)-(39))."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The report of a run: one self-contained page and its figures, from nothing but the run folder."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,8 +48,7 @@ MAIN_FIGURE = "mission_now"
 _SOURCES = (
     "M. G. Kapteyn, J. V. R. Pretorius, K. E. Willcox: A probabilistic graphical model foundation for "
     "enabling predictive digital twins at scale. Nature Computational Science 1 (2021) 337-347, "
-    "arXiv:2012.05841. "
-    "Equation numbers in the captions are those of this paper.",
+    "arXiv:2012.05841. Equation numbers in the captions are those of this paper.",
     "Colours: M. Okabe, K. Ito, Color Universal Design (2008).",
 )
 

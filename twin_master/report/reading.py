@@ -1,7 +1,5 @@
 """Reading a run folder into a `RunRecord`."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -47,11 +45,6 @@ def read_run(folder: Path) -> RunRecord:
 
 def open_run(folder: Path | str) -> xr.DataTree:
     """Return everything that a run left, `run.nc`, as labelled arrays in memory.
-
-    Parameters
-    ----------
-    folder : path
-        The run folder.
 
     Returns
     -------

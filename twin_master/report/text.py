@@ -1,7 +1,5 @@
 """Captions and phrases of the report."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -123,8 +121,7 @@ def belief_caption(record: RunRecord) -> str:
     ring = "; ring: truth" if record.truth_state is not None else ""
     return (
         f"Joint probability of {first} and {second} ({_state_units(record)}) given the observations up to "
-        f"the {record.step_word} named; "
-        f"diamond: mean{ring}. Source: filtered/probability in run.nc."
+        f"the {record.step_word} named; diamond: mean{ring}. Source: filtered/probability in run.nc."
     )
 
 

@@ -1,7 +1,5 @@
 """What the report shows of a run: which turn, which sensors, and the lines and bands drawn of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -5,8 +5,6 @@ A kind is one class in one file: a subclass of `AssetSection` or `BeliefSection`
 mission needs. Nothing else has to know of it.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from importlib import import_module
@@ -15,8 +13,9 @@ from typing import Any, ClassVar, Self
 
 from pydantic import ModelWrapValidatorHandler, model_validator
 
+from reporting.section import shown
 from scenarios import asset_scripts, binding_files
-from twin_master.scenario.section import Section, short, shown
+from twin_master.scenario.section import Section, short
 
 SHIPPED_DESIGN_NAME = "uav_wing"
 CALIBRATED_DESIGN_NAME = "calibration"
@@ -57,7 +56,7 @@ class FileSection(Section):
         """Return the table with its relative paths from a folder."""
         return self.model_copy(update={key: str(folder / path) for key, path in self.own_files().items()})
 
-    def portable(self) -> FileSection:
+    def portable(self) -> "FileSection":
         """Return the table with the paths of the copies inside a run folder."""
         return self.model_copy(update={key: self.copies()[key] for key in self.own_files()})
 

@@ -1,7 +1,5 @@
 """Scenario files of format 1, in which `[asset]` said both what flies and what the twin believes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

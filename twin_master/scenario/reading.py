@@ -1,7 +1,5 @@
 """Reading scenario files: TOML in, a checked `Scenario` out, and one clear sentence for whatever is wrong."""
 
-from __future__ import annotations
-
 import hashlib
 import typing
 from collections.abc import Mapping, Sequence
@@ -11,13 +9,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from reporting.section import shown
 from reporting.toml_file import read_toml
 from scenarios import scenario_files
 from twin_master.errors import ScenarioError, UnknownScenarioError
 from twin_master.scenario.asset import KindSection
 from twin_master.scenario.format import from_format_1
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Section, shown
+from twin_master.scenario.section import Section
 
 
 @dataclass(frozen=True)

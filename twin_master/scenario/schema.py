@@ -5,8 +5,6 @@ what is kept here, and in `config.json` of a run, is in SI. Nothing here knows a
 another scenario file.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self

@@ -1,13 +1,12 @@
 """A table of a scenario file: what all tables have in common, and the kinds of values that they hold."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-_SHOWN_LENGTH = 60
+from reporting.section import shown
+
 UNIT_DIVISOR = {"percent": 100.0, "microstrain": 1.0e6, "microstrain_per_step": 1.0e6}
 
 LARGEST_COUNT = 1_000_000
@@ -23,15 +22,6 @@ def _at_most(limit: int, why: str) -> AfterValidator:
         return value
 
     return AfterValidator(check)
-
-
-def shown(value: object) -> str:
-    """Return a value for a sentence, cut where it is long."""
-    try:
-        text = repr(value)
-    except ValueError:  # an integer of thousands of digits
-        return "a number of thousands of digits"
-    return text if len(text) <= _SHOWN_LENGTH else text[: _SHOWN_LENGTH - 3] + "..."
 
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]

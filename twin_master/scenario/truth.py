@@ -1,7 +1,5 @@
 """The tables of a scenario that say what really happens, unseen by the twin: damage, noise, faults."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, Self
 

@@ -1,7 +1,5 @@
 """What came of a run: its folder, report, summary and timing."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A flown mission as labelled arrays: what was observed, believed, predicted, decided, and true."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """The figures of a mission, each beside the one that the scenario gives as its reference."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any

@@ -4,8 +4,6 @@ A strain is given in microstrain, a dimensionless state is a fraction and given 
 stays in its unit.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The run store: NetCDF for programs, CSV for people, a summary; every file whole or not there."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -53,8 +53,6 @@ class PortForce(Primitive):
     """Whether the force depends on what happened before."""
     proportional: ClassVar[tuple[str, ...]] = ()
     """The numbers that the force is in proportion to."""
-    units: ClassVar[dict[str, str]] = {}
-    """Unit of each real number; of a port that is displaced, or one that turns."""
 
     port: str
 

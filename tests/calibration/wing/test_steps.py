@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from calibration.wing.steps import (
     gaussian_reward,
     moment_reward,
 )
+from reporting.record_json import record_of
 
 
 def quantity(prior: float, posterior: float, measured: float | None, spread: float | None = 0.5) -> Update:
@@ -78,4 +80,4 @@ def test_a_step_is_plain_data() -> None:
         2, "Load test", "exact", "pairs", (quantity(0.0, 1.0, None, None),), (quantity(0.0, 1.0, 1.2),),
         StepReward(-1.0, None, 0.5, None),
     )  # fmt: skip
-    assert CalibrationStep.from_dict(step.to_dict()) == step
+    assert record_of(CalibrationStep, asdict(step)) == step

@@ -15,8 +15,9 @@ from pymor.parameters.functionals import MinThetaParameterFunctional, Projection
 from pymor.reductors.coercive import CoerciveRBReductor
 from scipy import sparse
 
+from fe.full.affine import affine_sum
 from fe.full.operators import AffineOperators
-from fe.full.subspace import Norm, OrthonormalBasis, affine_sum, conjugate_gradients, triangular_factors
+from fe.full.subspace import Norm, OrthonormalBasis, conjugate_gradients, triangular_factors
 from fe.reduction.compression import compressed, relative_bound
 from fe.reduction.modal_basis import ModalSettings
 from fe.reduction.reduced_basis import Reduction, reduce_model

@@ -10,6 +10,7 @@ import pytest
 
 from fe.full.patch_operators import strip_edges
 from fe.reduction import patch_cache
+from fe.reduction.model_cache import cache_key
 from fe.reduction.patch_basis import PatchSettings, area_shares
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.patch_arrays import PatchArrays
@@ -90,7 +91,7 @@ def test_the_cache_builds_once(
     assert patch_cache.patch_arrays(coarse_design).to_bytes() == first.to_bytes()
     assert built == [coarse_design.hash]
     other = PatchSettings(vectors=30)
-    assert patch_cache.patch_cache_key(coarse_design) != patch_cache.patch_cache_key(coarse_design, other)
+    assert cache_key(coarse_design) != cache_key(coarse_design, other)
     (file,) = (tmp_path / "uav-twin").glob("*-patches.npz")
     file.write_bytes(b"rubbish")
     patch_cache.patch_arrays(coarse_design)

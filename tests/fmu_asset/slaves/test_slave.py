@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 
 from fe.runtime.damping import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.transient import ModalIntegrator, TransientState
 from fmu_asset.slaves.base import Contents
-from fmu_asset.slaves.behaviour import Physics, WingBehaviour
+from fmu_asset.slaves.behaviour import WingBehaviour
 from fmu_asset.slaves.variables import (
     STATUS_BAD_CALL,
     STATUS_BAD_STATE,
@@ -44,11 +43,10 @@ class Bare:
 def make_slave(model: ReducedModel) -> Callable[..., Any]:
     table = variable_table(gauge_count=24, mode_count=6, validity=model.validity, start=START)
     reference = {row.name: row.reference for row in table}
-    physics = Physics(model, ModalIntegrator, TransientState, rayleigh_damping_ratio)
 
     class Wing(WingSlave, Bare):
         content_tag = "tag"
-        load_contents = staticmethod(lambda _: Contents(table, lambda: WingBehaviour(physics, 6)))
+        load_contents = staticmethod(lambda _: Contents(table, lambda: WingBehaviour(model, 6)))
 
         def of(self, name: str) -> float:
             index = reference[name]

@@ -1,0 +1,50 @@
+"""What the FMU of the wing holds in its resources: its table of variables and its behaviour.
+
+This file is copied into the FMU, as `behaviour`.
+"""
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from fe.runtime.reduced import ReducedModel
+
+from .base import Contents
+from .behaviour import WingBehaviour
+from .variables import variable_table
+
+
+def load_contents(resources: Path) -> Contents:
+    """Return what the files that `fmu_asset.packing.wing_fmu` packed describe."""
+    model = ReducedModel.load(resources / "reduced_model.npz")
+    setting = _read(resources / "start.json")
+    count, start = setting["mode_count"], setting["start"]
+    table = variable_table(
+        gauge_count=model.gauge_count, mode_count=count, validity=model.validity, start=start
+    )
+    if not (resources / "effects.json").is_file():
+        return Contents(table, lambda: WingBehaviour(model, count))
+    # a plain wing needs nothing of these
+    from .effect_variables import effect_rows
+    from .patched_behaviour import PatchedBehaviour
+
+    record = _read(resources / "effects.json")
+    effects, channels = record["effects"], tuple((name, quantity) for name, quantity in record["channels"])
+    steps = None
+    arrays = resources / "patch_arrays.npz"
+    if arrays.is_file():
+        from fe.runtime.patch_arrays import PatchArrays
+        from fe.runtime.patched_steps import PatchedSteps
+        from fe.runtime.patched_wing import PatchedWing
+
+        steps = partial(PatchedSteps, model, PatchedWing(PatchArrays.load(arrays)))
+    return Contents(
+        table + effect_rows(effects, len(table), start),
+        lambda: PatchedBehaviour(model, count, effects, channels, steps),
+    )
+
+
+def _read(path: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return record
