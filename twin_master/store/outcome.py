@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from reporting.errors import DamagedFileError
+from reporting.json_file import read_json
 from twin_master.assets.asset_source import FlownAndBelieved
+from twin_master.errors import NotResumableError
 from twin_master.run_folder import read_config
 from twin_master.store.summary import Figure
 from twin_master.store.writing import SUMMARY_NAME, TIMING_NAME, read_run
@@ -50,14 +51,12 @@ def finished_run(folder: Path) -> RunOutcome | None:
     """Return the outcome of a run that is finished; None where its results are missing or damaged."""
     report = folder / REPORT_NAME
     try:
-        timing, summary = (
-            json.loads((folder / name).read_text(encoding="utf-8")) for name in (TIMING_NAME, SUMMARY_NAME)
-        )
+        timing, summary = (read_json(folder / name, DamagedFileError) for name in (TIMING_NAME, SUMMARY_NAME))
         read_run(folder)
         figures = tuple(Figure(**figure) for figure in summary["figures"])
         differ = bool(summary["asset_and_model_differ"])
         origin = FlownAndBelieved(str(summary["asset"]), str(summary["twin_model"]), differ)
         step_name = str(read_config(folder)["scenario"]["mission"]["step_name"])
-    except (OSError, ValueError, KeyError, TypeError, DamagedFileError):
+    except (KeyError, TypeError, DamagedFileError, NotResumableError):
         return None
     return RunOutcome(folder, report if report.is_file() else None, figures, timing, origin, step_name)
