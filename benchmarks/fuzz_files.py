@@ -43,6 +43,7 @@ kind = "power_stiffness"
 port = "place"
 coefficient = "share * port_stiffness * port_displacement"
 exponent = 2.0
+side = 1
 reference_displacement = "port_displacement"
 """
 

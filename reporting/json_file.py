@@ -19,7 +19,7 @@ def read_json(path: Path | str, error: type[Exception], *, what: str = "file") -
     ------
     error
         The file is not there, cannot be read, is not UTF-8 or not JSON (which has no NaN), is nested too
-        deeply, or holds a number that 64 bits cannot.
+        deeply, names a key twice, or holds a number that 64 bits cannot.
     """
     return parse_json(read_text(path, error, what=what), f"The {what} {path}", error)
 
@@ -28,13 +28,28 @@ def parse_json(content: bytes | str, source: str, error: type[Exception]) -> Any
     """Return the content of JSON that was read elsewhere; `source` names it in the sentence of `error`."""
     text = decoded(content, source, error) if isinstance(content, bytes) else content
     try:
-        found = json.loads(text, parse_int=_integer, parse_float=_decimal, parse_constant=_refuse)
+        found = json.loads(
+            text,
+            parse_int=_integer,
+            parse_float=_decimal,
+            parse_constant=_refuse,
+            object_pairs_hook=_table,
+        )
     except ValueError as cause:
         raise error(f"{source} is not valid JSON: {cause}.") from cause
     except RecursionError:
         raise error(too_deep(source)) from None
     check_nesting(found, source, error)
     return found
+
+
+def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of JSON; of a key that comes twice Python would take the last."""
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"the key {next(name for name in names if names.count(name) > 1)!r} comes twice")
+    return table
 
 
 def _refuse(number: str) -> NoReturn:

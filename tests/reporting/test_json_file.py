@@ -30,6 +30,7 @@ def test_a_byte_order_mark_means_nothing(tmp_path: Path, mark: str) -> None:
         (b'{"a": ' + b"1" * 41 + b"}", "an integer of 41 digits, and 64 bits"),
         (b'{"a": 9223372036854775808}', "an integer of 19 digits, and 64 bits"),
         (b'{"a": -' + b"1" * 5000 + b"}", "an integer of 5001 digits"),
+        (b'[{"b": 1, "a": 1, "a": 1}]', "the key 'a' comes twice"),
         (b'{"a": NaN}', "NaN is no number in JSON"),
         (b'{"a": [-Infinity]}', "-Infinity is no number in JSON"),
         (b'{"a": 1e400}', "1e400 is no number in JSON"),
