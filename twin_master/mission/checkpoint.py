@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import io
 import json
 import os
 import zlib
@@ -237,7 +238,7 @@ def _read(path: Path, content: bytes, config_hash: str) -> tuple[list[FlownTurn]
     ends: list[int] = []
     kept = [0]
     end = 0
-    for number, line in enumerate(content.splitlines(keepends=True)):
+    for number, line in enumerate(io.BytesIO(content)):
         if number and not line.endswith(b"\n"):
             break  # cut off by a kill
         end += len(line)

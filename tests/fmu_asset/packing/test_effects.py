@@ -326,7 +326,7 @@ REFUSED = {
         content({"slip": [MicroSlip("tip", 1.0, 2.0, 0.0, 10**12)]}), "must be 10000 at most"
     ),
     "a nest": (b"[" * 5000 + b"]" * 5000, "nested deeper than 32"),
-    "a list for a kind": (content().replace(b'"thermal_strain"', b"[]"), "the kind []"),
+    "a list for a kind": (content().replace(b'"kind": "thermal_strain"', b'"kind": []'), "the kind []"),
     "two bytes a letter": (content().decode().encode("utf-16"), "not text in UTF-8"),
 }  # fmt: skip
 
