@@ -43,6 +43,7 @@ kind = "power_stiffness"
 port = "place"
 coefficient = "share * port_stiffness * port_displacement"
 exponent = 2.0
+side = 1
 reference_displacement = "port_displacement"
 """
 
@@ -57,6 +58,7 @@ def make_files(folder: Path) -> Path:
         ("laboratory", _laboratory),
         ("run", _run),
         ("checkpoint", _checkpoint),
+        ("static", _static),
         ("calibrated", _calibration),
         ("library.nc", _library),
         ("system.ssp", _ssp),
@@ -126,6 +128,10 @@ def _checkpoint(folder: Path) -> None:
         for _ in range(4):
             observed = generator.normal(size=24)
             file.keep(FlownTurn(1, 0, observed, observed[:2], observed, {"rounds": 2.0}, b"state" * 20))
+
+
+def _static(folder: Path) -> None:
+    _command("calibrate", "static", "--out", folder / "static")
 
 
 def _calibration(folder: Path) -> None:

@@ -114,7 +114,7 @@ LOADERS: dict[str, Loader] = {
     "run, report": Loader("run/run.nc", lambda path: read_record(path.parent), BINARY),
     "checkpoint": Loader("checkpoint/checkpoint.jsonl", _checkpoint, TEXT),
     "configuration": Loader("run/config.json", _config, TEXT),
-    "calibration of e": Loader("run/calibration.json", read_calibration, TEXT),
+    "calibration of e": Loader("static/calibration.json", read_calibration, TEXT),
     "calibration": Loader("calibrated/calibration.nc", load_calibration, BINARY),
     "observations": Loader("library.nc", load_observation_library, BINARY),
     "strains": Loader("strains.json", load_strain_library, TEXT),

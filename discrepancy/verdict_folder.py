@@ -1,7 +1,7 @@
 """The folder that an investigation leaves: verdict, patch, residuals, figures, report; whole or not."""
 
+import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +23,7 @@ from fe.wing.design import WingDesign
 from reporting.errors import FileNotWrittenError
 from reporting.figures import to_png
 from reporting.files import atomic_write_bytes, atomic_write_text, write_error
+from reporting.folders import fresh_folder, lock_folder, replace_folder, restore_folder
 
 REPORT_NAME = "report.html"
 FMU_NAME = "patched.fmu"
@@ -63,13 +64,14 @@ class VerdictContent:
 
 
 def check_folder(folder: Path, *, replace_it: bool) -> None:
-    """Look at the place before the work begins.
+    """Look at the place before the work begins; a verdict that a killed process had moved aside comes back.
 
     Raises
     ------
     FileNotWrittenError
         If it is no folder, holds something else than a verdict, or a verdict that is not to be replaced.
     """
+    restore_folder(folder)
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise FileNotWrittenError(f"{folder} exists and is no folder: choose another --out.")
     if not folder.is_dir() or not any(folder.iterdir()):
@@ -112,27 +114,28 @@ def write_verdict_folder(
     """
     check_folder(folder, replace_it=replace_it)
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
-    except OSError as error:
-        raise write_error(error, folder) from error
-    try:
-        fresh = scratch / folder.name
-        fresh.mkdir()
-        _write(fresh, content, report=report)
-        if folder.is_dir():
-            folder.rename(scratch / "old")
+        fresh = fresh_folder(folder)
         try:
-            fresh.rename(folder)
-        except OSError:
-            if (scratch / "old").is_dir():
-                (scratch / "old").rename(folder)
-            raise
+            _write(fresh, content, report=report)
+            _move(fresh, folder)
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
     except OSError as error:
         raise write_error(error, folder) from error
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
     return folder / REPORT_NAME if report else folder
+
+
+def _move(fresh: Path, folder: Path) -> None:
+    if not folder.is_dir():
+        fresh.rename(folder)
+        return
+    held = lock_folder(folder)
+    if held is None:
+        raise FileNotWrittenError(f"another process is replacing {folder}: look at what it leaves.")
+    try:
+        replace_folder(fresh, folder)
+    finally:
+        os.close(held)
 
 
 def _write(folder: Path, content: VerdictContent, *, report: bool) -> None:

@@ -1,4 +1,4 @@
-"""Files that are either whole or not there: atomic writes and reproducible archives.
+"""Files that are either whole or not there: atomic writes.
 
 Everything is written under a temporary name in the folder of its destination, flushed to the disk and
 moved into place in one step. A kill, a full disk or a refused permission leaves the previous file as it was.
@@ -7,20 +7,13 @@ moved into place in one step. A kill, a full disk or a refused permission leaves
 from __future__ import annotations
 
 import errno
-import io
 import itertools
 import os
-import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy.lib import format as npy_format
-from numpy.typing import NDArray
-
-from reporting.errors import DamagedFileError, DiskFullError, FileNotWrittenError
+from reporting.errors import DiskFullError, FileNotWrittenError
 
 TEMPORARY_SUFFIX = ".partial"
 """Ending of the temporary names, so that a leftover of a killed process is recognisable."""
@@ -28,7 +21,6 @@ TEMPORARY_SUFFIX = ".partial"
 _NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _REFUSED = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
 _temporary_count = itertools.count()
-_ARCHIVE_DATE = (1980, 1, 1, 0, 0, 0)  # the first date that the zip format can hold
 
 
 def write_error(error: OSError, path: Path) -> FileNotWrittenError:
@@ -145,91 +137,3 @@ def remove_leftovers(folder: str | os.PathLike[str]) -> int:
     for path in leftovers:
         path.unlink(missing_ok=True)
     return len(leftovers)
-
-
-def npz_bytes(arrays: Mapping[str, Any], *, compressed: bool = False) -> bytes:
-    """Return the bytes of an ``.npz`` archive that depend on nothing but the arrays.
-
-    Fixed dates, members in the order of their names, C order, little-endian or single-byte data, no pickles.
-    ``numpy.load`` reads it.
-
-    Parameters
-    ----------
-    arrays
-        Name -> array of numbers, booleans or fixed-width text.
-    compressed
-        Deflate the members. The bytes then also depend on the version of zlib.
-
-    Raises
-    ------
-    ValueError
-        A name is empty or holds a slash, or an array holds Python objects.
-    """
-    buffer = io.BytesIO()
-    method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
-    with zipfile.ZipFile(buffer, "w", method) as archive:
-        for name in sorted(arrays):
-            if not name or "/" in name or "\\" in name:
-                raise ValueError(f"An array in an archive needs a name without slashes, not {name!r}.")
-            member = zipfile.ZipInfo(f"{name}.npy", date_time=_ARCHIVE_DATE)
-            member.compress_type = method
-            member.create_system = 3  # the same on every platform
-            member.external_attr = 0o644 << 16
-            archive.writestr(member, _npy_bytes(name, arrays[name]))
-    return buffer.getvalue()
-
-
-def _npy_bytes(name: str, values: Any) -> bytes:
-    array = np.asarray(values)
-    if array.dtype.hasobject:
-        raise ValueError(
-            f"The array {name!r} holds Python objects; only numbers, booleans and text can be saved."
-        )
-    # `asarray` keeps a scalar a scalar, which `ascontiguousarray` would not.
-    array = np.asarray(array, dtype=array.dtype.newbyteorder("<"), order="C")
-    buffer = io.BytesIO()
-    npy_format.write_array(buffer, array, version=(1, 0), allow_pickle=False)
-    return buffer.getvalue()
-
-
-def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], *, compressed: bool = False) -> Path:
-    """Write `npz_bytes` of the arrays to `path` in one step; return the path.
-
-    Raises
-    ------
-    ValueError
-        As `npz_bytes`.
-    DiskFullError, FileNotWrittenError
-        As `atomic_file`.
-    """
-    return atomic_write_bytes(path, npz_bytes(arrays, compressed=compressed))
-
-
-def read_npz(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
-    """Read all arrays of an ``.npz`` archive; no pickles.
-
-    Raises
-    ------
-    FileNotFoundError
-        There is no such file.
-    DamagedFileError
-        The file is not a whole archive of arrays.
-    """
-    source = Path(path)
-    if not source.is_file():
-        raise FileNotFoundError(f"There is no file {source}.")
-    try:
-        with zipfile.ZipFile(source) as archive:
-            members = [name for name in archive.namelist() if name.endswith(".npy")]
-            arrays = {}
-            for member in members:
-                with archive.open(member) as stream:
-                    array = npy_format.read_array(stream, allow_pickle=False)
-                    if stream.read(1):
-                        raise ValueError("bytes follow the array")
-                arrays[member.removesuffix(".npy")] = np.asarray(array)
-    except (zipfile.BadZipFile, ValueError, EOFError, OSError) as error:
-        raise DamagedFileError(
-            f"{source} is not a whole archive of arrays ({error}): make it again."
-        ) from error
-    return arrays

@@ -28,6 +28,22 @@ def lock_folder(folder: Path) -> int | None:
     return descriptor
 
 
+def fresh_folder(folder: Path) -> Path:
+    """Return an empty folder beside the one to be, with the permissions of the user's umask.
+
+    Raises
+    ------
+    OSError
+        The place is not writable.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(prefix=_prefix(folder, "new"), dir=folder.parent))
+    mask = os.umask(0)
+    os.umask(mask)
+    fresh.chmod(0o777 & ~mask)
+    return fresh
+
+
 def replace_folder(fresh: Path, folder: Path) -> None:
     """Put a folder in the place of another, which is removed; this process holds both.
 

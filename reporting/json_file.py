@@ -1,10 +1,13 @@
 """The one reader of JSON: whatever is wrong with a file becomes one sentence of the caller's exception."""
 
 import json
+from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
-from reporting.text_file import check_nesting, read_text, too_deep
+from reporting.text_file import check_nesting, decoded, read_text, too_deep
+
+_LONGEST_INTEGER = len(str(-(2**63)))
 
 
 def read_json(path: Path | str, error: type[Exception], *, what: str = "file") -> Any:
@@ -13,15 +16,51 @@ def read_json(path: Path | str, error: type[Exception], *, what: str = "file") -
     Raises
     ------
     error
-        The file is not there, cannot be read, is not UTF-8 or not JSON, or is nested too deeply.
+        The file is not there, cannot be read, is not UTF-8 or not JSON (which has no NaN), is nested too
+        deeply, names a key twice, or holds a number that 64 bits cannot.
     """
-    subject = f"The {what} {path}"
-    text = read_text(path, error, what=what)
+    return parse_json(read_text(path, error, what=what), f"The {what} {path}", error)
+
+
+def parse_json(content: bytes | str, source: str, error: type[Exception]) -> Any:
+    """Return the content of JSON that was read elsewhere; `source` names it in the sentence of `error`."""
+    text = decoded(content, source, error) if isinstance(content, bytes) else content
     try:
-        content = json.loads(text)
+        found = json.loads(
+            text,
+            parse_int=_integer,
+            parse_float=_decimal,
+            parse_constant=_refuse,
+            object_pairs_hook=_table,
+        )
     except ValueError as cause:
-        raise error(f"{subject} is not valid JSON: {cause}.") from cause
+        raise error(f"{source} is not valid JSON: {cause}.") from cause
     except RecursionError:
-        raise error(too_deep(subject)) from None
-    check_nesting(content, subject, error)
-    return content
+        raise error(too_deep(source)) from None
+    check_nesting(found, source, error)
+    return found
+
+
+def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of JSON; of a key that comes twice Python would take the last."""
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"the key {next(name for name in names if names.count(name) > 1)!r} comes twice")
+    return table
+
+
+def _refuse(number: str) -> NoReturn:
+    raise ValueError(f"{number} is no number in JSON")
+
+
+def _decimal(text: str) -> float:
+    number = float(text)
+    return number if isfinite(number) else _refuse(text)
+
+
+def _integer(digits: str) -> int:
+    """Return an integer that NumPy, HDF5 and `float` hold; Python's own is as long as the text."""
+    if len(digits) > _LONGEST_INTEGER or not -(2**63) <= (number := int(digits)) < 2**63:
+        raise ValueError(f"an integer of {len(digits)} digits, and 64 bits are what a file may hold")
+    return number

@@ -210,8 +210,8 @@ def parse_table(
     separator: str | None = ",",
 ) -> TextTable:
     """Return the table of a text, separated by commas or (None) by blanks; errors as `read_table`."""
-    # Comment lines become empty ones, so that the reader's line numbers stay those of the file.
-    kept = ["" if line.lstrip().startswith("#") else line for line in text.splitlines()]
+    # Comments and blanks become empty lines, so that the reader's line numbers stay those of the file.
+    kept = ["" if not line.strip() or line.lstrip().startswith("#") else line for line in text.splitlines()]
     if separator is None:
         found = [(number, line.split()) for number, line in enumerate(kept, start=1) if line.strip()]
     else:

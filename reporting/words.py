@@ -1,4 +1,4 @@
-"""Numbers beside their nouns, for sentences."""
+"""Numbers beside their nouns, and reasons, for sentences."""
 
 
 def counted(count: int, noun: str, plural: str | None = None) -> str:
@@ -19,3 +19,8 @@ def counted(count: int, noun: str, plural: str | None = None) -> str:
 def be(count: int) -> str:
     """Return "is" for one and "are" for any other count."""
     return "is" if count == 1 else "are"
+
+
+def one_line(reason: object) -> str:
+    """Return what a foreign error says as one line without its full stop, to stand in a sentence."""
+    return " ".join(str(reason).split()).removesuffix(".")

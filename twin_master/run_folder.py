@@ -6,13 +6,13 @@ Layout: see `docs/run_folder.md`.
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from reporting.files import atomic_write_bytes, atomic_write_text, remove_leftovers, write_error
-from reporting.folders import lock_folder, replace_folder
+from reporting.folders import fresh_folder, lock_folder, replace_folder
+from reporting.json_file import read_json
 from reporting.provenance import collect_provenance
 from twin_master.errors import NotResumableError, RunFolderError, RunFolderExistsError
 
@@ -32,8 +32,8 @@ def to_json(record: Mapping[str, Any]) -> str:
 def is_run_folder(folder: Path) -> bool:
     """Return whether a folder holds a run."""
     try:
-        record = json.loads((folder / CONFIG_NAME).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        record = read_json(folder / CONFIG_NAME, NotResumableError)
+    except NotResumableError:
         return False
     return isinstance(record, dict) and record.get("kind") == KIND
 
@@ -109,16 +109,8 @@ def create_run_folder(
 
 def _fresh_folder(folder: Path) -> tuple[Path, int]:
     """Return an empty folder beside the one to be, held by this process."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
-    fresh.chmod(0o777 & ~_umask())
+    fresh = fresh_folder(folder)
     return fresh, lock_run_folder(fresh)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -135,7 +127,7 @@ def read_config(folder: Path) -> dict[str, Any]:
         )
     if not is_run_folder(folder):
         raise NotResumableError(f"{folder} is no run folder: it holds no {CONFIG_NAME} of a run.")
-    config: dict[str, Any] = json.loads((folder / CONFIG_NAME).read_text(encoding="utf-8"))
+    config: dict[str, Any] = read_json(folder / CONFIG_NAME, NotResumableError)
     for name in ("scenario", "scenario_file", "provenance"):
         if not isinstance(config.get(name), dict):
             raise NotResumableError(

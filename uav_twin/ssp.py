@@ -46,13 +46,14 @@ def export(
 
 def _is_design(what: str) -> bool:
     """Return whether a name or path is that of a wing design: a TOML file without a mission."""
-    import tomllib
+    from reporting.errors import ReportingError
+    from reporting.toml_file import read_toml
 
     if what == "uav_wing":
         return True
     try:
-        return "planform" in tomllib.loads(Path(what).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return "planform" in read_toml(what, ReportingError)
+    except ReportingError:
         return False
 
 

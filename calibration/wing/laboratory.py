@@ -100,6 +100,11 @@ def read_weighed_mass(folder: Path) -> WeighedMass:
             f"{file} needs a header `mass,standard_deviation` and one row in grams, and {len(table)} came."
         )
     mass, deviation = (float(table.positive_numbers(name, "a weighing")[0]) for name in _WEIGHED_COLUMNS)
-    if mass < 10.0:
-        raise ExperimentDataError(f"{file}: mass is {mass:g} g, which looks like kg: give it in g.")
+    for wrong, unit in ((mass < 10.0, "kg"), (mass > 1e5, "mg")):
+        if wrong:
+            raise ExperimentDataError(f"{file}: mass is {mass:g} g, which looks like {unit}: give it in g.")
+    if deviation >= mass:
+        raise ExperimentDataError(
+            f"{file}: the standard deviation, {deviation:g} g, must be less than the mass, {mass:g} g."
+        )
     return WeighedMass(1e-3 * mass, 1e-3 * deviation)

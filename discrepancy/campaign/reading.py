@@ -142,6 +142,12 @@ def _trial(
             )
     else:
         time = np.full(count, start)
+    if not dynamic:
+        table.refuse_repeated(
+            [*zip(*table.columns.values(), strict=True)],
+            "row",
+            "leave one out, or tell repeated readings apart by a column `time`",
+        )
     zeros = np.zeros(count)
     forced = section.kind in (TrialKind.STATIC, TrialKind.FORCED)
     chosen = _measured(section, table, campaign)

@@ -170,7 +170,7 @@ class CampaignSection(Section):
 
     format: Literal[1]
     name: str
-    reference_temperature: Number | None = None
+    reference_temperature: Annotated[float, Field(allow_inf_nan=False, ge=-273.15)] | None = None
     parameters: dict[Name, ParameterSection] = Field(default_factory=dict)
     noise: NoiseFileSection | None = None
     channel: tuple[ChannelSection, ...] = Field(min_length=1)

@@ -19,6 +19,7 @@ from pydantic import TypeAdapter, ValidationError
 from discrepancy.errors import VerdictFileError
 from fe.runtime.patch import ModelPatch
 from reporting.files import atomic_write_text
+from reporting.json_file import read_json
 from reporting.provenance import Provenance
 
 _Record = TypeVar("_Record")
@@ -131,16 +132,9 @@ def read_document(path: Path, schema: str, kind: type[_Record]) -> tuple[_Record
         If the file is missing, damaged, of another schema or does not fit the record.
     """
     path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError as cause:
-        raise VerdictFileError(
-            f"There is no file {path}; give the one that the discrepancy workflow left."
-        ) from cause
-    except OSError as cause:
-        raise VerdictFileError(f"{path} cannot be read: {cause.strerror}.") from cause
-    except (ValueError, RecursionError) as cause:
-        raise VerdictFileError(f"{path} is damaged or no JSON file ({cause}); write it again.") from cause
+    if not path.exists():
+        raise VerdictFileError(f"There is no file {path}; give the one that the discrepancy workflow left.")
+    content = read_json(path, VerdictFileError)
     came = content.pop("schema", None) if isinstance(content, dict) else None
     if came != schema:
         raise VerdictFileError(

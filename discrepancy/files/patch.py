@@ -16,9 +16,8 @@ from discrepancy.errors import VerdictFileError
 from discrepancy.files.document import Origin, read_document, write_document
 from discrepancy.verdict import NamedEffect, VerdictKind
 from fe.runtime.patch import ModelPatch
+from fmu_asset.packing.patch_file import SCHEMA as PATCH_SCHEMA
 
-PATCH_SCHEMA = "uav-twin patch 1"
-"""Value of the key `schema`."""
 PATCH_NAME = "patch.json"
 
 _INTERVAL = (0.05, 0.95)

@@ -16,7 +16,10 @@ from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Release
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import DiscrepancyError, VerdictFileError
 from discrepancy.location.residuals import FittedTrial, ResidualSet
+from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
+from reporting.netcdf import read_groups
+from reporting.words import one_line
 
 RESIDUALS_NAME = "residuals.nc"
 
@@ -82,26 +85,30 @@ def read_residuals(path: Path) -> ResidualSet:
     if not path.is_file():
         raise VerdictFileError(f"There is no file {path}; give the one that the discrepancy workflow left.")
     try:
-        with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as tree:
-            root = dict(tree.attrs)
-            groups = {name: tree[name].to_dataset().load() for name in tree.children if name != "noise"}
-            noise = {
-                str(group.attrs["channel"]): group.to_dataset().load()
-                for group in (tree["noise"].children.values() if "noise" in tree.children else ())
-            }
-    except (OSError, ValueError, KeyError, RuntimeError, AttributeError, TypeError) as error:
+        tree = read_groups(path)
+    except DamagedFileError as error:
         raise VerdictFileError(
             f"{path} is damaged or no file of residuals: it cannot be read as NetCDF; write it again."
         ) from error
-    if root.get("schema") != SCHEMA:
-        raise VerdictFileError(f"{path} has the schema {root.get('schema')!r}, but {SCHEMA!r} is needed.")
+    schema = tree.attrs.get("schema")
+    if not isinstance(schema, str) or schema != SCHEMA:
+        raise VerdictFileError(f"{path} has the schema {schema!r}, but {SCHEMA!r} is needed.")
     try:
-        channels = {row["name"]: _channel(row, noise) for row in json.loads(root["channels"])}
-        return ResidualSet(channels, tuple(_trial(groups[name]) for name in sorted(groups)))
-    except (KeyError, TypeError, ValueError, AttributeError, DiscrepancyError) as error:
+        return _residuals(tree)
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError, DiscrepancyError) as error:
         raise VerdictFileError(
-            f"{path} is damaged ({type(error).__name__}: {error}); write it again."
+            f"{path} is damaged ({type(error).__name__}: {one_line(error)}); write it again."
         ) from error
+
+
+def _residuals(tree: xr.DataTree) -> ResidualSet:
+    groups = {name: group.to_dataset() for name, group in tree.children.items()}
+    noise = {
+        str(group.attrs["channel"]): group.to_dataset()
+        for group in (tree["noise"].children.values() if groups.pop("noise", None) is not None else ())
+    }
+    channels = {row["name"]: _channel(row, noise) for row in json.loads(tree.attrs["channels"])}
+    return ResidualSet(channels, tuple(_trial(groups[name]) for name in sorted(groups)))
 
 
 def _or_nan(value: float | None) -> float:

@@ -9,6 +9,7 @@ from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.verdict import Proof, Verdict
 from fe.runtime.patch import ModelPatch
+from reporting.folders import restore_folder
 
 VERDICT_SCHEMA = "uav-twin verdict 1"
 """Value of the key `schema`."""
@@ -91,6 +92,7 @@ def read_verdict_folder(folder: Path | str) -> VerdictFolder:
         If a file is missing, damaged, of another schema, or holds something else than it should.
     """
     place = Path(folder)
+    restore_folder(place)
     stored = read_verdict(place / VERDICT_NAME)
     patch, residuals = place / PATCH_NAME, place / RESIDUALS_NAME
     return VerdictFolder(

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
@@ -26,6 +25,7 @@ from fmu_asset.packing.patch_file import load_patch
 from fmu_asset.packing.patched_runtime import output_channels
 from reporting.errors import DamagedFileError
 from reporting.folders import restore_folder
+from reporting.json_file import read_json
 from reporting.netcdf import read_groups
 from reporting.provenance import hash_file
 from reporting.toml_file import read_toml
@@ -237,11 +237,9 @@ def _refuse_others(folder: Path, scenario: dict[str, Any]) -> None:
 
 def _config(folder: Path) -> dict[str, Any]:
     try:
-        config = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as cause:
-        raise CampaignFileError(
-            f"{folder} is no run folder: {CONFIG_FILE} cannot be read ({cause})."
-        ) from cause
+        config = read_json(folder / CONFIG_FILE, CampaignFileError)
+    except CampaignFileError as cause:
+        raise CampaignFileError(f"{folder} is no run folder. {cause}") from cause
     if not isinstance(config, dict) or not isinstance(config.get("scenario"), dict):
         raise CampaignFileError(f"{folder / CONFIG_FILE} is not that of a run: it has no `scenario`.")
     return config

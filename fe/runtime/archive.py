@@ -7,7 +7,6 @@ import io
 import os
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -78,20 +77,14 @@ def arrays_from_bytes(
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             for entry in archive.namelist():
-                arrays[entry.removesuffix(".npy")] = np.lib.format.read_array(
-                    io.BytesIO(archive.read(entry)), allow_pickle=False
-                )
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        ValueError,
-        EOFError,
-        KeyError,
-        NotImplementedError,
-        OSError,
-    ) as cause:
+                member = io.BytesIO(archive.read(entry))
+                arrays[entry.removesuffix(".npy")] = np.lib.format.read_array(member, allow_pickle=False)
+                if member.read(1):
+                    raise ValueError("bytes follow an array")
+    except Exception as cause:  # zipfile and NumPy answer damage with nearly every exception that there is
+        reason = " ".join(str(cause).split()) or type(cause).__name__
         raise ReducedModelFileError(
-            f"{where} is not a sound archive of plain arrays ({cause}); delete it and build it anew."
+            f"{where} is not a sound archive of plain arrays ({reason}); delete it and build it anew."
         ) from cause
     missing = [name for name in wanted if name not in arrays]
     if missing:

@@ -345,10 +345,10 @@ class ModelPatch:
 
 
 def _primitive(row: object, where: str) -> Primitive:
-    if not isinstance(row, Mapping) or row.get("kind") not in PRIMITIVES:
-        got = row.get("kind") if isinstance(row, Mapping) else row
-        raise InvalidPatchError(f"{where} has the kind {got!r}, but known are {', '.join(PRIMITIVES)}.")
-    primitive = PRIMITIVES[str(row["kind"])]
+    kind = row.get("kind") if isinstance(row, Mapping) else row
+    if not isinstance(row, Mapping) or not isinstance(kind, str) or kind not in PRIMITIVES:
+        raise InvalidPatchError(f"{where} has the kind {kind!r}, but known are {', '.join(PRIMITIVES)}.")
+    primitive = PRIMITIVES[kind]
     types = {item.name: item.type for item in fields(primitive)}
     values = {str(name): value for name, value in row.items() if name != "kind"}
     for name, value in values.items():

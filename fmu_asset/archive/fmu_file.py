@@ -17,6 +17,7 @@ from fmpy import platform_tuple, read_model_description, sharedLibraryExtension
 from fmu_asset.errors import FmuFileError, FmuUnsupportedError
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances.plan import Interface
+from reporting.words import one_line
 
 from .declared import FmuDescription, UnitInfo, VariableInfo, describe_fmu, read_declared
 
@@ -82,8 +83,7 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
     except FmuUnsupportedError:
         raise
     except Exception as error:
-        why = " ".join(str(error).split()).removesuffix(".")
-        raise FmuFileError(f"The model description of {file} cannot be read ({why}).") from error
+        raise FmuFileError(f"The model description of {file} cannot be read ({one_line(error)}).") from error
     if not _IDENTIFIER.fullmatch(description.model_identifier):
         raise FmuFileError(
             f"The model identifier of {file}, {description.model_identifier!r}, is no name of a C function; "

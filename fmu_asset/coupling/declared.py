@@ -10,6 +10,7 @@ from fmpy import read_model_description
 
 from fmu_asset.archive.fmu_file import FmuDescription, VariableInfo, read_fmu
 from fmu_asset.errors import FmuFileError
+from reporting.words import one_line
 
 READABLE = ("output", "local", "calculatedParameter")
 """Causalities of what can be the source of a connection."""
@@ -62,5 +63,5 @@ def read_declared(path: Path) -> DeclaredFmu:
             if variable.declaredType is not None and getattr(variable.declaredType, "items", None)
         }
     except Exception as error:
-        raise FmuFileError(f"The model structure of {path} cannot be read ({error}).") from error
+        raise FmuFileError(f"The model structure of {path} cannot be read ({one_line(error)}).") from error
     return DeclaredFmu(description, variables, feedthrough, items)

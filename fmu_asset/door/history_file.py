@@ -2,7 +2,6 @@
 
 import csv
 import io
-import math
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +11,7 @@ import numpy.typing as npt
 
 from fmu_asset.errors import FmuInputError
 from reporting.files import atomic_write_bytes, atomic_write_text
+from reporting.table_file import TableErrors, read_table
 
 from .binding import INPUT_ROLES, Binding
 from .session import FmiAsset
@@ -61,17 +61,14 @@ def read_histories(path: Path, binding: Binding) -> InputHistories:
         If the file is missing or no CSV, a column is missing, unknown or there twice, a cell is no finite
         number, or time is uneven.
     """
-    table = _table(path)
-    if _TIME not in table:
-        raise FmuInputError(
-            f"{path} lacks the column `time`; its columns are {', '.join(table)}. Give the time in seconds "
-            "at which each step begins."
-        )
-    time = table.pop(_TIME)
+    table = read_table(path, TableErrors(FmuInputError, FmuInputError))
+    time = table.numbers(_TIME, "a simulation")
     _check_time(path, time, binding)
     names = _input_names(binding)
     columns: dict[tuple[str, str], dict[int, npt.NDArray[np.float64]]] = {}
-    for column, values in table.items():
+    for column in table.columns:
+        if column == _TIME:
+            continue
         key, element = names.get(column), 0
         if key is None and (found := _ELEMENT.fullmatch(column)):
             key, element = names.get(found[1]), int(found[2])
@@ -83,7 +80,7 @@ def read_histories(path: Path, binding: Binding) -> InputHistories:
         taken = columns.setdefault(key, {})
         if element in taken or (taken and 0 in (element, *taken)):
             raise FmuInputError(f"{path} gives {'.'.join(key)} in more than one column; keep one.")
-        taken[element] = values
+        taken[element] = table.numbers(column, "a simulation")
     roles: Roles = {}
     for (role, name), elements in columns.items():
         if 0 in elements:
@@ -124,47 +121,6 @@ def write_history(path: Path, asset: FmiAsset, history: ObservationHistory) -> N
     rows = np.column_stack([history.time, history.values, *history.extra.values()])
     writer.writerows(rows.tolist())
     atomic_write_text(path, text.getvalue())
-
-
-def _table(path: Path) -> dict[str, npt.NDArray[np.float64]]:
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            lines = [
-                (number, row) for number, row in enumerate(csv.reader(stream), 1) if any(map(str.strip, row))
-            ]
-    except FileNotFoundError:
-        raise FmuInputError(f"There is no file {path}; give the CSV file of the inputs.") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FmuInputError(f"{path} cannot be read as a CSV text file: {error}.") from error
-    if len(lines) < 2:
-        raise FmuInputError(
-            f"{path} has no steps; a line of column names and a line for each step are needed."
-        )
-    header = [name.strip() for name in lines[0][1]]
-    twice = next((name for name in header if header.count(name) > 1), None)
-    if twice is not None:
-        raise FmuInputError(f"{path} has the column {twice!r} more than once; keep one.")
-    values = np.empty((len(lines) - 1, len(header)))
-    for index, (number, row) in enumerate(lines[1:]):
-        if len(row) != len(header):
-            raise FmuInputError(
-                f"Line {number} of {path} has {len(row)} cells, but there are {len(header)} columns."
-            )
-        for column, cell in enumerate(row):
-            values[index, column] = _number(path, number, header[column], cell)
-    return dict(zip(header, np.ascontiguousarray(values.T), strict=True))
-
-
-def _number(path: Path, line: int, column: str, cell: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise FmuInputError(
-            f"Line {line} of {path}: {column} must be a finite number, but is {cell.strip()!r}."
-        )
-    return value
 
 
 def _check_time(path: Path, time: npt.NDArray[np.float64], binding: Binding) -> None:

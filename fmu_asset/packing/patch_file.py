@@ -14,7 +14,6 @@ where `id` may also be called `identifier`, and `primitives` `patch`.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -23,10 +22,11 @@ from pathlib import Path
 from typing import Any
 
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import EVERY_CHANNEL, Clock, HighPass, ModelPatch, Primitive, RunOffset
+from fe.runtime.patch import EVERY_CHANNEL, Clock, HighPass, ModelPatch, PortForce, Primitive, RunOffset
 from fe.runtime.sensor_stream import needs_structure
 from fe.runtime.sensors import check_channels
 from fmu_asset.errors import PatchFileError
+from reporting.json_file import parse_json
 
 SCHEMA = "uav-twin patch 1"
 """Value of `schema` in a patch file."""
@@ -150,12 +150,7 @@ def load_patch(path: str | os.PathLike[str]) -> PatchFile:
 
 def parse_patch(content: bytes, where: str = "The patch file") -> PatchFile:
     """Return what the bytes of a patch file say; see `load_patch`."""
-    try:
-        record = json.loads(content.decode("utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise PatchFileError(f"{where} is not JSON ({error}).") from error
-    except RecursionError:
-        raise PatchFileError(f"{where} is nested far deeper than any patch.") from None
+    record = parse_json(content, where, PatchFileError)
     if not isinstance(record, dict) or record.get("schema") != SCHEMA:
         came = record.get("schema") if isinstance(record, dict) else type(record).__name__
         raise PatchFileError(f'{where} must have "schema": "{SCHEMA}", but has {came!r}.')
@@ -181,6 +176,9 @@ def _effects(rows: list[dict[str, Any]], where: str) -> tuple[Effect, ...]:
             )
         try:
             patch = ModelPatch.from_list(row.get("primitives", row.get("patch")), f"{where}, effect {name}")
+            for item in patch:
+                if isinstance(item, PortForce) and item.magnitude:
+                    item.check()
         except InvalidPatchError as cause:
             raise PatchFileError(str(cause)) from cause
         if not len(patch):

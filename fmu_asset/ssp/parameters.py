@@ -1,6 +1,7 @@
 """Parameter sets (SSV) and mappings (SSM): read into plain values by target name."""
 
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any, NamedTuple
 
 from fmu_asset.archive.fmu_file import UnitInfo
@@ -122,7 +123,7 @@ def _value(parameter: Any, where: str) -> Setting:
         text = item.get("value")
         value: SettingValue = text
         if kind == "Real":
-            value = float(text)
+            value = _finite(text, f"the value of {name!r} of {where}")
         elif kind == "Integer":
             value = int(text)
         elif kind == "Boolean":
@@ -165,7 +166,18 @@ def read_transformation(element: Any, where: str) -> tuple[float, float]:
     linear = element.find(tag("ssc", "LinearTransformation"))
     if linear is None:
         return 1.0, 0.0
-    return float(linear.get("factor", "1")), float(linear.get("offset", "0"))
+    factor, offset = (
+        _finite(linear.get(name, default), f"the {name} of {where}")
+        for name, default in (("factor", "1"), ("offset", "0"))
+    )
+    return factor, offset
+
+
+def _finite(text: str, what: str) -> float:
+    value = float(text)  # a number by its schema, in which NaN and INF are numbers
+    if not isfinite(value):
+        raise SspError(f"{what} must be a finite number, and {text} came.")
+    return value
 
 
 def _mapped(values: dict[str, Setting], entries: list[_Entry], where: str) -> dict[str, Setting]:

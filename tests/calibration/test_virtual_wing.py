@@ -190,6 +190,8 @@ def test_the_weighed_mass_file(tmp_path: Path) -> None:
         ("mass,standard_deviation\n472,1\n471,1\n", ExperimentFileError, "one row in grams, and 2 came"),
         ("mass,standard_deviation\n472,5,1\n", ExperimentFileError, "3 cells came"),
         ("mass,standard_deviation\n0.472,0.001\n", ExperimentDataError, "looks like kg"),
+        ("mass,standard_deviation\n472000,1\n", ExperimentDataError, "looks like mg"),
+        ("mass,standard_deviation\n472,1e40\n", ExperimentDataError, "must be less than the mass, 472 g"),
         ("mass,standard_deviation\n472,-1\n", ExperimentDataError, "column 'standard_deviation' holds -1"),
         ("mass,standard_deviation\n472,\n", ExperimentFileError, "'standard_deviation' must hold a number"),
     ):

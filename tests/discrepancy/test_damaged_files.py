@@ -101,3 +101,25 @@ def test_numbers_of_a_lumped_model_make_sense(tmp_path: Path, old: str, new: str
     with pytest.raises(DiscrepancyError, match=told) as caught:
         load_lumped(path)
     assert "\n" not in str(caught.value)
+
+
+def static(folder: Path, table: str, more: str = "") -> Path:
+    head, _, _ = CAMPAIGN.partition("[[trial]]")
+    trial = '[[trial]]\nname = "load"\nkind = "static"\nfile = "load.csv"\n'
+    campaign(folder, more + head + trial)
+    (folder / "load.csv").write_text(table, encoding="utf-8")
+    return folder
+
+
+def test_a_row_that_comes_twice_is_refused(tmp_path: Path) -> None:
+    rows = "1.0,0.52\n2.0,1.03\n2.0,1.04\n"
+    assert len(read_campaign(static(tmp_path / "a", "force,tip\n" + rows)).trials[0].force) == 3
+    with pytest.raises(DiscrepancyError, match="lines 3 and 5 hold the same row; leave one out"):
+        read_campaign(static(tmp_path / "b", "force,tip\n" + rows + "2.0,1.03\n"))
+    timed = "time,force,tip\n0,2.0,1.03\n9,2.0,1.03\n"
+    assert len(read_campaign(static(tmp_path / "c", timed)).trials[0].force) == 2
+
+
+def test_no_temperature_is_below_absolute_zero(tmp_path: Path) -> None:
+    with pytest.raises(DiscrepancyError, match=r"reference_temperature.*-273\.15"):
+        read_campaign(static(tmp_path, "force,tip\n1.0,0.5\n", "reference_temperature = -300.0\n"))

@@ -1,23 +1,17 @@
-"""Files are whole or not there, and archives are reproducible."""
+"""Files are whole or not there."""
 
 import errno
-import io
 import os
 import stat
 import subprocess
 import sys
 import time
-import zipfile
 from pathlib import Path
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from reporting import files
-from reporting.errors import DamagedFileError, DiskFullError, FileNotWrittenError
+from reporting.errors import DiskFullError, FileNotWrittenError
 
 
 def test_bytes_and_text_arrive_and_nothing_else_is_left(tmp_path: Path) -> None:
@@ -131,55 +125,3 @@ def test_leftovers_are_counted_and_other_files_stay(tmp_path: Path) -> None:
     (tmp_path / "run.nc").write_bytes(b"whole")
     assert files.remove_leftovers(tmp_path) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == [".hidden", "run.nc"]
-
-
-@given(
-    hnp.arrays(
-        dtype=st.sampled_from([np.float64, np.float32, np.int64, np.uint8, np.bool_, np.dtype("U3")]),
-        shape=hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
-    )
-)
-def test_archives_give_back_what_they_were_given(values: np.ndarray) -> None:
-    data = files.npz_bytes({"values": values, "text": np.array("µ"), "number": 3.5})
-    loaded = np.load(io.BytesIO(data), allow_pickle=False)
-    np.testing.assert_array_equal(loaded["values"], values)
-    assert loaded["values"].shape == values.shape
-    assert loaded["values"].dtype.newbyteorder("=") == values.dtype.newbyteorder("=")
-    assert str(loaded["text"]) == "µ"
-    assert loaded["number"].shape == ()
-
-
-def test_archive_bytes_depend_on_the_arrays_only() -> None:
-    values = np.arange(6.0).reshape(2, 3)
-    first = files.npz_bytes({"a": values, "b": values[0]})
-    assert first == files.npz_bytes({"b": values[0].copy(), "a": np.asfortranarray(values)})
-    assert first == files.npz_bytes({"b": values[0].astype(">f8"), "a": values})
-    assert first != files.npz_bytes({"a": values, "b": values[1]})
-    with zipfile.ZipFile(io.BytesIO(first)) as archive:
-        assert archive.namelist() == ["a.npy", "b.npy"]
-        assert {member.date_time for member in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
-
-
-def test_objects_and_odd_names_are_refused() -> None:
-    with pytest.raises(ValueError, match="Python objects"):
-        files.npz_bytes({"bad": np.array([object()])})
-    with pytest.raises(ValueError, match="without slashes"):
-        files.npz_bytes({"a/b": 1.0})
-
-
-@pytest.mark.parametrize("compressed", [False, True])
-def test_reading_back_and_every_truncation_is_noticed(tmp_path: Path, compressed: bool) -> None:
-    path = files.write_npz(tmp_path / "x.npz", {"a": np.arange(5)}, compressed=compressed)
-    np.testing.assert_array_equal(files.read_npz(path)["a"], np.arange(5))
-    whole = path.read_bytes()
-    for length in range(0, len(whole), 7):
-        path.write_bytes(whole[:length])
-        with pytest.raises(DamagedFileError, match="make it again"):
-            files.read_npz(path)
-    damaged = bytearray(whole)
-    damaged[60] ^= 0xFF
-    path.write_bytes(bytes(damaged))
-    with pytest.raises(DamagedFileError):
-        files.read_npz(path)
-    with pytest.raises(FileNotFoundError):
-        files.read_npz(tmp_path / "none.npz")

@@ -11,8 +11,17 @@ from pathlib import Path
 import pytest
 
 from reporting.folders import restore_folder
-from twin_master.errors import RunFolderError
-from twin_master.run_folder import FIELD_NAME, KIND, create_run_folder, lock_run_folder, tidy
+from twin_master.errors import NotResumableError, RunFolderError, RunFolderExistsError
+from twin_master.run_folder import (
+    FIELD_NAME,
+    KIND,
+    create_run_folder,
+    is_run_folder,
+    lock_run_folder,
+    read_config,
+    tidy,
+)
+from twin_master.store.outcome import finished_run
 
 
 def make(folder: Path, name: str, *, replace: bool = False) -> None:
@@ -84,3 +93,23 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) ->
     tidy(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".mine", "csv", FIELD_NAME]
     tidy(tmp_path)
+
+
+DEEP = '{"a":' * 5000 + "1" + "}" * 5000
+
+
+@pytest.mark.parametrize("text", [DEEP, "[1]", "", '{"kind": NaN}', '{"kind": ' + "1" * 5000 + "}"])
+def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path: Path, text: str) -> None:
+    (tmp_path / "config.json").write_text(text, encoding="utf-8")
+    assert not is_run_folder(tmp_path)
+    with pytest.raises(NotResumableError, match="is no run folder"):
+        read_config(tmp_path)
+    with pytest.raises(RunFolderExistsError, match="not touched"):
+        make(tmp_path, "second", replace=True)
+
+
+@pytest.mark.parametrize("name", ["timing.json", "summary.json"])
+def test_a_run_whose_results_cannot_be_read_is_not_finished(tmp_path: Path, name: str) -> None:
+    for file in ("timing.json", "summary.json"):
+        (tmp_path / file).write_text(DEEP if file == name else "{}", encoding="utf-8")
+    assert finished_run(tmp_path) is None

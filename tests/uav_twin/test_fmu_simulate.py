@@ -93,7 +93,7 @@ def test_bad_inputs_are_a_sentence_and_nothing_is_written(
 ) -> None:
     fmu, given, out = foreign_fmu("room2"), tmp_path / "inputs.csv", tmp_path / "out.csv"
     cold = "time,outside\n120,5\n180,-41\n"
-    for content, sentence in ((None, "There is no file"), (cold, "It is the value of step 1 of the 2")):
+    for content, sentence in ((None, "No such file"), (cold, "It is the value of step 1 of the 2")):
         if content is not None:
             given.write_text(content, encoding="utf-8")
         refused = call(fmu, "--binding", room, "--inputs", given, "--out", out)
@@ -106,19 +106,23 @@ def test_bad_inputs_are_a_sentence_and_nothing_is_written(
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ("", "has no steps"),
-        ("time,power\n", "has no steps"),
-        ("power\n1\n", "lacks the column `time`; its columns are power"),
+        ("", "is empty: it needs a header line"),
+        ("time,power\n", "has a header line but no rows"),
+        ("power\n1\n", "has no column 'time', which a simulation needs; its columns are power"),
         (
             "time,pwer\n120,1\n",
             "'pwer' .* is no input of the binding room; it has control.power, load.outside",
         ),
-        ("time,power,power\n120,1,2\n", "has the column 'power' more than once"),
+        ("time,power,power\n120,1,2\n", "has more than one column 'power'"),
         ("time,power,control.power\n120,1,2\n", r"gives control\.power in more than one column"),
         ("time,power[2]\n120,1\n", r"lacks the column control\.power\[1\]"),
-        ("time,power\n120,1\n180\n", "Line 3 .* has 1 cells, but there are 2 columns"),
-        ("time,power\n120,1\n\n180,nan\n", "Line 4 .*: power must be a finite number, but is 'nan'"),
-        ("time,power\n120,\n", "Line 2 .*: power must be a finite number, but is ''"),
+        ("time,power\n120,1\n180\n", "line 3: 1 cell came, and the header has 2 columns"),
+        ("time,power\n120,1\n\n180,nan\n", "line 4: column 'power' holds nan, and a finite number"),
+        ("time,power\n120,\n", "line 2: column 'power' must hold a number, and nothing came"),
+        ("time,power\n120,\u0663\n", "line 2: column 'power' must hold a number"),
+        ("time,power\n120,1_000\n", "line 2: column 'power' must hold a number"),
+        ("time,power\n120,9,81\n", "line 2: 3 cells came, and the header has 2 columns"),
+        ("time;power\n120;1\n", "not separated by commas"),
         ("time,power\n120,1\n180,1\n250,1\n", "the time 250 s where step 2 begins at 240 s"),
         ("time,power\n0,1\n", "the time 0 s where step 0 begins at 120 s"),
     ],

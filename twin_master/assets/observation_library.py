@@ -16,7 +16,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
+from reporting.netcdf import read_groups
 from twin_master.errors import InvalidModelError, InvalidObservationLibraryError
 from twin_master.network.graphical_model import Factor, StateSpace
 
@@ -252,11 +254,10 @@ def load_observation_library(path: Path) -> ObservationLibrary:
             f"there is no observation library {path}: make it with `uav-twin library sample`."
         )
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as dataset:
-            dataset.load()
-    except (OSError, ValueError, KeyError, RuntimeError, AttributeError) as error:
+        dataset = read_groups(path).to_dataset()
+    except DamagedFileError as error:
         raise InvalidObservationLibraryError(
-            f"{path} is not a whole NetCDF file ({error}): sample the library again."
+            f"{path} is not a whole NetCDF file: sample the library again."
         ) from error
     if dataset.attrs.get("kind") != KIND or dataset.attrs.get("format") != FORMAT:
         raise InvalidObservationLibraryError(

@@ -16,17 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from fe.runtime.archive import arrays_from_bytes, arrays_to_bytes
+from fe.runtime.errors import ReducedModelFileError
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.session import FmiAsset
-from reporting.errors import DamagedFileError
-from reporting.files import (
-    TEMPORARY_SUFFIX,
-    atomic_write_text,
-    npz_bytes,
-    read_npz,
-    remove_leftovers,
-    write_error,
-)
+from reporting.files import TEMPORARY_SUFFIX, atomic_write_text, remove_leftovers, write_error
+from reporting.json_file import parse_json
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_file
 from twin_master.assets.observation_library import ObservationLibrary, write_observation_library
@@ -233,8 +228,8 @@ def _prepare_folder(out: Path, record: dict[str, Any], *, resume: bool, replace_
                 f"{folder} holds the finished blocks of an interrupted sampling: give --resume to go on with "
                 "them, or --replace to begin anew."
             )
-        kept = plan.read_text(encoding="utf-8") if plan.is_file() else ""
-        if kept and kept != text:
+        kept = plan.read_bytes() if plan.is_file() else b""
+        if kept and kept != text.encode("utf-8"):
             raise InvalidObservationLibraryError(
                 f"{folder} holds blocks of another FMU, binding, grid or version ({_difference(kept, record)}"
                 "): give --replace to begin anew."
@@ -245,12 +240,12 @@ def _prepare_folder(out: Path, record: dict[str, Any], *, resume: bool, replace_
     return folder
 
 
-def _difference(kept: str, record: dict[str, Any]) -> str:
+def _difference(kept: bytes, record: dict[str, Any]) -> str:
     try:
-        before = json.loads(kept)
-    except ValueError:
+        before = parse_json(kept, PLAN_NAME, InvalidObservationLibraryError)
+        return ", ".join(key for key in record if before.get(key) != record[key]).replace("_", " ")
+    except (InvalidObservationLibraryError, AttributeError):
         return "damaged"
-    return ", ".join(key for key in record if before.get(key) != record[key]).replace("_", " ")
 
 
 def _block_file(folder: Path, number: int) -> Path:
@@ -265,7 +260,7 @@ def _keep_block(path: Path, values: Float) -> None:
     """
     temporary = path.with_name(f".{path.stem}{TEMPORARY_SUFFIX}{path.suffix}")
     try:
-        temporary.write_bytes(npz_bytes({"values": values}))
+        temporary.write_bytes(arrays_to_bytes({"values": values}))
         temporary.replace(path)
     except OSError as error:
         raise write_error(error, path) from error
@@ -278,8 +273,8 @@ def _read_blocks(grid: SamplingGrid, folder: Path) -> dict[int, Float]:
         path = _block_file(folder, number)
         if path.is_file():
             try:
-                values = read_npz(path)["values"]
-            except (DamagedFileError, KeyError):
+                values = arrays_from_bytes(path.read_bytes(), str(path), ["values"])["values"]
+            except (OSError, ReducedModelFileError):
                 continue
             if values.ndim == 2 and len(values) == last - first:
                 found[number] = values

@@ -10,6 +10,7 @@ ends without a line feed, and is flown again; any other line that does not have 
 
 import base64
 import binascii
+import io
 import json
 import os
 import zlib
@@ -235,7 +236,7 @@ def _read(path: Path, content: bytes, config_hash: str) -> tuple[list[FlownTurn]
     ends: list[int] = []
     kept = [0]
     end = 0
-    for number, line in enumerate(content.splitlines(keepends=True)):
+    for number, line in enumerate(io.BytesIO(content)):
         if number and not line.endswith(b"\n"):
             break  # cut off by a kill
         end += len(line)

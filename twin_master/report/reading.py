@@ -1,6 +1,5 @@
 """Reading a run folder into a `RunRecord`."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from reporting.errors import DamagedFileError
 from reporting.folders import restore_folder
+from reporting.json_file import read_json
 from reporting.netcdf import read_groups
 from twin_master.errors import RunFolderError
 from twin_master.report.data import NORMAL_95, Estimate, PolicyTable, RunRecord, Uncertain, moments
@@ -100,10 +100,7 @@ def _check_values(record: RunRecord) -> None:
 def _read_json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RunFolderError(f"{path} is damaged and cannot be read ({error}): fly the run again.") from error
+    content = read_json(path, RunFolderError)
     if not isinstance(content, dict):
         raise RunFolderError(f"{path} must hold one JSON object: fly the run again.")
     return content

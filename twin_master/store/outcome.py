@@ -1,13 +1,14 @@
 """What came of a run: its folder, report, summary and timing."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from reporting.errors import DamagedFileError
+from reporting.json_file import read_json
 from twin_master.assets.asset_source import FlownAndBelieved
+from twin_master.errors import NotResumableError
 from twin_master.run_folder import read_config
 from twin_master.store.summary import Figure
 from twin_master.store.writing import SUMMARY_NAME, TIMING_NAME, read_run
@@ -52,13 +53,11 @@ def read_outcome(folder: Path) -> RunOutcome:
 
     Raises
     ------
-    OSError, ValueError, KeyError, TypeError, DamagedFileError
+    KeyError, TypeError, DamagedFileError, NotResumableError
         A result is missing or damaged.
     """
     report = folder / REPORT_NAME
-    timing, summary = (
-        json.loads((folder / name).read_text(encoding="utf-8")) for name in (TIMING_NAME, SUMMARY_NAME)
-    )
+    timing, summary = (read_json(folder / name, DamagedFileError) for name in (TIMING_NAME, SUMMARY_NAME))
     return RunOutcome(
         folder,
         report if report.is_file() else None,
@@ -77,5 +76,5 @@ def finished_run(folder: Path) -> RunOutcome | None:
     try:
         read_run(folder)
         return read_outcome(folder)
-    except (OSError, ValueError, KeyError, TypeError, DamagedFileError):
+    except (KeyError, TypeError, DamagedFileError, NotResumableError):
         return None

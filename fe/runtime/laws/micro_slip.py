@@ -9,7 +9,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from ..errors import InvalidPatchError
 from .interface import HEAD, FloatArray, PortForce
+
+MOST_ELEMENTS = 10_000
+"""Far more than the curve of a joint can show."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +62,11 @@ class MicroSlip(PortForce):
             },
             least_zero={"stiffness": self.stiffness, "-chi": -self.chi},
         )
+        if self.element_count > MOST_ELEMENTS:
+            raise InvalidPatchError(
+                f"element_count of {self.kind!r} must be {MOST_ELEMENTS} at most, "
+                f"but is {self.element_count}."
+            )
 
 
 def slip_displacements(joint: MicroSlip) -> FloatArray:

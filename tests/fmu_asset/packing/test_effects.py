@@ -23,6 +23,7 @@ from fe.runtime.patch import (
     DecayingLine,
     HighPass,
     Line,
+    MicroSlip,
     ModelPatch,
     RunOffset,
     SensorDrift,
@@ -318,7 +319,16 @@ REFUSED = {
     "an id that is no name": (content({"a b": [SensorGain("g3", 0.1)]}), "letters, digits and underscores"),
     "nothing to do": (content({"gain": []}), "no primitives"),
     "a wrong primitive": (content().replace(b"thermal_strain", b"magic"), "kind 'magic'"),
-    "no JSON": (b"{", "is not JSON"),
+    "no JSON": (b"{", "is not valid JSON"),
+    "a long number": (content().replace(b'"schema"', b'"n": ' + b"1" * 5000 + b', "schema"'), "5000 digits"),
+    "a number that is none": (content({"gain": [SensorGain("g3", 0.1)]}).replace(b"0.1", b"NaN"), "NaN"),
+    "a law that cannot be": (content({"slip": [MicroSlip("tip", 1.0, 2.0, 0.5)]}), "-chi of 'micro_slip'"),
+    "a host of elements": (
+        content({"slip": [MicroSlip("tip", 1.0, 2.0, 0.0, 10**12)]}), "must be 10000 at most"
+    ),
+    "a nest": (b"[" * 5000 + b"]" * 5000, "nested deeper than 32"),
+    "a list for a kind": (content().replace(b'"kind": "thermal_strain"', b'"kind": []'), "the kind []"),
+    "two bytes a letter": (content().decode().encode("utf-16"), "not text in UTF-8"),
 }  # fmt: skip
 
 
@@ -332,6 +342,10 @@ def test_patches_that_mean_nothing_are_refused_in_one_sentence(
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_byte_order_mark_means_nothing() -> None:
+    assert parse_patch(b"\xef\xbb\xbf" + content()).effects == parse_patch(content()).effects
 
 
 def test_an_id_that_comes_twice_is_numbered() -> None:
@@ -366,7 +380,7 @@ def test_the_command_line_refuses_before_it_models_a_wing(tmp_path: Path) -> Non
     out = tmp_path / "wing.fmu"
     for words, sentence in (
         (("--patch", tmp_path / "patch.json", "--kind", "compiled"), "build the kind 'python'"),
-        (("--patch", tmp_path / "broken.json"), "is not JSON"),
+        (("--patch", tmp_path / "broken.json"), "is not valid JSON"),
         (("--patch", tmp_path / "none.json"), "cannot be read"),
         (("--activate",), "no --patch"),
         (("--script", "gear_pump", "--patch", tmp_path / "patch.json"), "are for the wing"),

@@ -86,6 +86,7 @@ def test_a_changed_or_foreign_checkpoint_is_refused(tmp_path: Path) -> None:
         (lines[0] + lines[2] + lines[1], 2),
         (lines[0] + lines[1] + lines[3], 3),
         (whole[:-2] + b"\n", 4),
+        (lines[0] + lines[1].replace(b"a.b", b"a\rb") + lines[2], 2),
         (b"no checkpoint\n" + whole, 1),
         (b"no checkpoint", 1),
         (b"PK\x03\x04\xff", 1),
