@@ -53,7 +53,7 @@ def test_reliability(wing: ReducedModel) -> None:
 def test_the_whole_chain_and_its_resumption(
     wing: ReducedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
 ) -> None:
-    monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+    monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
     loaded = load_scenario("level_turns")
     outcome = new_run(loaded, tmp_path / "whole")
     figures = {figure.key: figure for figure in outcome.figures}
@@ -77,7 +77,7 @@ def test_the_whole_chain_and_its_resumption(
 def test_the_mission_is_the_same_with_the_compiled_wing_and_without_a_worker(
     wing: ReducedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+    monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
     loaded = load_scenario("level_turns")
 
     def arrays(name: str, overrides: Overrides) -> dict[str, np.ndarray]:

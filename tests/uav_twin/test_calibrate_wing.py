@@ -205,7 +205,7 @@ def test_two_wings_are_two_fmus(
 
 @pytest.fixture
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin_master.workflow._report", lambda folder: folder / "report.html")
+    monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
 
 
 @pytest.mark.usefixtures("no_report")

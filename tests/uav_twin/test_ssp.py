@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_export_check_and_run(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("twin_master.workflow._report", lambda folder: folder / "report.html")
+    monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
     scenario, ssp, out = str(folder / "fouling.toml"), str(tmp_path / "x.ssp"), str(tmp_path / "run")
     assert call(monkeypatch, "ssp", "export", scenario, "--out", ssp) == 0
     assert "x.ssp: " in capsys.readouterr().out

@@ -90,7 +90,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True, scope="module")
 def no_report() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+        patch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
         yield
 
 

@@ -30,7 +30,7 @@ from pump_mission import PATH, pump_table, small_pump
 
 @pytest.fixture(autouse=True)
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+    monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
 
 
 @pytest.fixture(scope="module")

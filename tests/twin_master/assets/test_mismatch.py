@@ -416,7 +416,7 @@ class TestOnTheWing:
         copy = place / "copy" / "UAVconfig.json"
         copy.parent.mkdir()
         copy.write_bytes(library.read_bytes())
-        monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+        monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
         with monkeypatch.context() as patch:
             die_after_turn(patch, 23)
             with pytest.raises(KeyboardInterrupt):

@@ -38,7 +38,7 @@ def asset_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+    monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
 
 
 def changed(folder: Path, name: str, old: str, new: str) -> Path:

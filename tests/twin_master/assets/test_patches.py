@@ -146,7 +146,7 @@ def test_what_is_flown_and_what_is_believed_has_its_name(tmp_path: Path) -> None
 
 @pytest.fixture
 def mission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+    monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
 
     def fly(
         name: str, lines: str = "", parameters: str = "", belief: str = ""

@@ -74,7 +74,7 @@ def move(control: str, before: int, after: int) -> float:
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("pump")
     patch = pytest.MonkeyPatch()
-    patch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+    patch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
     loaded = small_pump()
     library = None
     if request.param == "library":

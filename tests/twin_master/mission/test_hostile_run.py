@@ -108,7 +108,7 @@ standard_deviation = 0.1
 
 @pytest.fixture(autouse=True)
 def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workflow, "_report", lambda folder: folder / "report.html")
+    monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
 
 
 def scenario(folder: Path, fmu: Path) -> Any:
