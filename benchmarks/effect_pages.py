@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.effect_pictures import PICTURES, draw, picture_patch, picture_setting
+from benchmarks.effect_pictures import draw, picture_of, picture_patch, picture_setting
 from discrepancy.catalogue.building import KIND_NAMES
 from discrepancy.catalogue.entry import Effect, Prior, Setting
 from discrepancy.catalogue.library import library
@@ -50,7 +50,7 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
     kinds = [name for kind, name in KIND_NAMES.items() if kind in effect.acts_on]
     places = effect.places(setting)
     patch, place = picture_patch(effect, setting)
-    values = PICTURES[effect.identifier].values
+    values = picture_of(effect).values
     rows = [
         f"| {cell(p.symbol)} | `{p.name}` | {cell(p.description)} | {p.unit} | {range_of(p.prior)} |"
         for p in effect.parameters

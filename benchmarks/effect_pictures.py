@@ -293,7 +293,13 @@ PICTURES: dict[str, Picture] = {
         (ringdown(end=4.5), backbone("frequency", "time")),
     ),
 }
-"""What shows each effect best."""
+"""What shows an effect best, where that is not what `picture_of` takes by itself."""
+
+
+def picture_of(effect: Effect) -> Picture:
+    """Return what the picture of an effect shows; by default a ring-down and a load line at large values."""
+    values = {parameter.name: parameter.prior.high for parameter in effect.parameters}
+    return PICTURES.get(effect.identifier, Picture(values, (ringdown(), load_line())))
 
 
 def picture_setting() -> Setting:
@@ -304,7 +310,7 @@ def picture_setting() -> Setting:
 
 def picture_patch(effect: Effect, setting: Setting) -> tuple[ModelPatch, str]:
     """Return the patch of an effect's picture and its place."""
-    picture = PICTURES[effect.identifier]
+    picture = picture_of(effect)
     place = effect.places(setting)[0] if picture.place is None else picture.place
     return effect.patch(setting, picture.values, place), place
 
@@ -316,7 +322,7 @@ def draw(effect: Effect, setting: Setting) -> bytes:
     with publication_style():
         figure = new_figure(2.1, 6.4)
         axes = figure.subplots(1, 2)
-        for axis, panel in zip(axes, PICTURES[effect.identifier].panels, strict=True):
+        for axis, panel in zip(axes, picture_of(effect).panels, strict=True):
             panel(view, axis)
         shown: list[str] = []
         for axis in axes:

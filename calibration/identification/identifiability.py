@@ -15,7 +15,7 @@ from calibration.errors import IdentificationError
 
 from .least_squares import DesignFit, minimise_local, objective
 from .local_model import build_local_model
-from .parameters import FreeParameter, deviations, scaled
+from .parameters import FreeParameter, deviations
 from .residuals import fitted_residuals
 from .targets import Targets, Weights
 
@@ -180,8 +180,3 @@ def profile(
 def _objective(fit: DesignFit, values: FloatArray, targets: Targets, weights: Weights) -> float:
     residual, _ = objective(fit.model, values, fit.parameters, targets, weights)
     return 0.5 * float(residual @ residual)
-
-
-def prior_shift(fit: DesignFit) -> FloatArray:
-    """Distance (P,) of the fit from the prior mean in prior standard deviations."""
-    return scaled(fit.parameters, fit.values)

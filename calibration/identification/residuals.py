@@ -28,43 +28,33 @@ class Residuals(NamedTuple):
     value : (M,)
     gradient : (M, P)
         Per unit of each parameter.
-    labels : tuple of str
-        What each is of.
     """
 
     value: FloatArray
     gradient: FloatArray
-    labels: tuple[str, ...]
 
 
 def fitted_residuals(wing: ReducedWing, targets: Targets, weights: Weights) -> Residuals:
     """Residuals of everything that is fitted, model less target, over its standard deviation."""
     parts = [part for group in (_strains, _stiffness, _frequencies) for part in group(wing, targets, weights)]
     return Residuals(
-        np.concatenate([value for value, _, _ in parts]),
-        np.concatenate([gradient for _, gradient, _ in parts]),
-        tuple(label for _, _, labels in parts for label in labels),
+        np.concatenate([part.value for part in parts]), np.concatenate([part.gradient for part in parts])
     )
 
 
-_Part = tuple[FloatArray, FloatArray, list[str]]
-
-
-def _part(found: Value, target: FloatArray, deviation: FloatArray | float, labels: list[str]) -> _Part:
+def _part(found: Value, target: FloatArray, deviation: FloatArray | float) -> Residuals:
     width = np.broadcast_to(deviation, target.shape)
-    return (found.value - target) / width, found.gradient / width[..., None], labels
+    return Residuals((found.value - target) / width, found.gradient / width[..., None])
 
 
-def _strains(wing: ReducedWing, targets: Targets, weights: Weights) -> Iterator[_Part]:
+def _strains(wing: ReducedWing, targets: Targets, weights: Weights) -> Iterator[Residuals]:
     gauges = targets.strain.shape[2]
-    numbers = range(1, gauges + 1)
     limiting = np.arange(gauges) == LIMITING_GAUGE
     healthy = wing.strain(LIBRARY_FACTOR, (0.0, 0.0))
     yield _part(
         healthy.log(),
         np.log(targets.strain[0, 0]),
         np.where(limiting, weights.limiting_strain, weights.strain),
-        [f"healthy strain {g}" for g in numbers],
     )
     for i, j in np.argwhere(fitted_states()):
         one, two = LEVELS[i], LEVELS[j]
@@ -72,17 +62,11 @@ def _strains(wing: ReducedWing, targets: Targets, weights: Weights) -> Iterator[
             wing.strain(LIBRARY_FACTOR, (one, two)).over(healthy),
             targets.ratio[i, j],
             np.where(limiting & (one > 0.0), weights.limiting_ratio, weights.ratio),
-            [f"ratio at z1 = {one:g}, z2 = {two:g}, gauge {g}" for g in numbers],
         )
-    yield _part(
-        wing.strain_slope(LIBRARY_FACTOR),
-        targets.strain_slope,
-        weights.slope,
-        [f"slope in e of gauge {g}" for g in numbers],
-    )
+    yield _part(wing.strain_slope(LIBRARY_FACTOR), targets.strain_slope, weights.slope)
 
 
-def _stiffness(wing: ReducedWing, targets: Targets, weights: Weights) -> Iterator[_Part]:
+def _stiffness(wing: ReducedWing, targets: Targets, weights: Weights) -> Iterator[Residuals]:
     found = wing.tip_stiffness()
     scale = np.array([targets.tip_stiffness, 1.0])
     relative = Value(found.value / scale, found.gradient / scale[:, None])
@@ -90,25 +74,16 @@ def _stiffness(wing: ReducedWing, targets: Targets, weights: Weights) -> Iterato
         relative,
         np.array([1.0, targets.tip_stiffness_slope]),
         np.array([weights.stiffness, weights.stiffness_slope]),
-        ["tip stiffness", "slope of the tip stiffness"],
     )
 
 
-def _frequencies(wing: ReducedWing, targets: Targets, weights: Weights) -> Iterator[_Part]:
+def _frequencies(wing: ReducedWing, targets: Targets, weights: Weights) -> Iterator[Residuals]:
     rows = np.flatnonzero(targets.fitted_row)
     found = wing.log_frequency(
         targets.young_modulus_factor[rows], targets.servo_mass[rows], targets.pitot_mass[rows]
     )
-    labels = [f"frequency {mode} of row {row}" for row in rows for mode in (1, 2)]
     flat = Value(found.value.ravel(), found.gradient.reshape(2 * len(rows), -1))
-    yield _part(flat, np.log(targets.frequency[rows]).ravel(), weights.frequency, labels)
+    yield _part(flat, np.log(targets.frequency[rows]).ravel(), weights.frequency)
     _, factor_slope, mass_slope = wing.frequency_slopes()
-    yield _part(
-        factor_slope,
-        targets.frequency_slope,
-        weights.frequency_slope,
-        ["slope of f1 in e", "slope of f2 in e"],
-    )
-    yield _part(
-        mass_slope, targets.mass_slope, weights.mass_slope, ["slope of f1 in mass", "slope of f2 in mass"]
-    )
+    yield _part(factor_slope, targets.frequency_slope, weights.frequency_slope)
+    yield _part(mass_slope, targets.mass_slope, weights.mass_slope)

@@ -14,6 +14,7 @@ from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_text
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance
+from reporting.record_json import plain
 
 from .comparison import compare, outputs
 from .design_file import design_toml
@@ -180,7 +181,7 @@ def record(result: Identification) -> dict[str, Any]:
             }
             for parameter, begin, value, own in zip(fit.parameters, fit.start, fit.values, width, strict=True)
         ],
-        "iterations": [asdict(iteration) for iteration in fit.iterations],
+        "iterations": plain(fit.iterations),
         "comparison": [{**asdict(row), "reached": row.reached} for row in result.comparison],
         "comparison_of_the_start": [asdict(row) for row in result.before],
         "healthy_strain": result.outputs.strain[0, 0].tolist(),
@@ -194,16 +195,7 @@ def record(result: Identification) -> dict[str, Any]:
         ],
         "correlated": [list(pair) for pair in analysis.pairs()],
         "imitated": [list(pair) for pair in analysis.fixed],
-        "profiles": [
-            {
-                "name": line.name,
-                "unit": line.unit,
-                "value": line.value.tolist(),
-                "rise": line.rise.tolist(),
-                "linear": line.linear.tolist(),
-            }
-            for line in result.profiles
-        ],
+        "profiles": plain(result.profiles),
         "remeshed": [
             {"refinement": refinement, "unknowns": unknowns, "comparison": [asdict(row) for row in rows]}
             for refinement, unknowns, rows in result.remeshed

@@ -80,8 +80,6 @@ class WingCalibration:
         Step 3 by the paper's procedure.
     joint : JointPosterior
         Step 3 together with step 2.
-    paper_quantities : (100, 5) array
-        `QUANTITIES` at the samples of `paper`, SI.
     """
 
     result: CalibrationResult
@@ -91,7 +89,6 @@ class WingCalibration:
     static_published: StaticCalibration
     paper: DynamicCalibration
     joint: JointPosterior
-    paper_quantities: Float
 
     def save(self, path: Path | str) -> Path:
         """Write what the twin is tailored with, whole or not at all; `load_calibration` reads it."""
@@ -182,7 +179,7 @@ def calibrate_wing(
         seed=seed,
         provenance=_provenance(lab, drawn, seed),
     )
-    return WingCalibration(result, lab, model, static, published, paper, joint, paper_quantities)
+    return WingCalibration(result, lab, model, static, published, paper, joint)
 
 
 def _paper_way(

@@ -224,21 +224,8 @@ def write_modes_vtu(
 
     Point data: `mode_1_5.632Hz` and so on, mass-normalised displacements [kg^-1/2]. Cell data: `region`.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file; an existing one is replaced.
-    wing : WingFields
-        The wing, from `fe.reduction.model_cache.wing_fields`.
-    young_modulus_factor, stiffness_loss, servo_mass, pitot_mass
-        As of `fe.runtime.state.DigitalState`.
-
-    Raises
-    ------
-    OutsideModelError
-        If a value lies outside the validity box of the model.
-    OSError
-        If the file cannot be written.
+    Parameters and errors are those of `write_wing_vtu`; the masses [kg] are as of
+    `fe.runtime.state.DigitalState`.
     """
     modes = wing.model.modes(young_modulus_factor, stiffness_loss, servo_mass, pitot_mass)
     shapes = wing.basis.modal_displacement @ modes.shape

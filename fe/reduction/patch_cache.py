@@ -22,19 +22,8 @@ def patch_arrays(
 ) -> PatchArrays:
     """Return the wing for patches of a design, from the cache if it is there.
 
-    Parameters
-    ----------
-    design : WingDesign, optional
-        The wing; the shipped one if left out.
-    progress : Progress, optional
-        Where a build reports.
-    settings : PatchSettings, optional
-        How far changes may go and how well they are held.
-
-    Raises
-    ------
-    FiniteElementError
-        If the design cannot be modelled or reduced.
+    Parameters and errors are those of `fe.reduction.model_cache.reduced_model`; the settings say how far
+    changes may go and how well they are held.
     """
     wing = given_or_shipped(design)
     path = cache_folder() / f"wing-{cache_key(wing, settings)}-patches.npz"

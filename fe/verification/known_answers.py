@@ -100,17 +100,6 @@ def patch_test(distortion: float = 0.25) -> PatchTest:
     )
 
 
-def rigid_motions(points: FloatArray) -> FloatArray:
-    """Six rigid motions (3 nodes, 6) of nodes (nodes, 3), orthonormal."""
-    motions = np.zeros((len(points), 3, 6))
-    centred = points - points.mean(axis=0)
-    for axis in range(3):
-        motions[:, axis, axis] = 1.0
-        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], centred)
-    orthonormal, _ = np.linalg.qr(motions.reshape(-1, 6))
-    return np.asarray(orthonormal)
-
-
 @dataclass(frozen=True)
 class RigidBodyCheck:
     """Eigenvalues of an unsupported body, relative to the largest.

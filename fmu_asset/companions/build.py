@@ -5,22 +5,19 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.contents import (
     PLACEHOLDER,
-    archive_bytes,
+    FmuInfo,
     check_start,
     checked_target,
-    content_hash_of,
-    filled,
-    guid_of,
+    sealed,
+    write_fmu,
 )
 from fmu_asset.packing.python_fmu import python_members
 from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable, Unit
-from reporting.files import atomic_write_bytes
 
 from . import damage_growth, strain_gauges
 
@@ -69,15 +66,6 @@ COMPANIONS = {
 """What can be built, by name."""
 
 
-@dataclass(frozen=True)
-class CompanionInfo:
-    """A companion FMU that was built: its file, GUID and content hash."""
-
-    path: Path
-    guid: str
-    content_hash: str
-
-
 def build_companion(
     name: str,
     path: str | os.PathLike[str],
@@ -85,7 +73,7 @@ def build_companion(
     start: Mapping[str, float] | None = None,
     gauge_count: int | None = None,
     replace: bool = False,
-) -> CompanionInfo:
+) -> FmuInfo:
     """Pack a companion as an FMU; equal input gives equal bytes.
 
     Parameters
@@ -109,8 +97,7 @@ def build_companion(
     """
     target = checked_target(path, replace=replace)
     content, content_hash = companion_bytes(name, start=start, gauge_count=gauge_count)
-    atomic_write_bytes(target, content)
-    return CompanionInfo(target, guid_of(content_hash), content_hash)
+    return write_fmu(target, content, content_hash, name)
 
 
 def companion_bytes(
@@ -130,9 +117,7 @@ def companion_bytes(
     except ValueError as error:
         raise FmuBuildError(f"The companion FMU {name} cannot be built: {error}.") from error
     check_start(table)
-    template = _members(companion, table, setting)
-    content_hash = content_hash_of(template)
-    return archive_bytes(filled(template, content_hash)), content_hash
+    return sealed(_members(companion, table, setting))
 
 
 def _members(

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 
 from fmu_asset.door.binding import INPUT_ROLES, Binding
 from fmu_asset.door.observation import Observation
 from fmu_asset.door.session import FmiAsset
+from fmu_asset.door.stepped import SteppedAsset
 from fmu_asset.errors import (
     AlgebraicLoopError,
     BindingError,
@@ -31,7 +31,7 @@ Algorithm = Literal["gauss_seidel", "jacobi"]
 ALGORITHMS: tuple[Algorithm, ...] = ("gauss_seidel", "jacobi")
 
 
-class CoupledAsset:
+class CoupledAsset(SteppedAsset):
     """Several FMUs that are flown step by step as one asset, through a binding.
 
     The step size of the binding is that of the system: outputs are exchanged once a step. With
@@ -92,10 +92,8 @@ class CoupledAsset:
                 f"{tolerance!r} came."
             )
         self._wiring = structure if isinstance(structure, Wiring) else Wiring(structure)
-        self._binding = binding
+        super().__init__(binding)
         self._jacobi, self._iterations, self._tolerance = algorithm == "jacobi", iterations, tolerance
-        self._step_size = binding.step_size
-        self._start_time = binding.binding.start_time
         loops = self._wiring.schedule.loops
         if loops and iterations == 1:
             raise AlgebraicLoopError(loop_sentence(loops))
@@ -108,8 +106,6 @@ class CoupledAsset:
             for role in INPUT_ROLES
             for name, item in binding.inputs(role).items()
         }
-        self._phase: Literal["new", "ready", "broken", "closed"] = "new"
-        self._index = 0
         self._layout = Layout(self._wiring, binding, self._roles)
         self._parameters = {name: float(value) for name, value in (parameters or {}).items()}
         self._parameter_values = self._layout.parameters(self._parameters)
@@ -122,11 +118,6 @@ class CoupledAsset:
         self._digest = wiring_hash(self._wiring, binding, algorithm, iterations, tolerance)
 
     # ------------------------------------------------------------------ what it is
-
-    @property
-    def binding(self) -> Binding:
-        """The binding."""
-        return self._binding
 
     @property
     def recorded_units(self) -> dict[str, str]:
@@ -144,16 +135,6 @@ class CoupledAsset:
         return self._wiring.schedule
 
     @property
-    def time(self) -> float:
-        """Time of the asset [s]: start + i * step size."""
-        return self._start_time + self._index * self._step_size
-
-    @property
-    def step_index(self) -> int:
-        """Number of steps since the last reset."""
-        return self._index
-
-    @property
     def log(self) -> tuple[tuple[str, str], ...]:
         """The last messages of the FMUs: status, and component with text."""
         return tuple(
@@ -163,16 +144,6 @@ class CoupledAsset:
         )
 
     # ------------------------------------------------------------------ life
-
-    def __enter__(self) -> Self:
-        if self._phase != "ready":
-            self.reset()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """End all workers; the asset can be opened again by `reset`."""
@@ -433,5 +404,5 @@ class CoupledAsset:
             "held": [f"{link.source} -> {link.target}" for link in plan.held],
             "loops": [" -> ".join(str(end) for end in loop) for loop in plan.loops],
             "binding": self._binding.name,
-            "step_size": self._step_size,
+            "step_size": self._interval,
         }

@@ -2,8 +2,7 @@
 
 import os
 from collections import deque
-from types import TracebackType
-from typing import Any, Literal, NoReturn, Self
+from typing import Any, NoReturn, Self
 
 import numpy as np
 
@@ -27,11 +26,12 @@ from .placement import Housing, limits_of
 from .reading import Reader
 from .restart import Instance, ResetTrial, Start
 from .saved_state import StateMethod
+from .stepped import SteppedAsset
 
 _LOG_LENGTH = 200
 
 
-class OpenedFmu:
+class OpenedFmu(SteppedAsset):
     """An FMU with a binding and the instance that stands for it; `FmiAsset` adds steps and states.
 
     Parameters and errors are those of `FmiAsset`.
@@ -53,13 +53,10 @@ class OpenedFmu:
         limits = limits_of(given, step_timeout, load_timeout, memory_limit)
         self._exchange = Exchange(self._description, given)
         self._housing = Housing(self._description, self._exchange.plan, limits, isolated=isolated)
-        self._binding = self._exchange.binding
+        super().__init__(self._exchange.binding)
         self._settings = self._exchange.settings(parameters or {})
         self._parameters = plain_values(parameters or {})
-        self._phase: Literal["new", "ready", "broken", "closed"] = "new"
-        self._index = 0
-        self._step_size, self._interval = self._binding.step_size, self._binding.interval
-        self._start_time = self._binding.binding.start_time
+        self._step_size = self._binding.step_size
         self._recording = self.state_method == "replay"
         self._record: list[bytes] = []
         self._start_inputs = b""
@@ -68,24 +65,9 @@ class OpenedFmu:
     # ------------------------------------------------------------------ what it is
 
     @property
-    def binding(self) -> Binding:
-        """The binding, with arrays that are observed or recorded as their elements."""
-        return self._binding
-
-    @property
     def description(self) -> FmuDescription:
         """What the FMU declares."""
         return self._description
-
-    @property
-    def time(self) -> float:
-        """Time of the asset [s]: start + i * interval, never accumulated."""
-        return self._start_time + self._index * self._interval
-
-    @property
-    def step_index(self) -> int:
-        """Number of steps since the last reset."""
-        return self._index
 
     @property
     def state_method(self) -> StateMethod:
@@ -162,16 +144,6 @@ class OpenedFmu:
         }
 
     # ------------------------------------------------------------------ life
-
-    def __enter__(self) -> Self:
-        if self._phase != "ready":
-            self.reset()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the worker and remove its files; the asset can be opened again by `reset`."""
@@ -290,7 +262,7 @@ class OpenedFmu:
     def _observation(self) -> Observation:
         if self._reader.suspicious():
             self._refuse_not_finite()
-        return self._reader.read(self._start_time + self._index * self._interval)
+        return self._reader.read(self.time)
 
     def _refuse_not_finite(self, which: str = "") -> None:
         bad = self._exchange.not_finite(self._reply)

@@ -10,12 +10,14 @@ import io
 import os
 import zipfile
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distribution, version
 from importlib.resources import files
 from pathlib import Path
 
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.slaves.variables import FmuVariable
+from reporting.files import atomic_write_bytes
 
 PYTHONFMU_VERSION = "0.7.0"
 """The only version whose wrapper these FMUs were tried with; its conventions are not a public interface."""
@@ -27,6 +29,30 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 _TEXT_SUFFIXES = (".py", ".xml", ".txt", ".html", ".json", ".c", ".h")
 # Where the GUID itself stands, between these two; elsewhere the placeholder stands for the tag.
 _GUID_PLACES = {"modelDescription.xml": 'guid="{}"', "sources/wing_variables.h": 'WING_GUID "{}"'}
+
+
+@dataclass(frozen=True)
+class FmuInfo:
+    """An FMU that was built.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    guid, content_hash, model_identifier : str
+        GUID (from the content hash), SHA-256 of the content, stem of the binary.
+    design_hash : str
+        Hash of the design that made the reduced model; empty where there is none.
+    size : int
+        Bytes of the file.
+    """
+
+    path: Path
+    guid: str
+    content_hash: str
+    model_identifier: str
+    design_hash: str
+    size: int
 
 
 def checked_target(path: str | os.PathLike[str], *, replace: bool) -> Path:
@@ -43,6 +69,13 @@ def checked_target(path: str | os.PathLike[str], *, replace: bool) -> Path:
     if target.exists() and not replace:
         raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
     return target
+
+
+def write_fmu(target: Path, content: bytes, content_hash: str, stem: str, design_hash: str = "") -> FmuInfo:
+    """Write the archive of an FMU, whole or not at all, and say what it is; `stem` is that of its binary."""
+    atomic_write_bytes(target, content)
+    identifier = f"{stem}_{tag_of(content_hash)}"
+    return FmuInfo(target, guid_of(content_hash), content_hash, identifier, design_hash, len(content))
 
 
 def check_start(table: Iterable[FmuVariable]) -> None:
@@ -186,6 +219,12 @@ def filled(template: Mapping[str, bytes], content_hash: str) -> dict[str, bytes]
         name.replace(PLACEHOLDER, tag): _exchanged(name, data, (PLACEHOLDER, guid), (PLACEHOLDER, tag))
         for name, data in template.items()
     }
+
+
+def sealed(template: Mapping[str, bytes]) -> tuple[bytes, str]:
+    """Return the archive of the files, filled, and their content hash."""
+    content_hash = content_hash_of(template)
+    return archive_bytes(filled(template, content_hash)), content_hash
 
 
 def emptied(members: Mapping[str, bytes], tag: str, guid: str) -> dict[str, bytes]:

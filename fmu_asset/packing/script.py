@@ -22,20 +22,16 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from fmu_asset.description import number
 from fmu_asset.errors import FmuBuildError
-from reporting.files import atomic_write_bytes
 
 from .contents import (
     PLACEHOLDER,
-    archive_bytes,
+    FmuInfo,
     checked_target,
-    content_hash_of,
-    filled,
-    guid_of,
     pythonfmu_members,
     pythonfmu_version,
-    tag_of,
+    sealed,
+    write_fmu,
 )
-from .wing_fmu import FmuInfo
 
 _BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
@@ -86,15 +82,7 @@ def build_script_fmu(
     """
     target = checked_target(path, replace=replace)
     content, content_hash = script_fmu(script)
-    atomic_write_bytes(target, content)
-    return FmuInfo(
-        path=target,
-        guid=guid_of(content_hash),
-        content_hash=content_hash,
-        model_identifier=f"{Path(script).stem}_{tag_of(content_hash)}",
-        design_hash="",
-        size=len(content),
-    )
+    return write_fmu(target, content, content_hash, Path(script).stem)
 
 
 def script_fmu(script: str | os.PathLike[str]) -> tuple[bytes, str]:
@@ -111,8 +99,7 @@ def script_fmu(script: str | os.PathLike[str]) -> tuple[bytes, str]:
         raise FmuBuildError(f"The model script {file} cannot be read ({error.strerror or error}).") from error
     pythonfmu_version()
     template = _members(file, source)
-    content_hash = content_hash_of(template)
-    return archive_bytes(filled(template, content_hash)), content_hash
+    return sealed(template)
 
 
 def _members(file: Path, source: bytes) -> dict[str, bytes]:

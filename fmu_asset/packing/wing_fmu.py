@@ -9,8 +9,6 @@ import json
 import os
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 from fe.runtime.patch_arrays import PatchArrays
@@ -20,10 +18,10 @@ from fmu_asset.compiled.package import DATA_FILE, binary_of, compiled_members
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.slaves.effect_variables import effect_rows, switch_of, units_of
 from fmu_asset.slaves.variables import UNITS, variable_table
-from reporting.files import atomic_write_bytes
 
 from .contents import (
     PLACEHOLDER,
+    FmuInfo,
     archive_bytes,
     check_start,
     checked_target,
@@ -33,6 +31,7 @@ from .contents import (
     guid_of,
     room_members,
     tag_of,
+    write_fmu,
 )
 from .patch_file import PatchFile
 from .patched_runtime import MODE_COUNT, output_channels, patched_members, plain_effects
@@ -49,30 +48,6 @@ DESCRIPTION = (
 _IMPORTS = """from .slaves.wing_contents import load_contents
 from .slaves.wing_slave import WingSlave as _Slave
 """
-
-
-@dataclass(frozen=True)
-class FmuInfo:
-    """An FMU that was built.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    guid, content_hash, model_identifier : str
-        GUID (from the content hash), SHA-256 of the content, stem of the binary.
-    design_hash : str
-        Hash of the design that made the reduced model.
-    size : int
-        Bytes of the file.
-    """
-
-    path: Path
-    guid: str
-    content_hash: str
-    model_identifier: str
-    design_hash: str
-    size: int
 
 
 def build_fmu(
@@ -128,19 +103,7 @@ def build_fmu(
     content, content_hash = fmu_bytes(
         model, state, kind, note=note, resources=resources, patch=patch, activate=activate, arrays=arrays
     )
-    atomic_write_bytes(target, content)
-    return _info(model, target, content, content_hash)
-
-
-def _info(model: ReducedModel, path: Path, content: bytes, content_hash: str) -> FmuInfo:
-    return FmuInfo(
-        path=path,
-        guid=guid_of(content_hash),
-        content_hash=content_hash,
-        model_identifier=f"uav_wing_{tag_of(content_hash)}",
-        design_hash=model.design_hash,
-        size=len(content),
-    )
+    return write_fmu(target, content, content_hash, "uav_wing", model.design_hash)
 
 
 def fmu_bytes(

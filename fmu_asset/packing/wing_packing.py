@@ -11,8 +11,9 @@ from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from reporting.progress import Progress, SilentProgress
 
+from .contents import FmuInfo
 from .patch_file import PatchFile
-from .wing_fmu import FmuInfo, FmuKind, build_fmu
+from .wing_fmu import FmuKind, build_fmu
 
 
 class Tailoring(Protocol):

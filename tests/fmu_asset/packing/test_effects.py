@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import subprocess
 import sys
+import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -124,6 +126,14 @@ def test_off_is_the_plain_wing_to_the_bit(
     given = {"response": response, "release": 0.02 if response == 2.0 else 0.0}
     plain = flown(fmu, everything, inputs, **given)
     assert plain.tobytes() == flown(patched, everything, inputs, **given).tobytes()
+
+
+def test_what_is_packed_imports_nothing_of_the_project(fmu: Path, patched: Path) -> None:
+    project = re.compile(rb"^\s*(?:from|import) (?:fe|fmu_asset|reporting)\b", re.MULTILINE)
+    for file in (fmu, patched):
+        with zipfile.ZipFile(file) as archive:
+            names = [name for name in archive.namelist() if name.endswith(".py")]
+            assert not [name for name in names if project.search(archive.read(name))]
 
 
 def test_the_table_only_grows_at_its_end(fmu: Path, patched: Path) -> None:
