@@ -7,6 +7,7 @@ FMU.
 from dataclasses import dataclass
 from typing import ClassVar
 
+from ..errors import InvalidPatchError
 from .interface import FloatArray, PortForce, power
 
 
@@ -42,8 +43,10 @@ class PowerStiffness(PortForce):
         """Raise `InvalidPatchError` where a number cannot be."""
         self.require(
             positive={"reference_displacement": self.reference_displacement, "exponent": self.exponent},
-            least_zero={"1 - |side|": 1.0 - abs(self.side)},
+            least_zero={},
         )
+        if abs(self.side) > 1:
+            raise InvalidPatchError(f"side of {self.kind!r} must lie from -1 to 1, but is {self.side:g}.")
 
 
 def force(law: FloatArray, memory: FloatArray, x: float) -> float:

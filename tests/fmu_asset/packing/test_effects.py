@@ -377,7 +377,7 @@ def command(*words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "uav_twin", "fmu", *map(str, words)],
         cwd=ROOT,
-        env=dict(os.environ),  # without COLUMNS, which readline sets for children beside Python's own record
+        env={name: value for name, value in os.environ.items() if name != "COLUMNS"},  # readline sets it
         capture_output=True,
         text=True,
         check=False,
