@@ -114,9 +114,7 @@ def static(folder: Path, table: str, more: str = "") -> Path:
 def test_a_row_that_comes_twice_is_refused(tmp_path: Path) -> None:
     rows = "1.0,0.52\n2.0,1.03\n2.0,1.04\n"
     assert len(read_campaign(static(tmp_path / "a", "force,tip\n" + rows)).trials[0].force) == 3
-    with pytest.raises(
-        DiscrepancyError, match="lines 3 and 5 hold the same row; leave one out"
-    ):
+    with pytest.raises(DiscrepancyError, match="lines 3 and 5 hold the same row; leave one out"):
         read_campaign(static(tmp_path / "b", "force,tip\n" + rows + "2.0,1.03\n"))
     timed = "time,force,tip\n0,2.0,1.03\n9,2.0,1.03\n"
     assert len(read_campaign(static(tmp_path / "c", timed)).trials[0].force) == 2
