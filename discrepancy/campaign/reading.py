@@ -34,6 +34,7 @@ FloatArray = NDArray[np.float64]
 
 CAMPAIGN_FILE = "campaign.toml"
 """Name of the file that describes a campaign, in its folder."""
+_REPEATED = "leave one out, or tell repeated readings apart by a column `time`"
 
 
 def read_campaign(folder: str | Path) -> Campaign:
@@ -143,11 +144,8 @@ def _trial(
     else:
         time = np.full(count, start)
     if not dynamic:
-        table.refuse_repeated(
-            [*zip(*table.columns.values(), strict=True)],
-            "row",
-            "leave one out, or tell repeated readings apart by a column `time`",
-        )
+        rows = [*zip(*table.columns.values(), strict=True)]
+        table.refuse_repeated(rows, "row", _REPEATED)
     zeros = np.zeros(count)
     forced = section.kind in (TrialKind.STATIC, TrialKind.FORCED)
     chosen = _measured(section, table, campaign)

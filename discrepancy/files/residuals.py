@@ -186,6 +186,9 @@ def _dataset(item: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
 
 def _trial(group: xr.Dataset) -> FittedTrial:
     attributes = group.attrs
+    for name in (*_BY_ROW, "time", "health", "health_deviation"):
+        if not np.all(np.isfinite(group[name].values)):
+            raise ValueError(f"{name} is not finite")
     place = json.loads(attributes["load_place"])
     release = json.loads(attributes["release"]) if "release" in attributes else None
     trial = Trial(

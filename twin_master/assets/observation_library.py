@@ -281,6 +281,11 @@ def _from_dataset(dataset: xr.Dataset) -> ObservationLibrary:
     if not np.all(np.isfinite(values)):
         raise ValueError("an observation is not finite")
     values.setflags(write=False)
+    parameter = str(dataset.attrs["parameter"])
+    nodes = [f"control_{name}" for name in records["control_units"]] + ["parameter_value"] * bool(parameter)
+    for name in nodes:
+        if not np.all(np.isfinite(dataset[name].values)):
+            raise ValueError(f"a value of {name} is not finite")
     return ObservationLibrary(
         values=values,
         role=str(dataset.attrs["role"]),
@@ -294,7 +299,7 @@ def _from_dataset(dataset: xr.Dataset) -> ObservationLibrary:
             for name in records["control_units"]
         },
         control_units=records["control_units"],
-        parameter=str(dataset.attrs["parameter"]),
+        parameter=parameter,
         parameter_unit=str(dataset["parameter_value"].attrs["units"]),
         draws=np.asarray(dataset["parameter_value"].values, dtype=np.float64),
         load=records["load"],

@@ -259,6 +259,13 @@ def test_residual_file_carries_units_and_refuses_damage(tmp_path: Path, make_ben
         assert set(group["unit"].values) == {"1"}
         assert group["residual"].dims == ("row", "channel")
         assert group.attrs["name"] == "release 1"
+    with xr.open_datatree(path, engine="h5netcdf") as opened:
+        tree = opened.load()
+    tree["trial_001/time"].values[1] = nan
+    lost = tmp_path / "lost.nc"
+    tree.to_netcdf(lost, engine="h5netcdf")
+    with pytest.raises(VerdictFileError, match="time is not finite"):
+        read_residuals(lost)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(VerdictFileError, match="damaged"):

@@ -171,6 +171,23 @@ def test_files_that_are_no_library_are_refused(tmp_path: Path) -> None:
         load_observation_library(tmp_path / "other.nc")
 
 
+@pytest.mark.parametrize("name", ["observation", "control_speed", "wear"])
+def test_a_library_with_a_number_that_is_none_is_refused(
+    made: tuple[Path, SamplingGrid], tmp_path: Path, name: str
+) -> None:
+    import xarray as xr
+
+    with xr.open_dataset(made[0], engine="h5netcdf") as opened:
+        dataset = opened.load()
+    values = dataset[name].values.copy()
+    values[(0,) * values.ndim] = np.nan
+    changed = dataset.drop_vars(name).assign({name: (dataset[name].dims, values, dataset[name].attrs)})
+    changed.to_netcdf(tmp_path / "pump.nc", engine="h5netcdf")
+    with pytest.raises(InvalidObservationLibraryError, match="finite") as caught:
+        load_observation_library(tmp_path / "pump.nc")
+    assert "\n" not in str(caught.value)
+
+
 def test_a_library_is_named_by_the_belief_and_an_fmu_by_the_asset() -> None:
     for asset, words in (
         ({"library": "pump.nc"}, "unknown key `asset.library`"),
