@@ -46,7 +46,7 @@ from fe.runtime.reduced import ReducedModel
 from fmu_asset.check import check_fmu
 from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import FmuBuildError, FmuCallError, FmuInputError, PatchFileError
+from fmu_asset.errors import FmuCallError, FmuInputError, PatchFileError
 from fmu_asset.packing.patch_file import SCHEMA, PatchFile, load_patch, parse_patch
 from fmu_asset.packing.patched_runtime import output_channels
 from fmu_asset.packing.wing_fmu import build_fmu
