@@ -22,7 +22,7 @@ from discrepancy.files.document import Origin
 from discrepancy.files.patch import primitive_intervals, read_patch
 from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import read_verdict
-from discrepancy.judgement.naming import named_effects
+from discrepancy.judgement.conclusion import named_effects
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability, separability
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.model_choice import ModelKind, choose_model
@@ -363,7 +363,7 @@ def test_gates_say_what_they_compare(drag: Investigation) -> None:
     page.add_section("c")
     add_gates(page, drag)
     text = page.render()
-    absolute, shape, consistency = drag.verdict.gates
+    absolute, shape, consistency, _ = drag.verdict.gates
     for gate in (absolute, consistency):
         assert f"p = {gate.statistic:.2g}</td>" in text
         assert f"p at least {gate.limit:g}</td>" in text
@@ -373,7 +373,7 @@ def test_gates_say_what_they_compare(drag: Investigation) -> None:
 def test_the_gate_that_decided_stands_out_where_the_absolute_fit_could_not_be_judged(
     drag: Investigation,
 ) -> None:
-    absolute, shape, consistency = drag.verdict.gates
+    absolute, shape, consistency, _ = drag.verdict.gates
     gates = (
         replace(absolute, passed=None, statistic=float("nan")), shape,
         replace(consistency, passed=False, statistic=2e-5),
