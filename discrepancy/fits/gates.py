@@ -14,15 +14,9 @@ from discrepancy.verdict import Gate
 
 from .fitting import CandidateFit
 from .problem import Problem
-from .remainder import innovations
-from .remainder_inference import plain_point
 
 ABSOLUTE_LEVEL = 1e-3
 """Level of the absolute gate; a true name fails it this often."""
-COLOUR_LOSS = 3.0
-"""Log likelihood [nat] that a noise record may lose by a remainder that passes for the noise's own colour."""
-COLOUR_TIMES = 5.0
-"""Times of a remainder that the record has to last for it."""
 SHAPE_GAIN = 2.0
 """Log evidence that the free-shape family may gain before the name gives way to it [nat]."""
 
@@ -121,46 +115,10 @@ def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, floa
     return [(f"whiteness of {name}", combine(p_values)) for name, p_values in found.items()]
 
 
-def is_noise_colour(problem: Problem, fit: CandidateFit) -> bool:
-    """Whether the noise records admit every remainder of a fit as colour of the noise itself.
-
-    They do where a record as long as several of the remainder's times is as likely with its colour as white,
-    and what is left is no more than the record says.
-    """
+def is_noise_colour(fit: CandidateFit) -> bool:
+    """Whether all that a fit leaves beside white noise is the colour of the noise, as its records have it."""
     remainder = fit.point.remainder
-    if remainder is None:
-        return True
-    return all(_is_colour(problem, fit, int(channel)) for channel in np.flatnonzero(remainder.size > 0.0))
-
-
-def _is_colour(problem: Problem, fit: CandidateFit, channel: int) -> bool:
-    assert fit.point.remainder is not None
-    name = problem.channel_names[channel]
-    record, noise = problem.campaign.channels[name].noise, problem.noise[name]
-    if record is None or record.samples is None or record.interval is None:
-        return False
-    values = fit.point.remainder.of(channel)
-    size, time, frequency = values
-    if len(record.samples) * record.interval < COLOUR_TIMES * time:
-        return False  # it is too short to show or to deny it
-    series = noise.whiten(record.samples, record.interval) / noise.standard_deviation
-    steps, used = np.full(len(series), record.interval), np.ones(len(series), dtype=bool)
-    square, half = innovations(series, steps, used, *values)
-    loss = half + 0.5 * len(series) * float(np.log(square / (series @ series)))
-    if loss > COLOUR_LOSS:
-        return False
-    total, count = 0.0, 0.0
-    for number, data in enumerate(problem.trials):
-        if data.trial.is_dynamic and channel in data.groups:
-            column = int(np.flatnonzero(data.groups == channel)[0])
-            residual = problem.residual(number, plain_point(fit.point), fit.responses[number])[:, column]
-            total, count = total + float(residual @ residual), count + float(data.weight[:, column].sum())
-            interval = data.trial.interval
-    lags = interval * np.arange(1.0, 1.0 + COLOUR_TIMES * time / interval)
-    rho = size**2 / (1.0 + size**2) * np.exp(-lags / time) * np.cos(frequency * lags)
-    repeated = 1.0 + 2.0 * float(rho @ rho)  # of squares: samples that count as one
-    freedom = max(count / repeated, 1.0), max(record.degrees_of_freedom / repeated, 1.0)
-    return variance_p_value(total / count, *freedom) > ABSOLUTE_LEVEL
+    return remainder is None or not np.any(remainder.beyond_noise > 0.0)
 
 
 def shape_gate(named: CandidateFit, family: CandidateFit | None) -> Gate:

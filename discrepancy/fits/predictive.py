@@ -27,6 +27,11 @@ def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool =
         With covariance.
     sensitivities : bool
         Whether the exact covariance of the residuals is wanted (P columns a sample) or its diagonal only.
+
+    Notes
+    -----
+    With a remainder the leverage is that of the trials' own unknowns: what is shared takes a few samples of
+    all trials, and its uncertainty is that of the remainder, which χ² against the noise shall show.
     """
     fitted = _fitted(problem, found, sensitivities=sensitivities)
     held_out = problem.campaign.held_out
@@ -55,7 +60,9 @@ def _fitted(problem: Problem, found: CandidateFit, *, sensitivities: bool) -> li
         own = solve_triangular(np.tril(factor[0]), local, lower=True)
         # local unknowns follow the shared ones: J_s - J_l A^-1 B, then what is their own
         follow = (shared - cho_solve(factor, block.cross).T @ local).T @ shared_root[block.index]
-        leverage = np.einsum("nk,nk->n", follow, follow) + np.einsum("kn,kn->n", own, own)
+        leverage = np.einsum("kn,kn->n", own, own)
+        if found.point.remainder is None:
+            leverage = leverage + np.einsum("nk,nk->n", follow, follow)
         shape = found.residuals[number].shape
         sensitive = None
         if sensitivities:
@@ -94,8 +101,12 @@ def _held_out(problem: Problem, found: CandidateFit, trials: tuple[Trial, ...]) 
         own = np.einsum("kn,kn->n", local, cho_solve(factor, local))
         covariance = found.covariance[np.ix_(block.index, block.index)]
         carried = np.einsum("kn,kn->n", follow, covariance @ follow)
-        leverage = np.maximum(carried - own, -1.0 + 1e-9).reshape(adapted.residuals[number].shape)
-        items.append(_item(there, number, adapted, leverage, None, held_out=True))
+        shape = adapted.residuals[number].shape
+        leverage = np.maximum(carried - own, -1.0 + 1e-9).reshape(shape)
+        item = _item(there, number, adapted, leverage, None, held_out=True)
+        if found.point.remainder is not None:
+            item = replace(item, leverage=np.maximum(-own, -1.0 + 1e-9).reshape(shape))
+        items.append(item)
     return items
 
 
@@ -114,7 +125,7 @@ def _item(
     residual = problem.residual(number, plain_point(found.point), found.responses[number])
     variance = 1.0 + leverage if held_out else 1.0 + np.maximum(leverage, 0.0)
     if found.point.remainder is not None and trial.is_dynamic:
-        variance = variance + found.point.remainder.size[data.groups] ** 2
+        variance = variance + found.point.remainder.beyond_noise[data.groups] ** 2
     rates = None
     if trial.is_dynamic:
         rates = np.gradient(prediction, trial.interval, axis=0)

@@ -34,21 +34,33 @@ class Remainder:
         tau, over which it forgets [s].
     angular_frequency : (channels,) ndarray
         omega [rad/s]; nought for a process that does not swing.
+    of_noise : (channels,) ndarray of bool
+        Where it is the colour of the noise itself: both together then have the variance of the noise record.
     """
 
     size: FloatArray
     time: FloatArray
     angular_frequency: FloatArray
+    of_noise: NDArray[np.bool_]
 
     @classmethod
     def none(cls, channels: int) -> "Remainder":
         """Return no remainder in any channel."""
-        return cls(np.zeros(channels), np.ones(channels), np.zeros(channels))
+        return cls(np.zeros(channels), np.ones(channels), np.zeros(channels), np.zeros(channels, dtype=bool))
 
     @property
     def acts(self) -> bool:
         """Whether a channel has a remainder."""
         return bool(np.any(self.size > 0.0))
+
+    @property
+    def beyond_noise(self) -> FloatArray:
+        """Sizes (channels,) of what is left beside the noise, its own colour not counted."""
+        return np.where(self.of_noise, 0.0, self.size)
+
+    def _variance(self, channel: int) -> float:
+        """Return the variance of noise and colour together, over the unit that residuals are divided by."""
+        return 1.0 + float(self.size[channel]) ** 2 if self.of_noise[channel] else 1.0
 
     def of(self, channel: int) -> tuple[float, float, float]:
         """Return size, time and frequency of a channel."""
@@ -79,7 +91,8 @@ class Remainder:
             used = data.weight[:, column] > 0.0
             gains, _ = filter_gains(data.steps, used, *self.of(group))
             series = np.ascontiguousarray(columns[..., place].reshape(-1, len(used)))
-            found[..., place] = kernels()[1](series, gains, used).reshape(columns[..., place].shape)
+            white = kernels()[1](series, gains, used) * np.sqrt(self._variance(group))
+            found[..., place] = white.reshape(columns[..., place].shape)
         return found
 
     def log_determinant(self, data: TrialData) -> float:
@@ -91,6 +104,7 @@ class Remainder:
             if self.size[group] > 0.0:
                 used = data.weight[:, column] > 0.0
                 total += filter_gains(data.steps, used, *self.of(group))[1]
+                total -= 0.5 * float(used.sum()) * float(np.log(self._variance(group)))
         return total
 
 

@@ -37,6 +37,10 @@ CYCLES = (3.0, 30.0)
 PEAKS = 2
 LEAST_SIZE, LARGEST_SIZE = 1e-2, 1e5
 """Sizes over the noise that are searched."""
+NOISE_SIZES = (0.1, 30.0)
+"""The same of the noise's own colour, over its white part."""
+NOISE_TIMES = 5.0
+"""Times of the noise's own colour that its record lasts at least: else it can neither show nor deny it."""
 DIFFERENCE_STEP = 2e-2
 """Of the derivatives of the posterior, in logarithms."""
 DESCENTS, CONVERGED, LONGEST_STEP, LEAST_CURVATURE = 12, 0.02, 1.0, 0.3
@@ -108,6 +112,7 @@ def infer(problem: Problem, found: CandidateFit, prior: RemainderPrior) -> Infer
     """
     channels = len(problem.channel_names)
     size, time, frequency = np.zeros(channels), np.ones(channels), np.zeros(channels)
+    of_noise = np.zeros(channels, dtype=bool)
     log_factor = gain = 0.0
     residuals = [_plain_residual(problem, number, found) for number in range(len(problem.trials))]
     for channel in range(channels):
@@ -117,9 +122,10 @@ def infer(problem: Problem, found: CandidateFit, prior: RemainderPrior) -> Infer
         best = _best(series, float(prior.scale[channel]), found.point.remainder, channel)
         if best is not None:
             size[channel], time[channel], frequency[channel] = best.values
+            of_noise[channel] = best.of_noise
             log_factor += best.log_factor
             gain += best.gain
-    return Inferred(Remainder(size, time, frequency), log_factor, gain)
+    return Inferred(Remainder(size, time, frequency, of_noise), log_factor, gain)
 
 
 def with_remainder(
@@ -178,6 +184,15 @@ class _Record:
     used: NDArray[np.bool_]
 
 
+def _recorded(problem: Problem, name: str) -> _Record | None:
+    """Return what was recorded of a channel's noise, over its deviation and whitened as trials are."""
+    record, model = problem.campaign.channels[name].noise, problem.noise[name]
+    if record is None or record.samples is None or record.interval is None or not np.any(record.samples):
+        return None
+    values = np.ascontiguousarray(model.whiten(record.samples, record.interval) / model.standard_deviation)
+    return _Record(values, np.full(len(values), record.interval), np.ones(len(values), dtype=bool))
+
+
 @dataclass(frozen=True, eq=False)
 class _Series:
     """The records of a channel in motion, and what it shows at rest."""
@@ -186,6 +201,7 @@ class _Series:
     at_rest: float  # sum of squares
     count: float
     freedom: float
+    noise: _Record | None  # what was recorded of the noise alone, over its own deviation
 
     @classmethod
     def of(cls, problem: Problem, residuals: list[FloatArray], channel: int) -> "_Series | None":
@@ -199,20 +215,29 @@ class _Series:
                 else:
                     at_rest += float(values @ values)
         count, freedom = float(problem.counts[channel]), float(problem.freedom[channel])
-        return cls(tuple(records), at_rest, count, freedom) if records else None
+        noise = _recorded(problem, problem.channel_names[channel])
+        return cls(tuple(records), at_rest, count, freedom, noise) if records else None
 
-    def misfit(self, size: float, time: float, frequency: float) -> float:
-        """Return -ln L [nat] with a remainder."""
+    def misfit(self, size: float, time: float, frequency: float, *, of_noise: bool = False) -> float:
+        """Return -ln L [nat] with a remainder; of the noise record too where it is the noise's colour."""
         square, half = self.at_rest, 0.0
+        variance = 1.0 + size**2 if of_noise else 1.0
         for record in self.records:
             if size > 0.0:
                 more, log_determinant = innovations(
                     record.values, record.steps, record.used, size, time, frequency
                 )
-                half += log_determinant
+                half += log_determinant - 0.5 * float(record.used.sum()) * log(variance)
+                more *= variance
             else:
                 more = float(record.values @ record.values)
             square += more
+        if of_noise and self.noise is not None:
+            alone, log_determinant = innovations(
+                self.noise.values, self.noise.steps, self.noise.used, size, time, frequency
+            )
+            white = float(self.noise.values @ self.noise.values)
+            half += log_determinant + 0.5 * len(self.noise.values) * log(alone / white)
         if isinf(self.freedom):
             return 0.5 * square + half
         terms = misfits(np.array([self.freedom]), np.array([self.count]), np.array([square]))
@@ -227,6 +252,7 @@ class _Series:
 @dataclass(frozen=True)
 class _Found:
     values: tuple[float, float, float]
+    of_noise: bool
     log_factor: float
     gain: float
 
@@ -251,40 +277,57 @@ def _best(series: _Series, scale: float, known: Remainder | None, channel: int) 
         for cycles in CYCLES
     ]
     found = []
-    for starts, bounds in (
-        (plain, (times,)),
-        (swinging, (times, frequencies)),
-    ):
+    kinds: list[tuple[list[tuple[float, ...]], tuple[tuple[float, float], ...], bool]]
+    kinds = [
+        (list[tuple[float, ...]](plain), (times,), False),
+        (list[tuple[float, ...]](swinging), (times, frequencies), False),
+    ]
+    if series.noise is not None:
+        short = (times[0], float(series.noise.steps.sum()) / NOISE_TIMES)
+        own = [(size, item * interval) for size in (0.5, 2.0) for item in TIMES[:2]]
+        kinds.append((list[tuple[float, ...]](own), (short,), True))
+    for starts, bounds, of_noise in kinds:
         if known_one is not None and (known_one[2] > 0.0) is (len(bounds) == 2):
             starts = [known_one[: 1 + len(bounds)], *starts]
-        item = _kind(series, scale, [np.array(start) for start in starts], bounds)
+        item = _kind(series, None if of_noise else scale, [np.array(start) for start in starts], bounds)
         if item is not None:
-            found.append(item)
+            found.append((*item, of_noise))
     if not found:
         return None
     best = min(found, key=lambda item: item[1] - item[2])
-    values, likelihood, log_factor = best
+    values, likelihood, log_factor, of_noise = best
     gain = white - likelihood + log_factor
-    return _Found(values, log_factor, gain) if gain > 0.0 else None
+    return _Found(values, of_noise, log_factor, gain) if gain > 0.0 else None
 
 
 def _kind(
-    series: _Series, scale: float, starts: list[FloatArray], bounds: tuple[tuple[float, float], ...]
+    series: _Series, scale: float | None, starts: list[FloatArray], bounds: tuple[tuple[float, float], ...]
 ) -> tuple[tuple[float, float, float], float, float] | None:
-    """Return values, misfit and log factor of the best remainder that swings (two bounds) or does not."""
-    if not starts:
+    """Return values, misfit and log factor of the best remainder that swings (two bounds) or does not.
+
+    Without a scale of its size it is the colour of the noise.
+    """
+    if not starts or any(low >= high for low, high in bounds):
         return None
     # a half-normal size, times and frequencies flat in their logarithms, half of either kind
     ranges = sum(log(log(high / low)) for low, high in bounds)
-    constant = log(scale) + 0.5 * log(pi / 2.0) + ranges + log(2.0) - LOG_ODDS
+    constant = ranges + log(2.0) - LOG_ODDS
+    if scale is None:
+        constant += log(log(NOISE_SIZES[1] / NOISE_SIZES[0]))
+    else:
+        constant += log(scale) + 0.5 * log(pi / 2.0)
+
+    def likelihood_of(values: FloatArray) -> float:
+        swing = float(values[2]) if len(values) == 3 else 0.0
+        return series.misfit(float(values[0]), float(values[1]), swing, of_noise=scale is None)
 
     def energy(logarithms: FloatArray) -> float:
         values = np.exp(logarithms)
-        swing = float(values[2]) if len(values) == 3 else 0.0
-        prior = 0.5 * float(values[0] / scale) ** 2 - float(logarithms[0])
-        return series.misfit(float(values[0]), float(values[1]), swing) + prior + constant
+        prior = 0.0 if scale is None else 0.5 * float(values[0] / scale) ** 2 - float(logarithms[0])
+        return likelihood_of(values) + prior + constant
 
-    limits = [(log(LEAST_SIZE), log(LARGEST_SIZE)), *((log(low), log(high)) for low, high in bounds)]
+    sizes = NOISE_SIZES if scale is None else (LEAST_SIZE, LARGEST_SIZE)
+    limits = [(log(low), log(high)) for low, high in (sizes, *bounds)]
     low, high = np.array(limits).T
     points = [np.clip(np.log(start), low, high) for start in starts]
     begin = min(points, key=energy)
@@ -294,7 +337,7 @@ def _kind(
     width = 0.5 * float(len(place) * log(2.0 * pi) - np.log(eigenvalues).sum())
     values = np.exp(place)
     whole = (float(values[0]), float(values[1]), float(values[2]) if len(values) == 3 else 0.0)
-    likelihood = series.misfit(*whole)
+    likelihood = likelihood_of(values)
     return whole, likelihood, width - (least - likelihood)
 
 

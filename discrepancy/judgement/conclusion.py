@@ -34,7 +34,7 @@ class Conclusion:
             problem,
             found,
             best.candidate.identifiers,
-            log_bayes_factor=single_evidence(found, best) - found.none.log_evidence,
+            log_bayes_factor=single_evidence(found, best) - found.nothing.log_evidence,
             hypotheses=compared(problem, found, probabilities),
             inclusion={
                 effect.identifier: sum(

@@ -31,6 +31,9 @@ from .consistency_gate import consistency_gate
 from .explained_share import Shares
 from .proof import held_out_gate
 
+LEAST_SHOWN = 0.1
+"""Share of the gap from which a hypothesis is shown as the best one where none is named."""
+
 Outcome = tuple[Verdict, Search, CandidateFit]
 
 
@@ -55,20 +58,21 @@ def judged_with_remainder(problem: Problem, found: Search, first: Verdict) -> Ou
     weighed = _Weighed(problem, found)
     weighed.leave_out_stand_ins()
     best = found.best()
-    told = Conclusion.of(problem, found, best, found.set_probabilities())
+    probabilities = found.set_probabilities()
+    told = Conclusion.of(problem, found, best, probabilities)
+    gate, p_none = absolute_gate(problem, found.nothing), probabilities.get((), 0.0)
+    if p_none > 1.0 - SEARCH.sure and gate.passed is not False and _is_coloured(found.nothing):
+        if p_none >= SEARCH.unsure:
+            return _nothing(told, found.nothing, gate), found, found.nothing
+        return _too_small(told, p_none, gate), found, found.nothing
     if not best.candidate.terms:
-        gate = absolute_gate(problem, best)
-        if gate.passed is not False and best.point.remainder is not None and is_noise_colour(problem, best):
-            return _nothing(told, best, gate), found, best
-        leading = max(
-            (item for item in found.judged.values() if item.candidate.terms), key=found.score, default=best
-        )
+        leading = weighed.leading()
         return _unexplained(told, weighed, leading, first), found, leading
     if best.point.remainder is None:  # what is left is noise: another gate is why it has no name
         return _unexplained(told, weighed, best, first), found, best
     probability = weighed.probability(best)
     plain = not best.candidate.is_family and weighed.freed(best) is None
-    if plain and probability >= SEARCH.sure and is_noise_colour(problem, best):
+    if plain and probability >= SEARCH.sure and _is_coloured(best):
         gates = (
             absolute_gate(problem, best), consistency_gate(problem, best),
             held_out_gate(weighed.residuals(replace_remainder(best))),
@@ -90,6 +94,7 @@ class _Weighed:
 
     problem: Problem
     found: Search
+    left_out: list[CandidateFit] = field(default_factory=list)
     _residuals: dict[Key, ResidualSet] = field(default_factory=dict)
     _shares: dict[Key, Shares] = field(default_factory=dict)
 
@@ -110,6 +115,20 @@ class _Weighed:
             self._shares[key] = Shares.of(self._residuals[()], self.residuals(item), named)
         return self._shares[key]
 
+    def describes_better(self, best: CandidateFit) -> bool:
+        """Whether a stand-in that is as long as a set of laws was left out, and is more probable by far."""
+        return any(
+            len(item.candidate.terms) == len(best.candidate.terms)
+            and item.log_evidence > best.log_evidence + SEARCH.rival
+            for item in self.left_out
+        )
+
+    def leading(self) -> CandidateFit:
+        """Return the most probable set that closes a part of the gap, else the fit without effect."""
+        ranked = sorted(self.found.judged.values(), key=lambda item: -self.found.score(item))
+        closing = (item for item in ranked if item.candidate.terms and self.shares(item).value > LEAST_SHOWN)
+        return next(closing, self.found.none)
+
     def leave_out_stand_ins(self) -> None:
         """Take sets with a stand-in out of the comparison where a law explains as much, or it may not be.
 
@@ -127,8 +146,11 @@ class _Weighed:
                 and self.shares(law).value > share - SEARCH.rival_share
                 for law in laws.values()
             )
-            if beaten or not self._may_stand_in(item):
+            if not self._may_stand_in(item):
                 del kept[key]
+            elif beaten:
+                del kept[key]
+                self.left_out.append(item)
         self.found.judge(kept)
 
     def _stands_in(self, item: CandidateFit) -> bool:
@@ -221,12 +243,30 @@ def _plain(item: CandidateFit) -> tuple[str, ...]:
     return tuple(term.effect.identifier for term in item.candidate.terms)
 
 
+def _is_coloured(item: CandidateFit) -> bool:
+    """Whether what a fit leaves is coloured as the noise itself may be."""
+    return item.point.remainder is not None and is_noise_colour(item)
+
+
+def _too_small(told: Conclusion, p_none: float, gate: Gate) -> Verdict:
+    """Return the verdict that an effect may be there, too small to tell from coloured noise."""
+    hints = sorted(name for name, p in told.inclusion.items() if p > 1.0 - SEARCH.sure)
+    total = p_none + sum(told.inclusion[name] for name in hints)
+    return told.verdict(
+        VerdictKind.BELOW_LIMIT,
+        "Something may be missing, but too small for these data to tell from noise that is coloured"
+        + (f"; the nearest are {', '.join(hints[:4])}." if hints else "."),
+        min(total, 1.0), group=tuple(hints), gates=(gate,),
+        remainders=remainder_estimates(told.problem, told.found.nothing),
+    )  # fmt: skip
+
+
 def _nothing(told: Conclusion, best: CandidateFit, gate: Gate) -> Verdict:
     """Return the verdict that the noise is coloured, and nothing missing."""
     return told.verdict(
         VerdictKind.NOTHING_MISSING,
         "The model explains the data within their noise, which is coloured as its records admit.",
-        told.found.set_probabilities().get((), 0.0),
+        told.found.set_probabilities()[()],
         gates=(gate,),
         remainders=remainder_estimates(told.problem, best),
     )
@@ -278,7 +318,7 @@ def _in_part(
             effects=tuple(effect for item in members for effect in named_effects(problem, item)),
             group=tuple(" + ".join(sorted(_plain(item))) for item in members), **more,
         )  # fmt: skip
-    if rivals or probability < SEARCH.sure:
+    if rivals or probability < SEARCH.sure or weighed.describes_better(best):
         return _unexplained(told, weighed, best, first)
     named = named_effects(problem, best)
     what = f"An effect of the family {family}, with a shape of its own," if family else _words(named)
@@ -293,11 +333,11 @@ def _in_part(
 
 def _unexplained(told: Conclusion, weighed: _Weighed, leading: CandidateFit, first: Verdict) -> Verdict:
     """Return the verdict that there is a gap without a name, and how much the best hypothesis explains."""
-    sentence = first.sentence
-    if first.kind is not VerdictKind.UNEXPLAINED:
-        failed = next((gate.reason for gate in first.gates if gate.passed is False), "")
+    sentence, explained = first.sentence, None
+    failed = next((gate.reason for gate in first.gates if gate.passed is False), "")
+    nearest = sorted(first.resembles) == sorted(_plain(leading))  # else it would name two as the nearest
+    if first.kind is not VerdictKind.UNEXPLAINED or (failed and not nearest):
         sentence = f"There is a gap that no effect of the catalogue fits. {failed}".strip()
-    explained = None
     if leading.candidate.terms:
         explained = weighed.shares(leading).summary()
         words = _words(named_effects(told.problem, leading))
@@ -306,8 +346,9 @@ def _unexplained(told: Conclusion, weighed: _Weighed, leading: CandidateFit, fir
             f"{explained.trials} trials."
         )
     return told.verdict(
-        VerdictKind.UNEXPLAINED, sentence, first.probability, gates=first.gates, resembles=_plain(leading),
-        explained=explained, remainders=remainder_estimates(told.problem, leading),
+        VerdictKind.UNEXPLAINED, sentence, first.probability, gates=first.gates,
+        resembles=_plain(leading) or first.resembles, explained=explained,
+        remainders=remainder_estimates(told.problem, leading),
     )  # fmt: skip
 
 
@@ -319,7 +360,7 @@ def remainder_estimates(problem: Problem, found: CandidateFit) -> tuple[Remainde
     rows = (
         (name, *remainder.of(channel))
         for channel, name in enumerate(problem.channel_names)
-        if remainder.size[channel] > 0.0
+        if remainder.beyond_noise[channel] > 0.0
     )
     return tuple(
         RemainderEstimate(name, size, time, frequency / (2.0 * np.pi)) for name, size, time, frequency in rows

@@ -47,11 +47,14 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
     found = search(problem, effects)
     verdict, _, fit = _as_recorded(problem, found)
     stands = verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY)
-    if stands:
+    if stands or verdict.kind is VerdictKind.GROUP:
         gate = held_out_gate(residual_set(problem, fit, sensitivities=False))
-        verdict = replace(verdict, gates=(*verdict.gates, gate))
-        stands = gate.passed is not False
-    if stands or verdict.kind not in (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED):
+        said = f" {gate.reason}" if gate.passed is False else ""
+        verdict = replace(verdict, sentence=verdict.sentence + said, gates=(*verdict.gates, gate))
+        stands = stands and gate.passed is not False
+    misfits = any(gate.name == "absolute fit" and gate.passed is False for gate in verdict.gates)
+    open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
+    if stands or not (misfits or verdict.kind in open_kinds):
         return verdict, found, fit
     return judged_with_remainder(problem, found, verdict)
 

@@ -81,18 +81,13 @@ def shares_figure(explained: ExplainedShare) -> Figure:
     )
     with publication_style():
         figure = new_figure(0.9)
-        axes = figure.add_axes((0.03, 0.45, 0.94, 0.3))
+        axes = figure.add_axes((0.03, 0.45, 0.94, 0.25))
         at = 0.0
         for name, share, colour in rows:
-            axes.barh(0.0, share, left=at, color=colour, height=1.0)
-            if share > 0.08:
-                axes.text(
-                    at + 0.5 * share, 0.0, f"{name} {100.0 * share:.0f} %", ha="center", va="center",
-                    fontsize=7.0, color="white",
-                )  # fmt: skip
-            else:
-                axes.text(min(at, 0.97), 0.65, name, ha="left", va="bottom", fontsize=6.0)
+            label = f"{name} {100.0 * share:.0f} %"
+            axes.barh(0.0, share, left=at, color=colour, height=1.0, label=label)
             at += share
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False, fontsize=7.0)
         axes.set_xlim(0.0, 1.0)
         axes.set_ylim(-0.5, 0.5)
         axes.set_yticks([])

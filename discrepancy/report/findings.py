@@ -167,7 +167,11 @@ def _add_highlights(page: Page, investigation: Investigation) -> None:
         )
         if isfinite(proof.gap_closed):
             items.append((f"{percent(proof.gap_closed)} %", "of the gap closed on held-out trials"))
-    elif judged := [gate for gate in verdict.gates if gate.name != "shape" and isfinite(gate.statistic)]:
+    elif judged := [
+        gate
+        for gate in verdict.gates
+        if gate.name not in ("shape", "held-out trials") and isfinite(gate.statistic)
+    ]:
         # of gates whose statistic is a p-value, the one that decided
         gate = next((gate for gate in judged if gate.passed is False), judged[0])
         items.append(

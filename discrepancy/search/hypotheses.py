@@ -86,10 +86,14 @@ class Hypotheses:
         kept = (*self.rough.values(), *self.exact.values(), *self.judged.values())
         return frozenset(term.effect.identifier for item in kept for term in item.candidate.terms)
 
+    @property
+    def nothing(self) -> CandidateFit:
+        """The fit without effect as it is compared, with its remainder where others have theirs."""
+        return self.judged.get((), self.none)
+
     def judge(self, fits: dict[Key, CandidateFit]) -> None:
         """Compare these from now on."""
         self.judged = fits
-        self.none = fits[()]
 
     def set_probabilities(self) -> dict[tuple[str, ...], float]:
         """Return the probability of each set of identifiers, places summed, most probable first."""

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
+from discrepancy.fits.gates import is_noise_colour
+from discrepancy.fits.problem import Problem
 from discrepancy.fits.remainder import Remainder, filter_gains, innovations, kernels
 from discrepancy.fits.remainder_inference import RemainderPrior, infer, with_remainder
 
@@ -48,7 +50,7 @@ def test_fit_and_evidence_are_those_of_the_dense_gaussian(kit) -> None:  # type:
     """With exact noise all is Gaussian: optimum, covariance and evidence by dense algebra."""
     problem = kit.closed_problem(seed=2, kinds=("ringdown",), samples=50, left_out={0: [(7, 0), (8, 0)]})
     channels = len(problem.channel_names)
-    remainder = Remainder(np.full(channels, 1.7), np.full(channels, 0.08), np.zeros(channels))
+    remainder = replace(Remainder.none(channels), size=np.full(channels, 1.7), time=np.full(channels, 0.08))
     candidate = Candidate()
     start = replace(problem.start(candidate), remainder=remainder)
     found = fit(problem, candidate, start)
@@ -158,3 +160,40 @@ def test_evidence_counts_independent_samples(kit) -> None:  # type: ignore[no-un
     white, honest = np.array(gains).T
     assert white.max() > 20.0
     assert honest.max() < 4.0
+
+
+def test_colour_of_the_noise_is_told_from_a_remainder(kit) -> None:  # type: ignore[no-untyped-def]
+    """The same process in the trials, in the noise record or not."""
+    generator = np.random.default_rng(5)
+    time = 0.01 * np.arange(200)
+    dense = covariance(time, 1.5, 0.03, 0.0) / (1.0 + 1.5**2)
+    root = np.linalg.cholesky(dense)
+
+    def extra(rows: FloatArray) -> FloatArray:
+        dense = covariance(0.01 * rows, 1.5, 0.03, 0.0) - (1.0 - 1e-9) * np.eye(len(rows))
+        colour = np.linalg.cholesky(dense)
+        return np.asarray(0.02 * colour @ generator.standard_normal(len(rows)))
+
+    scale = 0.02 * np.sqrt(1.0 + 1.5**2)
+    for coloured in (True, False):
+        white = generator.standard_normal(len(time))
+        samples = scale * root @ white if coloured else 0.02 * white
+        record = NoiseRecord(float(samples.std()), 199.0, samples - samples.mean(), 0.01, "pre-trigger")
+        problem = kit.closed_problem(seed=6, kinds=("ringdown",), samples=400, extra=extra)
+        channels = dict(problem.campaign.channels)
+        channels["y1"] = replace(channels["y1"], noise=record)
+        problem = Problem(
+            replace(problem.campaign, channels=channels), problem.model,
+            replace(problem.setting, campaign=replace(problem.campaign, channels=channels)),
+        )  # fmt: skip
+        none = fit(problem, Candidate(), problem.start(Candidate()))
+        found = with_remainder(problem, none, RemainderPrior.of(problem, none))
+        assert found is not None
+        remainder = found.point.remainder
+        first = problem.channel_names.index("y1")
+        if coloured:  # what the record's own autoregression took out is no remainder, nor is what it left
+            assert remainder is None or remainder.beyond_noise[first] == 0.0
+        else:
+            assert remainder is not None
+            assert remainder.beyond_noise[first] == pytest.approx(1.5, rel=0.5)
+        assert is_noise_colour(found) is coloured
