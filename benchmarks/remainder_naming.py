@@ -149,7 +149,8 @@ def pushed(work: Workbench, chance: Chance, generator: np.random.Generator, at: 
         before = round(5.0 / interval)
         kept = np.exp(-interval / FORGETS)
         series = lfilter([1.0], [1.0, -kept], generator.standard_normal(before + len(trial.rows)))
-        modal = lsim((matrix, force, np.eye(2 * count), 0.0 * force), series, interval * np.arange(len(series)))[1]
+        system = (matrix, force, np.eye(2 * count), 0.0 * force)
+        modal = lsim(system, series, interval * np.arange(len(series)))[1]
         values = modal[before:, :count] @ (structure.outputs[columns] @ shapes).T
         found[trial.name] = values / scales
     return found
