@@ -69,7 +69,7 @@ def judged_with_remainder(problem: Problem, found: Search, first: Verdict) -> Ou
         leading = weighed.leading()
         return _unexplained(told, weighed, leading, first), found, leading
     if best.point.remainder is None:  # what is left is noise: another gate is why it has no name
-        return _unexplained(told, weighed, best, first), found, best
+        return _unexplained(told, weighed, best, first), found, weighed.shown(best)
     probability = weighed.probability(best)
     plain = not best.candidate.is_family and weighed.freed(best) is None
     if plain and probability >= SEARCH.sure and _is_coloured(best):
@@ -80,7 +80,8 @@ def judged_with_remainder(problem: Problem, found: Search, first: Verdict) -> Ou
         if all(gate.passed is not False for gate in gates):
             return _named(told, best, probability, gates), found, best
     best, probability, family = weighed.nameable(best)
-    return _in_part(told, weighed, best, probability, family, first), found, best
+    verdict = _in_part(told, weighed, best, probability, family, first)
+    return verdict, found, weighed.shown(best) if verdict.kind is VerdictKind.UNEXPLAINED else best
 
 
 def replace_remainder(found: CandidateFit) -> CandidateFit:
@@ -122,6 +123,12 @@ class _Weighed:
             and item.log_evidence > best.log_evidence + SEARCH.rival
             for item in self.left_out
         )
+
+    def shown(self, best: CandidateFit) -> CandidateFit:
+        """Return the best set if it closes a part of the gap, else the most probable one that does."""
+        if best.candidate.terms and self.shares(best).value > LEAST_SHOWN:
+            return best
+        return self.leading()
 
     def leading(self) -> CandidateFit:
         """Return the most probable set that closes a part of the gap, else the fit without effect."""
@@ -333,7 +340,7 @@ def _in_part(
 
 def _unexplained(told: Conclusion, weighed: _Weighed, leading: CandidateFit, first: Verdict) -> Verdict:
     """Return the verdict that there is a gap without a name, and how much the best hypothesis explains."""
-    sentence, explained = first.sentence, None
+    leading, sentence, explained = weighed.shown(leading), first.sentence, None
     failed = next((gate.reason for gate in first.gates if gate.passed is False), "")
     nearest = sorted(first.resembles) == sorted(_plain(leading))  # else it would name two as the nearest
     if first.kind is not VerdictKind.UNEXPLAINED or (failed and not nearest):
