@@ -20,7 +20,7 @@ from rich.table import Table
 from discrepancy.campaign.records import Campaign
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
-from discrepancy.judgement.naming import named_effects
+from discrepancy.judgement.conclusion import named_effects
 from discrepancy.models.wing import WingModel
 from discrepancy.sources.real_wing import SIGNAL, RecordPlan, wing_campaign
 from discrepancy.workflow import Investigation, investigate

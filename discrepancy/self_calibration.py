@@ -40,6 +40,7 @@ NULL_SHARE = 3
 NOTHING = "nothing"
 OTHER = {
     VerdictKind.NOTHING_MISSING: "nothing missing",
+    VerdictKind.NAMED_IN_PART: "named in part",
     VerdictKind.FAMILY: "family only",
     VerdictKind.GROUP: "group",
     VerdictKind.UNEXPLAINED: "unexplained",
@@ -47,6 +48,8 @@ OTHER = {
     VerdictKind.DATA_ERROR: "data error",
 }
 """Columns of the confusion matrix besides the names."""
+OUTCOMES = {VerdictKind.FAMILY: "family", VerdictKind.NAMED_IN_PART: "in part"}
+"""Of verdicts that say less than a name, where they hold what was hidden."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,7 @@ class CalibrationCase:
     named : tuple of str
         Identifiers that were named; members where the verdict is a group, the nearest where it is a family.
     outcome : str
-        "right", "wrong", "group", "family", "unexplained", "below detectability" or "data error".
+        "right", "wrong", "in part", "group", "family", "unexplained", "below detectability" or "data error".
     covered : tuple of Covered
         Parameters of the effect, where it was named.
     """
@@ -303,8 +306,8 @@ def outcome_of(hidden: str, kind: VerdictKind, named: tuple[str, ...], group: tu
         return "right" if named == (hidden,) else "wrong"
     if kind is VerdictKind.GROUP:
         return "group" if any(hidden in item.split(" + ") for item in group) else "wrong"
-    if kind is VerdictKind.FAMILY:
-        return "family" if hidden in named else "wrong"
+    if kind in (VerdictKind.FAMILY, VerdictKind.NAMED_IN_PART):
+        return OUTCOMES[kind] if hidden in named else "wrong"
     return kind.value
 
 
@@ -344,6 +347,7 @@ def outcomes(found: SelfCalibration, *, null: bool) -> list[str]:
         "right",
         "wrong",
         "group",
+        "in part",
         "family",
         "missed",
         "unexplained",

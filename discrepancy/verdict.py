@@ -13,6 +13,7 @@ class VerdictKind(StrEnum):
 
     NOTHING_MISSING = "nothing missing"  # the model explains the data
     NAMED = "named"  # one effect, or a set of effects
+    NAMED_IN_PART = "named in part"  # they close most of the gap; the rest is no noise and has no name
     FAMILY = "family"  # an effect of this family with a shape of its own
     GROUP = "group"  # one of a group that these data cannot separate
     UNEXPLAINED = "unexplained"  # a gap that no hypothesis fits
@@ -156,6 +157,63 @@ class Proof:
 
 
 @dataclass(frozen=True)
+class ExplainedShare:
+    """What the best hypothesis explains of the gap: mean squares over channels in units of their noise.
+
+    Attributes
+    ----------
+    value, low, high : float
+        1 - (rms after^2 - noise^2) / (rms before^2 - noise^2), 90 % interval by a bootstrap of blocks.
+    left : float
+        Root of rms after^2 - noise^2, over the noise.
+    effect, remainder, noise : float
+        Shares of rms before^2: what the effects take off, what is left beside the noise, the noise.
+    trials : str
+        "held-out", or "fitted" where none was held out.
+    """
+
+    value: Number
+    low: Number
+    high: Number
+    left: Number
+    effect: Number
+    remainder: Number
+    noise: Number
+    trials: str
+
+
+@dataclass(frozen=True)
+class RemainderEstimate:
+    """The remainder of a channel in the best hypothesis.
+
+    Attributes
+    ----------
+    channel : str
+        Which.
+    size : float
+        Its standard deviation over that of the channel's noise.
+    time : float
+        Time over which it forgets [s].
+    frequency : float
+        At which it swings [Hz]; nought if it does not.
+    """
+
+    channel: str
+    size: Number
+    time: Number
+    frequency: Number
+
+
+@dataclass(frozen=True)
+class NotFitted:
+    """An effect that was not fitted, and why; `gain` is what a screen promised at most [nat]."""
+
+    identifier: str
+    reason: str
+    gain: Number = nan
+
+
+@dataclass(frozen=True)
 class Experiment:
     """A proposed next experiment: what to do, its mutual information [nat], cost [1], and why."""
 
@@ -199,6 +257,12 @@ class Verdict:
         Limits and data errors, one sentence each.
     resembles : tuple of str
         What an unexplained rest looks like; never a name.
+    explained : ExplainedShare or None
+        Of the gap, by the best hypothesis, where none leaves noise alone.
+    remainders : tuple of RemainderEstimate
+        Of the best hypothesis.
+    not_fitted : tuple of NotFitted
+        Effects of the catalogue that were not.
     """
 
     kind: VerdictKind
@@ -214,3 +278,6 @@ class Verdict:
     next_experiments: tuple[Experiment, ...] = ()
     remarks: tuple[str, ...] = ()
     resembles: tuple[str, ...] = ()
+    explained: ExplainedShare | None = None
+    remainders: tuple[RemainderEstimate, ...] = ()
+    not_fitted: tuple[NotFitted, ...] = ()

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from discrepancy.files.document import Origin
-from discrepancy.files.patch import PATCH_NAME, fmu_outputs, primitive_intervals, write_patch
+from discrepancy.files.patch import PATCH_NAME, PATCHED, fmu_outputs, primitive_intervals, write_patch
 from discrepancy.files.residuals import RESIDUALS_NAME, write_residuals
 from discrepancy.files.verdict import VERDICT_NAME, write_verdict
-from discrepancy.judgement.naming import named_effects
+from discrepancy.judgement.conclusion import named_effects
 from discrepancy.judgement.separability import Separability
 from discrepancy.report.content import ReportInput
 from discrepancy.report.figures import draw, report_figures
@@ -28,9 +28,6 @@ from reporting.folders import fresh_folder, lock_folder, replace_folder, restore
 REPORT_NAME = "report.html"
 FMU_NAME = "patched.fmu"
 FIGURES = "figures"
-PATCHED = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.GROUP)
-"""Verdicts that leave a patch."""
-
 Pack = Callable[[Path, Path], str]
 """(patch.json, FMU to be written) -> what to say about it."""
 

@@ -4,6 +4,7 @@ import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from math import isnan, nan
 from pathlib import Path
 from typing import Protocol
 
@@ -40,12 +41,18 @@ from reporting.words import be
 from .errors import CampaignDataError
 from .model_choice import load_model
 from .search_settings import SEARCH
-from .verdict import Experiment, Proof, Verdict, VerdictKind
+from .verdict import Experiment, NotFitted, Proof, Verdict, VerdictKind
 
 DRAWS = 400
 IMPLAUSIBLE = 4.0
 """Prior deviations from which on a parameter or a gain is remarked on."""
-OPEN_KINDS = (VerdictKind.GROUP, VerdictKind.UNEXPLAINED, VerdictKind.FAMILY, VerdictKind.BELOW_LIMIT)
+OPEN_KINDS = (
+    VerdictKind.GROUP,
+    VerdictKind.UNEXPLAINED,
+    VerdictKind.FAMILY,
+    VerdictKind.NAMED_IN_PART,
+    VerdictKind.BELOW_LIMIT,
+)
 
 
 class Progress(Protocol):
@@ -186,7 +193,10 @@ def investigate(
     if thorough and verdict.kind in OPEN_KINDS:
         with stage("Looking for the next experiment", "next"):
             experiments = next_experiments(problem, open_hypotheses(search))
-    verdict = replace(verdict, remarks=tuple(remarks), next_experiments=experiments)
+    verdict = replace(
+        verdict, remarks=tuple(remarks), next_experiments=experiments,
+        not_fitted=not_fitted(problem.setting, catalogue, search),
+    )  # fmt: skip
     return Investigation(
         campaign, model, faults, verdict, location, proof, before, after, problem, search, fit, seconds
     )
@@ -306,6 +316,24 @@ def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
         what += f", such as vector = [{vector}] between the ground and {first.name!r}"
     listed = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
     return [f"Not tested for lack of a port: {listed}; declare {what} where such a force may act."]
+
+
+def not_fitted(setting: Setting, effects: Sequence[Effect], search: Search) -> tuple[NotFitted, ...]:
+    """Return the effects of a catalogue that were not fitted, each with the reason."""
+    fitted, rows = search.fitted(), []
+    for effect in effects:
+        unavailable = effect.unavailable(setting)
+        if unavailable is not None:
+            rows.append(NotFitted(effect.identifier, unavailable))
+        elif effect.identifier not in fitted:
+            gain = search.promised.get(effect.identifier, nan)
+            why = (
+                "less promising than others on the beginnings of the records"
+                if isnan(gain)
+                else f"screened out: {gain:.1f} nat at most beside the model as it is"
+            )
+            rows.append(NotFitted(effect.identifier, why, gain))
+    return tuple(rows)
 
 
 def open_hypotheses(search: Search, count: int = 5) -> list[tuple[CandidateFit, float]]:

@@ -227,6 +227,8 @@ def _show(found: "Investigation", folder: Path, console: "Console") -> None:
         estimate_text,
         headline,
         probability_text,
+        remainders_sentence,
+        shares_sentence,
         unit_text,
     )
     from discrepancy.verdict import VerdictKind
@@ -239,6 +241,9 @@ def _show(found: "Investigation", folder: Path, console: "Console") -> None:
         stored = read_patch(patch_file)
         if sizes := size_sentence(found, stored.effects, stored.intervals):
             console.print(sizes, soft_wrap=True)
+    for sentence in (shares_sentence(verdict), remainders_sentence(verdict)):
+        if sentence:
+            console.print(sentence, soft_wrap=True)
     if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
         against = f", ln Bayes factor against nothing missing {verdict.log_bayes_factor:.1f}"
         none = verdict.kind is VerdictKind.NOTHING_MISSING

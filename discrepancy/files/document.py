@@ -5,12 +5,13 @@ docs/verdict.md.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from importlib import resources
 from math import isfinite, isnan
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -123,8 +124,13 @@ def write_document(path: Path, schema: str, origin: Origin, record: object) -> P
     return atomic_write_text(path, json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def read_document(path: Path, schema: str, kind: type[_Record]) -> tuple[_Record, Origin]:
-    """Return the record of a document and its origin.
+def read_document(
+    path: Path,
+    schema: str,
+    kind: type[_Record],
+    older: Mapping[str, Callable[[dict[str, Any]], dict[str, Any]]] = MappingProxyType({}),
+) -> tuple[_Record, Origin]:
+    """Return the record of a document and its origin; `older` brings what older schemas hold up to this one.
 
     Raises
     ------
@@ -136,7 +142,7 @@ def read_document(path: Path, schema: str, kind: type[_Record]) -> tuple[_Record
         raise VerdictFileError(f"There is no file {path}; give the one that the discrepancy workflow left.")
     content = read_json(path, VerdictFileError)
     came = content.pop("schema", None) if isinstance(content, dict) else None
-    if came != schema:
+    if came != schema and came not in older:
         raise VerdictFileError(
             f"{path} is {f'of the schema {came!r}' if came else 'no file of this kind'}, but {schema!r} is "
             "needed."
@@ -144,7 +150,8 @@ def read_document(path: Path, schema: str, kind: type[_Record]) -> tuple[_Record
     of_origin = {item.name for item in fields(Origin)}
     before, after = f"{path} does not fit its schema: ", "; write it again."
     origin = _checked(Origin, {k: v for k, v in content.items() if k in of_origin}, before, after)
-    return _checked(kind, {k: v for k, v in content.items() if k not in of_origin}, before, after), origin
+    own = {k: v for k, v in content.items() if k not in of_origin}
+    return _checked(kind, older.get(str(came), dict)(own), before, after), origin
 
 
 def _checked(kind: type[_Record], content: dict[str, Any], before: str, after: str) -> _Record:

@@ -18,6 +18,8 @@ from discrepancy.verdict import NamedEffect, VerdictKind
 from fe.runtime.patch import ModelPatch
 from fmu_asset.packing.patch_file import SCHEMA as PATCH_SCHEMA
 
+PATCHED = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART, VerdictKind.FAMILY, VerdictKind.GROUP)
+"""Verdicts that leave a patch."""
 PATCH_NAME = "patch.json"
 
 _INTERVAL = (0.05, 0.95)
@@ -48,7 +50,7 @@ class PatchEffect(NamedEffect):
 
 
 def _patched(kind: VerdictKind) -> VerdictKind:
-    if kind not in (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.GROUP):
+    if kind not in PATCHED:
         raise ValueError(f"a patch rests on a name, a family or a group, and {kind.value!r} came")
     return kind
 
@@ -70,7 +72,7 @@ class PatchDocument:
     """
 
     verdict: Annotated[
-        VerdictKind, AfterValidator(_patched), WithJsonSchema({"enum": ["named", "family", "group"]})
+        VerdictKind, AfterValidator(_patched), WithJsonSchema({"enum": [kind.value for kind in PATCHED]})
     ]
     sentence: str
     effects: tuple[PatchEffect, ...]

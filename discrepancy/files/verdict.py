@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from discrepancy.files.document import Origin, read_document, write_document
 from discrepancy.files.patch import PATCH_NAME, read_patch
@@ -11,9 +12,12 @@ from discrepancy.verdict import Proof, Verdict
 from fe.runtime.patch import ModelPatch
 from reporting.folders import restore_folder
 
-VERDICT_SCHEMA = "uav-twin verdict 1"
-"""Value of the key `schema`."""
+VERDICT_SCHEMA = "uav-twin verdict 2"
+"""Value of the key `schema`; files of number 1 are read too."""
+FIRST_SCHEMA = "uav-twin verdict 1"
 VERDICT_NAME = "verdict.json"
+LATER_KEYS: dict[str, Any] = {"explained": None, "remainders": [], "not_fitted": []}
+"""Keys of the verdict that files of number 1 lack."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +78,14 @@ def read_verdict(path: Path) -> StoredVerdict:
     VerdictFileError
         If the file is missing, damaged, of another schema, or holds something else than it should.
     """
-    found, origin = read_document(path, VERDICT_SCHEMA, VerdictDocument)
+    found, origin = read_document(path, VERDICT_SCHEMA, VerdictDocument, {FIRST_SCHEMA: _with_later_keys})
     return StoredVerdict(found.verdict, found.proof, origin)
+
+
+def _with_later_keys(content: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of a file of number 1 with the keys of number 2, empty."""
+    verdict = content.get("verdict")
+    return {**content, "verdict": {**verdict, **LATER_KEYS}} if isinstance(verdict, dict) else content
 
 
 def read_verdict_folder(folder: Path | str) -> VerdictFolder:

@@ -4,7 +4,7 @@ Local unknowns are eliminated trial by trial (Schur complement). The derivatives
 change little with an effect; away from the end they may be those of the fit without effect (chord steps).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -292,7 +292,7 @@ class _Descent:
         prior += 0.5 * float(point.effect @ point.effect)
         for data, u in zip(problem.trials, point.local, strict=True):
             prior += 0.5 * float(data.unknowns.precision @ u**2)
-        objective = problem.misfit(sums) + prior
+        objective = problem.misfit(sums) + problem.log_determinant(point) + prior
         return _State(
             point,
             objective if np.isfinite(objective) else np.inf,
@@ -437,13 +437,14 @@ def _ahead(candidate: Candidate, point: Point, step: Point, share: float = 1.0) 
         for item, u, du in zip(parameters, point.effect.tolist(), (share * step.effect).tolist(), strict=True)
     ]
     return _bounded(
-        Point(
-            point.shared + share * step.shared,
-            tuple(u + share * du for u, du in zip(point.local, step.local, strict=True)),
-            np.array(effect, dtype=np.float64),
+        replace(
+            point,
+            shared=point.shared + share * step.shared,
+            local=tuple(u + share * du for u, du in zip(point.local, step.local, strict=True)),
+            effect=np.array(effect, dtype=np.float64),
         )
     )
 
 
 def _bounded(point: Point) -> Point:
-    return Point(point.shared, point.local, np.clip(point.effect, -LARGEST_EFFECT, LARGEST_EFFECT))
+    return replace(point, effect=np.clip(point.effect, -LARGEST_EFFECT, LARGEST_EFFECT))

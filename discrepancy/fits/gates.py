@@ -115,6 +115,12 @@ def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, floa
     return [(f"whiteness of {name}", combine(p_values)) for name, p_values in found.items()]
 
 
+def is_noise_colour(fit: CandidateFit) -> bool:
+    """Whether all that a fit leaves beside white noise is the colour of the noise, as its records have it."""
+    remainder = fit.point.remainder
+    return remainder is None or not np.any(remainder.beyond_noise > 0.0)
+
+
 def shape_gate(named: CandidateFit, family: CandidateFit | None) -> Gate:
     """Judge whether the free-shape family explains more than the named effect.
 

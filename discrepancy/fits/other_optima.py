@@ -1,5 +1,7 @@
 """Beside an optimum: other optima of the same candidate, and its law with a free shape."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from discrepancy.search_settings import SEARCH
@@ -77,7 +79,7 @@ def free_shape(
         return None
     terms[number] = Term(effect, terms[number].place, free_shape=True)
     parts[number] = np.append(parts[number], [item.prior.normal(item.canonical) for item in effect.shape])
-    start = Point(named.point.shared, named.point.local, np.concatenate(parts))
+    start = replace(named.point, effect=np.concatenate(parts))
     return attempt(
         problem, Candidate(tuple(terms)), start, iterations=SEARCH.shape_iterations, give_up=give_up
     )

@@ -1,5 +1,7 @@
 """Residuals of a fit with what their variance should be, for locating, proof and report."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
@@ -8,8 +10,8 @@ from discrepancy.campaign.records import Trial
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 
 from .fitting import CandidateFit, TrialBlock, fit, trial_block
-from .linearisation import Point
 from .problem import Problem
+from .remainder_inference import plain_point
 
 FloatArray = NDArray[np.float64]
 
@@ -25,6 +27,11 @@ def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool =
         With covariance.
     sensitivities : bool
         Whether the exact covariance of the residuals is wanted (P columns a sample) or its diagonal only.
+
+    Notes
+    -----
+    With a remainder the leverage is that of the trials' own unknowns: what is shared takes a few samples of
+    all trials, and its uncertainty is that of the remainder, which χ² against the noise shall show.
     """
     fitted = _fitted(problem, found, sensitivities=sensitivities)
     held_out = problem.campaign.held_out
@@ -45,7 +52,7 @@ def _fitted(problem: Problem, found: CandidateFit, *, sensitivities: bool) -> li
     ones = np.ones(len(problem.channel_names))
     for number, data in enumerate(problem.trials):
         block = trial_block(
-            problem, number, found.point, found.linearisations[number], found.candidate,
+            problem, number, plain_point(found.point), found.linearisations[number], found.candidate,
             found.residuals[number], ones,
         )  # fmt: skip
         local, shared = _halves(block)
@@ -53,7 +60,9 @@ def _fitted(problem: Problem, found: CandidateFit, *, sensitivities: bool) -> li
         own = solve_triangular(np.tril(factor[0]), local, lower=True)
         # local unknowns follow the shared ones: J_s - J_l A^-1 B, then what is their own
         follow = (shared - cho_solve(factor, block.cross).T @ local).T @ shared_root[block.index]
-        leverage = np.einsum("nk,nk->n", follow, follow) + np.einsum("kn,kn->n", own, own)
+        leverage = np.einsum("kn,kn->n", own, own)
+        if found.point.remainder is None:
+            leverage = leverage + np.einsum("nk,nk->n", follow, follow)
         shape = found.residuals[number].shape
         sensitive = None
         if sensitivities:
@@ -76,15 +85,14 @@ def _halves(block: TrialBlock) -> tuple[FloatArray, FloatArray]:
 def _held_out(problem: Problem, found: CandidateFit, trials: tuple[Trial, ...]) -> list[FittedTrial]:
     """Predict held-out trials: what is shared stays as fitted, their own nuisances adapt to them."""
     there = problem.with_trials(trials)
-    start = Point(
-        found.point.shared, tuple(np.zeros(data.unknowns.size) for data in there.trials), found.point.effect
-    )
+    nothing = tuple(np.zeros(data.unknowns.size) for data in there.trials)
+    start = replace(found.point, local=nothing)
     adapted = fit(there, found.candidate, start, local_only=True)
     items = []
     ones = np.ones(len(there.channel_names))
     for number in range(len(there.trials)):
         block = trial_block(
-            there, number, adapted.point, adapted.linearisations[number], adapted.candidate,
+            there, number, plain_point(adapted.point), adapted.linearisations[number], adapted.candidate,
             adapted.residuals[number], ones,
         )  # fmt: skip
         local, shared = _halves(block)
@@ -93,8 +101,12 @@ def _held_out(problem: Problem, found: CandidateFit, trials: tuple[Trial, ...]) 
         own = np.einsum("kn,kn->n", local, cho_solve(factor, local))
         covariance = found.covariance[np.ix_(block.index, block.index)]
         carried = np.einsum("kn,kn->n", follow, covariance @ follow)
-        leverage = np.maximum(carried - own, -1.0 + 1e-9).reshape(adapted.residuals[number].shape)
-        items.append(_item(there, number, adapted, leverage, None, held_out=True))
+        shape = adapted.residuals[number].shape
+        leverage = np.maximum(carried - own, -1.0 + 1e-9).reshape(shape)
+        item = _item(there, number, adapted, leverage, None, held_out=True)
+        if found.point.remainder is not None:
+            item = replace(item, leverage=np.maximum(-own, -1.0 + 1e-9).reshape(shape))
+        items.append(item)
     return items
 
 
@@ -110,14 +122,17 @@ def _item(
     data = problem.trials[number]
     trial = data.trial
     prediction = problem.prediction(number, found.point, found.responses[number])
+    residual = problem.residual(number, plain_point(found.point), found.responses[number])
     variance = 1.0 + leverage if held_out else 1.0 + np.maximum(leverage, 0.0)
+    if found.point.remainder is not None and trial.is_dynamic:
+        variance = variance + found.point.remainder.beyond_noise[data.groups] ** 2
     rates = None
     if trial.is_dynamic:
         rates = np.gradient(prediction, trial.interval, axis=0)
     return FittedTrial(
         trial=trial,
         prediction=prediction,
-        residual=found.residuals[number] * data.deviation,
+        residual=residual * data.deviation,  # what a remainder takes up is what is left
         noise_deviation=data.deviation,
         predictive_deviation=data.deviation * np.sqrt(np.maximum(variance, 1e-9)),
         leverage=leverage,

@@ -36,6 +36,20 @@ QUIETEST = 1e-12
 _NOTHING = np.empty((0, 0, 0))
 
 
+def misfits(freedom: FloatArray, counts: FloatArray, sums: FloatArray) -> FloatArray:
+    """Return -ln L of each channel [nat], its noise variance marginalised, up to a constant.
+
+    Parameters
+    ----------
+    freedom, counts, sums : (...) ndarray
+        n0 of the noise record, number of samples, sum of squared standardised residuals.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        known = 0.5 * (freedom + counts) * np.log1p(sums / freedom)
+        unknown = 0.5 * counts * np.log(np.maximum(sums, QUIETEST * counts))
+    return np.where(np.isinf(freedom), 0.5 * sums, np.where(freedom > 0.0, known, unknown))
+
+
 class Problem:
     """A campaign and a model, with everything that does not depend on the hypothesis.
 
@@ -155,7 +169,15 @@ class Problem:
     def residual(self, number: int, point: Point, response: FloatArray) -> FloatArray:
         """Return the standardised residuals (N, C) of a trial."""
         data = self.trials[number]
-        return data.standardised(data.trial.values - self.prediction(number, point, response))
+        return self.white(number, point, data.trial.values - self.prediction(number, point, response))
+
+    def white(
+        self, number: int, point: Point, columns: FloatArray, channels: Sequence[int] | None = None
+    ) -> FloatArray:
+        """Return columns (..., N, C) of a trial over s0, white under noise and remainder of a point."""
+        data = self.trials[number]
+        found = data.standardised(columns, channels)
+        return found if point.remainder is None else point.remainder.whitened(data, found, channels)
 
     # -------------------------------------------------------------------------- derivatives
 
@@ -326,7 +348,7 @@ class Problem:
             scale = np.zeros(len(channels))
             scale[column] = self.shared.gain_scale[position]
             blocks.append((parts.response * scale)[np.newaxis])
-        dense = data.standardised(np.concatenate(blocks))
+        dense = self.white(number, point, np.concatenate(blocks))
 
         # order of the unknowns: zeros, own, calibrated parameters, gains, effect; rows: zero, own,
         # calibrated parameters, effect, gain
@@ -341,6 +363,8 @@ class Problem:
         owners = np.full(rows.shape[:2], size)
         if head:
             rows[:, 0] = data.by_zero
+            if point.remainder is not None:
+                rows[:, 0] = point.remainder.whitened(data, data.by_zero.T).T
             owners[data.unknowns.zero_columns, 0] = np.arange(zeros)
         rows[:, head:] = dense.transpose(2, 0, 1)
         owners[:, head : head + len(everywhere)] = everywhere
@@ -375,15 +399,13 @@ class Problem:
 
     def misfit(self, sums: FloatArray) -> float:
         """Return -ln L with the noise variances marginalised, up to a constant."""
-        n0, n = self.freedom, self.counts
-        with np.errstate(divide="ignore", invalid="ignore"):
-            known = 0.5 * (n0 + n) * np.log1p(sums / n0)
-            terms = np.where(
-                np.isinf(n0),
-                0.5 * sums,
-                np.where(n0 > 0.0, known, 0.5 * n * np.log(np.maximum(sums, QUIETEST * n))),
-            )
-        return float(terms[n > 0].sum())
+        return float(misfits(self.freedom, self.counts, sums)[self.counts > 0].sum())
+
+    def log_determinant(self, point: Point) -> float:
+        """Return half the log determinant [nat] that the remainder of a point adds to -ln L."""
+        if point.remainder is None:
+            return 0.0
+        return sum(point.remainder.log_determinant(data) for data in self.trials)
 
     def precisions(self, sums: FloatArray) -> FloatArray:
         """Return the expected precision of each channel's noise over 1 / s0^2, given the residuals."""

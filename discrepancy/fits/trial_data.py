@@ -48,6 +48,16 @@ class TrialData:
         scale[self.unknowns.zero_columns] = self.unknowns.zero_scale
         return np.ascontiguousarray(self.standardised(np.broadcast_to(scale, self.weight.shape)).T)
 
+    @cached_property
+    def steps(self) -> FloatArray:
+        """Time since the sample before (N,) [s], of a dynamic trial; nought at the first."""
+        trial = self.trial
+        even = np.full(len(trial.time), trial.interval)
+        given = np.diff(trial.time, prepend=trial.time[0])
+        # stamps are rounded: samples that are even within that share one step
+        found = even if np.all(np.abs(given[1:] - even[1:]) < 1e-3 * even[1:]) else given
+        return np.concatenate((np.zeros(1), found[1:]))
+
     def standardised(self, columns: FloatArray, channels: Sequence[int] | None = None) -> FloatArray:
         """Return columns (..., N, C) over s0, whitened in time, zero where a sample does not count.
 

@@ -1,24 +1,27 @@
 """From fitted candidates to a verdict: named, a family, a group, unexplained, or nothing missing."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
-from discrepancy.catalogue.entry import NINETY, Effect
-from discrepancy.fits.candidate import FREE_SHAPE, Candidate
+from discrepancy.catalogue.entry import Effect
+from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, shape_gate
 from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.posterior import with_draws
+from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.search.strategy import Search, search
 from discrepancy.search_settings import SEARCH
-from discrepancy.verdict import Estimate, Gate, Hypothesis, NamedEffect, Verdict, VerdictKind
+from discrepancy.verdict import Gate, NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import INTERNAL_FORCES
 
+from .conclusion import Conclusion, best_of, named_effects, plain_names
 from .consistency_gate import consistency_gate
+from .in_part import judged_with_remainder
+from .proof import held_out_gate
 
 
 def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, CandidateFit]:
@@ -42,22 +45,26 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         group or of what is too small to tell; else the one without effect.
     """
     found = search(problem, effects)
+    verdict, _, fit = _as_recorded(problem, found)
+    stands = verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY)
+    if stands or verdict.kind is VerdictKind.GROUP:
+        gate = held_out_gate(residual_set(problem, fit, sensitivities=False))
+        said = f" {gate.reason}" if gate.passed is False else ""
+        verdict = replace(verdict, sentence=verdict.sentence + said, gates=(*verdict.gates, gate))
+        stands = stands and gate.passed is not False
+    misfits = any(gate.name == "absolute fit" and gate.passed is False for gate in verdict.gates)
+    open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
+    if stands or not (misfits or verdict.kind in open_kinds):
+        return verdict, found, fit
+    return judged_with_remainder(problem, found, verdict)
+
+
+def _as_recorded(problem: Problem, found: Search) -> tuple[Verdict, Search, CandidateFit]:
+    """Return the verdict if what a right model leaves is noise as the records say, and no more."""
     probabilities = _settled_probabilities(found)
     top, p_top = next(iter(probabilities.items()))
-    best = _best_of(found, top) if top else found.best()
-    told = _Conclusion(
-        problem,
-        found,
-        top,
-        log_bayes_factor=_single_evidence(found, best) - found.none.log_evidence,
-        hypotheses=_hypotheses(problem, found, probabilities),
-        inclusion={
-            effect.identifier: sum(
-                p for names, p in probabilities.items() if effect.identifier in _plain(names)
-            )
-            for effect in found.effects
-        },
-    )
+    best = best_of(found, top) if top else found.best()
+    told = Conclusion.of(problem, found, best, probabilities)
     none_gate = absolute_gate(problem, found.none)
     if not top or (told.log_bayes_factor < SEARCH.bayes_factor and none_gate.passed is not False):
         if none_gate.passed is False:
@@ -77,7 +84,9 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         return verdict, found, found.none
 
     # sets that hold the best one and more agree with it; they only leave a further effect open
-    p_top = min(sum(p for names, p in probabilities.items() if set(_plain(top)) <= set(_plain(names))), 1.0)
+    p_top = min(
+        sum(p for names, p in probabilities.items() if set(plain_names(top)) <= set(plain_names(names))), 1.0
+    )
     if best.candidate.is_family:  # reached from several members or places, it is one family
         p_top = max(p_top, _family_probability(found, best.candidate.terms[0].effect.family))
     if p_top < SEARCH.sure or told.log_bayes_factor < SEARCH.bayes_factor:
@@ -85,49 +94,7 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
     return _judged(told, best, p_top)
 
 
-@dataclass(frozen=True)
-class _Conclusion:
-    """What every verdict on a search says alike, and the kinds of it."""
-
-    problem: Problem
-    found: Search
-    top: tuple[str, ...]
-    log_bayes_factor: float
-    hypotheses: tuple[Hypothesis, ...]
-    inclusion: dict[str, float]
-
-    def verdict(self, kind: VerdictKind, sentence: str, probability: float, **more: Any) -> Verdict:
-        """Return a verdict."""
-        return Verdict(
-            kind=kind,
-            sentence=sentence,
-            probability=probability,
-            log_bayes_factor=self.log_bayes_factor,
-            hypotheses=self.hypotheses,
-            inclusion=self.inclusion,
-            **more,
-        )
-
-    def family(
-        self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...]
-    ) -> tuple[Verdict, Search, CandidateFit]:
-        """Return the verdict that names the family of a fit with a free shape."""
-        drawn = with_draws(self.problem, fit)
-        named = named_effects(self.problem, drawn)
-        text, sentence = _family(named)
-        more = {"effects": named, "family": text, "gates": gates}
-        return self.verdict(VerdictKind.FAMILY, sentence, probability, **more), self.found, drawn
-
-    def unexplained(
-        self, sentence: str, probability: float, gates: tuple[Gate, ...]
-    ) -> tuple[Verdict, Search, CandidateFit]:
-        """Return the verdict that there is a gap without a name."""
-        more = {"gates": gates, "resembles": _plain(self.top)}
-        verdict = self.verdict(VerdictKind.UNEXPLAINED, sentence, probability, **more)
-        return verdict, self.found, self.found.none
-
-
-def _judged(told: _Conclusion, best: CandidateFit, p_top: float) -> tuple[Verdict, Search, CandidateFit]:
+def _judged(told: Conclusion, best: CandidateFit, p_top: float) -> tuple[Verdict, Search, CandidateFit]:
     """Return the verdict on the best set, probable enough for a name: by the gates."""
     problem, found = told.problem, told.found
     gate, consistent = absolute_gate(problem, best), consistency_gate(problem, best)
@@ -183,7 +150,7 @@ def _settled_probabilities(found: Search) -> dict[tuple[str, ...], float]:
         rough = [names for names in _members(probabilities) if names not in exact]
         if not rough:
             break
-        _best_of(found, rough[0])
+        best_of(found, rough[0])
         probabilities = found.set_probabilities()
     return probabilities
 
@@ -211,11 +178,6 @@ def _family_probability(found: Search, family: str) -> float:
     return float(weights[members].sum() / weights.sum())
 
 
-def _plain(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return identifiers without the mark of a free shape."""
-    return tuple(name.removesuffix(FREE_SHAPE) for name in names)
-
-
 def _open(
     problem: Problem,
     found: Search,
@@ -226,9 +188,9 @@ def _open(
     """Return the verdict where no set reaches the probability that a name needs, as `name` does."""
     members = _members(probabilities)
     total = sum(probabilities[names] for names in members)
-    fits = [_best_of(found, names) for names in members]
+    fits = [best_of(found, names) for names in members]
     if () in members:
-        hints = sorted({name for names in members for name in _plain(names)})
+        hints = sorted({name for names in members for name in plain_names(names)})
         return (
             verdict(
                 VerdictKind.BELOW_LIMIT,
@@ -245,7 +207,9 @@ def _open(
         if each.passed is False:  # those that do not fit take their probability with them
             continue
         together += probabilities[names]
-        if _plain(names) not in [_plain(other) for other, _, _ in fitting]:  # else a law and its family
+        if plain_names(names) not in [
+            plain_names(other) for other, _, _ in fitting
+        ]:  # else a law and its family
             fitting.append((names, with_draws(problem, item), each))
     if not fitting or len(fitting) > SEARCH.largest_group:
         return (
@@ -254,11 +218,11 @@ def _open(
                 f"There is a gap that no effect of the catalogue fits. {gates[0].reason}"
                 if not fitting
                 else f"There is a gap, and {len(fitting)} explanations fit it alike.",
-                total, gates=(gates[0],), resembles=_plain(members[0]),
+                total, gates=(gates[0],), resembles=plain_names(members[0]),
             ),
             found, found.none,
         )  # fmt: skip
-    group = tuple(" + ".join(_plain(names)) for names, _, _ in fitting)
+    group = tuple(" + ".join(plain_names(names)) for names, _, _ in fitting)
     labels = [" + ".join(names) for names, _, _ in fitting]
     effects = tuple(effect for _, item, _ in fitting for effect in named_effects(problem, item))
     _, nearest, gate = fitting[0]
@@ -271,20 +235,6 @@ def _open(
         verdict(VerdictKind.GROUP, sentence, together, effects=effects, group=group, gates=(gate,)),
         found, nearest,
     )  # fmt: skip
-
-
-def _best_of(found: Search, identifiers: tuple[str, ...]) -> CandidateFit:
-    options = [item for item in found.all().values() if item.candidate.identifiers == identifiers]
-    best = max(options, key=found.score)
-    return found.exactly(best)
-
-
-def _single_evidence(found: Search, best: CandidateFit) -> float:
-    """Log evidence of the best set, averaged over its places."""
-    places = 0.0
-    for term in best.candidate.terms:
-        places += np.log(len(term.effect.places(found.problem.setting)))
-    return best.log_evidence - places
 
 
 def _may_be_free(found: Search, best: CandidateFit) -> bool:
@@ -310,79 +260,6 @@ def _shape(found: Search, best: CandidateFit) -> tuple[Gate, CandidateFit | None
         if kept is None or gate.statistic > outcome.statistic:
             outcome, kept = gate, family
     return outcome, kept if kept is not None and outcome.statistic > SHAPE_GAIN else None
-
-
-def named_effects(problem: Problem, found: CandidateFit) -> tuple[NamedEffect, ...]:
-    """Return the effects of a fit with values and 90 % intervals of their parameters.
-
-    Intervals are those of the fit's draws, else of its covariance.
-    """
-    named = []
-    deviation = np.sqrt(np.diag(found.effect_covariance))
-    low, high = found.point.effect - NINETY * deviation, found.point.effect + NINETY * deviation
-    if found.draws is not None:
-        low, high = np.quantile(found.draws, (0.05, 0.95), axis=0)
-        # the most probable value may be one of many optima along a ridge
-        low, high = np.minimum(low, found.point.effect), np.maximum(high, found.point.effect)
-    at = 0
-    for term, part in zip(found.candidate.terms, found.candidate.parts(found.point.effect), strict=True):
-        estimates = []
-        rows = slice(at, at + len(part))
-        for item, u, *interval in zip(term.parameters, part, low[rows], high[rows], strict=True):
-            ends = [item.prior.value(float(end)) for end in interval]
-            estimates.append(
-                Estimate(
-                    item.name,
-                    item.prior.value(float(u)),
-                    min(ends),
-                    max(ends),
-                    getattr(item, "unit", "1"),
-                    item.description,
-                )
-            )
-        count = len(term.effect.parameters)
-        named.append(
-            NamedEffect(
-                term.effect.identifier,
-                term.effect.name,
-                term.place,
-                term.effect.family,
-                tuple(estimates[:count]),
-                tuple(estimates[count:]),
-                Candidate((term,)).patch(problem.setting, part),
-            )
-        )
-        at += len(part)
-    return tuple(named)
-
-
-def _hypotheses(
-    problem: Problem, found: Search, probabilities: dict[tuple[str, ...], float]
-) -> tuple[Hypothesis, ...]:
-    rows = []
-    for identifiers, probability in probabilities.items():
-        options = [item for item in found.all().values() if item.candidate.identifiers == identifiers]
-        best = max(options, key=found.score)
-        rows.append(
-            Hypothesis(
-                named_effects(problem, best),
-                best.log_evidence,
-                probability,
-                best.chi_square,
-                float(problem.counts.sum() - best.spent.sum()),
-            )
-        )
-    return tuple(rows)
-
-
-def _family(named: tuple[NamedEffect, ...]) -> tuple[str, str]:
-    """Return the families whose shape is free, and the sentence of the verdict."""
-    text = ", ".join(sorted({effect.family for effect in named if effect.shape}))
-    beside = ", ".join(effect.name for effect in named if not effect.shape)
-    return text, (
-        f"An effect of the family {text} is missing, with a shape of its own"
-        f"{f', beside {beside}' if beside else ''}."
-    )
 
 
 def _named_sentence(named: tuple[NamedEffect, ...], probability: float, gate: Gate) -> str:

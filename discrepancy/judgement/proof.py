@@ -16,7 +16,7 @@ from discrepancy.errors import FitError
 from discrepancy.location.locate import Location
 from discrepancy.location.omnibus_tests import mean_square
 from discrepancy.location.residuals import FittedTrial, ResidualSet
-from discrepancy.verdict import Proof, Scores
+from discrepancy.verdict import Gate, Proof, Scores
 
 FloatArray = NDArray[np.float64]
 
@@ -25,6 +25,13 @@ PIT_BINS = 10
 
 SMALLEST_GAP = 2.0
 """A gap to close is at least this many standard deviations of χ²/dof above one."""
+
+HELD_OUT_DEVIATIONS = 3.0
+"""Deviations of χ²/dof on held-out trials above one from which on a name does not survive them."""
+COVERAGE = (0.80, 0.97)
+"""Share of held-out samples that 90 % intervals must hold."""
+LEAST_COVERED = 200
+"""Samples from which on that share is judged."""
 
 _ENOUGH_TRIALS = 5  # from which the scatter between trials alone gives the standard error
 _PARTS = 16  # of a record, for the error within a trial
@@ -204,6 +211,43 @@ def _variance_within(series: FloatArray) -> float:
     if sums.size < 2:
         return 0.0
     return float(0.5 * np.sum(np.diff(sums) ** 2) * sums.size / (sums.size - 1))
+
+
+def held_out_gate(after: ResidualSet) -> Gate:
+    """Judge whether a name survives the trials that it did not see.
+
+    Parameters
+    ----------
+    after : ResidualSet
+        With the effect.
+
+    Returns
+    -------
+    Gate
+        Failed where χ²/dof of the held-out trials lies more than `HELD_OUT_DEVIATIONS` of its deviations
+        above one, or the coverage of 90 % intervals is outside `COVERAGE`. `passed` is None without a
+        held-out trial or without a noise record.
+    """
+    outside = after.held_out
+    if outside is None:
+        return Gate("held-out trials", None, nan, HELD_OUT_DEVIATIONS, "No trial was held out.")
+    found = scores(outside)
+    beyond = (found.chi_square_per_dof - 1.0) / found.chi_square_deviation
+    if not np.isfinite(beyond):
+        return Gate("held-out trials", None, nan, HELD_OUT_DEVIATIONS, "No noise record to judge them by.")
+    if beyond > HELD_OUT_DEVIATIONS:
+        reason = (
+            f"On held-out trials χ²/dof is {found.chi_square_per_dof:.2f}, where 1 ± "
+            f"{found.chi_square_deviation:.2f} is expected."
+        )
+        return Gate("held-out trials", False, beyond, HELD_OUT_DEVIATIONS, reason)
+    if found.sample_count >= LEAST_COVERED and not COVERAGE[0] <= found.coverage_90 <= COVERAGE[1]:
+        reason = f"90 % intervals hold {100.0 * found.coverage_90:.0f} % of the samples of held-out trials."
+        return Gate("held-out trials", False, beyond, HELD_OUT_DEVIATIONS, reason)
+    return Gate(
+        "held-out trials", True, beyond, HELD_OUT_DEVIATIONS,
+        "Held-out trials are predicted within their noise.",
+    )  # fmt: skip
 
 
 def gap_closed(before: Scores | None, after: Scores | None) -> tuple[float, str]:

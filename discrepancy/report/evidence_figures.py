@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
 from discrepancy.report.text import hypothesis_name, probability_text
 from discrepancy.self_calibration import SelfCalibration
-from discrepancy.verdict import Hypothesis, Scores
+from discrepancy.verdict import ExplainedShare, Hypothesis, Scores
 from reporting.figures import LEVELS, OBSERVED, PAST, PREDICTION, REFERENCE, new_figure, publication_style
 
 SHOWN_HYPOTHESES = 8
@@ -70,6 +70,29 @@ def _signed(value: float) -> str:
         return "0"
     text = f"{value:+,.0f}" if abs(value) >= 1000.0 else f"{value:+.1f}"
     return text.replace("-", "\N{MINUS SIGN}")
+
+
+def shares_figure(explained: ExplainedShare) -> Figure:
+    """Draw one bar of the shares of effect, remainder and noise."""
+    rows = (
+        ("effect", explained.effect, PREDICTION),
+        ("remainder", explained.remainder, PAST),
+        ("noise", explained.noise, REFERENCE),
+    )
+    with publication_style():
+        figure = new_figure(0.9)
+        axes = figure.add_axes((0.03, 0.45, 0.94, 0.25))
+        at = 0.0
+        for name, share, colour in rows:
+            label = f"{name} {100.0 * share:.0f} %"
+            axes.barh(0.0, share, left=at, color=colour, height=1.0, label=label)
+            at += share
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False, fontsize=7.0)
+        axes.set_xlim(0.0, 1.0)
+        axes.set_ylim(-0.5, 0.5)
+        axes.set_yticks([])
+        axes.set_xlabel("share of the mean square")
+    return figure
 
 
 def pit_figure(scores: Mapping[str, Scores]) -> Figure:

@@ -12,6 +12,7 @@ from discrepancy.report.evidence_figures import (
     evidence_figure,
     pit_figure,
     separability_figure,
+    shares_figure,
 )
 from discrepancy.report.law_figures import backbone_figure, force_figure
 from discrepancy.report.motion_figures import (
@@ -68,6 +69,13 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
         _add_worst_record(before, after, add)
         _add_motion(before, after, add)
     _add_evidence(content, add)
+    explained = content.investigation.verdict.explained
+    if explained is not None:
+        add(
+            "shares", shares_figure(explained), "What the gap is made of",
+            f"Mean square of the residuals of the model as it was on {explained.trials} trials, all channels "
+            "in units of their noise: what the hypothesis takes off, what it leaves without a name, noise.",
+        )  # fmt: skip
     return found
 
 

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from math import isfinite, isnan
 
-from discrepancy.judgement.naming import named_effects
+from discrepancy.judgement.conclusion import named_effects
 from discrepancy.report.content import ReportInput
 from discrepancy.report.sizes import definite_unit, size_sentence
 from discrepancy.report.text import (
+    NAMING,
     added_label,
     catalogue_of,
     estimate_text,
@@ -18,7 +19,9 @@ from discrepancy.report.text import (
     p_value_text,
     percent,
     probability_text,
+    remainders_sentence,
     rounded,
+    shares_sentence,
     unit_text,
 )
 from discrepancy.verdict import NamedEffect, VerdictKind
@@ -41,6 +44,8 @@ def add_verdict(page: Page, content: ReportInput) -> None:
         if sentence := size_sentence(investigation, effects, content.intervals):
             page.add_paragraph(sentence)
     page.add_paragraph(meaning(verdict))
+    if shares := shares_sentence(verdict):
+        page.add_paragraph(f"{shares} {remainders_sentence(verdict)}".strip())
     _add_highlights(page, investigation)
     catalogue = catalogue_of(investigation)
     if verdict.kind is VerdictKind.UNEXPLAINED and verdict.resembles:
@@ -78,9 +83,10 @@ def add_verdict(page: Page, content: ReportInput) -> None:
         ),
         {
             VerdictKind.NAMED: "Most probable values and 90 % intervals.",
+            VerdictKind.NAMED_IN_PART: "Most probable values and 90 % intervals, wider for what is left.",
             VerdictKind.FAMILY: "Most probable values and 90 % intervals; the shape was fitted.",
         }.get(verdict.kind, "Most probable values and 90 % intervals of each, were it there alone."),
-        title="What is added" if verdict.kind is VerdictKind.NAMED else "What could be added",
+        title="What is added" if verdict.kind in NAMING else "What could be added",
     )  # fmt: skip
     _add_primitives(page, content)
 
@@ -114,7 +120,7 @@ def _add_primitives(page: Page, content: ReportInput) -> None:
             rows.append((item.parameter.replace("_", " "), value, interval, unit))
     if not rows:
         return
-    marked = "" if content.investigation.verdict.kind is VerdictKind.NAMED else (
+    marked = "" if content.investigation.verdict.kind in NAMING else (
         f" It is that of {added_label(content.investigation)}, which is not named."
     )  # fmt: skip
     fmu = f" {content.fmu}" if content.fmu else ""
@@ -136,6 +142,15 @@ def _add_primitives(page: Page, content: ReportInput) -> None:
 def _add_highlights(page: Page, investigation: Investigation) -> None:
     verdict, proof = investigation.verdict, investigation.proof
     items: list[tuple[str, str]] = []
+    if (share := verdict.explained) is not None:
+        items.append(
+            (
+                f"{100.0 * share.value:.0f} %",
+                f"of the gap explained on {share.trials} trials, "
+                f"{100.0 * share.low:.0f} to {100.0 * share.high:.0f} %",
+            )
+        )
+        items.append((number(share.left, 2), "noises are left"))
     if not isnan(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
         items.append((probability_text(verdict.probability), "probability of the verdict"))
     if isfinite(verdict.log_bayes_factor) and verdict.hypotheses and verdict.hypotheses[0].effects:
@@ -152,7 +167,11 @@ def _add_highlights(page: Page, investigation: Investigation) -> None:
         )
         if isfinite(proof.gap_closed):
             items.append((f"{percent(proof.gap_closed)} %", "of the gap closed on held-out trials"))
-    elif judged := [gate for gate in verdict.gates if gate.name != "shape" and isfinite(gate.statistic)]:
+    elif judged := [
+        gate
+        for gate in verdict.gates
+        if gate.name not in ("shape", "held-out trials") and isfinite(gate.statistic)
+    ]:
         # of gates whose statistic is a p-value, the one that decided
         gate = next((gate for gate in judged if gate.passed is False), judged[0])
         items.append(

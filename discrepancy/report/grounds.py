@@ -8,6 +8,7 @@ from discrepancy.files.document import Origin
 from discrepancy.report.check_tables import can_decide_table, group_lines
 from discrepancy.report.content import ReportInput
 from discrepancy.report.text import (
+    NAMING,
     added_label,
     listing,
     number,
@@ -16,7 +17,7 @@ from discrepancy.report.text import (
     probability_text,
 )
 from discrepancy.self_calibration import Share, outcomes
-from discrepancy.verdict import Gate, Proof, Scores, VerdictKind
+from discrepancy.verdict import Gate, Proof, Scores, Verdict
 from discrepancy.workflow import Investigation
 from reporting.page import Column, Page, Table
 
@@ -50,6 +51,8 @@ def _compared(gate: Gate) -> tuple[str, str]:
     """Return what a gate compares, and with what: a p-value, or a gain in evidence."""
     if isnan(gate.statistic):
         return "\N{EN DASH}", "\N{EN DASH}"
+    if gate.name == "held-out trials":
+        return f"{number(gate.statistic)} deviations", f"at most {number(gate.limit)}"
     if gate.name == "shape":
         return f"gain {number(gate.statistic)} nat", f"at most {number(gate.limit)} nat"
     text = p_value_text(gate.statistic)
@@ -69,9 +72,23 @@ def add_inclusion(page: Page, investigation: Investigation) -> None:
     )
 
 
+def add_not_fitted(page: Page, verdict: Verdict) -> None:
+    """Add what was not fitted, and why."""
+    if not verdict.not_fitted:
+        return
+    page.add_table(
+        Table(
+            (Column("effect"), Column("why"), Column("promised at most", "nat", numeric=True)),
+            [(item.identifier, item.reason, number(item.gain, 2)) for item in verdict.not_fitted],
+        ),
+        "What is not in this table was fitted and compared.",
+        title="Not fitted",
+    )
+
+
 def add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
     """Add scores before and after."""
-    if investigation.verdict.kind is not VerdictKind.NAMED:
+    if investigation.verdict.kind not in NAMING:
         page.add_notice(
             f'The model "with the effect" has {added_label(investigation)} here, which is not named: '
             "the figures "

@@ -6,6 +6,7 @@ from discrepancy.report.grounds import (
     add_data,
     add_gates,
     add_inclusion,
+    add_not_fitted,
     add_origin,
     add_proof,
     add_self_calibration,
@@ -47,6 +48,7 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
 
     page.add_section("Verdict")
     add_verdict(page, content)
+    show("shares")
     if verdict.kind is VerdictKind.DATA_ERROR:
         add_data(page, investigation)
         add_origin(page, origin)
@@ -63,6 +65,7 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
     add_gates(page, investigation)
     show("evidence")
     add_inclusion(page, investigation)
+    add_not_fitted(page, verdict)
     add_parameters(page, investigation)
     if investigation.proof is not None:
         page.add_section("Proof on held-out trials")

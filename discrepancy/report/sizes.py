@@ -12,8 +12,8 @@ from discrepancy.files.patch import PrimitiveInterval
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.wing import WingModel
-from discrepancy.report.text import rounded, unit_text
-from discrepancy.verdict import NamedEffect, VerdictKind
+from discrepancy.report.text import NAMING, rounded, unit_text
+from discrepancy.verdict import NamedEffect
 from discrepancy.workflow import Investigation
 from fe.runtime.patch import CHANNEL_UNIT, ModelPatch, Primitive
 
@@ -65,7 +65,7 @@ def size_sentence(
     """Return the sizes of the effects of a patch in one sentence; empty where none has a unit."""
     model, campaign = investigation.model, investigation.campaign
     sizes = [si_sizes(e.patch, row, model, campaign) for e, row in zip(effects, intervals, strict=True)]
-    named = investigation.verdict.kind is VerdictKind.NAMED
+    named = investigation.verdict.kind in NAMING
     parts = [
         size if named and len(effects) == 1 else f"{effect.name} {size}"
         for effect, size in zip(effects, sizes, strict=True)

@@ -12,6 +12,8 @@ MEANING = {
     VerdictKind.NOTHING_MISSING: "No effect of the catalogue is needed: what the model leaves is noise.",
     VerdictKind.NAMED: "The name has the probability, the evidence and the fit that a name needs: it passed "
     "every gate that could be applied.",
+    VerdictKind.NAMED_IN_PART: "The name is the most probable one and closes most of the gap on trials that "
+    "it did not see, but what it leaves is more than noise and has no name: the numbers hold as far as that.",
     VerdictKind.FAMILY: "The kind of the effect is known, its exact law is not one of the catalogue: the "
     "shape below was fitted.",
     VerdictKind.GROUP: "Something is missing. Each member of the group fits the data; the figures after "
@@ -30,6 +32,9 @@ UNJUDGED = {
     "absolute fit could not be applied: it is not known whether that is all.",
 }
 """The same, where the absolute fit could not be judged: no noise record, or too few readings."""
+
+NAMING = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
+"""Verdicts that say what is missing, if not all of it."""
 
 LARGEST_PLAIN = 1e6
 """Numbers from here on have a power of ten."""
@@ -122,6 +127,27 @@ def headline(verdict: Verdict) -> str:
     if about is None:
         return text + "."
     return f"{text} ({about} {probability_text(verdict.probability)})."
+
+
+def shares_sentence(verdict: Verdict) -> str:
+    """Return what the mean square of the gap is made of, and what is left; empty where it is not known."""
+    found = verdict.explained
+    if found is None:
+        return ""
+    whose = "The best hypothesis takes" if verdict.kind is VerdictKind.UNEXPLAINED else "The effect takes"
+    return (
+        f"{whose} {percent(found.effect)} % of the mean square on {found.trials} trials, in units of the "
+        f"noise; {percent(found.remainder)} % is left without a name and {percent(found.noise)} % is noise."
+    )
+
+
+def remainders_sentence(verdict: Verdict) -> str:
+    """Return what is left in which channel, over what time; empty without a remainder."""
+    parts = []
+    for item in verdict.remainders:
+        swing = f", swinging at {number(item.frequency)} Hz" if item.frequency > 0.0 else ""
+        parts.append(f"{item.channel} {number(item.size, 2)} noises over {number(item.time, 2)} s{swing}")
+    return f"What is left beside the noise: {'; '.join(parts)}." if parts else ""
 
 
 def meaning(verdict: Verdict) -> str:

@@ -36,6 +36,10 @@ class Hypotheses:
         Fitted to convergence.
     rough : dict of Key to CandidateFit
         Fitted by few steps only; their evidence is approximate.
+    judged : dict of Key to CandidateFit
+        Fitted with their remainders; where there are any, they alone are compared.
+    promised : dict of str to float
+        The most that a screen at the fit without effect promised of each effect [nat].
     """
 
     problem: Problem
@@ -43,6 +47,8 @@ class Hypotheses:
     none: CandidateFit
     exact: dict[Key, CandidateFit] = field(default_factory=dict)
     rough: dict[Key, CandidateFit] = field(default_factory=dict)
+    judged: dict[Key, CandidateFit] = field(default_factory=dict)
+    promised: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.exact[()] = self.none
@@ -68,12 +74,26 @@ class Hypotheses:
         return found.log_evidence + self.log_prior(found.candidate)
 
     def all(self) -> dict[Key, CandidateFit]:
-        """Return every candidate, the exact fit where there is one."""
-        return {**self.rough, **self.exact}
+        """Return every candidate that is compared, the exact fit where there is one."""
+        return self.judged or {**self.rough, **self.exact}
 
     def best(self) -> CandidateFit:
         """Return the most probable candidate."""
-        return max(self.exact.values(), key=self.score)
+        return max((self.judged or self.exact).values(), key=self.score)
+
+    def fitted(self) -> frozenset[str]:
+        """Return the identifiers of all effects that were fitted, alone or with others."""
+        kept = (*self.rough.values(), *self.exact.values(), *self.judged.values())
+        return frozenset(term.effect.identifier for item in kept for term in item.candidate.terms)
+
+    @property
+    def nothing(self) -> CandidateFit:
+        """The fit without effect as it is compared, with its remainder where others have theirs."""
+        return self.judged.get((), self.none)
+
+    def judge(self, fits: dict[Key, CandidateFit]) -> None:
+        """Compare these from now on."""
+        self.judged = fits
 
     def set_probabilities(self) -> dict[tuple[str, ...], float]:
         """Return the probability of each set of identifiers, places summed, most probable first."""

@@ -46,7 +46,12 @@ class Search(Hypotheses):
     def screened(self, base: CandidateFit, effects: Iterable[Effect]) -> dict[str, list[Change]]:
         """Return for each effect its most promising changes, best first, at different places or values."""
         screen = Screen(self.problem, base)
-        return {effect.identifier: starts(screen, effect) for effect in effects}
+        found = {effect.identifier: starts(screen, effect) for effect in effects}
+        if not base.candidate.terms:
+            self.promised |= {
+                name: max((change.gain for change in changes), default=0.0) for name, changes in found.items()
+            }
+        return found
 
     def scan(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
         """Fit every effect roughly in addition to those of `base`; return the best of each, best first.
@@ -120,6 +125,8 @@ class Search(Hypotheses):
     def exactly(self, rough: CandidateFit) -> CandidateFit:
         """Fit a candidate to convergence from a rough fit, and keep it."""
         key = key_of(rough.candidate)
+        if key in self.judged:
+            return self.judged[key]
         found = self.exact.get(key)
         if found is None or found.log_evidence < rough.log_evidence - SEARCH.gained_again:
             again = attempt(self.problem, rough.candidate, rough.point)

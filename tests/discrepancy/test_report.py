@@ -22,7 +22,7 @@ from discrepancy.files.document import Origin
 from discrepancy.files.patch import primitive_intervals, read_patch
 from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import read_verdict
-from discrepancy.judgement.naming import named_effects
+from discrepancy.judgement.conclusion import named_effects
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability, separability
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.model_choice import ModelKind, choose_model
@@ -50,7 +50,16 @@ from discrepancy.report.residual_figures import (
     size_table,
 )
 from discrepancy.report.sizes import si_sizes, size_sentence
-from discrepancy.report.text import formula, headline, listing, number, probability_text, rounded
+from discrepancy.report.text import (
+    formula,
+    headline,
+    listing,
+    number,
+    probability_text,
+    remainders_sentence,
+    rounded,
+    shares_sentence,
+)
 from discrepancy.self_calibration import (
     NOTHING,
     outcome_of,
@@ -60,7 +69,7 @@ from discrepancy.self_calibration import (
 )
 from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.sources.simulated_campaigns import Simulator
-from discrepancy.verdict import Verdict, VerdictKind
+from discrepancy.verdict import ExplainedShare, NotFitted, RemainderEstimate, Verdict, VerdictKind
 from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
 from discrepancy.workflow import Investigation, investigate, patch_draws
 from fe.runtime.patch import (
@@ -363,7 +372,7 @@ def test_gates_say_what_they_compare(drag: Investigation) -> None:
     page.add_section("c")
     add_gates(page, drag)
     text = page.render()
-    absolute, shape, consistency = drag.verdict.gates
+    absolute, shape, consistency, _ = drag.verdict.gates
     for gate in (absolute, consistency):
         assert f"p = {gate.statistic:.2g}</td>" in text
         assert f"p at least {gate.limit:g}</td>" in text
@@ -373,7 +382,7 @@ def test_gates_say_what_they_compare(drag: Investigation) -> None:
 def test_the_gate_that_decided_stands_out_where_the_absolute_fit_could_not_be_judged(
     drag: Investigation,
 ) -> None:
-    absolute, shape, consistency = drag.verdict.gates
+    absolute, shape, consistency, _ = drag.verdict.gates
     gates = (
         replace(absolute, passed=None, statistic=float("nan")), shape,
         replace(consistency, passed=False, statistic=2e-5),
@@ -558,3 +567,28 @@ def test_models_that_cannot_be_used(name: str, message: str, tmp_path: Path) -> 
     (tmp_path / "design.toml").write_text("name = 'half a wing'\n", encoding="utf-8")
     with pytest.raises(ModelError, match=message):
         choose_model(tmp_path / name if "." in name else name)
+
+
+def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(drag: Investigation) -> None:
+    verdict = replace(
+        drag.verdict,
+        kind=VerdictKind.NAMED_IN_PART,
+        explained=ExplainedShare(0.94, 0.92, 0.953, 3.1, 0.9, 0.06, 0.04, "held-out"),
+        remainders=(RemainderEstimate("displacement", 3.1, 0.25, 2.0),),
+        not_fitted=(NotFitted("washout", "No flight trial."), NotFitted("free_play", "screened out", 0.3)),
+    )
+    content = ReportInput(replace(drag, verdict=verdict), ORIGIN)
+    figures = report_figures(content)
+    assert figures["shares"].title == "What the gap is made of"
+    text = render_report(content, draw({"shares": figures["shares"]}), {"shares": figures["shares"]})
+    text = text.replace("\N{NO-BREAK SPACE}", " ")
+    for words in (
+        "90.0 % of the mean square on held-out trials",
+        "displacement 3.1 noises over 0.25 s, swinging at 2 Hz",
+        "of the gap explained on held-out trials, 92 to 95 %",
+        "No flight trial.",
+        "closes most of the gap on trials that it did not see",
+    ):
+        assert words in text
+    assert shares_sentence(replace(verdict, explained=None)) == ""
+    assert remainders_sentence(replace(verdict, remainders=())) == ""

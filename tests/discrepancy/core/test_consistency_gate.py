@@ -197,7 +197,9 @@ def test_what_fails_the_gate_is_not_named(kit) -> None:  # type: ignore[no-untyp
     effects = (kit.offset_effect(),)
     verdict, _, _ = name(changed(truth), effects)
     assert verdict.kind is VerdictKind.NAMED, verdict.sentence
-    assert [gate.name for gate in verdict.gates] == ["absolute fit", "shape", "consistency"]
+    assert [gate.name for gate in verdict.gates] == [
+        "absolute fit", "shape", "consistency", "held-out trials",
+    ]  # fmt: skip
     verdict, _, _ = name(changed(truth, size=dict.fromkeys(STATIONS, 1.05)), effects)
     assert verdict.kind is VerdictKind.UNEXPLAINED, verdict.sentence
     assert "static loads" in verdict.sentence

@@ -13,7 +13,7 @@ from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.posterior import ensemble, with_draws
 from discrepancy.fits.screening import Screen
-from discrepancy.judgement.naming import named_effects
+from discrepancy.judgement.conclusion import named_effects
 from discrepancy.workflow import patch_draws
 from fe.runtime.patch import ModelPatch, RunOffset
 

@@ -23,9 +23,12 @@ from discrepancy.judgement.proof import prove
 from discrepancy.verdict import (
     Estimate,
     Experiment,
+    ExplainedShare,
     Gate,
     Hypothesis,
     NamedEffect,
+    NotFitted,
+    RemainderEstimate,
     Verdict,
     VerdictKind,
 )
@@ -61,6 +64,9 @@ VERDICT = Verdict(
     next_experiments=(Experiment("Release at half the amplitude", 0.6, 1.0, "Tells A from 1/A."),),
     remarks=("Trial 3 was clipped.",),
     resembles=("a line at 50 Hz",),
+    explained=ExplainedShare(0.94, 0.92, 0.95, 3.1, 0.9, 0.06, 0.04, "held-out"),
+    remainders=(RemainderEstimate("x1", 2.5, 0.3, 0.0),),
+    not_fitted=(NotFitted("free_play", "screened out", 0.3), NotFitted("washout", "no flight")),
 )
 
 
@@ -80,7 +86,7 @@ def test_a_verdict_comes_back_equal(tmp_path: Path, make_bench) -> None:
         assert same(back.proof, content)
         assert back.origin == ORIGIN
     text = path.read_text(encoding="utf-8")
-    assert json.loads(text)["schema"] == "uav-twin verdict 1"
+    assert json.loads(text)["schema"] == "uav-twin verdict 2"
     assert "NaN" not in text
     again = write_verdict(tmp_path / "again.json", VERDICT, content, ORIGIN)
     assert again.read_bytes() == path.read_bytes()
@@ -175,7 +181,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
 
     refused(whole[: len(whole) // 2], "is not valid JSON")
     refused("[]", "no file of this kind")
-    refused(whole.replace("uav-twin verdict 1", "uav-twin verdict 9"), "schema 'uav-twin verdict 9'")
+    refused(whole.replace("uav-twin verdict 2", "uav-twin verdict 9"), "schema 'uav-twin verdict 9'")
     refused(whole.replace('"kind": "named"', '"kind": "guessed"'), "verdict.kind")
     refused(whole.replace('"probability": 0.998', '"probability": "high"'), "verdict.probability")
     refused(whole.replace('"sentence"', '"sentences"', 1), "sentence")
@@ -192,7 +198,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(VerdictFileError, match="There is no file"):
         read_verdict(tmp_path / "nothing.json")
     path.write_text(whole, encoding="utf-8")
-    with pytest.raises(VerdictFileError, match="'uav-twin verdict 1', but 'uav-twin patch 1' is needed"):
+    with pytest.raises(VerdictFileError, match="'uav-twin verdict 2', but 'uav-twin patch 1' is needed"):
         read_patch(path)
 
 
@@ -278,3 +284,14 @@ def test_residual_file_carries_units_and_refuses_damage(tmp_path: Path, make_ben
     xr.Dataset(attrs={"schema": "other"}).to_netcdf(path, engine="h5netcdf")
     with pytest.raises(VerdictFileError, match="'other'"):
         read_residuals(path)
+
+
+def test_files_of_the_first_number_are_read(tmp_path: Path) -> None:
+    path = write_verdict(tmp_path / "verdict.json", VERDICT, None, ORIGIN)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    content["schema"] = "uav-twin verdict 1"
+    for key in ("explained", "remainders", "not_fitted"):
+        del content["verdict"][key]
+    path.write_text(json.dumps(content), encoding="utf-8")
+    found = read_verdict(path).verdict
+    assert same(found, replace(VERDICT, explained=None, remainders=(), not_fitted=()))
