@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from discrepancy.campaign.noise import noise_model
 from discrepancy.campaign.noise_records import pre_trigger_record, with_noise
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
-from discrepancy.campaign.sampling import check_sampling
+from discrepancy.campaign.sampling import check_sampling, nearly_even, spacing_sentence
 from discrepancy.campaign.schema import (
     INPUT_COLUMNS,
     CampaignSection,
@@ -73,6 +74,7 @@ def read_campaign(folder: str | Path) -> Campaign:
     )
     _check_every_channel_is_measured(section, trials, tables)
     channels = _channels(section, printed, tables, trials, remarks)
+    remarks += _not_whitened(channels, trials)
     return Campaign(
         name=section.name,
         channels=channels,
@@ -133,6 +135,8 @@ def _trial(
     start = section.start or 0.0
     if dynamic:
         time = check_sampling(table.numbers("time", user), table.cells("time", user), user, table.name)
+        uneven = spacing_sentence(time, user)
+        remarks += [] if uneven is None else [f"{table.name}: {uneven}"]
     elif "time" in table.columns:
         time = table.numbers("time", user)
         start = section.start if section.start is not None else float(time[0])
@@ -334,6 +338,29 @@ def _channels(
     return channels
 
 
+def _not_whitened(channels: Mapping[str, Channel], trials: tuple[Trial, ...]) -> list[str]:
+    """Return a sentence for each channel whose coloured noise cannot be whitened in some trial."""
+    found = []
+    for name, channel in channels.items():
+        noise = noise_model(channel, 1.0)
+        if not noise.autoregression.size:
+            continue
+        where = [
+            trial.name
+            for trial in trials
+            if trial.is_dynamic
+            and name in trial.channels
+            and (trial.whitened_at is None or not noise.applies(trial.whitened_at))
+        ]
+        if where:
+            found.append(
+                f"The noise of the channel {name!r} is coloured, and its record is not sampled like the "
+                f"{counted(len(where), 'trial')} {', '.join(map(repr, where))}: there its samples count as "
+                "independent, so that probabilities are too sharp; record the noise at the trials' sampling."
+            )
+    return found
+
+
 def _recorded_noise(section: CampaignSection, tables: Mapping[str, TextTable]) -> dict[str, NoiseRecord]:
     """Return the records of the samples at rest; a shorter record has empty cells at its end."""
     if section.noise is None:
@@ -343,7 +370,7 @@ def _recorded_noise(section: CampaignSection, tables: Mapping[str, TextTable]) -
     interval = section.noise.interval
     if interval is None:
         time = check_sampling(table.numbers("time", user), table.cells("time", user), user, table.name)
-        interval = float(time[-1] - time[0]) / (len(time) - 1)
+        interval = float(time[-1] - time[0]) / (len(time) - 1) if nearly_even(time) else None
     records = {}
     for item in section.channel:
         if item.table_column not in table.columns:

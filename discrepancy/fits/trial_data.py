@@ -56,8 +56,8 @@ class TrialData:
         chosen = range(len(self.deviation)) if channels is None else channels
         at = slice(None) if channels is None else list(channels)
         scaled = columns / self.deviation[at]
-        if self.trial.is_dynamic:
-            interval = self.trial.interval
+        interval = self.trial.whitened_at
+        if interval is not None:
             for number, channel in enumerate(chosen):
                 noise = self.noise[channel]
                 if noise.applies(interval):
@@ -69,7 +69,7 @@ class TrialData:
         """Return a trial of a campaign with its noise, by the noise models of the channels."""
         names = list(campaign.channels)
         noise = tuple(models[name] for name in trial.channels)
-        interval = trial.interval if trial.is_dynamic else None
+        interval = trial.whitened_at
         deviation = trial.noise_factor * np.array(
             [
                 item.standard_deviation
