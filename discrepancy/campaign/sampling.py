@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,18 +87,23 @@ def nearly_even(time: FloatArray) -> bool:
     return bool(np.max(np.abs(steps - usual)) <= ALIKE * usual)
 
 
-def spacing_sentence(time: FloatArray, user: str) -> str | None:
-    """Return what a reader has to know of uneven stamps, None where they are even."""
-    if is_even(time):
+def spacing_sentence(times: Mapping[str, FloatArray]) -> str | None:
+    """Return what a reader has to know of uneven stamps, by trial; None where all are even."""
+    uneven = {name: time for name, time in times.items() if not is_even(time)}
+    if not uneven:
         return None
-    steps = np.diff(time)
-    usual, widest = float(np.median(steps)), int(np.argmax(steps))
+    steps = np.concatenate([np.diff(time) for time in uneven.values()])
+    usual = float(np.median(steps))
+    names = ", ".join(map(repr, uneven))
     text = (
-        f"The samples of {user} are not evenly spaced (steps of {steps.min():.4g} to {steps.max():.4g} s, "
-        f"usually {usual:.4g} s): they are taken as stamped, and spectra are approximate."
+        f"The samples of the {'trial' if len(uneven) == 1 else 'trials'} {names} are not evenly spaced "
+        f"(steps of {steps.min():.4g} to {steps.max():.4g} s, usually {usual:.4g} s): they are taken as "
+        "stamped, and spectra are approximate."
     )
-    if steps[widest] > 1.5 * usual:
-        text += f" The widest gap, {steps[widest]:.4g} s, begins at {time[widest]:.6g} s."
+    if steps.max() > 1.5 * usual:
+        name, time = max(uneven.items(), key=lambda item: float(np.diff(item[1]).max()))
+        at = float(time[int(np.argmax(np.diff(time)))])
+        text += f" The widest gap, {steps.max():.4g} s, begins at {at:.6g} s of {name!r}."
     return text
 
 

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 from discrepancy.campaign.records import Quantity
 
-
 STANDARD_GRAVITY = 9.80665
 """m/s^2 in one g, exact by definition."""
 
@@ -114,7 +113,7 @@ def shifted(text: str, power: int) -> float:
 
 
 def in_unit(value: float, quantity: Quantity, unit: str) -> str:
-    """Return the text of an SI value in a unit; `si_value` gives it back exactly if that is a power of ten."""
+    """Return the text of an SI value in a unit; `si_value` gives it back, exactly for a power of ten."""
     power = power_of_ten(quantity, unit)
     if power is None:
         return repr(value / UNITS[quantity].factors[unit])

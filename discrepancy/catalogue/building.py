@@ -24,6 +24,7 @@ KIND_NAMES = {
     TrialKind.STATIC: "static",
     TrialKind.RINGDOWN: "ring-down",
     TrialKind.FORCED: "forced",
+    TrialKind.DRIVEN: "driven",
     TrialKind.FLIGHT: "flight",
 }
 """How a kind of trial is called in a sentence."""
@@ -33,8 +34,8 @@ NO_PORT = "has no port where an internal force can act"
 
 
 EVERY_TRIAL = frozenset(TrialKind)
-DYNAMIC = frozenset({TrialKind.RINGDOWN, TrialKind.FORCED})
-LOADED = frozenset({TrialKind.STATIC, TrialKind.FORCED})
+DYNAMIC = frozenset({TrialKind.RINGDOWN, TrialKind.FORCED, TrialKind.DRIVEN})
+LOADED = frozenset({TrialKind.STATIC, TrialKind.FORCED, TrialKind.DRIVEN})
 
 TEMPERATURE_STEP = 0.1
 """Least range of temperatures [K] in a campaign from which an effect of temperature can show."""

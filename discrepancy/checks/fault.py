@@ -22,9 +22,10 @@ class FaultKind(StrEnum):
     INPUT_SLIP = "input slip"  # force or load factor of a trial in another unit
     SIGN = "sign"
     SWAPPED = "swapped"
+    UNOBSERVABLE = "unobservable parameter"
 
 
-HARMLESS = frozenset({FaultKind.NO_NOISE_RECORD, FaultKind.NOISE_LABEL})
+HARMLESS = frozenset({FaultKind.NO_NOISE_RECORD, FaultKind.NOISE_LABEL, FaultKind.UNOBSERVABLE})
 """Faults that limit what can be concluded, but do not make the data wrong."""
 
 

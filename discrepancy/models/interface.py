@@ -7,7 +7,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Quantity, Trial
+from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
+from discrepancy.errors import ModelError
 from fe.runtime.patch import ModelPatch, Primitive
 
 FloatArray = NDArray[np.float64]
@@ -124,12 +125,22 @@ class Conditions:
         (rate, zero): a sample stamped t shows the motion at (1 + rate) t + zero [1], [s].
     health : (N, 2) ndarray
         Stiffness losses z1, z2 of each row (dynamic trials: row 0 holds for all).
+    offset : tuple of float
+        Constants that the recorded inputs of a driven trial lack, in their order [SI]; empty: none.
     """
 
     parameters: FloatArray
     initial: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     clock: tuple[float, float] = (0.0, 0.0)
     health: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
+    offset: tuple[float, ...] = ()
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """All of it as a value that can be looked up."""
+        return (
+            self.parameters.tobytes(), self.initial.tobytes(), self.clock, self.health.tobytes(), self.offset,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -217,3 +228,13 @@ class Model(Protocol):
         ModelError
             If the model lacks an output or cannot carry a primitive.
         """
+
+
+def check_plain(trial: Trial, what: str) -> None:
+    """Refuse a driven trial, and a forced one that is not settled, for a model that cannot follow them."""
+    if trial.kind is TrialKind.DRIVEN or trial.begins is not Start.SETTLED:
+        came = "is driven" if trial.kind is TrialKind.DRIVEN else f"begins {trial.begins.value}"
+        raise ModelError(
+            f"The trial {trial.name!r} {came}, which {what} cannot follow: describe the rig as a lumped "
+            "model, or record it forced from rest."
+        )

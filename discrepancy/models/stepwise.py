@@ -265,7 +265,7 @@ def advance(
     feed: FloatArray,
     memory: FloatArray | None,
 ) -> ModalMotion:
-    """Return the motion at the stamps of known steps; arguments as of `simulate_at` and `stepwise_kernel.Steps`."""
+    """Return the motion at the stamps of known steps; for arguments see `simulate_at` and `Steps`."""
     modes, count = len(q), len(boundaries.sample)
     result = ModalMotion(
         np.empty((count, modes)), np.empty((count, modes)), np.empty((count, len(laws))),

@@ -49,7 +49,7 @@ class SensorRecord:
     channels : sequence of (str, str)
         Name and quantity of each column.
     kind : str
-        "static", "flight", "ringdown" or "forced".
+        "static", "flight", "ringdown", "forced" or "driven".
     time : (N,) ndarray
         Dynamic: since the trial's start [s]. Static, flight: since the campaign's start [s].
     start : float
@@ -73,7 +73,7 @@ class SensorRecord:
     @property
     def is_dynamic(self) -> bool:
         """Whether the rows are samples of a motion."""
-        return self.kind in ("ringdown", "forced")
+        return self.kind in ("ringdown", "forced", "driven")
 
 
 def uses_sensors(patch: ModelPatch) -> bool:

@@ -165,7 +165,7 @@ def campaigns(draw: st.DrawFn) -> Campaign:
     trials = []
     for index in range(draw(st.integers(1, 3))):
         kind = draw(st.sampled_from(TrialKind))
-        dynamic = kind in (TrialKind.RINGDOWN, TrialKind.FORCED)
+        dynamic = kind not in (TrialKind.STATIC, TrialKind.FLIGHT)
         count = draw(st.integers(8, 20)) if dynamic else draw(st.integers(1, 5))
         # The first trial measures every channel: one that is measured nowhere is refused.
         chosen = draw(st.permutations(channel_names))[: None if index == 0 else draw(st.integers(1, 3))]
