@@ -162,6 +162,16 @@ def _ports(preferred: tuple[str, ...], setting: Setting) -> tuple[str, ...]:
     return tuple(port for port in preferred if port in known) or known
 
 
+def at_held_ports(*preferred: str) -> Places:
+    """Return the same without ports that nothing holds, for forces that depend on where a port is."""
+    return partial(_held_ports, preferred)
+
+
+def _held_ports(preferred: tuple[str, ...], setting: Setting) -> tuple[str, ...]:
+    free = {name for name, scale in setting.scales.ports.items() if scale.free}
+    return tuple(port for port in _ports(preferred, setting) if port not in free)
+
+
 def over_the_planform(*beside: str) -> Places:
     """Return the places of a force that is spread over the structure, and of the like at ports `beside`.
 

@@ -59,6 +59,8 @@ class PortScale:
     spread : tuple of (float, float)
         Where a force at the port acts: its share, and the motion there over that of the port, by place. A
         force that is spread over the wing acts on the motion of each place, and A is the mean's.
+    free : bool
+        Whether nothing holds the port (a body that falls or rolls), so that no place is its zero.
     """
 
     displacement: float
@@ -67,6 +69,7 @@ class PortScale:
     static_stiffness: float | None = None
     largest_displacement: float | None = None
     spread: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
+    free: bool = False
 
     def mean_power(self, exponent: float) -> float:
         """Return the mean of |motion / A|^exponent over the places where a force at the port acts."""

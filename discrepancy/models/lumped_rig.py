@@ -345,7 +345,10 @@ class PortSizes:
             still = 1.0 / float(np.sum(weight[seen] / frequency[seen] ** 2))
             w = float(frequency[first])
             return PortScale(amount, w**2 / float(weight[first]), w, still, largest or 1.0)
-        return PortScale(amount, (force or 1.0) / amount, (speed or 1.0) / amount, None, largest or amount)
+        free = not np.any(frequency[seen] > 0.0)
+        return PortScale(
+            amount, (force or 1.0) / amount, (speed or 1.0) / amount, None, largest or amount, free=free
+        )
 
 
 def rig_scales(
