@@ -13,6 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.campaign.units import si_value, units_of
 from discrepancy.checks.fault import DataFault, FaultKind
+from discrepancy.checks.holds import hold_sentence
 from discrepancy.checks.observability import unobservable
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
@@ -64,6 +65,9 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     scales = {key: scale for key, scale in scales.items() if key[0] not in exchanged}
     faults += _slips(campaign, scales)
     faults += _signs(campaign, scales)
+    for trial in campaign.trials:
+        said = hold_sentence(campaign, model, trial, prior_mean(campaign, model, trial))
+        faults += [] if said is None else [DataFault(FaultKind.BETWEEN_SAMPLES, said, trial=trial.name)]
     if any(trial.kind is TrialKind.DRIVEN for trial in campaign.fitted) and model.parameters:
         sentence = unobservable(campaign, model)
         faults += [] if sentence is None else [DataFault(FaultKind.UNOBSERVABLE, sentence)]

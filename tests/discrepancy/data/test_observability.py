@@ -119,3 +119,17 @@ def test_only_plausible_unit_slips_are_looked_for(tmp_path: Path, model: LumpedM
     assert slips(1000.0)  # mm for m, or kN for N
     assert not slips(100.0)
     assert not slips(9.81)
+
+
+@pytest.mark.parametrize(("samples", "said"), [(9, True), (200, False)])
+def test_it_is_said_where_straight_lines_are_too_coarse(
+    tmp_path: Path, model: LumpedModel, samples: int, said: bool
+) -> None:
+    time = np.arange(12 * samples) / samples
+    rows = [f"{t!r},{float(1.0 * np.sin(2.0 * np.pi * t))!r},{10.0 * t!r}" for t in time.tolist()]
+    (tmp_path / "push.csv").write_text("\n".join(["time,motor,x", *rows]))
+    (tmp_path / "campaign.toml").write_text(TOML)
+    faults = check_against_model(read_campaign(tmp_path), model)
+    found = [fault for fault in faults if fault.kind is FaultKind.BETWEEN_SAMPLES]
+    assert bool(found) is said
+    assert not said or "straight lines and curves between the samples of 'motor'" in found[0].sentence
