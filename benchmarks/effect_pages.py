@@ -20,7 +20,7 @@ from reporting.files import atomic_write_bytes, atomic_write_text
 
 FOLDER = Path(__file__).parents[1] / "docs" / "effects"
 
-LETTERS = {"static": "S", "ring-down": "R", "forced": "O", "flight": "F"}
+LETTERS = {"static": "S", "ring-down": "R", "forced": "O", "driven": "D", "flight": "F"}
 
 
 def paragraphs() -> dict[str, Any]:

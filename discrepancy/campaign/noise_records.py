@@ -18,15 +18,16 @@ SAME_INPUT = 1e-6
 _LEAST_DEGREES = 3
 
 
-def pre_trigger_record(samples: FloatArray, interval: float, name: str, source: str) -> NoiseRecord:
+def pre_trigger_record(samples: FloatArray, interval: float | None, name: str, source: str) -> NoiseRecord:
     """Return the noise record of samples at rest: mean removed, deviation with n - 1 degrees of freedom.
 
     Parameters
     ----------
     samples : (n,) ndarray
         [channel's unit].
-    interval : float
-        Of sampling [s].
+    interval : float or None
+        Of sampling [s]; None where the samples are not evenly spaced, so that nothing is known of their
+        correlation in time.
     name, source : str
         Channel and file, for error messages.
 

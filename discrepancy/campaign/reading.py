@@ -12,8 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.noise_records import pre_trigger_record, with_noise
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
-from discrepancy.campaign.sampling import check_sampling
+from discrepancy.campaign.records import (
+    Campaign,
+    Channel,
+    NoiseRecord,
+    Quantity,
+    RecordedInput,
+    Release,
+    Start,
+    Trial,
+    TrialKind,
+)
+from discrepancy.campaign.remarks import remarks_on
+from discrepancy.campaign.sampling import check_sampling, nearly_even
 from discrepancy.campaign.schema import (
     INPUT_COLUMNS,
     CampaignSection,
@@ -74,6 +85,7 @@ def read_campaign(folder: str | Path) -> Campaign:
     )
     _check_every_channel_is_measured(section, trials, tables)
     channels = _channels(section, printed, tables, trials, remarks)
+    remarks += remarks_on(section, channels, trials)
     return Campaign(
         name=section.name,
         channels=channels,
@@ -129,7 +141,7 @@ def _trial(
     remarks: list[str],
 ) -> Trial:
     user = f"the trial {section.name!r}"
-    dynamic = section.kind in (TrialKind.RINGDOWN, TrialKind.FORCED)
+    dynamic = section.kind not in (TrialKind.STATIC, TrialKind.FLIGHT)
     count = len(table)
     start = section.start or 0.0
     if dynamic:
@@ -150,6 +162,7 @@ def _trial(
     forced = section.kind in (TrialKind.STATIC, TrialKind.FORCED)
     chosen = _measured(section, table, campaign)
     known = {*INPUT_COLUMNS, *(channel.table_column for channel in campaign.channel)}
+    known |= {item.table_column for item in campaign.input}
     unknown = [name for name in table.columns if name not in known]
     if unknown:
         remarks.append(
@@ -158,6 +171,7 @@ def _trial(
         )
     columns, used = zip(*(_readings(channel, section, table, remarks) for channel in chosen), strict=True)
     health, health_deviation = _health(section, table, user)
+    inputs = _inputs(section, table, campaign, user)
     return Trial(
         name=section.name,
         kind=section.kind,
@@ -165,7 +179,7 @@ def _trial(
         values=np.stack(columns, axis=1),
         used=np.stack(used, axis=1),
         time=time,
-        force=table.numbers("force", user) if forced else zeros,
+        force=table.numbers("force", user) if forced else _first_force(inputs, zeros),
         load_factor=table.numbers("load_factor", user) if section.kind is TrialKind.FLIGHT else zeros,
         load_place=section.load_place,
         temperature=_temperature(section, table, campaign, user),
@@ -178,7 +192,38 @@ def _trial(
         else _release(section.release, str(printed["release"]["displacement"])),
         held_out=section.held_out,
         noise_factor=section.noise_factor,
+        begins=section.begins or Start.SETTLED,
+        inputs=inputs,
     )
+
+
+def _first_force(inputs: tuple[RecordedInput, ...], nothing: FloatArray) -> FloatArray:
+    """Return the first force or torque among recorded inputs."""
+    pushing = (item.values for item in inputs if item.quantity in (Quantity.FORCE, Quantity.TORQUE))
+    return next(pushing, nothing)
+
+
+def _inputs(
+    section: TrialSection,
+    table: TextTable,
+    campaign: CampaignSection,
+    user: str,
+) -> tuple[RecordedInput, ...]:
+    """Return the recorded inputs of a driven trial: those whose columns are there."""
+    if section.kind is not TrialKind.DRIVEN:
+        return ()
+    found = []
+    for item in campaign.input:
+        if item.table_column not in table.columns:
+            continue
+        values = table.numbers(
+            item.table_column,
+            user,
+            lambda text, item=item: si_value(text, item.quantity, item.unit),  # type: ignore[misc]
+        )
+        offset = si_value(repr(item.offset_deviation), item.quantity, item.unit)
+        found.append(RecordedInput(item.name, item.quantity, values, item.holds, offset))
+    return tuple(found)
 
 
 def _measured(
@@ -347,7 +392,7 @@ def _recorded_noise(section: CampaignSection, tables: Mapping[str, TextTable]) -
     interval = section.noise.interval
     if interval is None:
         time = check_sampling(table.numbers("time", user), table.cells("time", user), user, table.name)
-        interval = float(time[-1] - time[0]) / (len(time) - 1)
+        interval = float(time[-1] - time[0]) / (len(time) - 1) if nearly_even(time) else None
     records = {}
     for item in section.channel:
         if item.table_column not in table.columns:

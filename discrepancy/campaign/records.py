@@ -6,28 +6,49 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from discrepancy.campaign.sampling import is_even, nearly_even
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
 class Quantity(StrEnum):
-    """What a channel measures; the unit of its values here."""
+    """What a channel or an input is; the unit of its values here is that of `units.UNITS`."""
 
-    STRAIN = "strain"  # 1
-    DISPLACEMENT = "displacement"  # m
-    VELOCITY = "velocity"  # m/s
-    ACCELERATION = "acceleration"  # m/s^2
+    STRAIN = "strain"
+    DISPLACEMENT = "displacement"
+    VELOCITY = "velocity"
+    ACCELERATION = "acceleration"
     SIGNAL = "signal"  # uncalibrated, e.g. V: the channel's gain is unknown and fitted
+    ANGLE = "angle"
+    ANGULAR_VELOCITY = "angular_velocity"
+    ANGULAR_ACCELERATION = "angular_acceleration"
+    FORCE = "force"
+    TORQUE = "torque"
+    PRESSURE = "pressure"
+    LEVEL = "level"
+    FLOW = "flow"
+    TEMPERATURE = "temperature"
+    HEAT = "heat"
+    VOLTAGE = "voltage"
+    CURRENT = "current"
+    CHARGE = "charge"
+
+    @property
+    def moving(self) -> "tuple[Quantity, ...]":
+        """The quantity, if it is of a motion, among those that follow one another by derivation."""
+        return next((family for family in _MOVING if self in family), ())
 
     def derivatives_of(self, output: "Quantity") -> int:
         """Return how often an output of a model is derived in time for a channel of this quantity."""
-        moving = (Quantity.DISPLACEMENT, Quantity.VELOCITY, Quantity.ACCELERATION)
-        if self not in moving or output not in moving:
+        moving = self.moving
+        if output not in moving:
             return 0
         return max(moving.index(self) - moving.index(output), 0)
 
@@ -38,7 +59,54 @@ class Quantity(StrEnum):
     @property
     def is_rate(self) -> bool:
         """Whether it is nought at rest."""
-        return self in (Quantity.VELOCITY, Quantity.ACCELERATION)
+        return self in self.moving[1:]
+
+
+_MOVING = (
+    (Quantity.DISPLACEMENT, Quantity.VELOCITY, Quantity.ACCELERATION),
+    (Quantity.ANGLE, Quantity.ANGULAR_VELOCITY, Quantity.ANGULAR_ACCELERATION),
+)
+
+
+class Hold(StrEnum):
+    """What an input does between its samples."""
+
+    ZERO_ORDER = "zero_order"  # each value is held until the next sample, as a converter does
+    LINEAR = "linear"  # straight lines
+    SMOOTH = "smooth"  # a cubic spline through all samples
+
+
+class Start(StrEnum):
+    """How a trial under recorded inputs began; ring-downs say it by their release."""
+
+    SETTLED = "settled"  # at rest under what acts at the first sample
+    STILL = "still"  # at rest under nothing: displacements, speeds and states are zero
+    UNKNOWN = "unknown"  # anything: the initial state is a nuisance
+
+
+@dataclass(frozen=True)
+class RecordedInput:
+    """What one input of a model was in a trial.
+
+    Attributes
+    ----------
+    name : str
+        Input of the model.
+    quantity : Quantity
+        What it is.
+    values : (N,) ndarray
+        At the samples [SI].
+    hold : Hold
+        Between them.
+    offset_deviation : float
+        Prior standard deviation of a constant that the record lacks in this trial [SI]; zero: none.
+    """
+
+    name: str
+    quantity: Quantity
+    values: FloatArray
+    hold: Hold = Hold.LINEAR
+    offset_deviation: float = 0.0
 
 
 class TrialKind(StrEnum):
@@ -46,7 +114,8 @@ class TrialKind(StrEnum):
 
     STATIC = "static"  # rows are load levels at rest: an applied force
     RINGDOWN = "ringdown"  # rows are samples in time after a release; no external load
-    FORCED = "forced"  # rows are samples in time under a recorded force, from rest
+    FORCED = "forced"  # rows are samples in time under a recorded force
+    DRIVEN = "driven"  # rows are samples in time under any recorded inputs, or none (a fall)
     FLIGHT = "flight"  # rows are steady turns: a load factor
 
 
@@ -154,8 +223,8 @@ class Trial:
     used : (N, C) ndarray of bool
         False where a sample is left out (an outlier, a gap), with the reason in the campaign's `remarks`.
     time : (N,) ndarray
-        Ring-down, forced: time since the trial's start [s], evenly spaced. Static, flight: time of each row
-        since the campaign's start [s].
+        Ring-down, forced: time since the trial's start [s], strictly increasing. Static, flight: time of each
+        row since the campaign's start [s].
     force : (N,) ndarray
         Applied force [N], upwards positive; zero in ring-downs and flights.
     load_factor : (N,) ndarray
@@ -180,6 +249,10 @@ class Trial:
     noise_factor : float
         Standard deviation of the noise in this trial over that of the channels' noise records, as known from
         the acquisition (averaging, another range) [1].
+    begins : Start
+        How a forced or driven trial began.
+    inputs : tuple of RecordedInput
+        Driven trials: what acted. `force` is then the first force or torque among them, or zero.
     """
 
     name: str
@@ -199,16 +272,28 @@ class Trial:
     release: Release | None = None
     held_out: bool = False
     noise_factor: float = 1.0
+    begins: Start = Start.SETTLED
+    inputs: tuple[RecordedInput, ...] = ()
 
     @property
     def is_dynamic(self) -> bool:
         """Whether the rows are samples in time of a motion."""
-        return self.kind in (TrialKind.RINGDOWN, TrialKind.FORCED)
+        return self.kind in (TrialKind.RINGDOWN, TrialKind.FORCED, TrialKind.DRIVEN)
 
     @property
     def interval(self) -> float:
-        """Sampling interval [s] of a dynamic trial."""
+        """Sampling interval [s] of a dynamic trial; the mean one where stamps are uneven."""
         return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
+
+    @cached_property
+    def is_even(self) -> bool:
+        """Whether the stamps of a dynamic trial are even to a thousandth of the interval."""
+        return is_even(self.time)
+
+    @cached_property
+    def whitened_at(self) -> float | None:
+        """Interval [s] at which noise of a dynamic trial can be whitened; None at too uneven stamps."""
+        return self.interval if self.is_dynamic and nearly_even(self.time) else None
 
 
 @dataclass(frozen=True)

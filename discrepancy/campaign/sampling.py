@@ -1,8 +1,8 @@
-"""Sampling in time: even to a thousandth of the interval, without gaps, long enough to be a record."""
+"""Sampling in time: strictly increasing stamps, even to a thousandth of the interval or as they came."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,12 @@ EVEN = 1e-3
 LEAST_SAMPLES = 8
 """Fewest samples of a dynamic record."""
 _EXACT = 1e-9
+ALIKE = 0.1
+"""Largest departure of a step, as a share of the interval, at which a filter of even samples holds."""
 
 
 def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str) -> FloatArray:
-    """Return evenly spaced times.
+    """Return the times of a record: on the even grid where they are even as printed, else as they came.
 
     Times may be printed with few decimals: half a unit of the last one is allowed in addition, and the times
     are then put on the even grid through first and last. Times that are even to 1e-9 stay as they are.
@@ -37,7 +39,7 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
     Raises
     ------
     CampaignDataError
-        Too few samples, a time that does not increase, a gap, or uneven sampling.
+        Too few samples, or a time that does not increase.
     """
     count = len(time)
     if count < LEAST_SAMPLES:
@@ -52,28 +54,57 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
             f"{file}: the time of {user} does not increase after sample {back + 1} ({cells[back]} s, then "
             f"{cells[back + 1]} s); put the samples in order and keep each once."
         )
-    usual = float(np.median(steps))
     # Trailing zeros may be dropped in print, so the finest cell says how many decimals there are.
     rounding = 0.5 * min(_last_digit(cell) for cell in cells)
-    wide = int(np.argmax(steps))
-    if steps[wide] > 1.5 * usual + 2.0 * rounding:
-        raise CampaignDataError(
-            f"{file}: the time of {user} has a gap of {steps[wide]:.4g} s after {cells[wide]} s, and the "
-            "usual "
-            f"interval is {usual:.4g} s; fill it with rows whose readings are empty, or cut the record there."
-        )
-    even: FloatArray = time[0] + (time[-1] - time[0]) / (count - 1) * np.arange(count)
     interval = float(time[-1] - time[0]) / (count - 1)
+    even = even_grid(time)
     off = float(np.max(np.abs(time - even)))
-    if off <= _EXACT * interval:
-        return time
-    if off > EVEN * interval + 2.0 * rounding:
-        raise CampaignDataError(
-            f"{file}: the samples of {user} are up to {off / interval:.2%} of an interval off an even "
-            "spacing of "
-            f"{interval:.4g} s ({EVEN:.1%} is allowed); resample the record evenly."
-        )
-    return even
+    if _EXACT * interval < off <= EVEN * interval + 2.0 * rounding:
+        return even
+    return time
+
+
+def even_grid(time: FloatArray) -> FloatArray:
+    """Return the even grid (N,) through the first and the last of times (N,)."""
+    grid: FloatArray = time[0] + (time[-1] - time[0]) / (len(time) - 1) * np.arange(len(time))
+    return grid
+
+
+def is_even(time: FloatArray) -> bool:
+    """Whether samples lie on an even grid to a thousandth of the interval."""
+    if len(time) < 3:
+        return True
+    interval = float(time[-1] - time[0]) / (len(time) - 1)
+    return bool(np.max(np.abs(time - even_grid(time))) <= EVEN * abs(interval))
+
+
+def nearly_even(time: FloatArray) -> bool:
+    """Whether every step is within a tenth of the interval, so that a filter of even samples still holds."""
+    steps = np.diff(time)
+    if not len(steps):
+        return True
+    usual = float(steps.mean())
+    return bool(np.max(np.abs(steps - usual)) <= ALIKE * usual)
+
+
+def spacing_sentence(times: Mapping[str, FloatArray]) -> str | None:
+    """Return what a reader has to know of uneven stamps, by trial; None where all are even."""
+    uneven = {name: time for name, time in times.items() if not is_even(time)}
+    if not uneven:
+        return None
+    steps = np.concatenate([np.diff(time) for time in uneven.values()])
+    usual = float(np.median(steps))
+    names = ", ".join(map(repr, uneven))
+    text = (
+        f"The samples of the {'trial' if len(uneven) == 1 else 'trials'} {names} are not evenly spaced "
+        f"(steps of {steps.min():.4g} to {steps.max():.4g} s, usually {usual:.4g} s): they are taken as "
+        "stamped, and spectra are approximate."
+    )
+    if steps.max() > 1.5 * usual:
+        name, time = max(uneven.items(), key=lambda item: float(np.diff(item[1]).max()))
+        at = float(time[int(np.argmax(np.diff(time)))])
+        text += f" The widest gap, {steps.max():.4g} s, begins at {at:.6g} s of {name!r}."
+    return text
 
 
 def _last_digit(cell: str) -> float:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from discrepancy.campaign.records import Quantity, TrialKind
+from discrepancy.campaign.records import Hold, Quantity, Start, TrialKind
 from discrepancy.campaign.units import units_of
 from discrepancy.errors import CampaignFileError
 from fe.runtime.patch import EVERY_CHANNEL
@@ -51,14 +51,24 @@ class StatedNoise(Section):
     source: Literal["stated", "repeats", "pre-trigger"] = "stated"
 
 
-class ChannelSection(Section):
-    """`[[channel]]`."""
+class ColumnSection(Section):
+    """What a channel and an input have in common: a column of the tables."""
 
     name: Name
     quantity: Quantity = Field(strict=False)
     unit: Name
-    output: Name
     column: Name | None = None
+
+    @property
+    def table_column(self) -> str:
+        """Column of the tables."""
+        return self.column or self.name
+
+
+class ChannelSection(ColumnSection):
+    """`[[channel]]`."""
+
+    output: Name
     station: Number | None = None
     chord: Number | None = None
     gain_deviation: Deviation = 0.0
@@ -82,10 +92,35 @@ class ChannelSection(Section):
             )
         return self
 
+
+class InputSection(ColumnSection):
+    """`[[input]]`: a recorded input of driven trials."""
+
+    hold: Hold | None = Field(default=None, strict=False)
+    offset_deviation: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.unit not in units_of(self.quantity):
+            raise ValueError(
+                f"the input {self.name!r} is {self.quantity.value} and must have one of the units "
+                f"{', '.join(units_of(self.quantity))}, and {self.unit!r} came"
+            )
+        if self.table_column in INPUT_COLUMNS and self.table_column != "force":
+            raise ValueError(
+                f"the column {self.table_column!r} is reserved: give the input {self.name!r} another column"
+            )
+        if self.quantity.moving and self.hold not in (None, Hold.SMOOTH):
+            raise ValueError(
+                f"the input {self.name!r} is a motion, which no drive makes in steps or corners: leave "
+                "`hold` out, or say smooth"
+            )
+        return self
+
     @property
-    def table_column(self) -> str:
-        """Column of the tables."""
-        return self.column or self.name
+    def holds(self) -> Hold:
+        """What it does between its samples: a motion is smooth, the rest linear unless it is said."""
+        return self.hold or (Hold.SMOOTH if self.quantity.moving else Hold.LINEAR)
 
 
 class ReleaseSection(Section):
@@ -130,6 +165,7 @@ class TrialSection(Section):
     release: ReleaseSection | None = None
     channels: tuple[Name, ...] | None = None
     left_out: dict[str, tuple[Annotated[int, Field(ge=1)], ...]] = Field(default_factory=dict)
+    begins: Start | None = Field(default=None, strict=False)
 
     @field_validator("load_place", mode="before")
     @classmethod
@@ -162,6 +198,11 @@ class TrialSection(Section):
             raise ValueError(f"the ring-down {self.name!r} needs `release` with its displacement")
         if self.kind is not TrialKind.RINGDOWN and self.release is not None:
             raise ValueError(f"the trial {self.name!r} is no ring-down and cannot have a `release`")
+        if self.begins is not None and self.kind not in (TrialKind.FORCED, TrialKind.DRIVEN):
+            raise ValueError(
+                f"the trial {self.name!r} is {self.kind.value}, and `begins` is for forced and driven ones; "
+                "a ring-down says it by its `release`"
+            )
         return self
 
 
@@ -174,10 +215,11 @@ class CampaignSection(Section):
     parameters: dict[Name, ParameterSection] = Field(default_factory=dict)
     noise: NoiseFileSection | None = None
     channel: tuple[ChannelSection, ...] = Field(min_length=1)
+    input: tuple[InputSection, ...] = ()
     trial: tuple[TrialSection, ...] = Field(min_length=1)
     remarks: tuple[str, ...] = ()
 
-    @field_validator("channel", "trial", "remarks", mode="before")
+    @field_validator("channel", "input", "trial", "remarks", mode="before")
     @classmethod
     def _tuple(cls, value: object) -> object:
         return tuple(value) if isinstance(value, list) else value
@@ -186,17 +228,25 @@ class CampaignSection(Section):
     def _check(self) -> Self:
         for kind, names in (
             ("channel", [item.name for item in self.channel]),
+            ("input", [item.name for item in self.input]),
             ("trial", [item.name for item in self.trial]),
         ):
             twice = sorted({name for name in names if names.count(name) > 1})
             if twice:
                 raise ValueError(f"there is more than one {kind} called {twice[0]!r}: rename one")
-        columns = [item.table_column for item in self.channel]
+        if self.input and not any(item.kind is TrialKind.DRIVEN for item in self.trial):
+            raise ValueError('[[input]] is for trials of the kind "driven", and there is none')
+        every: tuple[ColumnSection, ...] = (*self.channel, *self.input)
+        columns = [item.table_column for item in every]
         twice = sorted({column for column in columns if columns.count(column) > 1})
         if twice:
+            what = "channel or input" if self.input else "channel"
             raise ValueError(
-                f"more than one channel reads the column {twice[0]!r}: give each its own `column`"
+                f"more than one {what} reads the column {twice[0]!r}: give each its own `column`"
             )
+        scales = {item.unit for item in every if item.quantity is Quantity.TEMPERATURE}
+        if len(scales) > 1:
+            raise ValueError("temperatures are given in degC and in K: give all of them in one of the two")
         known = {item.name for item in self.channel}
         for item in self.trial:
             for name in (*(item.channels or ()), *item.left_out):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.reading import CAMPAIGN_FILE
-from discrepancy.campaign.records import Campaign, Channel, Release, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Channel, RecordedInput, Release, Start, Trial, TrialKind
 from discrepancy.campaign.schema import FORMAT, INPUT_COLUMNS
 from discrepancy.campaign.units import UNITS, in_unit, sum_text
 from discrepancy.errors import CampaignFileError
@@ -95,6 +95,8 @@ def _trial_table(campaign: Campaign, trial: Trial) -> str:
             columns[name] = _plain(trial.health[:, index])
         if np.any(trial.health_deviation[:, index] != 0.0):
             columns[f"{name}_deviation"] = _plain(trial.health_deviation[:, index])
+    for item in trial.inputs:
+        columns[item.name] = _plain(item.values)
     for index, name in enumerate(trial.channels):
         columns[name] = _in_unit(trial.values[:, index], campaign.channels[name])
     return table_text(list(columns), list(columns.values()))
@@ -155,6 +157,9 @@ def _campaign_text(campaign: Campaign, files: list[str], noise_interval: float |
         ]
     for channel in campaign.channels.values():
         lines += ["", "[[channel]]", *_channel_lines(channel)]
+    inputs = {item.name: item for trial in campaign.trials for item in trial.inputs}
+    for item in inputs.values():
+        lines += ["", "[[input]]", *_input_lines(item)]
     order = list(campaign.channels)
     for trial, file in zip(campaign.trials, files, strict=True):
         lines += ["", "[[trial]]", *_trial_lines(trial, file, order)]
@@ -196,6 +201,19 @@ def _channel_lines(channel: Channel) -> list[str]:
     return [f"{key} = {value}" for key, value in values.items()]
 
 
+def _input_lines(item: RecordedInput) -> list[str]:
+    lines = [
+        f"name = {_quoted(item.name)}",
+        f"quantity = {_quoted(item.quantity.value)}",
+        f"unit = {_quoted(UNITS[item.quantity].si)}",
+        f"hold = {_quoted(item.hold.value)}",
+    ]
+    return [
+        *lines,
+        *([f"offset_deviation = {_number(item.offset_deviation)}"] if item.offset_deviation else []),
+    ]
+
+
 def _trial_lines(trial: Trial, file: str, order: list[str]) -> list[str]:
     values: dict[str, str] = {
         "name": _quoted(trial.name),
@@ -210,6 +228,8 @@ def _trial_lines(trial: Trial, file: str, order: list[str]) -> list[str]:
         values["noise_factor"] = _number(trial.noise_factor)
     if trial.start or not trial.is_dynamic:
         values["start"] = _number(trial.start)
+    if trial.kind is TrialKind.DRIVEN or trial.begins is not Start.SETTLED:
+        values["begins"] = _quoted(trial.begins.value)
     place = trial.load_place
     if place != "tip_load":
         values["load_place"] = (

@@ -24,6 +24,7 @@ KIND_NAMES = {
     TrialKind.STATIC: "static",
     TrialKind.RINGDOWN: "ring-down",
     TrialKind.FORCED: "forced",
+    TrialKind.DRIVEN: "driven",
     TrialKind.FLIGHT: "flight",
 }
 """How a kind of trial is called in a sentence."""
@@ -33,8 +34,8 @@ NO_PORT = "has no port where an internal force can act"
 
 
 EVERY_TRIAL = frozenset(TrialKind)
-DYNAMIC = frozenset({TrialKind.RINGDOWN, TrialKind.FORCED})
-LOADED = frozenset({TrialKind.STATIC, TrialKind.FORCED})
+DYNAMIC = frozenset({TrialKind.RINGDOWN, TrialKind.FORCED, TrialKind.DRIVEN})
+LOADED = frozenset({TrialKind.STATIC, TrialKind.FORCED, TrialKind.DRIVEN})
 
 TEMPERATURE_STEP = 0.1
 """Least range of temperatures [K] in a campaign from which an effect of temperature can show."""
@@ -159,6 +160,16 @@ def at_ports(*preferred: str) -> Places:
 def _ports(preferred: tuple[str, ...], setting: Setting) -> tuple[str, ...]:
     known = setting.model.ports()
     return tuple(port for port in preferred if port in known) or known
+
+
+def at_held_ports(*preferred: str) -> Places:
+    """Return the same without ports that nothing holds, for forces that depend on where a port is."""
+    return partial(_held_ports, preferred)
+
+
+def _held_ports(preferred: tuple[str, ...], setting: Setting) -> tuple[str, ...]:
+    free = {name for name, scale in setting.scales.ports.items() if scale.free}
+    return tuple(port for port in _ports(preferred, setting) if port not in free)
 
 
 def over_the_planform(*beside: str) -> Places:

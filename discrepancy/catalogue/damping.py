@@ -25,6 +25,7 @@ from scipy.special import beta
 from discrepancy.catalogue.building import (
     DYNAMIC,
     LARGEST_SHARE,
+    at_held_ports,
     at_least_zero,
     at_ports,
     carried,
@@ -32,6 +33,7 @@ from discrepancy.catalogue.building import (
     needs,
     over_the_planform,
     port_scale,
+    somewhere,
     trial_of,
 )
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting, ShapeParameter
@@ -48,6 +50,7 @@ def loss_integral(velocity_exponent: float, displacement_exponent: float) -> flo
 def _damping(setting: Setting, values: Mapping[str, float], port: str, equivalent_ratio: float) -> ModelPatch:
     scale = port_scale(setting, port)
     p, a = at_least_zero(values, "velocity_exponent"), at_least_zero(values, "displacement_exponent")
+    a = 0.0 if scale.free else a  # a port that nothing holds has no zero
     loss = loss_integral(p, a) * scale.mean_power(p + a + 1.0)
     force = pi * equivalent_ratio * scale.stiffness * scale.displacement / loss
     if scale.static_stiffness is not None:  # a stronger one holds a stiff port still
@@ -135,8 +138,13 @@ STRUCTURAL_DAMPING = Effect(
     ),
     build=_structural,
     shape=_exponents(0.0, 1.0),
-    places=at_ports("root"),
-    unavailable=_AVAILABLE,
+    places=at_held_ports("root"),
+    unavailable=needs(
+        trial_of(DYNAMIC),
+        carried(PowerDamping),
+        has_port,
+        somewhere(at_held_ports(), "Nothing holds a port of the model, so that no place is its zero."),
+    ),
     confusable=("coulomb_friction", "quadratic_damping", "joint_micro_slip"),
 )
 

@@ -22,9 +22,18 @@ class FaultKind(StrEnum):
     INPUT_SLIP = "input slip"  # force or load factor of a trial in another unit
     SIGN = "sign"
     SWAPPED = "swapped"
+    BETWEEN_SAMPLES = "between samples"  # what an input did there matters, and is not known
+    UNOBSERVABLE = "unobservable parameter"
 
 
-HARMLESS = frozenset({FaultKind.NO_NOISE_RECORD, FaultKind.NOISE_LABEL})
+HARMLESS = frozenset(
+    {
+        FaultKind.NO_NOISE_RECORD,
+        FaultKind.NOISE_LABEL,
+        FaultKind.BETWEEN_SAMPLES,
+        FaultKind.UNOBSERVABLE,
+    }
+)
 """Faults that limit what can be concluded, but do not make the data wrong."""
 
 

@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
+from discrepancy.campaign.units import si_value, units_of
 from discrepancy.checks.fault import DataFault, FaultKind
+from discrepancy.checks.holds import hold_sentence
+from discrepancy.checks.observability import unobservable
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
+from discrepancy.models.wrapped import oscillates
 from fe.runtime.patch import ModelPatch
 
 FloatArray = NDArray[np.float64]
@@ -61,6 +65,12 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     scales = {key: scale for key, scale in scales.items() if key[0] not in exchanged}
     faults += _slips(campaign, scales)
     faults += _signs(campaign, scales)
+    for trial in campaign.trials:
+        said = hold_sentence(campaign, model, trial, prior_mean(campaign, model, trial))
+        faults += [] if said is None else [DataFault(FaultKind.BETWEEN_SAMPLES, said, trial=trial.name)]
+    if any(trial.kind is TrialKind.DRIVEN for trial in campaign.fitted) and model.parameters:
+        sentence = unobservable(campaign, model)
+        faults += [] if sentence is None else [DataFault(FaultKind.UNOBSERVABLE, sentence)]
     return (*faults, *(fault for _, fault in swaps))
 
 
@@ -101,8 +111,9 @@ def _missing_outputs(campaign: Campaign, model: Model) -> Iterator[DataFault]:
 
 
 def _lengths(campaign: Campaign, model: Model) -> Iterator[DataFault]:
-    dynamic = [trial for trial in campaign.trials if trial.is_dynamic]
-    if not dynamic:
+    # A driven trial is long enough if the parameters can be observed in it, see `unobservable`.
+    dynamic = [trial for trial in campaign.trials if trial.is_dynamic and trial.kind is not TrialKind.DRIVEN]
+    if not dynamic or not oscillates(model):
         return
     frequency = model.scales(campaign).angular_frequency / (2.0 * pi)
     for trial in dynamic:
@@ -188,16 +199,31 @@ def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, used: NDAr
     return ratio * (float(np.sign(np.median(centred[:until] * np.sign(model[0])))) or 1.0)
 
 
-def _slip(scale: float) -> float | None:
+def _plausible(campaign: Campaign, name: str, trial: str) -> tuple[tuple[float, float], ...]:
+    """Return the factors of unit slips that a channel can have, and by which factor physics may be off.
+
+    In driven trials those between two units of the channel, or of an input; in others all that are usual.
+    """
+    inputs = next(item for item in campaign.trials if item.name == trial)
+    if inputs.kind is not TrialKind.DRIVEN:
+        return _SLIPS
+    found = set()
+    for quantity in (campaign.channels[name].quantity, *(item.quantity for item in inputs.inputs)):
+        sizes = [si_value("1.0", quantity, unit) for unit in units_of(quantity)]
+        found |= {one / other for one in sizes for other in sizes if not 1.0 / 5.0 < one / other < 5.0}
+    return tuple((factor, 3.0 if not 5e-3 < factor < 200.0 else 1.35) for factor in sorted(found))
+
+
+def _slip(scale: float, slips: tuple[tuple[float, float], ...] = _SLIPS) -> float | None:
     """Return the factor of a unit slip nearest to a scale, None if it is none."""
-    for factor, wide in _SLIPS:
+    for factor, wide in slips:
         if abs(log10(abs(scale) / factor)) < log10(wide):
             return factor
     return None
 
 
 def _slips(campaign: Campaign, scales: dict[tuple[str, str], float]) -> Iterator[DataFault]:
-    found = {key: _slip(scale) for key, scale in scales.items()}
+    found = {key: _slip(scale, _plausible(campaign, *key)) for key, scale in scales.items()}
     by_trial: dict[str, list[float | None]] = defaultdict(list)
     by_channel: dict[str, list[float | None]] = defaultdict(list)
     for (name, trial), factor in found.items():

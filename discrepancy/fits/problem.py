@@ -85,7 +85,7 @@ class Problem:
         self.channel_names = tuple(campaign.channels)
         self.refinement: int = 1 if like is None else like.refinement
         self.noise: dict[str, NoiseModel] = like.noise if like is not None else noise_models(campaign)
-        self.trials = tuple(TrialData.of(campaign, trial, self.noise) for trial in chosen)
+        self.trials = tuple(TrialData.of(campaign, trial, self.noise, model) for trial in chosen)
         counts = np.zeros(len(self.channel_names))
         for data in self.trials:
             np.add.at(counts, data.groups, data.weight.sum(axis=0))
@@ -144,10 +144,7 @@ class Problem:
         data = self.trials[number]
         refinement = self.refinement * finer
         conditions = data.unknowns.conditions(data.trial, self.shared.parameters(shared), local)
-        key = (
-            number, refinement, patch.primitives, conditions.parameters.tobytes(),
-            conditions.initial.tobytes(), conditions.clock, conditions.health.tobytes(),
-        )  # fmt: skip
+        key = (number, refinement, patch.primitives, conditions.key)
         kept = self._responses.get(key)
         if kept is None:
             observed = observe(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.noise import NoiseModel, noise_model
 from discrepancy.campaign.records import Campaign, Trial
+from discrepancy.models.interface import Model
 
 from .unknowns import LocalUnknowns, local_unknowns
 
@@ -66,8 +67,8 @@ class TrialData:
         chosen = range(len(self.deviation)) if channels is None else channels
         at = slice(None) if channels is None else list(channels)
         scaled = columns / self.deviation[at]
-        if self.trial.is_dynamic:
-            interval = self.trial.interval
+        interval = self.trial.whitened_at
+        if interval is not None:
             for number, channel in enumerate(chosen):
                 noise = self.noise[channel]
                 if noise.applies(interval):
@@ -75,11 +76,13 @@ class TrialData:
         return np.asarray(scaled * self.weight[:, at])
 
     @classmethod
-    def of(cls, campaign: Campaign, trial: Trial, models: Mapping[str, NoiseModel]) -> "TrialData":
+    def of(
+        cls, campaign: Campaign, trial: Trial, models: Mapping[str, NoiseModel], model: Model
+    ) -> "TrialData":
         """Return a trial of a campaign with its noise, by the noise models of the channels."""
         names = list(campaign.channels)
         noise = tuple(models[name] for name in trial.channels)
-        interval = trial.interval if trial.is_dynamic else None
+        interval = trial.whitened_at
         deviation = trial.noise_factor * np.array(
             [
                 item.standard_deviation
@@ -95,7 +98,7 @@ class TrialData:
                 if item.applies(interval):
                     for row in np.flatnonzero(~trial.used[:, number]):
                         weight[row : row + len(item.autoregression) + 1, number] = 0.0
-        return cls(trial, deviation, groups, local_unknowns(campaign, trial, deviation), weight, noise)
+        return cls(trial, deviation, groups, local_unknowns(campaign, trial, deviation, model), weight, noise)
 
 
 def noise_models(campaign: Campaign) -> dict[str, NoiseModel]:
@@ -118,4 +121,5 @@ def stand_in(campaign: Campaign, name: str) -> float:
 def shortened(trial: Trial, count: int) -> Trial:
     """Return the first rows of a trial."""
     rows = ("values", "used", "time", "force", "load_factor", "temperature", "health", "health_deviation")
-    return replace(trial, **{name: getattr(trial, name)[:count] for name in rows})
+    inputs = tuple(replace(item, values=item.values[:count]) for item in trial.inputs)
+    return replace(trial, inputs=inputs, **{name: getattr(trial, name)[:count] for name in rows})

@@ -2,17 +2,19 @@
 
 Each unknown is a scaled variable u with prior N(0, 1), or flat where nothing is known; the value is
 centre + scale u. Global ones: calibrated parameters, gains of channels. Local to a trial: zeros of its
-channels, initial state and time zero of a ring-down, health where it is uncertain.
+channels, initial state and time zero of a ring-down, an unknown initial state and constants of inputs of a
+driven trial, health where it is uncertain.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isinf
 
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
 from discrepancy.models.interface import Conditions, Model
+from discrepancy.models.wrapped import initial_sizes
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -75,7 +77,7 @@ class GlobalUnknowns:
 
 @dataclass(frozen=True)
 class LocalUnknowns:
-    """Layout of the unknowns of one trial, in the order: zeros, initial state, time zero, health.
+    """Layout of the unknowns of one trial: zeros, initial state, constants of inputs, time zero, health.
 
     Attributes
     ----------
@@ -87,6 +89,10 @@ class LocalUnknowns:
         (R, 1) or (R, 2): entries of the initial state that are unknown.
     initial_scale : float
         Their prior deviation.
+    initial_sizes : (initials,) ndarray
+        Natural sizes of an unknown initial state of a driven trial; empty for ring-downs.
+    offset_scale : tuple of float
+        Prior deviations of the constants that the recorded inputs lack; zero where none is lacking.
     time_zero_scale : float
         Zero if it is known.
     health_rows, health_columns : (H,) ndarray of int
@@ -101,6 +107,8 @@ class LocalUnknowns:
     time_zero_scale: float
     health_rows: IntArray
     health_columns: IntArray
+    offset_scale: tuple[float, ...] = ()
+    initial_sizes: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def zeros(self) -> int:
@@ -109,8 +117,13 @@ class LocalUnknowns:
 
     @property
     def initials(self) -> int:
-        """Number of unknown initial entries."""
-        return self.initial_shape[0] * self.initial_shape[1]
+        """Number of unknown initial entries, and after them of unknown constants of inputs."""
+        return self.initial_shape[0] * self.initial_shape[1] + self.offsets
+
+    @property
+    def offsets(self) -> int:
+        """Number of unknown constants of inputs."""
+        return sum(scale > 0.0 for scale in self.offset_scale)
 
     @property
     def size(self) -> int:
@@ -132,10 +145,17 @@ class LocalUnknowns:
         """Return the conditions of the trial's response."""
         at = self.zeros
         initial = np.zeros((self.initial_shape[0], 2))
-        if self.initials:
-            entries = self.initial_scale * u[at : at + self.initials]
+        first = self.initials - self.offsets
+        if first:
+            entries = self.initial_scale * u[at : at + first]
+            if len(self.initial_sizes):
+                entries = entries * self.initial_sizes
             initial[:, : self.initial_shape[1]] = entries.reshape(self.initial_shape)
-            at += self.initials
+            at += first
+        offset = np.array(self.offset_scale)
+        if self.offsets:
+            offset[offset > 0.0] *= u[at : at + self.offsets]
+            at += self.offsets
         time_zero = 0.0
         if self.time_zero_scale > 0.0:
             time_zero = self.time_zero_scale * float(u[at])
@@ -147,7 +167,7 @@ class LocalUnknowns:
             health[entry] = np.clip(
                 health[entry] + trial.health_deviation[entry] * u[at:], LEAST_LOSS, LARGEST_LOSS
             )
-        return Conditions(parameters, initial, (0.0, time_zero), health)
+        return Conditions(parameters, initial, (0.0, time_zero), health, tuple(offset.tolist()))
 
 
 def global_unknowns(
@@ -200,17 +220,21 @@ def global_unknowns(
     )
 
 
-def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray) -> LocalUnknowns:
+def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray, model: Model) -> LocalUnknowns:
     """Return the layout of the unknowns of one trial; `deviation` (C,) scales zeros nothing is known of."""
     zero_scale = np.array([campaign.channels[name].offset_deviation for name in trial.channels])
     columns = np.flatnonzero(zero_scale > 0.0)
     free = np.isinf(zero_scale[columns])
     release = trial.release if trial.kind is TrialKind.RINGDOWN else None
-    shape, scale, time_zero = (0, 1), 1.0, 0.0
+    shape, scale, time_zero, sizes = (0, 1), 1.0, 0.0, np.zeros(0)
     if release is not None:
         shape = (release.mode_count, 1 if release.at_rest else 2)
         scale = release.deviation if release.at_rest else FREE_MOTION
         time_zero = release.time_zero_deviation
+    elif trial.begins is Start.UNKNOWN:
+        sizes = initial_sizes(model, campaign, trial)
+        shape, scale = (-(-len(sizes) // 2), 2), FREE_MOTION
+        sizes = np.pad(sizes, (0, len(sizes) % 2))
     uncertain = trial.health_deviation[:1] if trial.is_dynamic else trial.health_deviation
     of_health, rows = np.nonzero(uncertain.T)  # region by region, as their derivatives are taken
     return LocalUnknowns(
@@ -222,4 +246,6 @@ def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray) -> L
         time_zero_scale=time_zero,
         health_rows=rows,
         health_columns=of_health,
+        initial_sizes=sizes,
+        offset_scale=tuple(item.offset_deviation for item in trial.inputs),
     )

@@ -6,6 +6,7 @@ from inspect import getmembers, isfunction
 from types import ModuleType
 from typing import Any
 
+from discrepancy.models import stepwise_kernel
 from fe.compilation import callable_when_compiled, choose_when_compiled, compiled
 from fe.runtime import flexible_ports, laws, motion_arrays, motion_kernel, static_path
 from fe.runtime.laws import interface
@@ -15,6 +16,7 @@ SELDOM = (
     motion_kernel.follow,
     motion_kernel.find_routes,
     motion_kernel.begin_on_modes,
+    motion_kernel.find_answer,
     flexible_ports.begin_flexible,
     flexible_ports.settle_port,
 )
@@ -37,11 +39,8 @@ def law_functions() -> tuple[Callable[..., Any], ...]:
 
 
 @cache
-def compiled_kernel() -> Kernel:
-    """Return the compiled loops, for `kernel` of `fe.runtime.motion.simulate` and `static_solution`.
-
-    The functions of `fe` stay plain; they can be called from compiled ones from then on.
-    """
+def _kernel_functions() -> tuple[Callable[..., Any], ...]:
+    """Return the functions of the loops, which compiled functions can call from then on."""
     functions = list(law_functions())
     for module in (motion_arrays, flexible_ports, motion_kernel):
         for function in _functions(module):
@@ -50,8 +49,24 @@ def compiled_kernel() -> Kernel:
                 callable_when_compiled(
                     function, error_model="numpy", makes_arrays=False, inline=function not in SELDOM
                 )
+    return tuple(functions)
+
+
+@cache
+def compiled_kernel() -> Kernel:
+    """Return the compiled loops, for `kernel` of `fe.runtime.motion.simulate` and `static_solution`.
+
+    The functions of `fe` stay plain; they can be called from compiled ones from then on.
+    """
+    functions = _kernel_functions()
     callable_when_compiled(static_path.static_forces, error_model="numpy")
     return Kernel(
         compiled(motion_kernel.integrate, functions, "numpy"),
         compiled(static_path.static_path, functions, "numpy"),
     )
+
+
+@cache
+def compiled_steps() -> Callable[..., None]:
+    """Return the compiled loop over steps of any lengths, `stepwise_kernel.integrate_steps`."""
+    return compiled(stepwise_kernel.integrate_steps, _kernel_functions(), "numpy")

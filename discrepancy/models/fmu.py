@@ -16,7 +16,14 @@ from discrepancy.models.fmu_rest import port_flexibility, rest_with_laws
 from discrepancy.models.fmu_runs import FmuRuns
 from discrepancy.models.fmu_samples import sampled
 from discrepancy.models.fmu_trials import DEFAULT_PLACE, FmuTrials
-from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.interface import (
+    Conditions,
+    ModelParameter,
+    PortScale,
+    Response,
+    Scales,
+    check_plain,
+)
 from fe.runtime.patch import (
     ModelPatch,
     Primitive,
@@ -208,6 +215,7 @@ class FmuModel:
 
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
         """
+        check_plain(trial, f"the FMU model {self.name!r}")
         if conditions.parameters.shape != (len(self._parameters),):
             raise ModelError(
                 f"The FMU model {self.name!r} has {counted(len(self._parameters), 'parameter')}, but "

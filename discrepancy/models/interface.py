@@ -7,7 +7,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Quantity, Trial
+from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
+from discrepancy.errors import ModelError
 from fe.runtime.patch import ModelPatch, Primitive
 
 FloatArray = NDArray[np.float64]
@@ -58,6 +59,8 @@ class PortScale:
     spread : tuple of (float, float)
         Where a force at the port acts: its share, and the motion there over that of the port, by place. A
         force that is spread over the wing acts on the motion of each place, and A is the mean's.
+    free : bool
+        Whether nothing holds the port (a body that falls or rolls), so that no place is its zero.
     """
 
     displacement: float
@@ -66,6 +69,7 @@ class PortScale:
     static_stiffness: float | None = None
     largest_displacement: float | None = None
     spread: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
+    free: bool = False
 
     def mean_power(self, exponent: float) -> float:
         """Return the mean of |motion / A|^exponent over the places where a force at the port acts."""
@@ -124,12 +128,22 @@ class Conditions:
         (rate, zero): a sample stamped t shows the motion at (1 + rate) t + zero [1], [s].
     health : (N, 2) ndarray
         Stiffness losses z1, z2 of each row (dynamic trials: row 0 holds for all).
+    offset : tuple of float
+        Constants that the recorded inputs of a driven trial lack, in their order [SI]; empty: none.
     """
 
     parameters: FloatArray
     initial: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     clock: tuple[float, float] = (0.0, 0.0)
     health: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
+    offset: tuple[float, ...] = ()
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """All of it as a value that can be looked up."""
+        return (
+            self.parameters.tobytes(), self.initial.tobytes(), self.clock, self.health.tobytes(), self.offset,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -217,3 +231,13 @@ class Model(Protocol):
         ModelError
             If the model lacks an output or cannot carry a primitive.
         """
+
+
+def check_plain(trial: Trial, what: str) -> None:
+    """Refuse a driven trial, and a forced one that is not settled, for a model that cannot follow them."""
+    if trial.kind is TrialKind.DRIVEN or trial.begins is not Start.SETTLED:
+        came = "is driven" if trial.kind is TrialKind.DRIVEN else f"begins {trial.begins.value}"
+        raise ModelError(
+            f"The trial {trial.name!r} {came}, which {what} cannot follow: describe the rig as a lumped "
+            "model, or record it forced from rest."
+        )

@@ -1,6 +1,5 @@
 """A lumped linear structure as a model: masses, springs, dampers with named inputs, outputs and ports."""
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -8,12 +7,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
-from discrepancy.models.lumped_file import LumpedDescription, load_lumped, matrix_of
+from discrepancy.models.lumped_file import Damping, LumpedDescription, load_lumped, matrix_of
+from discrepancy.models.lumped_patch import sorted_lumped
+from discrepancy.models.lumped_rig import LumpedRig, rig_scales, state_sizes
+from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
 from fe.runtime.errors import InvalidPatchError
+from fe.runtime.laws import LAWS
 from fe.runtime.motion import NO_LAWS, laws_of
 from fe.runtime.patch import (
     INTERNAL_FORCES,
@@ -55,11 +58,9 @@ class LumpedModel:
 
     def __init__(self, description: LumpedDescription) -> None:
         self.description = description
-        self._mass = matrix_of(description.mass)
-        self._stiffness = matrix_of(description.stiffness)
         self._inputs = {item.name: item for item in description.input}
-        self._outputs = {item.name: np.array(item.vector) for item in description.output}
-        self._quantities = {item.name: Quantity(item.quantity) for item in description.output}
+        self._outputs = {item.name: np.array(item.vector or ()) for item in description.output}
+        self._quantities = {item.name: item.quantity for item in description.output}
         self._ports = {item.name: np.array(item.vector) for item in description.port}
         places = sorted(description.place, key=lambda place: place.station)
         self._stations = np.array([place.station for place in places])
@@ -68,7 +69,7 @@ class LumpedModel:
             ModelParameter(item.name, item.mean, item.deviation, item.unit, item.low, item.high)
             for item in description.parameter
         )
-        self._systems: OrderedDict[tuple[object, ...], SecondOrderSystem] = OrderedDict()
+        self._systems = Memory(KEPT_SYSTEMS)
 
     @classmethod
     def load(cls, path: Path | str) -> "LumpedModel":
@@ -93,6 +94,12 @@ class LumpedModel:
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive."""
+        plain = self.description.is_plain
+        if primitive is StiffnessDrift and not plain:
+            return self.description.size > 0
+        if primitive in LAWS and not plain and not primitive.of_speed:
+            n = self.description.size  # the position of a state's port means nothing
+            return bool(self._ports) and all(np.any(row[:n]) for row in self._ports.values())
         if primitive in SENSORS or primitive in (ModulusTemperature, LoadGain, StiffnessDrift):
             return True
         if primitive is PointMass:
@@ -115,6 +122,13 @@ class LumpedModel:
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign."""
+        if any(self._as_rig(trial) for trial in campaign.trials):
+            return rig_scales(
+                self._rig(self._prior_mean(campaign), (), 0.0),
+                self._prior_mean(campaign),
+                campaign,
+                self.stations(),
+            )
         values = [campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in self._parameters]
         conditions = Conditions(np.array(values))
         system = self._system(conditions.parameters, (), 0.0)
@@ -144,7 +158,9 @@ class LumpedModel:
         return Scales(
             length=self.description.characteristic_length or (max(map(abs, ends)) if ends else 0.0) or 1.0,
             tip_stiffness=1.0 / flexible,
-            modal_mass=1.0 / participation if participation else float(np.trace(self._mass)),
+            modal_mass=1.0 / participation
+            if participation
+            else float(np.trace(self.description.whole("mass"))),
             angular_frequency=float(first),
             force=max((float(np.max(np.abs(trial.force))) for trial in campaign.trials), default=0.0),
             load_factor=max((float(np.max(np.abs(t.load_factor))) for t in campaign.trials), default=0.0),
@@ -177,14 +193,19 @@ class LumpedModel:
                 f"The trial {trial.name!r} is a flight, but the lumped model {self.name!r} has no "
                 f"lift; leave it out."
             )
-        rows = self._rows(outputs)
+        self._check_outputs(outputs)
         quantities = [quantity for _, quantity in outputs]
-        structure, forces, gain, tare, along_span, along_chord = self._sorted(patch)
+        structure, forces, gain, tare, along_span, along_chord = sorted_lumped(patch, self)
         try:
             laws = laws_of(forces, self._ports) if len(forces) else NO_LAWS
         except InvalidPatchError as cause:
             raise ModelError(str(cause)) from cause
         acting = trial.force * (1.0 + gain) + tare * (trial.force != 0.0) if gain or tare else trial.force
+        if self._as_rig(trial):
+            lumped = self._rig(conditions.parameters, structure, float(trial.temperature[0]))
+            place = self._moved_place(lumped, trial, along_span, along_chord)
+            return lumped.response(trial, outputs, laws, conditions, (gain, tare, place), refinement)
+        rows = np.array([self._outputs[output] for output, _ in outputs]).reshape(-1, self.description.size)
         row = self._input_row(trial.load_place)
         if trial.kind is TrialKind.STATIC:
             if any(quantity.is_rate for quantity in quantities):
@@ -217,10 +238,49 @@ class LumpedModel:
             )  # fmt: skip
         return motion.response(rows, quantities)
 
+    @property
+    def oscillates(self) -> bool:
+        """Whether it has a mode that vibrates."""
+        mean = np.array([item.mean for item in self._parameters])
+        return self.description.is_plain or bool(
+            np.any(self._rig(mean, (), 0.0).rig().angular_frequency > 0.0)
+        )
+
+    def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
+        """Return natural sizes (L,) of the state at the begin of a driven or forced trial."""
+        return state_sizes(
+            self._rig(self._prior_mean(campaign), (), 0.0),
+            campaign,
+            trial,
+            Conditions(self._prior_mean(campaign)),
+        )
+
+    # ------------------------------------------------------------ rigs
+
+    def _moved_place(
+        self, lumped: LumpedRig, trial: Trial, along_span: float, along_chord: float
+    ) -> FloatArray | None:
+        """Return the row of the first input where its place has moved, None where it has not."""
+        if not (along_span or along_chord):
+            return None
+        name = lumped.recorded(trial)[0].name
+        return self._moved_row(name, self._input_row(name), along_span, along_chord)
+
+    def _as_rig(self, trial: Trial) -> bool:
+        """Whether a trial asks for more than a structure on springs under one force."""
+        return (
+            not self.description.is_plain
+            or trial.kind is TrialKind.DRIVEN
+            or trial.begins is not Start.SETTLED
+        )
+
+    def _prior_mean(self, campaign: Campaign) -> FloatArray:
+        given = campaign.parameters
+        return np.array([given.get(item.name, (item.mean, 0.0))[0] for item in self._parameters])
+
     # ------------------------------------------------------------ parts
 
-    def _rows(self, outputs: Sequence[tuple[str, Quantity]]) -> FloatArray:
-        rows = []
+    def _check_outputs(self, outputs: Sequence[tuple[str, Quantity]]) -> None:
         for output, quantity in outputs:
             own = self._quantities.get(output)
             if own is None:
@@ -233,8 +293,6 @@ class LumpedModel:
                     f"The output {output!r} of {self.name!r} is a {own.value}, but a channel measures "
                     f"{quantity.value}."
                 )
-            rows.append(self._outputs[output])
-        return np.array(rows).reshape(len(rows), self.description.size)
 
     def _input_row(self, place: str | tuple[float, float]) -> FloatArray:
         if place == DEFAULT_PLACE and place not in self._inputs and len(self._inputs) == 1:
@@ -260,27 +318,6 @@ class LumpedModel:
         row = row + along_span * np.array(item.station_derivative)
         return row if item.chord_derivative is None else row + along_chord * np.array(item.chord_derivative)
 
-    def _sorted(
-        self, patch: ModelPatch
-    ) -> tuple[tuple[Primitive, ...], ModelPatch, float, float, float, float]:
-        """Return structure, internal forces, gain and tare of loads, and how far their place moves."""
-        structure, forces = [], []
-        gain, tare, along_span, along_chord = 0.0, 0.0, 0.0, 0.0
-        for item in patch:
-            if isinstance(item, SENSORS):
-                continue
-            if isinstance(item, INTERNAL_FORCES):
-                forces.append(item)
-            elif not self.supports(type(item)):
-                raise ModelError(f"The lumped model {self.name!r} cannot carry the primitive {item.kind!r}.")
-            elif isinstance(item, LoadGain):
-                gain, tare = (1.0 + gain) * (1.0 + item.gain) - 1.0, tare + item.tare
-            elif isinstance(item, LoadPlace):
-                along_span, along_chord = along_span + item.along_span, along_chord + item.along_chord
-            else:
-                structure.append(item)
-        return tuple(structure), ModelPatch(tuple(forces)), gain, tare, along_span, along_chord
-
     @staticmethod
     def _coefficient(structure: Sequence[Primitive]) -> float:
         return sum(item.coefficient for item in structure if isinstance(item, ModulusTemperature))
@@ -291,19 +328,22 @@ class LumpedModel:
         """Return the structure at values of the parameters and a temperature above the reference [K]."""
         softening = self._coefficient(structure) * temperature
         key = (parameters.tobytes(), structure, softening)
-        found = self._systems.get(key)
-        if found is not None:
-            self._systems.move_to_end(key)
-            return found
-        system = self._made(parameters, structure, softening)
-        self._systems[key] = system
-        if len(self._systems) > KEPT_SYSTEMS:
-            self._systems.popitem(last=False)
-        return system
+        return self._systems.get(key, lambda: self._made(parameters, structure, softening))
 
-    def _made(
+    def _rig(self, parameters: FloatArray, structure: tuple[Primitive, ...], temperature: float) -> LumpedRig:
+        """Return the same as a rig."""
+        softening = self._coefficient(structure) * temperature
+
+        def make() -> LumpedRig:
+            mass, stiffness, factors = self._matrices(parameters, structure, softening)
+            return LumpedRig(self.description, mass, stiffness, factors)
+
+        return self._systems.get(("rig", parameters.tobytes(), structure, softening), make)
+
+    def _matrices(
         self, parameters: FloatArray, structure: tuple[Primitive, ...], softening: float
-    ) -> SecondOrderSystem:
+    ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
+        """Return mass and stiffness (n, n), patched, and the factors of the terms."""
         description = self.description
         if parameters.shape != (len(self._parameters),):
             raise ModelError(
@@ -314,17 +354,12 @@ class LumpedModel:
         for item, value in zip(description.parameter, parameters, strict=True):
             for term in item.scaled:
                 factors[term] = factors.get(term, 1.0) * float(value)
-        mass, stiffness = self._mass.copy(), self._stiffness.copy()
-        for part in description.mass_part:
-            mass += factors.get(part.name, 1.0) * matrix_of(part.matrix)
-        for part in description.stiffness_part:
-            stiffness += factors.get(part.name, 1.0) * matrix_of(part.matrix)
-        mass *= factors.get("mass", 1.0)
         if 1.0 - softening < LEAST_STIFFNESS:
             raise ModelError(
                 f"The temperature leaves {1.0 - softening:.2g} of the stiffness, which no structure has."
             )
-        stiffness *= factors.get("stiffness", 1.0) * (1.0 - softening)
+        softened = factors | {"stiffness": factors.get("stiffness", 1.0) * (1.0 - softening)}
+        mass, stiffness = description.whole("mass", factors), description.whole("stiffness", softened)
         for change in structure:
             if isinstance(change, PointMass):
                 row = self._place_row(change.station)
@@ -334,8 +369,14 @@ class LumpedModel:
                 pull = stiffness @ np.array(description.root.lever)
                 stiff = float(pull @ np.array(description.root.lever))
                 stiffness -= np.outer(pull, pull) * change.compliance / (1.0 + change.compliance * stiff)
+        return mass, stiffness, factors
+
+    def _made(
+        self, parameters: FloatArray, structure: tuple[Primitive, ...], softening: float
+    ) -> SecondOrderSystem:
+        mass, stiffness, factors = self._matrices(parameters, structure, softening)
         system = SecondOrderSystem(mass, np.zeros_like(mass), stiffness, self._ports)
-        damping = description.damping
+        damping = self.description.damping or Damping(alpha=0.0)
         if damping.matrix is not None:
             matrix = matrix_of(damping.matrix)
         elif damping.ratios is not None:

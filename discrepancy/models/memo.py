@@ -37,9 +37,7 @@ class MemoModel(WrappedModel):
     ) -> Response:
         """Return the response of a trial, kept or computed; as `Model.respond`."""
         key = (
-            id(trial), outputs, patch.primitives, conditions.parameters.tobytes(),
-            conditions.initial.tobytes(), conditions.clock, conditions.health.tobytes(), components,
-            refinement,
+            id(trial), outputs, patch.primitives, conditions.key, components, refinement,
         )  # fmt: skip
         kept = self._kept.get(key)
         if kept is not None:

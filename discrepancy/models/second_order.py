@@ -15,10 +15,12 @@ from scipy.linalg import cho_factor, eigh
 from scipy.linalg.lapack import dpotrs
 
 from discrepancy.campaign.records import Release
+from discrepancy.campaign.sampling import is_even
 from discrepancy.errors import ModelError
 from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.free_motion import free_motion
 from discrepancy.models.second_order_motion import Motion
+from discrepancy.models.stepwise import simulate_at
 from fe.runtime.errors import SolutionError
 from fe.runtime.modal_system import ModalSystem, linear_step
 from fe.runtime.motion import Laws, StaticSolution, simulate, static_solution
@@ -193,7 +195,7 @@ class SecondOrderSystem:
         initial : (R, 2) ndarray
             As in `Conditions`; rows beyond the modes are passed over.
         time : (N,) ndarray
-            Stamps of the samples [s], evenly spaced.
+            Stamps of the samples [s], strictly increasing.
         laws : Laws
             Internal forces.
         clock : tuple of float
@@ -243,10 +245,17 @@ class SecondOrderSystem:
                     refinement=refinement, kernel=compiled_kernel(),
                 )  # fmt: skip
                 q, v, memory, start = first.q[-1], first.v[-1], first.memory, lead
-            moved = simulate(
-                self.modal, laws, q=q, v=v, memory=memory, force=nothing[held:], interval=interval or 1.0,
-                start=start, refinement=refinement, kernel=compiled_kernel(),
-            )  # fmt: skip
+            if is_even(time):
+                moved = simulate(
+                    self.modal, laws, q=q, v=v, memory=memory, force=nothing[held:], interval=interval or 1.0,
+                    start=start, refinement=refinement, kernel=compiled_kernel(),
+                )  # fmt: skip
+            else:
+                none = np.zeros((count - held, len(q)))
+                moved = simulate_at(
+                    self.modal, laws, q=q, v=v, time=times[held:] - times[held] + start, force=none,
+                    memory=memory, refinement=refinement,
+                )  # fmt: skip
             all_q[held:], all_v[held:], forces[held:] = moved.q, moved.v, moved.port_forces
             lagged[held:] = moved.lagged
         if held and memory is not None:
@@ -291,11 +300,17 @@ class SecondOrderSystem:
                 shape=shape, feed=feed, start=start, refinement=refinement, kernel=compiled_kernel(),
             )  # fmt: skip
             q, v, memory, start = first.q[-1], first.v[-1], first.memory, start + lead
-        moved = simulate(
-            modal, laws, q=q, v=v, memory=memory, force=acting, shape=shape, feed=feed, start=start,
-            interval=float(times[-1] - times[0]) / (len(times) - 1), refinement=refinement,
-            kernel=compiled_kernel(),
-        )  # fmt: skip
+        if is_even(time):
+            moved = simulate(
+                modal, laws, q=q, v=v, memory=memory, force=acting, shape=shape, feed=feed, start=start,
+                interval=float(times[-1] - times[0]) / (len(times) - 1), refinement=refinement,
+                kernel=compiled_kernel(),
+            )  # fmt: skip
+        else:
+            moved = simulate_at(
+                modal, laws, q=q, v=v, time=times - times[0] + start, force=np.outer(acting, shape),
+                memory=memory, feed=np.outer(acting, feed[0]), refinement=refinement,
+            )  # fmt: skip
         return Motion(self, times, moved.q, moved.v, acting, input_row, moved.port_forces, moved.lagged, laws)
 
     # ------------------------------------------------------------ parts

@@ -12,7 +12,14 @@ from calibration.wing.result_file import load_calibration
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.compiled_motion import compiled_kernel
-from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.interface import (
+    Conditions,
+    ModelParameter,
+    PortScale,
+    Response,
+    Scales,
+    check_plain,
+)
 from discrepancy.models.memory import Memory
 from discrepancy.models.wing_structure import MovingWing, Outputs, Stiffness, WingStructure
 from fe.reduction.patch_cache import patch_arrays
@@ -229,6 +236,7 @@ class WingModel:
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero. In a
         dynamic trial the structure is that at its first temperature.
         """
+        check_plain(trial, self.name)
         if len(conditions.parameters) != len(self._parameters):
             raise ModelError(
                 f"The wing has {len(self._parameters)} parameters, but {len(conditions.parameters)} came."

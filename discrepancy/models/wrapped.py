@@ -1,9 +1,14 @@
 """What models around another model have in common: everything but the response is that of the inner one."""
 
-from discrepancy.campaign.records import Campaign, Quantity
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.records import Campaign, Quantity, Trial
 from fe.runtime.patch import ModelPatch, Primitive
 
 from .interface import Model, ModelParameter, Scales
+
+FloatArray = NDArray[np.float64]
 
 
 class WrappedModel:
@@ -49,9 +54,26 @@ class WrappedModel:
         """Return the least and largest station [m], None if the model has no length."""
         return self.inner.stations()
 
+    def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
+        """Return natural sizes (L,) of the state at the begin of a trial; empty: it cannot be unknown."""
+        return initial_sizes(self.inner, campaign, trial)
+
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign."""
         return self.inner.scales(campaign)
+
+
+def initial_sizes(model: Model, campaign: Campaign, trial: Trial) -> FloatArray:
+    """Return natural sizes (L,) of a model's state at the begin of a trial; empty: it is never unknown."""
+    sizes = getattr(model, "initial_sizes", None)
+    return np.zeros(0) if sizes is None else np.asarray(sizes(campaign, trial), dtype=np.float64)
+
+
+def oscillates(model: Model) -> bool:
+    """Whether a model has a mode that vibrates; models that do not say it have one."""
+    while isinstance(model, WrappedModel):
+        model = model.inner
+    return bool(getattr(model, "oscillates", True))
 
 
 def built_in_sensors(model: Model) -> ModelPatch:

@@ -24,6 +24,7 @@ _KIND_WORDS = {
     TrialKind.STATIC: "a static loading",
     TrialKind.RINGDOWN: "a ring-down",
     TrialKind.FORCED: "a forced vibration",
+    TrialKind.DRIVEN: "a driven test",
     TrialKind.FLIGHT: "a flight",
 }
 

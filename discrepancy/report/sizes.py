@@ -129,9 +129,10 @@ def _turns(port: str, model: Model) -> bool | None:
     vectors = [np.array(item.vector) for item in model.description.port if item.name == port]
     if not vectors or not np.all(np.isin(vectors[0], (-1.0, 0.0, 1.0))):
         return None
+    rows = [item.vector for item in model.description.output if item.quantity == "displacement"]
     measured = {
-        int(np.argmax(item.vector))
-        for item in model.description.output
-        if item.quantity == "displacement" and np.count_nonzero(item.vector) == 1 and max(item.vector) == 1.0
+        int(np.argmax(row))
+        for row in rows
+        if row is not None and np.count_nonzero(row) == 1 and max(row) == 1.0
     }
     return False if set(np.flatnonzero(vectors[0])) <= measured else None

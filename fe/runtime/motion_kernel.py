@@ -120,9 +120,20 @@ def find_routes(ports: Ports, acting: Acting) -> None:
             acting.route[j] = SPEED if ports.of_speed[j] == 1 else POSITION
 
 
+def find_answer(linear: Linear, ports: Ports, acting: Acting, j: int) -> None:
+    """Set what a unit kick at the port of a law of speed does in a step."""
+    modes = ports.rows.shape[1]
+    for m in range(2 * modes):
+        acting.answer[j, m] = 0.0
+        for k in range(modes):
+            acting.answer[j, m] += linear.transition[m, modes + k] * ports.rows[j, k]
+    acting.give[j] = 0.0
+    for m in range(modes):
+        acting.give[j] += ports.rows[j, m] * acting.answer[j, m]
+
+
 def begin_on_modes(linear: Linear, ports: Ports, acting: Acting, state: State, known: bool) -> None:
     """Take the laws that act on the modes, and those of speed on flexible ports, to the first sample."""
-    modes = len(state.q)
     for j in range(len(ports.numbers)):
         if acting.route[j] == STILL:
             continue
@@ -135,11 +146,7 @@ def begin_on_modes(linear: Linear, ports: Ports, acting: Acting, state: State, k
                 state.memory[j, 2] = state.current[j]
         elif acting.route[j] == SPEED:
             acting.strength[j] = strength(ports.numbers[j], ports.values[j], acting.weight[j])
-            for m in range(2 * modes):
-                for k in range(modes):
-                    acting.answer[j, m] += linear.transition[m, modes + k] * ports.rows[j, k]
-            for m in range(modes):
-                acting.give[j] += ports.rows[j, m] * acting.answer[j, m]
+            find_answer(linear, ports, acting, j)
             if holds(ports.numbers[j], ports.values[j]) and speed == 0.0 and acting.strength[j] > 0.0:
                 state.memory[j, 0] = 1.0
                 state.memory[j, 1] = x

@@ -49,9 +49,9 @@ class SensorRecord:
     channels : sequence of (str, str)
         Name and quantity of each column.
     kind : str
-        "static", "flight", "ringdown" or "forced".
+        "static", "flight", "ringdown", "forced" or "driven".
     time : (N,) ndarray
-        Dynamic: since the trial's start [s], evenly spaced. Static, flight: since the campaign's start [s].
+        Dynamic: since the trial's start [s]. Static, flight: since the campaign's start [s].
     start : float
         Of a dynamic trial since the campaign's start [s].
     temperature : (N,) ndarray
@@ -73,7 +73,7 @@ class SensorRecord:
     @property
     def is_dynamic(self) -> bool:
         """Whether the rows are samples of a motion."""
-        return self.kind in ("ringdown", "forced")
+        return self.kind in ("ringdown", "forced", "driven")
 
 
 def uses_sensors(patch: ModelPatch) -> bool:
@@ -278,13 +278,28 @@ def _filter(
     values: FloatArray,
     rates: FloatArray | None,
 ) -> None:
-    interval = float(record.time[-1] - record.time[0]) / max(len(record.time) - 1, 1)
-    signal = values[:, columns]
+    signal, slope = values[:, columns], None if rates is None else rates[:, columns]
+    time = record.time
+    count = max(len(time) - 1, 1)
+    interval = float(time[-1] - time[0]) / count
+    even = len(time) < 3 or bool(np.max(np.abs(np.diff(time) - interval)) <= 2e-3 * interval)
+    if not even:  # on a grid twice as fine as the usual step, and back
+        count = int(np.ceil(2.0 * float(time[-1] - time[0]) / float(np.median(np.diff(time)))))
+        interval = float(time[-1] - time[0]) / count
+        grid = np.linspace(time[0], time[-1], count + 1)
+        signal = _at(grid, time, signal)
+        slope = None if slope is None else _at(grid, time, slope)
     held = signal[0] if record.kind == "ringdown" else np.zeros(columns.size)
     filtered = high_pass(signal, interval, item.time_constant, item.order, held)
-    if rates is not None:
-        rates[:, columns] = _filtered_rates(item, interval, signal, filtered, held, rates[:, columns])
-    values[:, columns] = filtered
+    if rates is not None and slope is not None:
+        changed = _filtered_rates(item, interval, signal, filtered, held, slope)
+        rates[:, columns] = changed if even else _at(time, grid, changed)
+    values[:, columns] = filtered if even else _at(time, grid, filtered)
+
+
+def _at(times: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:
+    """Return columns (N, C) that are known at some times at others, linear in between."""
+    return np.stack([np.interp(times, known, column) for column in values.T], axis=1)
 
 
 def _filtered_rates(

@@ -1,0 +1,68 @@
+"""What the reader of a campaign says of its records in time: their stamps, their begin, their noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from discrepancy.campaign.noise import noise_model
+from discrepancy.campaign.records import Channel, Start, Trial, TrialKind
+from discrepancy.campaign.sampling import spacing_sentence
+from discrepancy.campaign.schema import CampaignSection
+from reporting.words import counted
+
+
+def remarks_on(
+    section: CampaignSection, channels: Mapping[str, Channel], trials: tuple[Trial, ...]
+) -> list[str]:
+    """Return the sentences on the trials of a campaign, in one order."""
+    uneven = spacing_sentence({trial.name: trial.time for trial in trials if trial.is_dynamic})
+    found = [] if uneven is None else [uneven]
+    return [*found, *_begins(section, trials), *_not_whitened(channels, trials)]
+
+
+_BEGINS = {
+    Start.SETTLED: "taken to begin at rest under what acts at the first sample",
+    Start.STILL: "taken to begin at rest under nothing",
+    Start.UNKNOWN: "begun in a state that is fitted",
+}
+
+
+def _begins(section: CampaignSection, trials: tuple[Trial, ...]) -> list[str]:
+    """Return what is said or assumed of how trials begin, one sentence for each kind of begin."""
+    groups: dict[tuple[Start, bool], list[str]] = {}
+    for given, trial in zip(section.trial, trials, strict=True):
+        matters = trial.kind is TrialKind.DRIVEN or (trial.kind is TrialKind.FORCED and trial.force[0] != 0.0)
+        if given.begins is not None or matters:
+            assumed = given.begins is None
+            groups.setdefault((trial.begins, assumed), []).append(repr(trial.name))
+    found = []
+    for (begins, assumed), names in groups.items():
+        what = "The trial {} is {}" if len(names) == 1 else "The trials {} are {}"
+        text = what.format(", ".join(names), _BEGINS[begins])
+        found.append(
+            text + (' (assumed: say `begins`, "settled", "still" or "unknown").' if assumed else ".")
+        )
+    return found
+
+
+def _not_whitened(channels: Mapping[str, Channel], trials: tuple[Trial, ...]) -> list[str]:
+    """Return a sentence for each channel whose coloured noise cannot be whitened in some trial."""
+    found = []
+    for name, channel in channels.items():
+        noise = noise_model(channel, 1.0)
+        if not noise.autoregression.size:
+            continue
+        where = [
+            trial.name
+            for trial in trials
+            if trial.is_dynamic
+            and name in trial.channels
+            and (trial.whitened_at is None or not noise.applies(trial.whitened_at))
+        ]
+        if where:
+            found.append(
+                f"The noise of the channel {name!r} is coloured, and its record is not sampled like the "
+                f"{counted(len(where), 'trial')} {', '.join(map(repr, where))}: there its samples count as "
+                "independent, so that probabilities are too sharp; record the noise at the trials' sampling."
+            )
+    return found

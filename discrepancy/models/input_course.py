@@ -1,0 +1,94 @@
+"""What a recorded input does between its samples, and prescribed motions with their derivatives."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline, PPoly
+
+from discrepancy.campaign.records import Hold
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """A load over time.
+
+    Attributes
+    ----------
+    time, values : (N,) ndarray
+        Its samples [s], [SI].
+    hold : Hold
+        Between them; before the first and after the last it keeps their values.
+    """
+
+    time: FloatArray
+    values: FloatArray
+    hold: Hold
+
+    @property
+    def is_smooth(self) -> bool:
+        """Whether it is a spline."""
+        return self.hold is Hold.SMOOTH
+
+    @cached_property
+    def _spline(self) -> CubicSpline:
+        return CubicSpline(self.time, self.values)
+
+    def _inside(self, time: FloatArray) -> FloatArray:
+        return np.clip(time, self.time[0], self.time[-1])
+
+    def at(self, time: FloatArray) -> FloatArray:
+        """Return the values (N,) at times; of a held one that of just before."""
+        if self.hold is Hold.ZERO_ORDER:
+            row = np.searchsorted(self.time, time - 1e-9 * (self.time[-1] - self.time[0]) / len(self.time))
+            return np.asarray(self.values[np.maximum(row - 1, 0)])
+        if self.is_smooth:
+            return np.asarray(self._spline(self._inside(time)))
+        return np.asarray(np.interp(time, self.time, self.values))
+
+    def ends(self, time: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the values (K,) at the begin and at the end of the steps between times (K + 1,).
+
+        Of a spline those of straight lines that have its mean effect, to fourth order in the step.
+        """
+        if self.hold is Hold.ZERO_ORDER:
+            held = self.at(0.5 * (time[1:] + time[:-1]))
+            return held, held
+        found = self.at(time)
+        if not self.is_smooth:
+            return found[:-1], found[1:]
+        bend = np.diff(time) ** 2 / 12.0
+        curve = self._spline(self._inside(time), 2)
+        return found[:-1] - bend * curve[:-1], found[1:] - bend * curve[1:]
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A prescribed motion: a spline through the record of its displacement, velocity or acceleration.
+
+    Attributes
+    ----------
+    time, values : (N,) ndarray
+        Its samples [s], [SI].
+    order : int
+        0 displacement, 1 velocity, 2 acceleration; the latter two begin at zero displacement, and the last at
+        zero velocity.
+    """
+
+    time: FloatArray
+    values: FloatArray
+    order: int = 0
+
+    @cached_property
+    def _splines(self) -> tuple[PPoly, ...]:
+        base: PPoly = CubicSpline(self.time, self.values)
+        lower = [base.antiderivative(number) for number in range(self.order, 0, -1)]
+        upper = [base.derivative(number) for number in range(1, 4 - self.order)]
+        return (*lower, base, *upper)
+
+    def at(self, time: FloatArray, order: int) -> FloatArray:
+        """Return the motion (N,), its first, second or third derivative at times."""
+        return np.asarray(self._splines[order](time))

@@ -1,0 +1,298 @@
+"""Motion of few modes at any time stamps, under several forces: exact between the stamps without laws.
+
+The linear step of each length is the exponential of one matrix (Van Loan 1978), by a Taylor polynomial and
+squaring, all lengths at once. Lengths that differ by less than `ALIKE` of the usual one are one.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.models.compiled_motion import compiled_steps
+from discrepancy.models.memory import Memory
+from discrepancy.models.stepwise_kernel import Structure
+from fe.runtime.modal_system import ModalSystem
+from fe.runtime.motion import FASTEST_PHASE, SLOWEST_PHASE, Laws, ModalMotion, port_flexibility
+from fe.runtime.motion_arrays import Samples, State
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+ALIKE = 1e-9
+"""Lengths of steps that differ by less than this share of the usual one are taken as one."""
+KEPT_STEPS = 16
+STEPS_AT_LEAST = 8
+"""Substeps of an interval with laws where nothing in the structure has a pace of its own."""
+_TAYLOR = 14
+_kept = Memory(KEPT_STEPS)
+
+
+@dataclass(frozen=True)
+class CoupledModes(ModalSystem):
+    """Coordinates q'' + D q' + S q = forces, S and D any matrices; the first-order ones have no stiffness.
+
+    Attributes
+    ----------
+    stiffness_matrix : (M, M) ndarray, optional
+        S [1/s^2]; the squared angular frequencies where it is left out.
+    """
+
+    stiffness_matrix: FloatArray | None = None
+
+    @cached_property
+    def coupled(self) -> bool:
+        """Whether damping or stiffness couples the coordinates."""
+        return self.stiffness_matrix is not None or bool(
+            np.any(self.damping != np.diag(np.diag(self.damping)))
+        )
+
+    @cached_property
+    def paces(self) -> FloatArray:
+        """Magnitudes (2M,) of the eigenvalues [1/s] of the motion, without those that are zero."""
+        count = len(self.angular_frequency)
+        stiffness = np.diag(self.stiffness) if self.stiffness_matrix is None else self.stiffness_matrix
+        matrix = np.block([[np.zeros((count, count)), np.eye(count)], [-stiffness, -self.damping]])
+        found = np.abs(np.linalg.eigvals(matrix))
+        return np.asarray(found[found > 1e-7 * np.max(found, initial=0.0)])
+
+
+@dataclass(frozen=True)
+class ExactSteps:
+    """Exact steps of a linear structure under modal forces that are linear in time within each step.
+
+    Attributes
+    ----------
+    length : (S,) ndarray
+        Distinct lengths [s].
+    which : (K,) ndarray of int
+        That of each step.
+    transition : (S, 2M, 2M) ndarray
+        Of (q, v).
+    begin, end : (S, 2M, M) ndarray
+        By the modal forces at the begin and at the end of a step.
+    """
+
+    length: FloatArray
+    which: IntArray
+    transition: FloatArray
+    begin: FloatArray
+    end: FloatArray
+
+    def push(self, begin: FloatArray, end: FloatArray) -> FloatArray:
+        """Return what modal forces (K, M) at both ends of the steps add to (q, v), (K, 2M)."""
+        if len(self.length) == 1:
+            return np.asarray(begin @ self.begin[0].T + end @ self.end[0].T)
+        return np.asarray(
+            np.einsum("knm,km->kn", self.begin[self.which], begin)
+            + np.einsum("knm,km->kn", self.end[self.which], end)
+        )
+
+
+def exact_steps(system: ModalSystem, lengths: FloatArray) -> ExactSteps:
+    """Return the exact steps of lengths (K,) [s]."""
+    usual = float(np.median(lengths))
+    _, first, which = np.unique(np.round(lengths / (ALIKE * usual)), return_index=True, return_inverse=True)
+    distinct = np.ascontiguousarray(lengths[first])
+    stiffness = _stiffness_of(system)
+    key = (stiffness.tobytes(), system.damping.tobytes(), distinct.tobytes())
+    transition, begin, end = _kept.get(key, lambda: _exponentials(system, distinct))
+    return ExactSteps(distinct, np.asarray(which, dtype=np.int64).ravel(), transition, begin, end)
+
+
+def _exponentials(system: ModalSystem, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return transitions (S, 2M, 2M) and the parts of the force at both ends (S, 2M, M)."""
+    if not system.coupled:
+        return _by_mode(system, lengths)
+    return _whole(_stiffness_of(system), np.asarray(system.damping), lengths)
+
+
+def _stiffness_of(system: ModalSystem) -> FloatArray:
+    given = system.stiffness_matrix if isinstance(system, CoupledModes) else None
+    return np.diag(system.stiffness) if given is None else given
+
+
+def _by_mode(system: ModalSystem, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the same for modes that do not act on each other, each by itself."""
+    count, size = len(system.angular_frequency), len(lengths)
+    transition = np.zeros((size, 2 * count, 2 * count))
+    begin, end = np.zeros((2, size, 2 * count, count))
+    for mode in range(count):
+        at = np.array([mode, count + mode])
+        one = _whole(system.stiffness[mode].reshape(1, 1), system.damping[mode, mode].reshape(1, 1), lengths)
+        transition[:, at[:, None], at] = one[0]
+        begin[:, at, mode], end[:, at, mode] = one[1][:, :, 0], one[2][:, :, 0]
+    return transition, begin, end
+
+
+def _whole(
+    stiffness: FloatArray, damping: FloatArray, lengths: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the same for coordinates that act on each other."""
+    count = len(stiffness)
+    own = np.eye(count)
+    longest = float(lengths.max())
+    # Velocities are measured in units of the highest frequency, which balances the matrix.
+    unit = max(float(np.sqrt(np.max(np.abs(stiffness)))), float(np.max(np.abs(damping))), 1.0 / longest)
+    q, v = slice(0, count), slice(count, 2 * count)
+    f, s = slice(2 * count, 3 * count), slice(3 * count, 4 * count)
+    matrix = np.zeros((4 * count, 4 * count))
+    matrix[q, v] = unit * own
+    matrix[v, q] = -stiffness / unit
+    matrix[v, v] = -damping
+    matrix[v, f] = own / unit
+    scaled = matrix * lengths[:, None, None]
+    scaled[:, f, s] = own  # the force changes by one over the step
+    norm = float(np.max(np.sum(np.abs(scaled[:, : 2 * count, : 2 * count]), axis=2), initial=0.0))
+    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.5))))
+    scaled /= 2.0**squarings
+    unity = np.eye(4 * count)
+    result = np.broadcast_to(unity, scaled.shape)
+    for order in range(_TAYLOR, 0, -1):
+        result = unity + scaled @ result / order
+    for _ in range(squarings):
+        result = result @ result
+    scale = np.repeat((1.0, unit), count)
+    state = slice(0, 2 * count)
+    slope = result[:, state, s] * scale[:, None]
+    whole = result[:, state, f] * scale[:, None]
+    transition = result[:, state, state] * scale[:, None] / scale
+    return np.ascontiguousarray(transition), np.ascontiguousarray(whole - slope), np.ascontiguousarray(slope)
+
+
+def simulate_at(
+    system: ModalSystem,
+    laws: Laws,
+    *,
+    q: FloatArray,
+    v: FloatArray,
+    time: FloatArray,
+    force: FloatArray,
+    memory: FloatArray | None = None,
+    feed: FloatArray | None = None,
+    refinement: int = 1,
+) -> ModalMotion:
+    """Return the motion at time stamps from a state at the first of them.
+
+    Parameters
+    ----------
+    system : ModalSystem
+        The linear structure.
+    laws : Laws
+        Its internal forces.
+    q, v : (M,) ndarray
+        State at the first stamp.
+    time : (N,) ndarray
+        Stamps since the begin of the record [s], strictly increasing.
+    force : (N, M) ndarray
+        Modal forces at the stamps, linear between them.
+    memory : (J, 5 + E) ndarray, optional
+        Of the laws; left out, each law has been loaded from zero to its first position without turning back.
+    feed : (N, J) ndarray, optional
+        What the loads add to the positions of the laws' ports beyond the modes.
+    refinement : int
+        Steps are this many times smaller than usual.
+
+    Returns
+    -------
+    ModalMotion
+        At the stamps, the first included.
+    """
+    boundaries = substeps(system, laws, time, refinement)
+    fed = np.zeros((len(time), len(laws))) if feed is None else feed
+    load, led = boundaries.between(force), boundaries.between(fed)
+    found = exact_steps(system, boundaries.lengths)
+    push = found.push(load[:-1], load[1:])
+    return advance(system, laws, found, boundaries, q, v, push, load[:-1], load[1:], led, memory)
+
+
+@dataclass(frozen=True)
+class Boundaries:
+    """Stamps, and steps between them.
+
+    Attributes
+    ----------
+    time : (K + 1,) ndarray
+        Of the boundaries of the steps [s].
+    at : (K + 1,) ndarray
+        The same as fractional numbers of stamps.
+    sample : (N,) ndarray of int
+        Boundary of each stamp.
+    lengths : (K,) ndarray
+        [s].
+    """
+
+    time: FloatArray
+    at: FloatArray
+    sample: IntArray
+    lengths: FloatArray
+
+    def between(self, values: FloatArray) -> FloatArray:
+        """Return rows of values (N, ...) at the boundaries, linear between the stamps."""
+        if len(self.at) == len(values):
+            return np.ascontiguousarray(values)
+        row = np.minimum(self.at.astype(np.int64), len(values) - 2)
+        share = (self.at - row).reshape((-1, *(1,) * (values.ndim - 1)))
+        return np.ascontiguousarray((1.0 - share) * values[row] + share * values[row + 1])
+
+
+def substeps(
+    system: ModalSystem, laws: Laws, time: FloatArray, refinement: int = 1, least: int = 1
+) -> Boundaries:
+    """Return the steps between stamps (N,) that the laws ask for, at least `least` in each interval."""
+    parts = np.maximum(_substeps(system, laws, np.diff(time)), least) * refinement
+    sample = np.concatenate(([0], np.cumsum(parts))).astype(np.int64)
+    lengths = np.repeat(np.diff(time) / parts, parts)
+    interval = np.repeat(np.arange(len(parts)), parts)
+    place = np.arange(1, len(interval) + 1) - sample[:-1][interval]
+    at = np.concatenate(([0.0], interval + place / parts[interval]))
+    moments = np.concatenate((time[:1], time[interval] + place * lengths))
+    moments[sample] = time
+    return Boundaries(moments, at, sample, lengths)
+
+
+def advance(
+    system: ModalSystem,
+    laws: Laws,
+    steps: ExactSteps,
+    boundaries: Boundaries,
+    q: FloatArray,
+    v: FloatArray,
+    push: FloatArray,
+    begin: FloatArray,
+    end: FloatArray,
+    feed: FloatArray,
+    memory: FloatArray | None,
+) -> ModalMotion:
+    """Return the motion at the stamps of known steps; for arguments see `simulate_at` and `Steps`."""
+    modes, count = len(q), len(boundaries.sample)
+    result = ModalMotion(
+        np.empty((count, modes)), np.empty((count, modes)), np.empty((count, len(laws))),
+        laws.memory() if memory is None else memory.copy(), np.empty((count, len(laws))),
+    )  # fmt: skip
+    arrays = (steps.transition, steps.length, steps.which, push, begin, end, feed, boundaries.time)
+    given = (*(np.ascontiguousarray(item) for item in arrays), boundaries.sample)  # fields of `Steps`
+    structure = Structure(
+        system.coupled, system.stiffness, np.ascontiguousarray(system.damping), laws.rate, memory is not None
+    )
+    state = State(np.array(q, dtype=float), np.array(v, dtype=float), result.memory, np.zeros(len(laws)))
+    ports = laws.at(
+        laws.rows(system.ports, modes), port_flexibility(system, laws), system.relaxation,
+        np.zeros((2, len(laws))),
+    )  # fmt: skip
+    out = Samples(result.q, result.v, result.port_forces, result.lagged)
+    compiled_steps()(given, tuple(structure), tuple(ports), tuple(state), tuple(out))
+    return result
+
+
+def _substeps(system: ModalSystem, laws: Laws, lengths: FloatArray) -> IntArray:
+    """Return how many steps each interval (K,) is divided into, as `fe.runtime.motion.substeps_for` does."""
+    if laws.linear:
+        return np.ones(len(lengths), dtype=np.int64)
+    paces = system.paces if isinstance(system, CoupledModes) else system.angular_frequency
+    paces = paces[paces > 0.0]
+    if not len(paces):
+        return np.full(len(lengths), STEPS_AT_LEAST, dtype=np.int64)
+    rate = max(float(paces.min()) / SLOWEST_PHASE, float(paces.max()) / FASTEST_PHASE)
+    return np.maximum(np.ceil(rate * lengths - 1e-9), 1.0).astype(np.int64)

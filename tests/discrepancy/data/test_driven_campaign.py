@@ -1,0 +1,124 @@
+"""Campaigns of driven trials: inputs with unit and hold, the begin of a trial, what is wrong with them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.records import Hold, Quantity, Start
+from discrepancy.campaign.writing import write_campaign
+from discrepancy.errors import CampaignFileError
+
+TOML = """
+format = 1
+name = "A heated plate on a shaker"
+[[channel]]
+name = "plate"
+quantity = "temperature"
+unit = "degC"
+output = "plate"
+noise = { standard_deviation = 0.1 }
+[[channel]]
+name = "turned"
+quantity = "angle"
+unit = "deg"
+output = "turned"
+noise = { standard_deviation = 0.5 }
+[[input]]
+name = "heater"
+quantity = "heat"
+unit = "kW"
+hold = "zero_order"
+offset_deviation = 0.01
+[[input]]
+name = "table"
+quantity = "displacement"
+unit = "mm"
+column = "x"
+[[input]]
+name = "fan"
+quantity = "torque"
+unit = "mN m"
+[[trial]]
+name = "first"
+kind = "driven"
+file = "first.csv"
+begins = "unknown"
+[[trial]]
+name = "second"
+kind = "driven"
+file = "second.csv"
+"""
+HEAD = "time,heater,x,fan,plate,turned\n"
+ROWS = [f"{0.1 * k + 0.01 * (k % 3):.3f},{1 + k},{k},{2 * k},{20 + k},{90 * k}" for k in range(10)]
+FIRST = HEAD + "\n".join(ROWS)
+SECOND = "time,plate,turned\n" + "\n".join(f"{k},{20 + k},{k}" for k in range(10))
+
+
+def folder_of(path: Path, toml: str = TOML) -> Path:
+    for name, text in (("campaign.toml", toml), ("first.csv", FIRST), ("second.csv", SECOND)):
+        (path / name).write_text(text)
+    return path
+
+
+def test_inputs_come_out_in_si(tmp_path: Path) -> None:
+    campaign = read_campaign(folder_of(tmp_path))
+    first, second = campaign.trials
+    heater, table, fan = first.inputs
+    assert (heater.quantity, heater.hold, heater.offset_deviation) == (Quantity.HEAT, Hold.ZERO_ORDER, 10.0)
+    assert heater.values[:2].tolist() == [1000.0, 2000.0]
+    assert (table.hold, fan.hold) == (Hold.SMOOTH, Hold.LINEAR)
+    assert table.values[3] == 3e-3
+    assert first.force.tolist() == fan.values.tolist()
+    assert fan.values[3] == 6e-3
+    np.testing.assert_allclose(first.values[2], [22.0, np.pi])
+    assert (first.begins, second.begins, second.inputs) == (Start.UNKNOWN, Start.SETTLED, ())
+    said = " ".join(campaign.remarks)
+    assert "The trial 'first' is begun in a state that is fitted." in said
+    assert "The trial 'second' is taken to begin at rest under what acts at the first sample (assumed" in said
+
+
+def test_driven_trials_come_back_as_they_were(tmp_path: Path) -> None:
+    campaign = read_campaign(folder_of(tmp_path))
+    (tmp_path / "again").mkdir()
+    again = read_campaign(write_campaign(campaign, tmp_path / "again"))
+    for one, other in zip(campaign.trials, again.trials, strict=True):
+        np.testing.assert_array_equal(one.values, other.values)
+        np.testing.assert_array_equal(one.time, other.time)
+        assert one.begins == other.begins
+        for given, found in zip(one.inputs, other.inputs, strict=True):
+            np.testing.assert_array_equal(given.values, found.values)
+            assert (given.name, given.quantity, given.hold) == (found.name, found.quantity, found.hold)
+            assert given.offset_deviation == found.offset_deviation
+
+
+def test_a_forced_trial_says_what_it_assumes_of_its_begin(tmp_path: Path) -> None:
+    toml = TOML.split("[[input]]")[0] + '[[trial]]\nname = "pushed"\nkind = "forced"\nfile = "pushed.csv"\n'
+    (tmp_path / "campaign.toml").write_text(toml)
+    rows = [row.split(",") for row in ROWS]
+    for first, said in (("0", False), ("3", True)):
+        body = [f"{k}.0,{first if k == 0 else 1},{row[4]},{row[5]}" for k, row in enumerate(rows)]
+        (tmp_path / "pushed.csv").write_text("time,force,plate,turned\n" + "\n".join(body))
+        remarks = " ".join(read_campaign(tmp_path).remarks)
+        assert ("is taken to begin at rest under what acts at the first sample" in remarks) is said
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ('unit = "kW"', 'unit = "kN"', "the input 'heater' is heat and must have one of the units W, mW, kW"),
+        ('column = "x"', 'column = "x"\nhold = "linear"', "'table' is a motion, which no drive makes"),
+        ('column = "x"', 'column = "plate"', "more than one channel or input reads the column 'plate'"),
+        ('column = "x"', 'column = "z1"', "the column 'z1' is reserved"),
+        ('begins = "unknown"', 'begins = "sometime"', "begins"),
+        ('kind = "driven"', 'kind = "flight"', "`begins` is for forced and driven ones"),
+        ('name = "fan"', 'name = "heater"', "more than one input called 'heater'"),
+    ],
+)
+def test_a_wrong_input_is_named_in_one_sentence(tmp_path: Path, old: str, new: str, sentence: str) -> None:
+    assert old in TOML
+    with pytest.raises(CampaignFileError) as caught:
+        read_campaign(folder_of(tmp_path, TOML.replace(old, new, 1)))
+    assert sentence in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,168 @@
+"""Motion at uneven time stamps against matrix exponentials, a general integrator, and the even stepper."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
+from discrepancy.models.compiled_motion import compiled_kernel
+from discrepancy.models.interface import Conditions
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.stepwise import CoupledModes, exact_steps, simulate_at
+from fe.runtime.modal_system import ModalSystem
+from fe.runtime.motion import NO_LAWS, laws_of, simulate
+from fe.runtime.patch import HighPass, ModelPatch, PowerDamping, PowerStiffness, Primitive
+from fe.runtime.sensors import SensorRecord, apply_sensors
+
+FloatArray = NDArray[np.float64]
+
+OUTPUTS = (("x1", Quantity.DISPLACEMENT), ("x3", Quantity.VELOCITY), ("x3", Quantity.ACCELERATION))
+COULOMB = PowerDamping("joint", 0.4, 0.0, 0.0, 1.0, 1.0)
+QUADRATIC = PowerDamping("joint", 2.0, 2.0, 0.0, 0.2, 1.0)
+CUBIC = PowerStiffness("joint", 4.0, 3.0, 0, 0.01)
+
+
+@pytest.fixture(scope="module")
+def chain() -> LumpedModel:
+    return LumpedModel.load("three_mass_chain")
+
+
+def jittered(count: int, interval: float, share: float, seed: int = 1) -> FloatArray:
+    generator = np.random.default_rng(seed)
+    time = interval * (np.arange(count) + share * generator.uniform(-0.5, 0.5, count))
+    return np.asarray(np.delete(time - time[0], slice(count // 3, count // 3 + 7)))  # and a gap
+
+
+def trial(kind: TrialKind, time: FloatArray, **changes: Any) -> Trial:
+    count = len(time)
+    base: dict[str, Any] = {
+        "name": "a trial", "kind": kind, "channels": (), "values": np.zeros((count, 0)),
+        "used": np.ones((count, 0), bool), "time": time, "force": np.zeros(count),
+        "load_factor": np.zeros(count), "load_place": "end", "temperature": np.zeros(count), "start": 0.0,
+        "run": "A", "health": np.zeros((1, 2)), "health_deviation": np.zeros((1, 2)),
+    }  # fmt: skip
+    return Trial(**{**base, **changes})
+
+
+def shown(model: LumpedModel, what: Trial, *items: Primitive, refinement: int = 1) -> FloatArray:
+    return model.respond(
+        what, OUTPUTS, ModelPatch(items), Conditions(np.ones(3)), refinement=refinement
+    ).values
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+def test_steps_of_any_length_are_matrix_exponentials(coupled: bool) -> None:
+    generator = np.random.default_rng(3)
+    damping = np.diag([0.3, 1.0, 200.0])
+    if coupled:
+        damping = damping + generator.normal(size=(3, 3))
+    frequency = np.array([0.0, 7.0, 60.0])
+    system = CoupledModes(frequency, damping)
+    lengths = np.array([0.01, 0.013, 0.01, 0.4])
+    found = exact_steps(system, lengths)
+    np.testing.assert_array_equal(found.length[found.which], lengths)
+    for k, h in enumerate(lengths):
+        matrix = np.zeros((12, 12))
+        matrix[:3, 3:6] = np.eye(3)
+        matrix[3:6, :3], matrix[3:6, 3:6] = -np.diag(frequency**2), -damping
+        matrix[3:6, 6:9], matrix[6:9, 9:] = np.eye(3), np.eye(3) / h
+        whole = expm(h * matrix)
+        at = found.which[k]
+        np.testing.assert_allclose(found.transition[at], whole[:6, :6], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(found.end[at], whole[:6, 9:], rtol=1e-9, atol=1e-13)
+        np.testing.assert_allclose(found.begin[at], whole[:6, 6:9] - whole[:6, 9:], rtol=1e-9, atol=1e-13)
+
+
+@pytest.mark.parametrize("laws", [(), (COULOMB,), (QUADRATIC, CUBIC)])
+def test_even_stamps_are_those_of_the_even_stepper(laws: tuple[Primitive, ...]) -> None:
+    system = ModalSystem(np.array([9.0, 31.0]), np.diag([0.1, 0.4]), {"joint": np.array([0.7, -1.1])})
+    internal = laws_of(ModelPatch(laws), system.ports) if laws else NO_LAWS
+    time, shape = 0.01 * np.arange(300), np.array([0.4, 0.9])
+    force = np.random.default_rng(0).normal(size=300)
+    q, v = np.array([0.01, 0.002]), np.zeros(2)
+    even = simulate(
+        system, internal, q=q, v=v, force=force, interval=0.01, shape=shape, kernel=compiled_kernel()
+    )
+    found = simulate_at(system, internal, q=q, v=v, time=time, force=np.outer(force, shape))
+    for one, other in zip(found, even, strict=True):
+        np.testing.assert_allclose(
+            one, other, rtol=1e-9, atol=1e-9 * max(1e-9, float(np.abs(other).max(initial=0.0)))
+        )
+
+
+def test_a_forced_motion_at_uneven_stamps_is_exact(chain: LumpedModel) -> None:
+    time = jittered(200, 0.02, 0.9)
+    force = np.random.default_rng(2).normal(size=len(time))
+    force[0] = 0.0
+    system = chain._system(np.ones(3), (), 0.0)
+    matrix = np.zeros((8, 8))
+    matrix[:3, 3:6] = np.eye(3)
+    matrix[3:6, :3] = -np.linalg.solve(system.mass, system.stiffness)
+    matrix[3:6, 3:6] = -np.linalg.solve(system.mass, system.damping)
+    matrix[3:6, 6] = np.linalg.solve(system.mass, [0, 0, 1.0])
+    matrix[6, 7] = 1.0
+    state, states = np.zeros(6), [np.zeros(6)]
+    for k, h in enumerate(np.diff(time)):
+        state = (expm(h * matrix) @ np.concatenate((state, [force[k], (force[k + 1] - force[k]) / h])))[:6]
+        states.append(state)
+    found = np.array(states)
+    acceleration = found @ matrix[5, :6] + force * matrix[5, 6]
+    expected = np.stack([found[:, 0], found[:, 5], acceleration], axis=1)
+    measured = shown(chain, trial(TrialKind.FORCED, time, force=force))
+    np.testing.assert_allclose(measured, expected, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("kind", [TrialKind.RINGDOWN, TrialKind.FORCED])
+@pytest.mark.parametrize("laws", [(), (QUADRATIC, CUBIC), (COULOMB,)])
+def test_leaving_samples_out_changes_nothing_at_the_others(
+    chain: LumpedModel, kind: TrialKind, laws: tuple[Primitive, ...]
+) -> None:
+    time = 0.005 * np.arange(400)
+    kept = np.flatnonzero(np.random.default_rng(5).uniform(size=400) < 0.6)
+    kept = np.unique(np.r_[0, kept, 399])
+    bare = 0.5 * np.interp(time, time[kept], np.sin(20.0 * time[kept]))
+    given = {"release": Release(0.02)} if kind is TrialKind.RINGDOWN else {"force": bare}
+    dense = shown(chain, trial(kind, time, **given), *laws, refinement=8)
+    if kind is TrialKind.FORCED:
+        given = {"force": bare[kept]}
+    found = shown(chain, trial(kind, time[kept], **given), *laws, refinement=8)
+    np.testing.assert_allclose(found, dense[kept], atol=2e-4 * np.abs(dense).max())
+
+
+def test_a_smooth_law_at_uneven_stamps_is_that_of_a_general_integrator(chain: LumpedModel) -> None:
+    time = jittered(120, 0.01, 0.8)
+    system = chain._system(np.ones(3), (), 0.0)
+    row, end = chain._ports["joint"], np.array([0.0, 0.0, 1.0])
+    inverse = np.linalg.inv(system.mass)
+    start = 0.02 * system.flexibility(end) / float(end @ system.flexibility(end))
+
+    def slope(_: float, state: FloatArray) -> FloatArray:
+        u, v = state[:3], state[3:]
+        speed = float(row @ v)
+        law = 2.0 * abs(speed / 0.2) * speed / 0.2
+        return np.r_[v, inverse @ (-system.stiffness @ u - system.damping @ v - row * law)]
+
+    solution = solve_ivp(
+        slope, (0.0, time[-1]), np.r_[start, np.zeros(3)], t_eval=time, rtol=1e-10, atol=1e-13
+    ).y.T
+    measured = shown(chain, trial(TrialKind.RINGDOWN, time, release=Release(0.02)), QUADRATIC, refinement=16)
+    np.testing.assert_allclose(measured[:, 0], solution[:, 0], atol=2e-6)
+    np.testing.assert_allclose(measured[:, 1], solution[:, 5], atol=2e-5)
+
+
+def test_a_high_pass_follows_uneven_stamps() -> None:
+    time = jittered(400, 0.01, 0.6)
+    wave = 2.0 * np.pi * 1.3
+    record = SensorRecord((("x", "velocity"),), "forced", time, 0.0, np.zeros(len(time)))
+    patch = ModelPatch((HighPass("x", 0.3),))
+    found, _ = apply_sensors(patch, record, np.sin(wave * time)[:, None], wave * np.cos(wave * time)[:, None])
+    # y' = x' - y / tau from rest: steady part and what the begin leaves
+    gain = 1j * wave * 0.3 / (1.0 + 1j * wave * 0.3)
+    steady = np.imag(gain * np.exp(1j * wave * time))
+    expected = steady - steady[0] * np.exp(-time / 0.3)
+    # the gap of eight intervals is bridged by a straight line
+    np.testing.assert_allclose(found[:, 0], expected, atol=8e-3)
