@@ -141,24 +141,8 @@ def _trial(
     remarks: list[str],
 ) -> Trial:
     user = f"the trial {section.name!r}"
-    dynamic = section.kind not in (TrialKind.STATIC, TrialKind.FLIGHT)
-    count = len(table)
-    start = section.start or 0.0
-    if dynamic:
-        time = check_sampling(table.numbers("time", user), table.cells("time", user), user, table.name)
-    elif "time" in table.columns:
-        time = table.numbers("time", user)
-        start = section.start if section.start is not None else float(time[0])
-        if np.any(np.diff(time) < 0.0):
-            raise CampaignDataError(
-                f"{table.name}: the times of {user} run backwards; put its rows in order."
-            )
-    else:
-        time = np.full(count, start)
-    if not dynamic:
-        rows = [*zip(*table.columns.values(), strict=True)]
-        table.refuse_repeated(rows, "row", _REPEATED)
-    zeros = np.zeros(count)
+    time, start = _times(section, table, user)
+    zeros = np.zeros(len(table))
     forced = section.kind in (TrialKind.STATIC, TrialKind.FORCED)
     chosen = _measured(section, table, campaign)
     known = {*INPUT_COLUMNS, *(channel.table_column for channel in campaign.channel)}
@@ -224,6 +208,21 @@ def _inputs(
         offset = si_value(repr(item.offset_deviation), item.quantity, item.unit)
         found.append(RecordedInput(item.name, item.quantity, values, item.holds, offset))
     return tuple(found)
+
+
+def _times(section: TrialSection, table: TextTable, user: str) -> tuple[FloatArray, float]:
+    """Return the times of a trial's rows and its start [s]."""
+    start = section.start or 0.0
+    if section.kind not in (TrialKind.STATIC, TrialKind.FLIGHT):
+        cells = table.cells("time", user)
+        return check_sampling(table.numbers("time", user), cells, user, table.name), start
+    table.refuse_repeated([*zip(*table.columns.values(), strict=True)], "row", _REPEATED)
+    if "time" not in table.columns:
+        return np.full(len(table), start), start
+    time = table.numbers("time", user)
+    if np.any(np.diff(time) < 0.0):
+        raise CampaignDataError(f"{table.name}: the times of {user} run backwards; put its rows in order.")
+    return time, float(time[0]) if section.start is None else start
 
 
 def _measured(

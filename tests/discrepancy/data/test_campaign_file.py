@@ -175,7 +175,9 @@ def campaigns(draw: st.DrawFn) -> Campaign:
         if dynamic:
             time = draw(st.floats(1e-5, 1.0)) * np.arange(count)
         else:
-            time = draw(st.just(np.full(count, start)) | column.map(np.sort))
+            time = np.full(count, start)
+            if count > 1:  # the same row twice is refused
+                time = np.sort(draw(arrays(float, count, elements=finite, unique=True)))
         trials.append(
             Trial(
                 name=f"{index} {draw(names)}", kind=kind, channels=tuple(chosen),
@@ -185,7 +187,8 @@ def campaigns(draw: st.DrawFn) -> Campaign:
                 force=draw(column) if kind in (TrialKind.STATIC, TrialKind.FORCED) else zeros,
                 load_factor=draw(column) if kind is TrialKind.FLIGHT else zeros,
                 load_place=draw(names | st.tuples(finite, finite)),
-                temperature=draw(st.just(zeros) | column), start=start, run=draw(st.just("") | names),
+                temperature=draw(st.just(zeros) | column.map(np.abs)), start=start,
+                run=draw(st.just("") | names),
                 health=draw(arrays(float, (count, 2), elements=st.floats(0.0, 1.0))),
                 health_deviation=draw(st.just(np.zeros((count, 2))) | arrays(float, (count, 2),
                 elements=positive)), release=draw(st.builds(Release, positive, positive, st.booleans(),
@@ -197,7 +200,8 @@ def campaigns(draw: st.DrawFn) -> Campaign:
         )  # fmt: skip
     text = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=20)
     return Campaign(
-        draw(text), channels, tuple(trials), draw(finite), {draw(names): (draw(finite), draw(positive))}, "",
+        draw(text), channels, tuple(trials), max(draw(finite), -273.15),
+        {draw(names): (draw(finite), draw(positive))}, "",
         tuple(draw(st.lists(text, max_size=2))),
     )  # fmt: skip
 
