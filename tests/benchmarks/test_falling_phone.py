@@ -1,6 +1,5 @@
 """A phone that fell, measured by others: the model that lacks drag, and the drag that explains it."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -18,16 +17,14 @@ from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import load_model
 from discrepancy.models.interface import Model
 
-FOLDER = "UAV_TWIN_MEASURED"
-"""Variable that names the folder of the published records."""
+RECORDS = Path(__file__).parents[2].parent / "shared" / "reference" / "measured" / "falling_phone"
 
 
 @pytest.fixture(scope="module")
 def phone(tmp_path_factory: pytest.TempPathFactory) -> tuple[Campaign, Model]:
-    data = Path(os.environ.get(FOLDER, "measured")) / "falling_phone"
-    if not data.is_dir():
-        pytest.skip(f"no published records of the falling phone: name their folder in {FOLDER}")
-    folder = write_campaign(data, tmp_path_factory.mktemp("phone") / "campaign")
+    if not RECORDS.is_dir():
+        pytest.skip("the published records of the falling phone are not here")
+    folder = write_campaign(RECORDS, tmp_path_factory.mktemp("phone") / "campaign")
     return read_campaign(folder), load_model(folder / "model.toml")
 
 

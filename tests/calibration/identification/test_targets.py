@@ -109,11 +109,13 @@ def test_other_levels_and_signs_are_refused(published_folder: Path) -> None:
     library = published_folder / LIBRARY
     text = library.read_text()
 
-    def refused(change: Callable[[dict[str, Any]], None], match: str) -> None:
+    def refused(
+        change: Callable[[dict[str, Any]], None], match: str, error: type[Exception] = ExperimentDataError
+    ) -> None:
         content = json.loads(text)
         change(content)
         library.write_text(json.dumps(content))
-        with pytest.raises(ExperimentDataError, match=match):
+        with pytest.raises(error, match=match):
             read_targets(published_folder)
 
     def put(value: float) -> Callable[[dict[str, Any]], None]:
@@ -122,7 +124,11 @@ def test_other_levels_and_signs_are_refused(published_folder: Path) -> None:
 
         return change
 
-    refused(put(float("nan")), r"\[20\]\[0\]\[3g\]\[mean\] must hold 24 finite")
+    refused(put(float("nan")), "NaN is no number in JSON", ExperimentFileError)
+    refused(
+        lambda content: content["observations"]["20"]["0"]["3g"]["mean"].pop(),
+        r"\[20\]\[0\]\[3g\]\[mean\] must hold 24 finite",
+    )
     refused(put(-5.0), "must be positive")
     refused(lambda content: content["states"][0].pop(), "the levels of z1")
     refused(lambda content: content["controls"].pop(), "has no control 3g")
