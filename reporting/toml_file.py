@@ -1,11 +1,15 @@
 """The one reader of TOML: whatever is wrong with a file becomes one sentence of the caller's exception."""
 
+import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from reporting.text_file import check_nesting, decoded, read_text, too_deep
+
+_LONGEST_KEY = re.compile(r"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){1000}""", re.ASCII)
+"""A dotted key of so many parts; `tomllib` takes a time that grows with their square."""
 
 
 def read_toml(
@@ -53,6 +57,8 @@ def parse_toml(
 def _parsed(
     text: str, subject: str, error: type[Exception], parse_float: Callable[[str], Any]
 ) -> dict[str, Any]:
+    if _LONGEST_KEY.search(text):
+        raise error(too_deep(subject))
     try:
         content = tomllib.loads(text, parse_float=parse_float)
     except tomllib.TOMLDecodeError as cause:

@@ -182,7 +182,7 @@ def test_a_refused_point_a_crash_and_a_hanging_fmu_are_one_sentence_each(
 ) -> None:
     out = tmp_path / "lever.nc"
     with pytest.raises(
-        FmuCallError, match=r"at wear = 0\.5, control push = 2, mode = 5, gain = 0\.9: .*Discard"
+        FmuCallError, match=r"at wear = 0\.5, control push = [24], mode = 5, gain = 0\.9: .*Discard"
     ):
         sample_library(grid(files, REFUSE), out, workers=2)
     # What came before is kept, so that the user can mend the FMU's surroundings and go on.
