@@ -309,7 +309,11 @@ def _in_part(
     more = {
         "explained": explained, "remainders": remainder_estimates(problem, best), "gates": gates,
     }  # fmt: skip
-    left = f"what is left is {explained.left:.2g} times the noise and unexplained"
+    left = (
+        f"what is left is {explained.left:.2g} times the noise and unexplained"
+        if explained.left > 0.0
+        else "nothing is left beyond the noise"
+    )
     if rivals and len(rivals) < SEARCH.largest_group:
         members = [best, *rivals]
         told_of = [
@@ -317,7 +321,7 @@ def _in_part(
             for item in members
         ]
         sentence = (
-            f"Either {', '.join(told_of[:-1])} or {told_of[-1]} closes so much of the gap on "
+            f"Either {', '.join(told_of[:-1])} or {told_of[-1]} closes this share of the gap on "
             f"{explained.trials} trials; these data cannot tell which, and {left}."
         )
         return told.verdict(
