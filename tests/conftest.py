@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import os
+
+# Two workers on two cores: threads of BLAS that wait for each other cost more than they bring, and sums of
+# one thread repeat. Before NumPy is imported.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import importlib.util
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
