@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from fmu_asset.door.session import FmiAsset
     from fmu_asset.packing.wing_fmu import build_fmu
     from twin_master.mission.preparation import prepare_twin
+    from twin_master.network.estimator import Carried, Estimate, ExactFilter
     from twin_master.network.graphical_model import GraphicalModel
     from twin_master.network.inference import filter_sequence
     from twin_master.network.planner import value_iteration
@@ -34,6 +35,9 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from twin_master.workflow import resume_run as resume
 
 __all__ = [
+    "Carried",
+    "Estimate",
+    "ExactFilter",
     "FmiAsset",
     "GaussianSensorModel",
     "GraphicalModel",
@@ -62,6 +66,9 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Carried": "twin_master.network.estimator",
+    "Estimate": "twin_master.network.estimator",
+    "ExactFilter": "twin_master.network.estimator",
     "FmiAsset": "fmu_asset.door.session",
     "GaussianSensorModel": "twin_master.network.sensor_model",
     "GraphicalModel": "twin_master.network.graphical_model",

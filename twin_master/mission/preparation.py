@@ -16,11 +16,12 @@ from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.mission.plant import Plant
 from twin_master.mission.truth import Truth
+from twin_master.network.estimator import Estimator
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.planner import PlannedPolicy, given_policy, value_iteration
 from twin_master.network.rewards import RewardModel, RewardSettings
 from twin_master.network.sensor_model import GaussianSensorModel, check_noise
-from twin_master.network.twin import Twin, build_graphical_model
+from twin_master.network.twin import Planner, Twin, build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 
@@ -60,22 +61,35 @@ class Knowledge:
         weights = self.scenario.rewards
         return self.rewards.planning_reward(weights.health_weight, weights.control_weight)
 
-    def twin(self, policy: ArrayLike | None = None) -> Twin:
+    def twin(
+        self,
+        policy: ArrayLike | Planner | None = None,
+        *,
+        lag: int | None = None,
+        estimator: Estimator | None = None,
+    ) -> Twin:
         """Return a twin that has seen nothing yet.
 
         Parameters
         ----------
-        policy : (S, U), optional
-            p(U | D), row-stochastic; that of the plan if left out.
+        policy : (S, U) or callable, optional
+            p(U | D), row-stochastic, or a planner; that of the plan if left out.
+        lag : int or None
+            How many turns back it smooths and may be revised; None keeps all, as a mission of a known length
+            wants.
+        estimator : Estimator, optional
+            What holds the belief in the place of the exact filter.
         """
         return Twin(
             self.scenario.mission.name,
             self.model,
             self.sensor_model,
-            self.plan.policy if policy is None else self.model.policy(policy),
-            self.scenario.mission.steps,
-            self.scenario.mission.prediction_steps,
-            self.scenario.planner.decide_on,
+            self.plan.policy if policy is None else policy,
+            prediction_steps=self.scenario.mission.prediction_steps,
+            decide_on=self.scenario.planner.decide_on,
+            lag=lag,
+            first_control=self.scenario.mission.first_control,
+            estimator=estimator,
         )
 
     def truth(self, seed: int) -> Truth:

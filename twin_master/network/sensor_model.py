@@ -20,6 +20,7 @@ __all__ = ["GaussianSensorModel", "PredictiveCheck", "check_noise"]
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+_WORST_SHOWN = 3
 LOG_ROOT_TWO_PI = 0.5 * float(np.log(2.0 * np.pi))
 
 
@@ -268,6 +269,17 @@ class GaussianSensorModel(QuantityModel):
             result,
         )
         return result
+
+    def worst_residuals(self, observation: ArrayLike, control_index: int) -> dict[str, float]:
+        """Return the sensors that fit worst in the state that fits best, in standard deviations."""
+        predicted = self.mean[:, control_index]
+        deviation = self.total_standard_deviation[:, control_index]
+        with np.errstate(over="ignore"):  # an absurd observation is what this is for
+            residual = (np.asarray(observation) - predicted) / deviation
+            distance = np.nan_to_num(np.abs(residual), nan=0.0)
+            best = int(np.argmin(distance.sum(axis=1)))
+        order = np.argsort(-distance[best])[:_WORST_SHOWN]
+        return {f"sensor {index + 1}": float(residual[best, index]) for index in order}
 
     def noise(self, joint: ArrayLike) -> Float:
         """Return the standard deviation (..., G) of noise and model error under beliefs (..., S, U), SI."""

@@ -3,22 +3,35 @@
 It holds no asset and no truth.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from twin_master.errors import InvalidModelError
+from twin_master.network.estimator import (
+    Carried,
+    Estimate,
+    Estimator,
+    ExactFilter,
+    Learnt,
+    Notice,
+    SensorModel,
+)
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
-from twin_master.network.inference import ObservationContext, Predicted, filter_step, predict, smooth
-from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.network.inference import Predicted, predict
+from twin_master.network.packed_arrays import packed_arrays, unpacked_arrays
 from twin_master.scenario.schema import Scenario
 
 Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
-_WORST_SHOWN = 3
+Planner = Callable[[GraphicalModel], ArrayLike]
+"""Returns the policy p(U | D), (S, U), for states, controls and transitions."""
+DEFAULT_LAG = 50
+"""Turns back that a twin smooths and may be revised."""
 
 
 def build_graphical_model(scenario: Scenario) -> GraphicalModel:
@@ -48,10 +61,14 @@ def build_graphical_model(scenario: Scenario) -> GraphicalModel:
 
 @dataclass(frozen=True)
 class TwinTurn:
-    """What the twin concludes in one turn t.
+    """What the twin concludes in one turn t, and its decision.
 
     Attributes
     ----------
+    turn : int
+        The number t, from 0.
+    control_index : int
+        Control u_t in force.
     filtered : (S,)
         p(D_t | o_0..o_t).
     log_evidence : float
@@ -62,17 +79,36 @@ class TwinTurn:
         policy(U | D) averaged over the belief that the twin decides on.
     next_control : int
         Its mode, the first of equals: the control to fly in step t + 1.
+    learnt : dict of str to Learnt
+        Posterior of what the estimator learns.
+    notices : tuple of Notice
+        What the operator should know.
     """
 
+    turn: int
+    control_index: int
     filtered: Float
     log_evidence: float
     prediction: Predicted
     decision_probability: Float
     next_control: int
+    learnt: Mapping[str, Learnt] = field(default_factory=dict)
+    notices: tuple[Notice, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A turn that is kept: what was observed and what the estimator carries on."""
+
+    observation: Float
+    estimate: Carried
 
 
 class Twin:
-    """Belief about one asset, updated turn by turn.
+    """Belief about one asset, updated turn by turn, without end.
+
+    A turn costs the same time and memory at the start and after years: what is kept are the last `lag` turns,
+    over which the twin smooths and into which it takes what comes late.
 
     Parameters
     ----------
@@ -80,105 +116,234 @@ class Twin:
         Name of the twin, for messages.
     model : GraphicalModel
         S states, U controls.
-    sensor_model : GaussianSensorModel
-        Gives log p(o_t | D_t, u_t).
-    policy : (S, U)
-        p(U | D), row-stochastic.
-    steps : int
-        Largest number of turns.
+    sensor_model : SensorModel
+        Gives log p(o_t | D_t, u_t): a `GaussianSensorModel`, or anything with its `log_likelihood`.
+    policy : (S, U) or callable
+        p(U | D), row-stochastic, or a planner: called with the model, it returns the policy.
     prediction_steps : int
         How far to predict.
     decide_on : {"filtered", "predicted"}
         The next control is the mode of policy(U | D) averaged over p(D_t | o_0..o_t), so that the policy
         acts on the state last observed, as in the paper's graph; or over p(D_{t+1} | o_0..o_t), one step
         ahead, as in the authors' published code.
+    lag : int or None
+        How many turns back the twin smooths and may be revised; None keeps all turns.
+    first_control : int or str
+        Control of the first turn, where none is given with it.
+    estimator : Estimator, optional
+        What holds the belief in the place of the exact filter of model and sensor model.
+
+    Raises
+    ------
+    InvalidModelError, InvalidDistributionError
+        The policy has another shape or is none, there is no such control, or the lag is negative.
     """
 
     def __init__(
         self,
         name: str,
         model: GraphicalModel,
-        sensor_model: GaussianSensorModel,
-        policy: Float,
-        steps: int,
-        prediction_steps: int,
+        sensor_model: SensorModel,
+        policy: "ArrayLike | Planner",
+        *,
+        prediction_steps: int = 10,
         decide_on: Literal["filtered", "predicted"] = "filtered",
+        lag: int | None = DEFAULT_LAG,
+        first_control: int | str = 0,
+        estimator: Estimator | None = None,
     ) -> None:
+        if lag is not None and lag < 0:
+            raise InvalidModelError(f"expected a lag of 0 or more turns, or None for all, got {lag}")
         self.name = name
-        self.model = model
         self.sensor_model = sensor_model
-        self.policy = policy
+        self.estimator: Estimator = estimator or ExactFilter(model, sensor_model, name)
+        self.policy = model.policy(policy(model) if callable(policy) else policy)
         self.prediction_steps = prediction_steps
         self.decide_on = decide_on
-        size = model.states.size
-        self._log_filtered: Float = np.zeros((steps, size))
-        self._control: Index = np.zeros(steps, dtype=np.int64)
+        self.lag = lag
+        # One turn more than is smoothed: what the oldest of them followed from.
+        self._seen: deque[_Seen] = deque(maxlen=None if lag is None else lag + 2)
         self._turns = 0
+        self._proposed = self._index_of(first_control)
+
+    @property
+    def model(self) -> GraphicalModel:
+        """States, controls, prior and transitions."""
+        return self.estimator.model
 
     @property
     def turns(self) -> int:
         """Number of turns seen so far."""
         return self._turns
 
-    def turn(self, observation: Float, control_index: int) -> TwinTurn:
-        """Assimilate one observation, predict and decide.
+    @property
+    def proposed_control(self) -> int:
+        """Index of the control for the next turn: that of the last decision, or the first control."""
+        return self._proposed
+
+    @property
+    def first_kept(self) -> int:
+        """The first turn of `smoothed`, and the first that may still be revised."""
+        return self._turns - len(self._recent())
+
+    def turn(self, observation: ArrayLike, control: int | str | None = None) -> TwinTurn:
+        """Advance by one turn, correct by an observation, predict and decide.
 
         Parameters
         ----------
         observation : (G,)
-            What the sensors say, SI; NaN where nothing was received.
-        control_index : int
-            The control in force during this turn.
+            What the sensors say, SI; NaN where nothing was received. All NaN predicts through the turn.
+        control : int or str, optional
+            Index or name of the control in force during this turn; the one that was proposed if left out.
 
         Raises
         ------
         ImpossibleObservation
             If the observation is impossible in every state that the belief allows; the twin is unchanged.
+        InvalidObservationError, InvalidModelError
+            If the observation has another shape or is infinite; if there is no such control.
         """
-        step = self._turns
-        log_likelihood = self.sensor_model.log_likelihood(observation, control_index)
+        given = np.array(observation, dtype=np.float64)
+        index = self._proposed if control is None else self._index_of(control)
+        before = self._seen[-1].estimate if self._seen else None
+        estimate = self.estimator.turn(before, given, index, self._turns)
+        self._seen.append(_Seen(given, estimate.carried))
+        self._turns += 1
+        return self._decided(estimate)
 
-        def worst(_step: int) -> Mapping[str, float]:
-            return self._worst_residuals(observation, control_index)
+    def revise(self, turn: int, observation: ArrayLike, control: int | str | None = None) -> TwinTurn:
+        """Put an observation that came late in its place, and filter anew from there.
 
-        filtered = filter_step(
-            self.model,
-            self._log_filtered[step - 1] if step else None,
-            int(self._control[step - 1]) if step else None,
-            log_likelihood,
-            ObservationContext(self.name, step, worst),
-        )
-        self._log_filtered[step] = filtered.log_filtered
-        self._control[step] = control_index
-        self._turns = step + 1
-        prediction = predict(self.model, filtered.filtered, control_index, self.policy, self.prediction_steps)
-        decided_on = filtered.filtered
-        if self.decide_on == "predicted":
-            decided_on = filtered.filtered @ self.model.transition.matrix[control_index]
-        decision_probability: Float = decided_on @ self.policy
-        return TwinTurn(
-            filtered=filtered.filtered,
-            log_evidence=filtered.log_evidence,
-            prediction=prediction,
-            decision_probability=decision_probability,
-            next_control=int(np.argmax(decision_probability)),
-        )
+        The result is that of a twin which had it in time, to the last bit, where the controls in force were
+        the same.
+
+        Parameters
+        ----------
+        turn : int
+            Its turn, not before `first_kept`.
+        observation, control
+            As in `turn`; the control that was assumed for that turn if left out.
+
+        Returns
+        -------
+        TwinTurn
+            What the twin now concludes in its last turn.
+
+        Raises
+        ------
+        IndexError
+            The turn is not kept any more, or has not been.
+        ImpossibleObservation, InvalidObservationError, InvalidModelError
+            As in `turn`; the twin is unchanged.
+        """
+        if not self.first_kept <= turn < self._turns:
+            raise IndexError(
+                f"turn {turn} cannot be revised: the twin keeps the turns from {self.first_kept} on and has "
+                f"seen {self._turns}"
+            )
+        offset = self._turns - len(self._seen)
+        at = turn - offset
+        index = self._seen[at].estimate.control_index if control is None else self._index_of(control)
+        rows = [(np.array(observation, dtype=np.float64), index)]
+        rows += [(seen.observation, seen.estimate.control_index) for seen in list(self._seen)[at + 1 :]]
+        before = self._seen[at - 1].estimate if at else None
+        anew: list[_Seen] = []
+        for number, (given, in_force) in enumerate(rows, start=turn):
+            estimate = self.estimator.turn(before, given, in_force, number)
+            before = estimate.carried
+            anew.append(_Seen(given, before))
+        for position, seen in enumerate(anew, start=at):
+            self._seen[position] = seen
+        return self._decided(estimate)
+
+    def observed(self, turn: int) -> Float:
+        """Return what was observed in a turn that is kept: (G,), NaN where nothing was received."""
+        return self._seen[turn - self._turns + len(self._seen)].observation
+
+    def control_of(self, turn: int) -> int:
+        """Return the index of the control in force in a turn that is kept."""
+        return self._seen[turn - self._turns + len(self._seen)].estimate.control_index
+
+    def predict(self, belief: ArrayLike, control: int | str, steps: int | None = None) -> Predicted:
+        """Predict through the policy from any belief (S,) under a control in force: eqs. (37)-(39)."""
+        ahead = self.prediction_steps if steps is None else steps
+        return predict(self.model, belief, self._index_of(control), self.policy, ahead)
 
     def smoothed(self) -> Float:
-        """Return p(D_k | o_0..o_t) for every turn k = 0..t seen so far: (t + 1, S).
+        """Return p(D_k | o_0..o_t) for the turns k = `first_kept`..t: (n, S).
 
-        The decision does not need it, and after each turn it would cost the square of the turns.
+        The decision does not need it, and after each turn it would cost as many steps as are kept.
         """
-        seen = slice(0, self._turns)
-        return smooth(self.model, self._control[seen], self._log_filtered[seen]).smoothed
+        return self.estimator.smoothed([seen.estimate for seen in self._recent()])
 
-    def _worst_residuals(self, observation: Float, control_index: int) -> dict[str, float]:
-        """Return the sensors that fit worst in the state that fits best, in standard deviations."""
-        predicted = self.sensor_model.mean[:, control_index]
-        deviation = self.sensor_model.total_standard_deviation[:, control_index]
-        with np.errstate(over="ignore"):  # an absurd observation is what this is for
-            residual = (observation - predicted) / deviation
-            distance = np.nan_to_num(np.abs(residual), nan=0.0)
-            best = int(np.argmin(distance.sum(axis=1)))
-        order = np.argsort(-distance[best])[:_WORST_SHOWN]
-        return {f"sensor {index + 1}": float(residual[best, index]) for index in order}
+    def save_state(self) -> bytes:
+        """Return all that the twin has seen and keeps, for `restore_state`."""
+        arrays: dict[str, NDArray[Any]] = {"turns": np.array([self._turns, self._proposed])}
+        for place, seen in enumerate(self._seen):
+            arrays[f"{place}/observation"] = seen.observation
+            arrays[f"{place}/control"] = np.array(seen.estimate.control_index)
+            arrays |= {f"{place}/carried/{name}": value for name, value in seen.estimate.arrays.items()}
+        return packed_arrays(arrays)
+
+    def restore_state(self, state: bytes) -> None:
+        """Go on from a saved state of a twin of the same model, sensors and estimator, to the last bit.
+
+        Raises
+        ------
+        InvalidModelError
+            It is no such state.
+        """
+        arrays = unpacked_arrays(state)
+        try:
+            turns, proposed = arrays["turns"].tolist()
+            seen: list[_Seen] = []
+            while f"{len(seen)}/control" in arrays:
+                prefix = f"{len(seen)}/carried/"
+                own = {
+                    name.removeprefix(prefix): value
+                    for name, value in arrays.items()
+                    if name.startswith(prefix)
+                }
+                control = int(arrays[f"{len(seen)}/control"])
+                seen.append(_Seen(arrays[f"{len(seen)}/observation"], Carried(control, own)))
+        except (KeyError, ValueError, TypeError) as error:
+            raise InvalidModelError(f"this is no saved state of a twin: {error}") from error
+        self._turns, self._proposed = turns, proposed
+        self._seen.clear()
+        self._seen.extend(seen)
+
+    def _recent(self) -> list[_Seen]:
+        seen = list(self._seen)
+        return seen if self.lag is None else seen[-(self.lag + 1) :]
+
+    def _index_of(self, control: int | str) -> int:
+        controls = self.model.controls
+        if isinstance(control, str):
+            if control not in controls:
+                raise InvalidModelError(f"no control is named {control!r}; there are {', '.join(controls)}")
+            return controls.index(control)
+        if not 0 <= control < len(controls):
+            raise InvalidModelError(
+                f"expected a control index between 0 and {len(controls) - 1}, got {control}"
+            )
+        return int(control)
+
+    def _decided(self, estimate: Estimate) -> TwinTurn:
+        control_index = estimate.carried.control_index
+        prediction = predict(self.model, estimate.filtered, control_index, self.policy, self.prediction_steps)
+        decided_on = estimate.filtered
+        if self.decide_on == "predicted":
+            decided_on = estimate.filtered @ self.model.transition.matrix[control_index]
+        decision_probability: Float = decided_on @ self.policy
+        self._proposed = int(np.argmax(decision_probability))
+        return TwinTurn(
+            turn=self._turns - 1,
+            control_index=control_index,
+            filtered=estimate.filtered,
+            log_evidence=estimate.log_evidence,
+            prediction=prediction,
+            decision_probability=decision_probability,
+            next_control=self._proposed,
+            learnt=estimate.learnt,
+            notices=estimate.notices,
+        )

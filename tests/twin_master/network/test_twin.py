@@ -14,10 +14,12 @@ from scipy.stats import binom
 from scenarios import scenario_files
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
-from twin_master.errors import ImpossibleObservation
+from twin_master.errors import ImpossibleObservation, InvalidModelError
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.network.estimator import Carried, Estimate, ExactFilter, Learnt
 from twin_master.network.inference import filter_sequence, smooth
-from twin_master.network.twin import TwinTurn, build_graphical_model
+from twin_master.network.packed_arrays import packed_arrays
+from twin_master.network.twin import Twin, TwinTurn, build_graphical_model
 from twin_master.scenario.reading import load_scenario, parse_scenario
 
 
@@ -131,3 +133,116 @@ def test_an_impossible_observation_names_twin_step_and_sensors(knowledge: Knowle
     assert twin.turns == 1
     twin.turn(good, 1)
     assert twin.smoothed().shape == (2, 25)
+
+
+@pytest.fixture
+def seen(knowledge: Knowledge) -> np.ndarray:
+    """Forty turns (40, 24) of a wing that is getting worse, as 3g shows it."""
+    noise = np.random.default_rng(1).standard_normal((40, 24))
+    return knowledge.sensor_model.mean[np.arange(40) // 9 * 6, 1] + 150e-6 * noise
+
+
+def same_turn(first: TwinTurn, second: TwinTurn) -> bool:
+    """Return whether two turns are the same to the last bit."""
+    return (first.turn, first.next_control, first.log_evidence) == (
+        second.turn,
+        second.next_control,
+        second.log_evidence,
+    ) and all(
+        np.array_equal(getattr(first, name), getattr(second, name))
+        for name in ("filtered", "decision_probability")
+    )
+
+
+def test_a_twin_has_no_last_turn_and_smooths_over_its_lag(knowledge: Knowledge, seen: np.ndarray) -> None:
+    """The smoother of a lag is that of the whole history: it needs no likelihood from before."""
+    bounded, whole = knowledge.twin(lag=5), knowledge.twin()
+    for count, row in enumerate(seen, start=1):
+        assert same_turn(bounded.turn(row, "3g"), whole.turn(row, 1))
+        first = max(0, count - 6)
+        assert bounded.first_kept == first
+        np.testing.assert_array_equal(bounded.smoothed(), whole.smoothed()[first:])
+    assert knowledge.twin(lag=0).turn(seen[0]).control_index == 1  # the first control of the scenario
+
+
+@pytest.mark.parametrize("late", [0, 30, 34, 39])
+def test_what_comes_late_is_put_in_its_place(knowledge: Knowledge, seen: np.ndarray, late: int) -> None:
+    lag = None if late == 0 else 9
+    clean, twin = knowledge.twin(lag=lag), knowledge.twin(lag=lag)
+    for turn, row in enumerate(seen):
+        last = clean.turn(row, 1)
+        twin.turn(np.full(24, np.nan) if turn == late else row, 1)
+    assert same_turn(twin.revise(late, seen[late]), last)
+    np.testing.assert_array_equal(twin.smoothed(), clean.smoothed())
+    np.testing.assert_array_equal(twin.observed(late), seen[late])
+    np.testing.assert_array_equal(twin.turn(seen[0], 0).filtered, clean.turn(seen[0], 0).filtered)
+
+
+def test_a_turn_that_is_not_kept_cannot_be_revised(knowledge: Knowledge, seen: np.ndarray) -> None:
+    twin = knowledge.twin(lag=4)
+    for row in seen[:10]:
+        twin.turn(row)
+    for turn in (4, 10, -1):
+        with pytest.raises(IndexError, match=rf"turn {turn} .*from 5 on.*seen 10"):
+            twin.revise(turn, seen[0])
+    state = twin.save_state()
+    with pytest.raises(ImpossibleObservation):
+        twin.revise(7, np.full(24, 1e300))
+    assert twin.save_state() == state
+
+
+def test_a_stored_twin_goes_on_to_the_last_bit(knowledge: Knowledge, seen: np.ndarray) -> None:
+    twin = knowledge.twin(lag=6)
+    for row in seen[:20]:
+        twin.turn(row)
+    other = knowledge.twin(lag=6)
+    other.restore_state(twin.save_state())
+    assert other.proposed_control == twin.proposed_control
+    for row in seen[20:]:
+        assert same_turn(twin.turn(row), other.turn(row))
+    assert other.save_state() == twin.save_state()
+    for damaged in (b"", twin.save_state()[:-7], packed_arrays({"a": np.zeros(2)})):
+        with pytest.raises(InvalidModelError):
+            other.restore_state(damaged)
+
+
+def test_own_policy_planner_sensor_model_and_estimator(knowledge: Knowledge, seen: np.ndarray) -> None:
+    class Tenfold:
+        """A sensor model of a user's own: no residuals, only a likelihood."""
+
+        def log_likelihood(self, observation: object, control_index: int, /) -> np.ndarray:
+            return knowledge.sensor_model.log_likelihood(observation, control_index)  # type: ignore[arg-type]
+
+    class Counting(ExactFilter):
+        """An estimator that learns: it carries a figure from turn to turn beside the belief."""
+
+        def turn(
+            self, before: Carried | None, observation: np.ndarray, control_index: int, turn: int
+        ) -> Estimate:
+            estimate = super().turn(before, observation, control_index, turn)
+            count = 1.0 if before is None else float(before.arrays["count"]) + 1.0
+            carried = Carried(control_index, {**estimate.carried.arrays, "count": np.array(count)})
+            return replace(estimate, carried=carried, learnt={"count": Learnt(count, 0.0, count, count)})
+
+    model = knowledge.model
+    own = Twin(
+        "own",
+        model,
+        Tenfold(),
+        lambda given: np.eye(2)[np.zeros(given.states.size, dtype=int)],
+        estimator=Counting(model, Tenfold()),
+        lag=3,
+    )
+    plain = knowledge.twin()
+    for number, row in enumerate(seen[:8], start=1):
+        mine, theirs = own.turn(row, 1), plain.turn(row, 1)
+        np.testing.assert_array_equal(mine.filtered, theirs.filtered)
+        assert mine.next_control == 0
+        assert mine.learnt["count"].mean == number
+    assert own.revise(6, seen[6]).learnt["count"].mean == 8
+    assert np.isfinite(own.predict(mine.filtered, "2g", 4).predicted).all()
+    with pytest.raises(ImpossibleObservation):
+        own.turn(np.full(24, 1e300))
+    for wrong, match in (("4g", "no control is named '4g'"), (2, "between 0 and 1")):
+        with pytest.raises(InvalidModelError, match=match):
+            own.turn(seen[0], wrong)  # type: ignore[arg-type]

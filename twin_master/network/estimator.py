@@ -1,0 +1,193 @@
+"""What holds the belief of a twin: one protocol, and the exact filter of the graphical model.
+
+An estimator has no state of its own. What it carries from turn to turn are arrays that it hands out with each
+estimate and is given back for the next: a twin that keeps them can smooth over them, go back and take in what
+came late, and be stored and continued to the last bit.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.inference import ObservationContext, filter_step, smooth
+
+__all__ = ["Carried", "Estimate", "Estimator", "ExactFilter", "Learnt", "Notice", "SensorModel"]
+
+Float = NDArray[np.float64]
+
+
+class SensorModel(Protocol):
+    """What the sensors say in each state: a `GaussianSensorModel`, or one of a user's own.
+
+    It may have `worst_residuals(observation, control_index)`, a mapping of the sensors that fit worst to
+    their standardised residuals, for the message about an impossible observation.
+    """
+
+    def log_likelihood(self, observation: ArrayLike, control_index: int, /) -> Float:
+        """Return log p(o | D, u) for each state (S,); of an observation (G,), NaN where a sensor is lost."""
+
+
+@dataclass(frozen=True)
+class Carried:
+    """What an estimator carries from one turn to the next.
+
+    Attributes
+    ----------
+    control_index : int
+        Control u_t in force in the turn.
+    arrays : dict of str to array
+        All that the estimator needs of the turn, to go on and to smooth.
+    """
+
+    control_index: int
+    arrays: Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """Posterior of a quantity that does not change in time.
+
+    Attributes
+    ----------
+    mean, standard_deviation, lower, upper : float
+        Moments and the bounds of the central 90 % interval, in `unit`.
+    unit : str
+    """
+
+    mean: float
+    standard_deviation: float
+    lower: float
+    upper: float
+    unit: str = "1"
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something that the operator should know.
+
+    Attributes
+    ----------
+    kind : str
+        What sort of notice, for programs: `alarm`, `gauge_left_out`, ...
+    sentence : str
+        For people; an alarm ends with the command to type.
+    sensors : tuple of int
+        Numbers of the sensors that it concerns, from 1.
+    value : float or None
+        The figure that it rests on.
+    """
+
+    kind: str
+    sentence: str
+    sensors: tuple[int, ...] = ()
+    value: float | None = None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What an estimator concludes in one turn t.
+
+    Attributes
+    ----------
+    forecast : (S,)
+        p(D_t | o_0..o_{t-1}).
+    filtered : (S,)
+        p(D_t | o_0..o_t).
+    log_evidence : float
+        log p(o_t | o_0..o_{t-1}).
+    carried : Carried
+        For the turn after.
+    learnt : dict of str to Learnt
+        Posterior of what is learnt, by name.
+    notices : tuple of Notice
+        What the operator should know of this turn.
+    """
+
+    forecast: Float
+    filtered: Float
+    log_evidence: float
+    carried: Carried
+    learnt: Mapping[str, Learnt] = field(default_factory=dict)
+    notices: tuple[Notice, ...] = ()
+
+
+class Estimator(Protocol):
+    """What holds the belief: the exact filter, or one that learns beside it."""
+
+    @property
+    def model(self) -> GraphicalModel:
+        """States, controls, prior and transitions: what the twin predicts with."""
+
+    def turn(self, before: Carried | None, observation: Float, control_index: int, turn: int) -> Estimate:
+        """Advance the belief to turn t and correct it by an observation.
+
+        Parameters
+        ----------
+        before : Carried or None
+            Of turn t - 1; None at the first turn, which starts from the prior.
+        observation : (G,)
+            SI; NaN where a sensor is lost. With all of them lost the belief is predicted through.
+        control_index : int
+            Control u_t in force.
+        turn : int
+            Number t of the turn, for messages.
+
+        Raises
+        ------
+        ImpossibleObservation
+            The observation has probability zero wherever the belief has support.
+        """
+
+    def smoothed(self, carried: Sequence[Carried]) -> Float:
+        """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""
+
+
+class ExactFilter:
+    """The exact filter and smoother: Kapteyn et al. 2021, eqs. (2), (28)-(31).
+
+    It carries the logarithm of the filtered belief, `log_filtered` (S,).
+
+    Parameters
+    ----------
+    model : GraphicalModel
+    sensor_model : SensorModel
+    name : str
+        Name of the twin, for messages.
+    """
+
+    def __init__(self, model: GraphicalModel, sensor_model: SensorModel, name: str = "twin") -> None:
+        self._model = model
+        self._sensor_model = sensor_model
+        self._name = name
+
+    @property
+    def model(self) -> GraphicalModel:
+        """States, controls, prior and transitions."""
+        return self._model
+
+    def turn(self, before: Carried | None, observation: Float, control_index: int, turn: int) -> Estimate:
+        """Advance the belief to turn t and correct it by an observation, see `Estimator.turn`."""
+
+        def worst(_step: int) -> Mapping[str, float]:
+            own = getattr(self._sensor_model, "worst_residuals", None)
+            return {} if own is None else dict(own(observation, control_index))
+
+        step = filter_step(
+            self._model,
+            None if before is None else before.arrays["log_filtered"],
+            None if before is None else before.control_index,
+            self._sensor_model.log_likelihood(observation, control_index),
+            ObservationContext(self._name, turn, worst),
+        )
+        carried = Carried(control_index, {"log_filtered": step.log_filtered})
+        return Estimate(step.forecast, step.filtered, step.log_evidence, carried)
+
+    def smoothed(self, carried: Sequence[Carried]) -> Float:
+        """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""
+        size = self._model.states.size
+        rows = np.array([turn.arrays["log_filtered"] for turn in carried]).reshape(-1, size)
+        return smooth(self._model, [turn.control_index for turn in carried], rows).smoothed
