@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.progress import track
+from threadpoolctl import threadpool_limits
 
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import library
@@ -146,7 +147,7 @@ def main() -> None:
         if arguments.again or not (out / f"{folder.name}.json").exists()
     ]
     WingModel.shipped()  # built once, before the processes start
-    with ProcessPoolExecutor(arguments.jobs) as pool:
+    with ProcessPoolExecutor(arguments.jobs, initializer=threadpool_limits, initargs=(1,)) as pool:
         named = pool.map(partial(_one, out, left_out), folders, chunksize=1)
         for _ in track(named, description="verdicts", total=len(folders), console=Console()):
             pass

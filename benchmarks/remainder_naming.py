@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.signal import lfilter, lsim
+from threadpoolctl import threadpool_limits
 
 from benchmarks.blind.cases import Case, Order, Workbench, finite_signals, workbench
 from benchmarks.blind.changes import Changes
@@ -254,7 +255,7 @@ def main() -> None:
     shutil.rmtree(given.out / "campaigns", ignore_errors=True)
     rows = []
     work = partial(judge, given.out, given.seed, colour=given.colour)
-    with ProcessPoolExecutor(given.jobs) as pool:
+    with ProcessPoolExecutor(given.jobs, initializer=threadpool_limits, initargs=(1,)) as pool:
         for row in pool.map(work, range(given.count)):
             rows.append(row)
             true = ", ".join(row["identifiers"]) or "nothing"

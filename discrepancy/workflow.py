@@ -25,11 +25,11 @@ from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.judgement.look_alikes import look_alike_remark
+from discrepancy.judgement.look_alikes import look_alike_remark, with_untested
 from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
-from discrepancy.location.locate import Location, locate
+from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
@@ -55,12 +55,19 @@ OPEN_KINDS = (
 )
 
 
+class Stage(Protocol):
+    """A stretch of work under way."""
+
+    def advance(self, amount: int = 1, detail: str | None = None) -> None:
+        """Report so many parts done, and what is done now."""
+
+
 class Progress(Protocol):
     """Where the work reports how far it is; `reporting.progress` has implementations."""
 
     def stage(
         self, description: str, total: int | None = None, unit: str = ""
-    ) -> AbstractContextManager[object]:
+    ) -> AbstractContextManager[Stage]:
         """Open a stretch of work."""
 
 
@@ -160,14 +167,15 @@ def investigate(
         )
         return Investigation(campaign, model, faults, verdict, seconds=seconds)
     setting = Setting(campaign, model, model.scales(campaign))
-    with stage("Fitting what is known, and searching the catalogue", "name"):
+    with stage("Fitting what is known, and searching the catalogue", "name") as searching:
         problem = Problem(campaign, model, setting)
         cleaned = without_wrong_ends(problem)
         if cleaned is not campaign:
             campaign, setting = cleaned, replace(setting, campaign=cleaned)
             problem = Problem(campaign, model, setting)
         catalogue = load_catalogue() if effects is None else effects
-        verdict, search, fit = name(problem, catalogue)
+        verdict, search, fit = name(problem, catalogue, tell=searching.tell)
+        verdict = with_untested(verdict, setting, catalogue)
     remarks = [fault.sentence for fault in faults]
     remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stage("Checking the time steps", "steps"):
@@ -185,6 +193,7 @@ def investigate(
         with stage("Locating the gap", "locate"):
             location = locate(before, seed=seed)
             remarks += [text for text in location.remarks if text not in remarks]
+            remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     proof = None
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
@@ -370,10 +379,17 @@ class _Timed:
     ) -> None:
         self._stage = nullcontext() if progress is None else progress.stage(description)
         self._key, self._seconds = key, seconds
+        self._under_way: Stage | None = None
 
-    def __enter__(self) -> None:
+    def __enter__(self) -> "_Timed":
         self._began = time.perf_counter()
-        self._stage.__enter__()
+        self._under_way = self._stage.__enter__()
+        return self
+
+    def tell(self, what: str) -> None:
+        """Say what is done now."""
+        if self._under_way is not None:
+            self._under_way.advance(0, what)
 
     def __exit__(self, *error: object) -> None:
         self._stage.__exit__(*error)  # type: ignore[arg-type]

@@ -75,6 +75,7 @@ def run(
     from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
     from discrepancy.workflow import investigate
 
+    one_thread()
     if (campaign is None) == (from_run is None):
         raise CampaignFileError("Give either the folder of a campaign or --from-run with that of a mission.")
     if from_run is not None and model is not None:
@@ -103,6 +104,18 @@ def run(
     if json:
         terminal.print_json(_record(folder, report=None if no_report else place))
     _conclude(found, tried, folder, f"{'Verdict' if no_report else 'Report'}: {place}", silent=json)
+
+
+def one_thread() -> None:
+    """Hold the linear algebra of this process to one thread, for good.
+
+    Its matrices are small: more threads wait for each other, the longer the busier the machine is, and the
+    last bits of a sum would follow their number.
+    """
+    import scipy.linalg  # noqa: F401 - a library that is not loaded yet cannot be held
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1)
 
 
 def _origin(

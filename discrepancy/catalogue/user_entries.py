@@ -253,19 +253,24 @@ def _places(table: _Table) -> Any:
     given = table.row.get("places")
     if given is None:
         return nowhere_else
+    known = {
+        "ports": _all_ports, "channels": _all_channels, "strain channels": _strain_channels,
+        "runs": _all_runs,
+    }  # fmt: skip
     if isinstance(given, str):
-        known = {
-            "ports": _all_ports,
-            "channels": _all_channels,
-            "strain channels": _strain_channels,
-            "runs": _all_runs,
-        }
         if given not in known:
             raise CatalogueError(
                 f"{table.where}: 'places' must be a list or one of {', '.join(known)}, but is {given!r}."
             )
         return known[given]
-    return partial(_given_places, table.texts("places"))
+    names = table.texts("places")
+    words = [name for name in names if name in known]
+    if words:
+        raise CatalogueError(
+            f"{table.where}: 'places' is a list that holds {words[0]!r}, which would be the name of a single "
+            f'place; for all {words[0]} write places = "{words[0]}", without brackets.'
+        )
+    return partial(_given_places, names)
 
 
 def _given_places(names: tuple[str, ...], setting: Setting) -> tuple[str, ...]:

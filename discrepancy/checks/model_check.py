@@ -30,6 +30,15 @@ _SLIPS = (
     (100.0, 1.7), (0.01, 1.7), (9.80665, 1.35), (1.0 / 9.80665, 1.35),
 )  # fmt: skip
 """Factors of a unit slip, and the factor by which physics may be off besides."""
+_INPUTS = {
+    TrialKind.STATIC: (Quantity.FORCE,), TrialKind.FORCED: (Quantity.FORCE,),
+    TrialKind.RINGDOWN: (Quantity.DISPLACEMENT,), TrialKind.FLIGHT: (Quantity.ACCELERATION,),
+}  # fmt: skip
+"""What drives a trial, as its quantity: the load factor may have been given in m/s2."""
+_UNLISTED = {
+    Quantity.FORCE: {9.80665, 1.0 / 9.80665}, Quantity.DISPLACEMENT: {100.0, 0.01},
+}  # fmt: skip
+"""Factors of units that files do not have: kilograms of force, centimetres."""
 SURE_SLIP = 500.0
 """Slips beyond this factor are seen in a single trial of a channel; smaller ones need several trials."""
 _FROM_MOTION = {Quantity.DISPLACEMENT, Quantity.VELOCITY, Quantity.ACCELERATION}
@@ -202,15 +211,17 @@ def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, used: NDAr
 def _plausible(campaign: Campaign, name: str, trial: str) -> tuple[tuple[float, float], ...]:
     """Return the factors of unit slips that a channel can have, and by which factor physics may be off.
 
-    In driven trials those between two units of the channel, or of an input; in others all that are usual.
+    Those between two units of the channel, or of what drives the trial.
     """
     inputs = next(item for item in campaign.trials if item.name == trial)
-    if inputs.kind is not TrialKind.DRIVEN:
-        return _SLIPS
     found = set()
-    for quantity in (campaign.channels[name].quantity, *(item.quantity for item in inputs.inputs)):
+    own = campaign.channels[name].quantity
+    for quantity in (own, *_INPUTS.get(inputs.kind, ()), *(item.quantity for item in inputs.inputs)):
         sizes = [si_value("1.0", quantity, unit) for unit in units_of(quantity)]
         found |= {one / other for one in sizes for other in sizes if not 1.0 / 5.0 < one / other < 5.0}
+        found |= _UNLISTED.get(quantity, set())
+    if inputs.kind is not TrialKind.DRIVEN:
+        return tuple(slip for slip in _SLIPS if any(abs(slip[0] / item - 1.0) < 1e-3 for item in found))
     return tuple((factor, 3.0 if not 5e-3 < factor < 200.0 else 1.35) for factor in sorted(found))
 
 

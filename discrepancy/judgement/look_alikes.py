@@ -1,9 +1,39 @@
 """What a name does not exclude: causes that the catalogue lacks and that act alike."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
-from discrepancy.catalogue.entry import Effect
+from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.search.starting_points import are_related
 from discrepancy.verdict import Verdict, VerdictKind
+
+TOLD = 3
+"""Effects that were not tested and are called by name in the sentence of a verdict."""
+
+
+def with_untested(verdict: Verdict, setting: Setting, effects: Sequence[Effect]) -> Verdict:
+    """Return a verdict on a group or on several effects that says first what could not be tested.
+
+    A cause that needs another trial or a port is no member of a group, however like one it acts: those that
+    are easily taken for a member are named.
+    """
+    several = verdict.kind in (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART) and len(verdict.effects) > 1
+    if verdict.kind is not VerdictKind.GROUP and not several:
+        return verdict
+    untested = [effect for effect in effects if effect.unavailable(setting) is not None]
+    if not untested:
+        return verdict
+    known = {effect.identifier: effect for effect in effects}
+    members = [known[item.identifier] for item in verdict.effects if item.identifier in known]
+    untested.sort(key=lambda effect: not any(are_related(effect, member) for member in members))
+    names = [effect.name for effect in untested[:TOLD]]
+    rest = len(untested) - len(names)
+    listed = f"{', '.join(names)} and {rest} more" if rest else " and ".join(names)
+    tested = len(effects) - len(untested)
+    sentence = verdict.sentence[0].lower() + verdict.sentence[1:]
+    return replace(
+        verdict, sentence=f"Of the {tested} effects that these trials can test (not {listed}), {sentence}"
+    )
 
 
 def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | None:

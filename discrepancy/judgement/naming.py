@@ -13,6 +13,7 @@ from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.posterior import with_draws
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
+from discrepancy.search.hypotheses import Tell, in_silence
 from discrepancy.search.strategy import Search, search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, NamedEffect, Verdict, VerdictKind
@@ -24,7 +25,9 @@ from .in_part import judged_with_remainder
 from .proof import held_out_gate
 
 
-def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, CandidateFit]:
+def name(
+    problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence
+) -> tuple[Verdict, Search, CandidateFit]:
     """Name what is missing.
 
     Parameters
@@ -33,6 +36,8 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         Campaign and model.
     effects : sequence of Effect
         The catalogue.
+    tell : callable
+        Takes a few words on what is fitted, and how much is left.
 
     Returns
     -------
@@ -44,7 +49,7 @@ def name(problem: Problem, effects: Sequence[Effect]) -> tuple[Verdict, Search, 
         The one that stands for the verdict: of the named set, of the family, of the most probable member of a
         group or of what is too small to tell; else the one without effect.
     """
-    found = search(problem, effects)
+    found = search(problem, effects, tell)
     verdict, _, fit = _as_recorded(problem, found)
     stands = verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY)
     if stands or verdict.kind is VerdictKind.GROUP:

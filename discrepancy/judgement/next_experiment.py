@@ -25,7 +25,7 @@ FloatArray = NDArray[np.float64]
 SAMPLES = 300
 """Simulated outcomes of a trial for each hypothesis."""
 SEED = 20210527
-LEAST_INFORMATION = 0.02
+LEAST_INFORMATION = 0.03
 """Experiments that tell less are not proposed [nat]."""
 PROPOSED = 4
 
@@ -75,7 +75,8 @@ def next_experiments(
     weights = np.array([max(p, 1e-3) for _, p in open_fits])
     weights /= weights.sum()
     found = []
-    for proposal in proposals(problem.campaign, problem):
+    swings = oscillates(problem, open_fits[0][0]) if open_fits else True
+    for proposal in proposals(problem.campaign, problem, swings=swings):
         try:
             information = mutual_information(problem, proposal, [item for item, _ in open_fits], weights)
         except DiscrepancyError:  # not feasible with this model
@@ -145,7 +146,20 @@ def _log_density(outcomes: FloatArray, mean: FloatArray, root: FloatArray) -> Fl
     return np.asarray(-0.5 * (scaled**2).sum(axis=0) - np.log(np.diag(root)).sum())
 
 
-def proposals(campaign: Campaign, problem: Problem) -> Iterator[Proposal]:
+def oscillates(problem: Problem, found: CandidateFit) -> bool:
+    """Whether a release swings in a fit: its readings turn more than once in some channel."""
+    for data, response in zip(problem.trials, found.responses, strict=True):
+        if data.trial.kind is not TrialKind.RINGDOWN:
+            continue
+        steps = np.diff(response, axis=0)
+        large = np.abs(steps) > 1e-9 * np.abs(response).max(initial=0.0)
+        for column, moving in zip(steps.T, large.T, strict=True):
+            if np.count_nonzero(np.diff(np.sign(column[moving]))) > 1:
+                return True
+    return False
+
+
+def proposals(campaign: Campaign, problem: Problem, *, swings: bool = True) -> Iterator[Proposal]:
     """Yield feasible trials: variations of what was done, within its ranges doubled.
 
     Parameters
@@ -154,13 +168,15 @@ def proposals(campaign: Campaign, problem: Problem) -> Iterator[Proposal]:
         What was done.
     problem : Problem
         For the model's scales.
+    swings : bool
+        Whether a release oscillates: a longer record of one that does not shows rest.
     """
     ringdowns = [trial for trial in campaign.trials if trial.kind is TrialKind.RINGDOWN]
     statics = [trial for trial in campaign.trials if trial.kind is TrialKind.STATIC]
     flights = [trial for trial in campaign.trials if trial.kind is TrialKind.FLIGHT]
     scales = problem.setting.scales
     if ringdowns:
-        yield from _ringdowns(campaign, ringdowns, problem, scales.modal_mass)
+        yield from _ringdowns(campaign, ringdowns, problem, scales.modal_mass, swings=swings)
     if statics:
         yield from _statics(statics, problem)
     if flights:
@@ -176,7 +192,7 @@ def proposals(campaign: Campaign, problem: Problem) -> Iterator[Proposal]:
 
 
 def _ringdowns(
-    campaign: Campaign, ringdowns: list[Trial], problem: Problem, modal_mass: float
+    campaign: Campaign, ringdowns: list[Trial], problem: Problem, modal_mass: float, *, swings: bool
 ) -> Iterator[Proposal]:
     def release(trial: Trial) -> float:
         return abs(trial.release.displacement) if trial.release is not None else 0.0
@@ -202,6 +218,29 @@ def _ringdowns(
             "Linear effects scale with the amplitude, friction, slip and stiffening do not.",
             1.0,
         )
+    if swings:
+        yield _longer(largest)
+    if problem.model.supports(PointMass):
+        stations = problem.model.stations()
+        mass = 0.1 * modal_mass
+        yield Proposal(
+            replace(largest, name="added mass"),
+            f"Repeat the release with a known mass of {1e3 * mass:.3g} g at the tip.",
+            "Mass, stiffness and the clock move the frequencies differently when a known mass is added.",
+            1.5,
+            ModelPatch((PointMass(mass, stations[1] if stations is not None else 0.0),)),
+        )
+    if problem.model.supports(ModulusTemperature) and campaign.reference_temperature is not None:
+        yield Proposal(
+            replace(largest, name="warmer release", temperature=largest.temperature + 15.0),
+            "Repeat the release 15 K warmer.",
+            "Only effects of temperature follow it.",
+            3.0,
+        )
+
+
+def _longer(largest: Trial) -> Proposal:
+    """Return the same release, recorded three times as long."""
     count = len(largest.time)
     longer = replace(
         largest,
@@ -220,29 +259,12 @@ def _ringdowns(
         },
         time=largest.time[0] + largest.interval * np.arange(3 * count),
     )
-    yield Proposal(
+    return Proposal(
         longer,
         f"Record the same release three times as long ({3 * count * largest.interval:.3g} s).",
         "What decays with the motion and what goes on with time part company.",
         1.2,
     )
-    if problem.model.supports(PointMass):
-        stations = problem.model.stations()
-        mass = 0.1 * modal_mass
-        yield Proposal(
-            replace(largest, name="added mass"),
-            f"Repeat the release with a known mass of {1e3 * mass:.3g} g at the tip.",
-            "Mass, stiffness and the clock move the frequencies differently when a known mass is added.",
-            1.5,
-            ModelPatch((PointMass(mass, stations[1] if stations is not None else 0.0),)),
-        )
-    if problem.model.supports(ModulusTemperature) and campaign.reference_temperature is not None:
-        yield Proposal(
-            replace(largest, name="warmer release", temperature=largest.temperature + 15.0),
-            "Repeat the release 15 K warmer.",
-            "Only effects of temperature follow it.",
-            3.0,
-        )
 
 
 def _statics(statics: list[Trial], problem: Problem) -> Iterator[Proposal]:

@@ -11,12 +11,12 @@ from math import inf, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, NoiseRecord, Trial
+from discrepancy.campaign.records import Campaign, NoiseRecord, Start, Trial
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting
 from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.linearisation import PARAMETER_STEP
+from discrepancy.fits.linearisation import PARAMETER_STEP, Point
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen
 from discrepancy.fits.trial_data import stand_in
@@ -99,10 +99,11 @@ def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign
     """Return the campaign with what the model predicts in the place of the data.
 
     Such data leave no rest from which an unknown noise could be told: channels without a noise record get one
-    of a thousandth of their range.
+    of a thousandth of their range. Where the state at the begin of a trial is not known, the data say it:
+    from rest nothing would move, and nothing could be seen.
     """
     problem = Problem(campaign, model, setting)
-    point = problem.start(Candidate())
+    point = _begun(problem)
     trials: list[Trial] = []
     predicted = {}
     for number, data in enumerate(problem.trials):
@@ -123,6 +124,22 @@ def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign
     return replace(ideal, channels=channels)
 
 
+def _begun(problem: Problem) -> Point:
+    """Return the prior means, with the initial states that only the data tell."""
+    start = problem.start(Candidate())
+    unknown = [_unknown_begin(data.trial) for data in problem.trials]
+    if not any(unknown):
+        return start
+    found = fit(problem, Candidate(), start, local_only=True, evidence=False).point.local
+    chosen = zip(unknown, found, start.local, strict=True)
+    return replace(start, local=tuple(own if free else kept for free, own, kept in chosen))
+
+
+def _unknown_begin(trial: Trial) -> bool:
+    """Whether a trial begins in a state that only its data tell."""
+    return trial.begins is Start.UNKNOWN or (trial.release is not None and not trial.release.at_rest)
+
+
 def separability(
     campaign: Campaign, model: Model, setting: Setting, effects: Sequence[Effect]
 ) -> Separability:
@@ -131,7 +148,8 @@ def separability(
     Parameters
     ----------
     campaign : Campaign
-        Inputs, channels and noise count; the measured values do not. See `as_predicted` for unknown noise.
+        Inputs, channels and noise count; the measured values do not, but where a trial begins in a state that
+        is not known. See `as_predicted`, for unknown noise too.
     model : Model
         The model as it is.
     setting : Setting
@@ -141,7 +159,7 @@ def separability(
     """
     ideal = as_predicted(campaign, model, setting)
     problem = Problem(ideal, model, setting)
-    none = fit(problem, Candidate(), problem.start(Candidate()), iterations=1)
+    none = fit(problem, Candidate(), _begun(problem), iterations=1)
     screen = Screen(problem, none)
     rows: list[Detectability] = []
     changes: dict[str, list[Change]] = {}

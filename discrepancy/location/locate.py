@@ -25,7 +25,7 @@ from discrepancy.location.omnibus_tests import (
     variance_test,
 )
 from discrepancy.location.patterns import SingularPattern, singular_patterns
-from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.location.residuals import FittedTrial, ResidualSet, at_own_scale
 
 FloatArray = NDArray[np.float64]
 
@@ -37,6 +37,11 @@ MAP_RATE = 0.05
 
 _TOO_SMALL = 1e-3  # p-value below which residuals are smaller than the noise record allows
 _FAR_OUT = 6.0  # noise deviations; 2e-9 of Gaussian samples lie beyond
+_MEDIAN = 0.6745  # of the magnitude of a standard normal variable
+_OWN_SCALE = (
+    "The model is so far off that nothing is left to judge beside the noise: the map judges each cell by the "
+    "size of what is left in its channel as a whole."
+)
 _WORTH_TELLING = 0.05  # share of the excess variance below which a dependence is not told
 _CLOSE = 0.02  # shares this close are not told apart
 
@@ -88,7 +93,8 @@ class Location:
     disagreements : tuple of Disagreement
         Findings in words, largest first; empty if nothing disagrees.
     remarks : tuple of str
-        Limits: a missing noise record, noise that is not white, residuals smaller than the noise.
+        Limits: a missing noise record, noise that is not white, residuals smaller than the noise, a map by
+        the residuals' own scale.
     """
 
     disagrees: bool
@@ -142,14 +148,20 @@ def locate(
     patterns = singular_patterns(fitted, white, shapes or {}, generator)
     explained = explanations(fitted, frequencies)
     disagrees = any(rejected)
+    own: tuple[str, ...] = ()
+    cells = residual_map(fitted, white, MAP_RATE)
+    judged = any(cell.axis != "frequency" for cell in cells)
+    if not judged and (scaled := at_own_scale(fitted)) is not None:
+        cells = residual_map(scaled, scaled.white(generator), MAP_RATE)
+        own = (_OWN_SCALE,)
     return Location(
         disagrees=disagrees,
         tests=tests,
-        cells=residual_map(fitted, white, MAP_RATE),
+        cells=cells,
         patterns=patterns,
         explanations=explained,
         disagreements=_disagreements(fitted, white, explained, patterns, frequencies) if disagrees else (),
-        remarks=(*coloured.values(), *_noise_remarks(fitted), *_outlier_remarks(fitted)),
+        remarks=(*coloured.values(), *_noise_remarks(fitted), *own),
     )
 
 
@@ -180,26 +192,31 @@ def _noise_remarks(residuals: ResidualSet) -> tuple[str, ...]:
     return tuple(remarks)
 
 
-def _outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
-    """Return a sentence on single samples far out whose neighbours are not: errors of the data."""
+def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
+    """Return a sentence on single samples far out whose neighbours are not: errors of the data.
+
+    Far out of the noise, and of what the hypothesis leaves elsewhere: where a model is off, its residuals are
+    large at many places. Samples beside a gap have no neighbours to be compared with.
+    """
     places: dict[str, int] = {}
     for item in residuals.trials:
         if not item.trial.is_dynamic:
             continue
-        size = np.abs(np.nan_to_num(item.standardised))
-        beside = np.zeros_like(size)
-        beside[1:] = size[:-1]
-        beside[:-1] = np.maximum(beside[:-1], size[1:])
-        alone = (size > _FAR_OUT) & (beside < 0.5 * size)
         for column, name in enumerate(item.trial.channels):
-            places[name] = places.get(name, 0) + int(alone[:, column].sum())
+            size = np.abs(item.standardised[:, column])
+            kept = size[np.isfinite(size)]
+            beside = np.full((2, len(size)), np.nan)
+            beside[0, 1:], beside[1, :-1] = size[:-1], size[1:]
+            far = _FAR_OUT * max(1.0, float(np.median(kept)) / _MEDIAN) if kept.size else np.inf
+            alone = (size > far) & (beside.max(axis=0) < 0.5 * size)  # not a number beside a gap
+            places[name] = places.get(name, 0) + int(alone.sum())
     found = {name: count for name, count in places.items() if count}
     if not found:
         return ()
     listed = ", ".join(f"{name} ({count})" for name, count in found.items())
     return (
-        f"Single samples lie beyond {_FAR_OUT:g} noise deviations while their neighbours do not: {listed}; "
-        "outliers are errors of the data, leave them out.",
+        f"Single samples lie beyond {_FAR_OUT:g} deviations of noise and rest while their neighbours do not: "
+        f"{listed}; if they are errors of the data, leave them out.",
     )
 
 

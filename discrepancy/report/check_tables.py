@@ -95,6 +95,12 @@ def untested_lines(found: Separability) -> list[str]:
 
 def group_lines(found: Separability, told: str = "the table says to which") -> list[str]:
     """Return one sentence for each confusion group, or one that there is none; `told`: where to look."""
+    seen = [item for item in found.detectability if not item.reason and isfinite(item.detectable)]
+    if not found.identifiers or not any(item.parameter and item.distance > 0.0 for item in seen):
+        return [
+            "These trials show none of the effects that can be tested: nothing moves in what the model "
+            "predicts of them. Say how each trial begins and what drives it."
+        ]
     if not found.groups:
         return ["Every effect that can be tested here can be told from every other at its prior median."]
     lines = []

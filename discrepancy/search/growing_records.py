@@ -20,6 +20,7 @@ from discrepancy.fits.screening import Change, Screen, rescaled
 from discrepancy.fits.trial_data import shortened
 from discrepancy.search_settings import SEARCH
 
+from .hypotheses import Tell, in_silence
 from .starting_points import starts
 
 FloatArray = NDArray[np.float64]
@@ -32,10 +33,12 @@ class Beginnings:
     ----------
     problem : Problem
         With whole records.
+    tell : callable
+        Takes a few words on what is fitted, and how much is left.
     """
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
+    def __init__(self, problem: Problem, tell: Tell = in_silence) -> None:
+        self.problem, self._tell = problem, tell
 
     @cached_property
     def short(self) -> Problem:
@@ -80,7 +83,9 @@ class Beginnings:
     ) -> list[CandidateFit]:
         """Fit effects to the beginnings of the records, the best of them to whole records."""
         begun = []
-        for changes in ranked:
+        for number, changes in enumerate(ranked):
+            name = changes[0].term.effect.identifier
+            self._tell(f"fitting {name} to the beginnings of the records, {len(ranked) - number - 1} more")
             best = None
             for change in changes:
                 candidate = base.candidate.plus(change.term)
@@ -160,7 +165,10 @@ class Beginnings:
         found: list[CandidateFit] = []
         singles = all(len(item.candidate.terms) == 1 for item in begun)
         count = SEARCH.far_fits if singles else SEARCH.far_extensions
-        for item in sorted(begun, key=lambda start: start.objective)[:count]:
+        ranked = sorted(begun, key=lambda start: start.objective)[:count]
+        for number, item in enumerate(ranked):
+            names = " and ".join(item.candidate.identifiers)
+            self._tell(f"fitting {names} to whole records, {len(ranked) - number - 1} more")
             whole = attempt(
                 self.problem, item.candidate, item.point, iterations=SEARCH.far_steps, give_up=least
             )

@@ -29,7 +29,9 @@ def weigh_with_remainders(found: Search) -> None:
     chosen.sort(key=lambda item: -promised[key_of(item.candidate)])
     best = promised[key_of(chosen[0].candidate)] if chosen else 0.0
     judged = {}
-    for item in [found.none, *chosen[: SEARCH.weighed_fits]]:
+    for number, item in enumerate([found.none, *chosen[: SEARCH.weighed_fits]]):
+        words = " and ".join(item.candidate.identifiers) or "nothing missing"
+        found.tell(f"weighing {words} with its remainder, {len(chosen[: SEARCH.weighed_fits]) - number} more")
         key = key_of(item.candidate)
         if item is not found.none and promised[key] < best - SEARCH.weighed_within:
             continue

@@ -1,5 +1,6 @@
 """The hypotheses of a search: sets of effects with their fits, prior shares and probabilities."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import comb, exp, log
 
@@ -13,6 +14,11 @@ from discrepancy.fits.problem import Problem
 from discrepancy.search_settings import SEARCH
 
 Key = tuple[tuple[str, str], ...]
+Tell = Callable[[str], None]
+
+
+def in_silence(what: str) -> None:
+    """Tell nobody."""
 
 
 def key_of(candidate: Candidate) -> Key:
@@ -40,6 +46,8 @@ class Hypotheses:
         Fitted with their remainders; where there are any, they alone are compared.
     promised : dict of str to float
         The most that a screen at the fit without effect promised of each effect [nat].
+    tell : callable
+        Takes a few words on what is fitted, and how much is left.
     """
 
     problem: Problem
@@ -49,6 +57,7 @@ class Hypotheses:
     rough: dict[Key, CandidateFit] = field(default_factory=dict)
     judged: dict[Key, CandidateFit] = field(default_factory=dict)
     promised: dict[str, float] = field(default_factory=dict)
+    tell: Tell = in_silence
 
     def __post_init__(self) -> None:
         self.exact[()] = self.none

@@ -18,7 +18,7 @@ from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import MicroSlip, ModelPatch
 
 from .growing_records import Beginnings
-from .hypotheses import Hypotheses, key_of
+from .hypotheses import Hypotheses, Tell, in_silence, key_of
 from .starting_points import acts_within, are_related, pairs, starts
 
 FloatArray = NDArray[np.float64]
@@ -41,12 +41,14 @@ class Search(Hypotheses):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.beginnings = Beginnings(self.problem)
+        self.beginnings = Beginnings(self.problem, self.tell)
 
     def screened(self, base: CandidateFit, effects: Iterable[Effect]) -> dict[str, list[Change]]:
         """Return for each effect its most promising changes, best first, at different places or values."""
-        screen = Screen(self.problem, base)
-        found = {effect.identifier: starts(screen, effect) for effect in effects}
+        screen, found, chosen = Screen(self.problem, base), {}, tuple(effects)
+        for number, effect in enumerate(chosen):
+            self.tell(f"screening {_beside(effect, base)}, {len(chosen) - number - 1} more to screen")
+            found[effect.identifier] = starts(screen, effect)
         if not base.candidate.terms:
             self.promised |= {
                 name: max((change.gain for change in changes), default=0.0) for name, changes in found.items()
@@ -88,7 +90,9 @@ class Search(Hypotheses):
         ranked.sort(key=lambda changes: -max(change.gain for change in changes))
         enough = SEARCH.promising * max((change.gain for change in ranked[0]), default=0.0) if ranked else 0.0
         prospect = base.objective - (least if base.candidate.terms else 0.0)
-        for changes in ranked:
+        for number, changes in enumerate(ranked):
+            left = len(ranked) - number - 1
+            self.tell(f"fitting {_beside(changes[0].term.effect, base)}, {left} more to fit")
             fits: list[CandidateFit] = []
             for change in changes:
                 if change.gain < least:
@@ -142,7 +146,12 @@ class Search(Hypotheses):
         # far from the truth, chord steps rank only roughly
         margin = max(SEARCH.close, SEARCH.close_share * (top - floor))
         chosen = [item for item in rough[: SEARCH.exact_fits] if self.score(item) > max(top - margin, floor)]
-        return sorted((self.exactly(item) for item in chosen), key=lambda item: -self.score(item))
+        found = []
+        for number, item in enumerate(chosen):
+            names = " and ".join(item.candidate.identifiers)
+            self.tell(f"fitting {names} to the end, {len(chosen) - number - 1} more")
+            found.append(self.exactly(item))
+        return sorted(found, key=lambda item: -self.score(item))
 
     # ---------------------------------------------------------------- the strategy
 
@@ -281,7 +290,9 @@ class Search(Hypotheses):
         changes = {effect.identifier: starts(screen, effect) for effect in self.effects}
         ranked = sorted(pairs(changes, screen.sign), key=lambda item: item[0])[: SEARCH.pairs_fitted]
         rough: list[CandidateFit] = []
-        for _, first, second in ranked:
+        for number, (_, first, second) in enumerate(ranked):
+            pair = f"{first.term.effect.identifier} and {second.term.effect.identifier}"
+            self.tell(f"fitting the pair {pair}, {len(ranked) - number - 1} more to fit")
             candidate = Candidate((first.term, second.term))
             if key_of(candidate) in self.exact:
                 continue
@@ -355,7 +366,7 @@ STRATEGY = (
 """Simple causes before others: one effect, one law of free shape, more effects, any two; then fewer again."""
 
 
-def search(problem: Problem, effects: Sequence[Effect]) -> Search:
+def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -> Search:
     """Fit the model without effect, then search the catalogue.
 
     Parameters
@@ -364,17 +375,26 @@ def search(problem: Problem, effects: Sequence[Effect]) -> Search:
         Campaign and model.
     effects : sequence of Effect
         The catalogue; what is unavailable here is left out.
+    tell : callable
+        Takes a few words on what is fitted, and how much is left.
 
     Returns
     -------
     Search
         All candidates with their evidence.
     """
+    tell("fitting the model as it is")
     none = fit(problem, Candidate(), problem.start(Candidate()))
     usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
-    found = Search(problem, usable, none)
+    found = Search(problem, usable, none, tell=tell)
     found.run()
     return found
+
+
+def _beside(effect: Effect, base: CandidateFit) -> str:
+    """Return an effect, and what a fit has already, for a line of progress."""
+    there = " and ".join(base.candidate.identifiers)
+    return f"{effect.identifier} beside {there}" if there else effect.identifier
 
 
 def _slips(problem: Problem, found: CandidateFit) -> bool:

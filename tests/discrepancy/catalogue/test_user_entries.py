@@ -172,6 +172,7 @@ def test_an_effect_whose_place_is_no_port(write, setting: Setting) -> None:
         ('confusable = ["point_mass"]', 'confusable = ["mass"]', "names 'mass' as confusable"),
         ('confusable = ["point_mass"]', "colour = 1", "unknown key 'colour'"),
         ('confusable = ["point_mass"]', 'places = "wings"', "'places' must be a list or one of ports"),
+        ('confusable = ["point_mass"]', 'places = ["ports"]', 'write places = "ports", without brackets'),
         ('shape = "log_normal", low = 0.01', 'shape = "gamma", low = 0.01', "must be one of log_normal"),
         ("low = 0.01", "low = 0.0", "must have low > 0"),
         ("low = 0.01", "low = 0.5", "must have low < high"),

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
-from discrepancy.judgement.look_alikes import look_alike_remark
+from discrepancy.catalogue.entry import Setting
+from discrepancy.judgement.look_alikes import look_alike_remark, with_untested
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch
 
@@ -26,6 +29,22 @@ def test_declared_likenesses_are_told_from_those_left_out(catalogue) -> None:  #
     less = look_alike_remark(verdict_on(catalogue, "inertia_relief"), rest)
     assert less is not None
     assert "washout was not compared" in less
+
+
+def test_a_group_says_first_what_these_trials_cannot_test(kit, catalogue) -> None:  # type: ignore[no-untyped-def]
+    bench = kit.chain_bench(amplitudes=())
+    setting = Setting(bench.campaign, bench.model, bench.model.scales(bench.campaign))
+    group = replace(verdict_on(catalogue, "load_cell", kind=VerdictKind.GROUP), sentence="Either is missing.")
+    sentence = with_untested(group, setting, catalogue).sentence
+    first = sentence.split(".")[0]
+    assert first.startswith("Of the ")
+    assert first.endswith("either is missing")
+    named = [effect.name for effect in catalogue if effect.name in first]
+    assert named
+    able = [effect for effect in catalogue if effect.unavailable(setting) is None]
+    assert not {effect.name for effect in able} & set(named)
+    single = verdict_on(catalogue, "load_cell")
+    assert with_untested(single, setting, catalogue) is single
 
 
 def test_likeness_counts_both_ways(catalogue) -> None:  # type: ignore[no-untyped-def]

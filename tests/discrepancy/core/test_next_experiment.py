@@ -17,7 +17,13 @@ from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
-from discrepancy.judgement.next_experiment import Proposal, mutual_information, next_experiments, proposals
+from discrepancy.judgement.next_experiment import (
+    Proposal,
+    mutual_information,
+    next_experiments,
+    oscillates,
+    proposals,
+)
 
 TIGHT = {"slope": (1.0, 1e-9), "curvature": (0.5, 1e-9)}
 
@@ -125,6 +131,20 @@ def test_proposals_are_trials_of_the_kinds_that_were_done(bench) -> None:  # typ
     before = max((t for t in problem.campaign.trials if t.release), key=lambda t: t.release.displacement)
     assert longer.interval == pytest.approx(before.interval)
     assert len(longer.time) == 3 * len(before.time)
+
+
+def test_no_longer_record_of_what_does_not_swing(bench) -> None:  # type: ignore[no-untyped-def]
+    problem = bench.problem(bench.measured(1))
+    none = fit(problem, Candidate(), problem.start(Candidate()))
+    assert oscillates(problem, none)
+    decay = tuple(
+        np.exp(-data.trial.time)[:, np.newaxis] * np.ones(response.shape[1])
+        for data, response in zip(problem.trials, none.responses, strict=True)
+    )
+    assert not oscillates(problem, replace(none, responses=decay))
+    names = [item.trial.name for item in proposals(problem.campaign, problem, swings=False)]
+    assert names
+    assert "longer record" not in names
 
 
 def test_without_a_record_the_rest_stands_for_the_noise(kit) -> None:  # type: ignore[no-untyped-def]

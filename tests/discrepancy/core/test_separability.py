@@ -14,6 +14,7 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.catalogue.entry import Setting
 from discrepancy.judgement.separability import CONFUSED, Separability, _groups, as_predicted, separability
 from discrepancy.models.lumped import LumpedModel
+from discrepancy.report.check_tables import group_lines
 
 ONE_MODE = """
 format = 1
@@ -72,6 +73,21 @@ def test_ringdown_of_one_mode_cannot_tell_mass_root_and_clock(kit, catalogue, tm
     for seen, item in zip(found.detectability, hidden.detectability, strict=True):
         if item.effect.identifier != "clock_error":  # its time zero shows
             assert item.distance < 1e-3 * seen.distance
+
+
+def test_a_release_of_unknown_state_shows_effects_as_one_from_rest_does(kit, catalogue) -> None:  # type: ignore[no-untyped-def]
+    """Its data say how it begins; from rest nothing would move, and every effect would be seen "never"."""
+    bench = kit.chain_bench(static=False, amplitudes=(0.02, 0.012))
+    effects = chosen(catalogue, ("quadratic_damping", "coulomb_friction"))
+    measured = bench.measured(3)
+    free = tuple(replace(trial, release=replace(trial.release, at_rest=False)) for trial in measured.trials)
+    known, found = (
+        decided(bench.model, item, effects) for item in (measured, replace(measured, trials=free))
+    )
+    for one, other in zip(known.detectability, found.detectability, strict=True):
+        assert 0.5 < other.detectable / one.detectable < 5.0
+    nothing = replace(found, identifiers=(), distance=np.zeros((0, 0)), groups=())
+    assert "none of the effects" in group_lines(nothing)[0]
 
 
 def test_static_displacement_cannot_tell_root_load_place_and_load_cell(kit, bench, catalogue) -> None:  # type: ignore[no-untyped-def]

@@ -14,7 +14,7 @@ from calibration.dynamics.records import read_records
 from discrepancy.campaign.noise_tests import holm
 from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import FitError
-from discrepancy.location.locate import locate
+from discrepancy.location.locate import locate, outlier_remarks
 from discrepancy.location.map import residual_map
 from discrepancy.location.omnibus_tests import serial_tests, variance_test
 from discrepancy.location.residuals import FittedTrial, ResidualSet, sensitivity
@@ -171,9 +171,38 @@ def test_outliers_are_remarked_as_errors_of_the_data(make_bench) -> None:
     bench = make_bench()
     spikes = np.zeros((300, 4))
     spikes[[20, 150, 280], [0, 2, 2]] = 30.0
-    found = locate(bench.fit(np.random.default_rng(4), extra={1: spikes}))
-    assert any("g1 (1), g3 (2)" in remark for remark in found.remarks)
-    assert not any("outliers" in r for r in locate(bench.fit(np.random.default_rng(4))).remarks)
+    told = bench.fit(np.random.default_rng(4), extra={1: spikes})
+    assert any("g1 (1), g3 (2)" in remark for remark in outlier_remarks(told))
+    assert not outlier_remarks(bench.fit(np.random.default_rng(4)))
+    # beside a gap a sample has no neighbours, and where the model is off many are far out
+    item = told.trials[1]
+    used = item.used.copy()
+    used[[19, 21, 149, 151, 279, 281]] = False
+    gaps = replace(item, trial=replace(item.trial, used=used))
+    assert not outlier_remarks(replace(told, trials=(gaps,)))
+    off = replace(item, residual=item.residual + 20.0 * item.noise_deviation)
+    assert not outlier_remarks(replace(told, trials=(off,)))
+
+
+def test_where_the_model_is_far_off_cells_are_judged_by_what_is_left(make_bench) -> None:
+    """What was fitted is uncertain by the size of what is left: beside the noise no cell could be judged."""
+    bench = make_bench(count=120)
+    told = bench.fit(np.random.default_rng(5))
+    generator, trials = np.random.default_rng(6), []
+    for item in told.trials:
+        size = 300.0 * item.noise_deviation * generator.standard_normal(item.residual.shape)
+        size[:30] *= 5.0  # most is left at the begin of each record
+        wide = 200.0 * generator.standard_normal((*item.residual.shape, 1))
+        trials.append(
+            replace(item, residual=size, leverage=np.ones_like(item.leverage), sensitivity=wide)
+            if not item.trial.held_out
+            else replace(item, sensitivity=np.zeros((*item.residual.shape, 1)))
+        )
+    found = locate(replace(told, trials=tuple(trials)))
+    assert found.cells
+    assert any("by the size of what is left" in remark for remark in found.remarks)
+    worst = {(cell.axis, round(cell.low, 6)) for cell in found.cells if cell.significant and cell.value > 2.0}
+    assert {axis for axis, _ in worst} & {"time", "amplitude"}
 
 
 def test_temperature_is_told(make_bench) -> None:
