@@ -112,7 +112,7 @@ LOADERS: dict[str, Loader] = {
     "residuals": Loader("verdict/residuals.nc", read_residuals, BINARY),
     "run, store": Loader("run/run.nc", lambda path: read_run(path.parent), BINARY),
     "run, report": Loader("run/run.nc", lambda path: read_record(path.parent), BINARY),
-    "checkpoint": Loader("checkpoint/checkpoint.jsonl", _checkpoint, TEXT),
+    "checkpoint": Loader("checkpoint/journal.jsonl", _checkpoint, TEXT),
     "configuration": Loader("run/config.json", _config, TEXT),
     "calibration of e": Loader("static/calibration.json", read_calibration, TEXT),
     "calibration": Loader("calibrated/calibration.nc", load_calibration, BINARY),

@@ -15,7 +15,7 @@ import tempfile
 import time
 from pathlib import Path
 
-COMPARED = ("run.nc", "config.json", "summary.json", "calibration.json", "wing.vtu", "checkpoint.jsonl")
+COMPARED = ("run.nc", "config.json", "summary.json", "calibration.json", "wing.vtu", "journal.jsonl")
 
 
 def command(*arguments: str) -> list[str]:
@@ -39,7 +39,7 @@ def wait_for_moment(
     if moment.random() < 0.5:
         deadline = begin + moment.random() * seconds
     else:
-        while process.poll() is None and not (folder / "checkpoint.jsonl").exists():
+        while process.poll() is None and not (folder / "journal.jsonl").exists():
             time.sleep(0.001)
         deadline = time.monotonic() + moment.random() * 0.1 * seconds
     while process.poll() is None and time.monotonic() < deadline:

@@ -225,7 +225,7 @@ class _Outcome:
 
 
 def _outcome(knowledge: Knowledge, flight: Flight) -> _Outcome:
-    scenario, model, truth = knowledge.scenario, knowledge.model, flight.truth.state
+    scenario, model, truth = knowledge.scenario, knowledge.model, flight.happened.state
     first = scenario.control_names.index(scenario.mission.first_control)
     fallback = find_fallback(model, knowledge.plan.control_index, first, flight.control_index, truth)
     delay = float("nan")

@@ -28,7 +28,8 @@ from twin_master.assets.resolution import (
     resolve_scenario,
 )
 from twin_master.errors import NotResumableError
-from twin_master.mission.checkpoint import CHECKPOINT_NAME, open_checkpoint
+from twin_master.mission.checkpoint import open_checkpoint
+from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import Flight, fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.network.twin import build_graphical_model
@@ -290,7 +291,7 @@ def _unflown(folder: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if not (folder / CHECKPOINT_NAME).exists():
+        if not (folder / JOURNAL_NAME).exists():
             error.add_note("Nothing was flown yet: once this is mended, fly again with --replace.")
         raise
 

@@ -208,7 +208,7 @@ def test_a_full_disk_loses_nothing(
         patch.setattr(os, "fsync", full)
         with pytest.raises(DiskFullError, match="No space is left"):
             fly(tmp_path / "part", library_file)
-    assert (tmp_path / "part" / "checkpoint.jsonl").read_bytes().count(b"\n") > 2
+    assert (tmp_path / "part" / "journal.jsonl").read_bytes().count(b"\n") > 2
     resume_run(tmp_path / "part")
     assert contents(tmp_path / "part") == whole
 

@@ -1,37 +1,39 @@
-"""The checkpoint of a mission: what cannot be computed again, a line for each turn.
+"""The checkpoint of a mission: what cannot be computed again, in the journal of its run folder.
 
 That is what was observed, what was commanded, what really happened, and the state of the asset. The twin's
 beliefs follow from the observations; they are computed again on resuming, and the decisions must come out as
-they were taken.
-
-The file only grows: a turn is one line, its JSON behind the SHA-256 of it. A line that was cut off by a kill
-ends without a line feed, and is flown again; any other line that does not have its hash was changed.
+they were taken. Beside it a line has the belief of the turn, for those who read along.
 """
 
 import base64
 import binascii
-import io
-import json
-import os
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reporting.files import write_error
-from twin_master.errors import NotResumableError
+from twin_master.mission.journal import (
+    JOURNAL_NAME,
+    JournalFile,
+    array_of,
+    belief_record,
+    damaged,
+    line_of,
+    open_journal,
+    plain,
+    read_records,
+)
 from twin_master.mission.plant import PlantRecord
+from twin_master.network.twin import TwinTurn
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-CHECKPOINT_NAME = "checkpoint.jsonl"
 STATE_ALLOWANCE = 64_000_000
 STATE_SHARE = 4_000
 """Bytes of asset states that a checkpoint may hold, and how many more for each turn.
@@ -59,6 +61,8 @@ class FlownTurn:
         Figures that the asset reported of itself.
     asset_state : bytes or None
         State of the asset after the turn; None where it was not kept.
+    concluded : TwinTurn or None
+        What the twin concluded, for those who read along; None once read back.
     """
 
     control_index: int
@@ -68,6 +72,7 @@ class FlownTurn:
     observation: Float
     monitors: dict[str, float]
     asset_state: bytes | None
+    concluded: TwinTurn | None = None
 
 
 @dataclass(frozen=True)
@@ -127,27 +132,14 @@ class CheckpointFile:
         Turns in the file.
     """
 
-    def __init__(self, path: Path, config_hash: str) -> None:
-        self._path = path
-        header = _line({"config_hash": config_hash})
-        content = path.read_bytes() if path.exists() else b""
-        turns: list[FlownTurn] = []
-        ends: list[int] = []
-        kept = [0]
-        if not header.startswith(content):  # one that was cut off is no damage
-            turns, ends, kept = _read(path, content, config_hash)
+    def __init__(self, path: Path, config_hash: str, journal: JournalFile) -> None:
+        self._journal = journal
+        turns, ends, kept = _read(path, config_hash)
         self.checkpoint = checkpoint_of(turns)
         count = self.checkpoint.turns if self.checkpoint else 0
         self.turns, self._state_bytes = count, kept[count]
-        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-        if content.startswith(header):
-            self._size = ends[count - 1] if count else len(header)
-            os.truncate(self._descriptor, self._size)
-        else:
-            self._size = 0
-            os.truncate(self._descriptor, 0)
-            self._append(header)
-            _synchronise_folder(path.parent)
+        if count < len(turns):  # without the state of the asset they are flown again
+            journal.truncate(ends[count])
 
     def keep(self, turn: FlownTurn) -> None:
         """Add a turn; it is on the disk when this returns.
@@ -164,36 +156,19 @@ class CheckpointFile:
             if self._state_bytes + len(packed) <= STATE_ALLOWANCE + STATE_SHARE * self.turns:
                 state = packed
                 self._state_bytes += len(packed)
-        self._append(
-            _line(
-                {
-                    "turn": self.turns - 1,
-                    "control_index": turn.control_index,
-                    "next_control": turn.next_control,
-                    "observed": turn.observed.tolist(),
-                    "state": turn.state.tolist(),
-                    "observation": turn.observation.tolist(),
-                    "monitors": turn.monitors,
-                    "asset_state": state,
-                }
-            )
+        self._journal.append(
+            {
+                "turn": self.turns - 1,
+                "control_index": turn.control_index,
+                "next_control": turn.next_control,
+                "observed": plain(turn.observed),
+                "state": plain(turn.state),
+                "observation": plain(turn.observation),
+                "monitors": dict(zip(turn.monitors, plain(list(turn.monitors.values())), strict=True)),
+                "asset_state": state,
+            }
+            | ({} if turn.concluded is None else belief_record(turn.concluded))
         )
-
-    def _append(self, line: bytes) -> None:
-        try:
-            written = 0
-            while written < len(line):
-                written += os.write(self._descriptor, line[written:])
-            os.fsync(self._descriptor)
-        except OSError as error:
-            with suppress(OSError):
-                os.truncate(self._descriptor, self._size)
-            raise write_error(error, self._path) from error
-        self._size += len(line)
-
-    def close(self) -> None:
-        """Let go of the file."""
-        os.close(self._descriptor)
 
 
 @contextmanager
@@ -210,88 +185,40 @@ def open_checkpoint(folder: Path, config_hash: str) -> Iterator[CheckpointFile]:
     Raises
     ------
     NotResumableError
-        The checkpoint was changed or is damaged, or belongs to another configuration.
+        The journal was changed or is damaged, or belongs to another configuration.
     FileNotWrittenError
         The disk is full or the folder cannot be written.
     """
-    path = folder / CHECKPOINT_NAME
-    try:
-        file = CheckpointFile(path, config_hash)
-    except OSError as error:
-        raise write_error(error, path) from error
-    try:
-        yield file
-    finally:
-        file.close()
+    with open_journal(folder, config_hash) as journal:
+        yield CheckpointFile(folder / JOURNAL_NAME, config_hash, journal)
 
 
-def _line(record: dict[str, Any]) -> bytes:
-    text = json.dumps(record, sort_keys=True).encode("ascii")
-    return sha256(text).hexdigest().encode("ascii") + b" " + text + b"\n"
-
-
-def _read(path: Path, content: bytes, config_hash: str) -> tuple[list[FlownTurn], list[int], list[int]]:
-    """Return the turns, where their lines end, and the bytes of asset states up to each number of turns."""
+def _read(path: Path, config_hash: str) -> tuple[list[FlownTurn], list[int], list[int]]:
+    """Return the turns, where the lines before and after them end, and the bytes of asset states so far."""
     turns: list[FlownTurn] = []
-    ends: list[int] = []
-    kept = [0]
-    end = 0
-    for number, line in enumerate(io.BytesIO(content)):
-        if number and not line.endswith(b"\n"):
-            break  # cut off by a kill
-        end += len(line)
-        record = _record(path, line, number)
-        if not number:
-            if record.get("config_hash") != config_hash:
-                raise NotResumableError(
-                    f"the checkpoint {path} belongs to another configuration than the config.json beside it: "
-                    "fly the mission again with --replace."
-                )
-            continue
+    ends, kept = [len(line_of({"config_hash": config_hash}))], [0]
+    for record, end in read_records(path, config_hash):
+        number = len(turns) + 1
         if record.get("turn") != len(turns):
-            raise _damaged(path, number, f"turn {len(turns)} was expected")
+            raise damaged(path, number, f"turn {len(turns)} was expected")
         try:
             state = record["asset_state"]
-            turns.append(
-                FlownTurn(
-                    control_index=int(record["control_index"]),
-                    next_control=int(record["next_control"]),
-                    observed=np.array(record["observed"], dtype=np.float64),
-                    state=np.array(record["state"], dtype=np.float64),
-                    observation=np.array(record["observation"], dtype=np.float64),
-                    monitors=dict(record["monitors"]),
-                    asset_state=None if state is None else zlib.decompress(base64.b64decode(state)),
-                )
-            )
-        except (KeyError, TypeError, ValueError, zlib.error, binascii.Error) as error:
-            raise _damaged(path, number, f"it has another layout, {error}") from error
+            turns.append(_turn(record, state))
+        except (KeyError, TypeError, ValueError, AttributeError, zlib.error, binascii.Error) as error:
+            raise damaged(path, number, f"it has another layout, {error}") from error
         ends.append(end)
         kept.append(kept[-1] + len(state or ""))
     return turns, ends, kept
 
 
-def _record(path: Path, line: bytes, number: int) -> dict[str, Any]:
-    digest, _, text = line.rstrip(b"\n").partition(b" ")
-    if sha256(text).hexdigest().encode("ascii") != digest:
-        raise _damaged(path, number, "it does not have the hash that stands before it")
-    record = json.loads(text)
-    if not isinstance(record, dict):
-        raise _damaged(path, number, "it is no record")
-    return record
-
-
-def _damaged(path: Path, number: int, why: str) -> NotResumableError:
-    return NotResumableError(
-        f"line {number + 1} of the checkpoint {path} was changed or is damaged ({why}): "
-        "fly the mission again with --replace."
+def _turn(record: dict[str, Any], state: str | None) -> FlownTurn:
+    monitors = record["monitors"]
+    return FlownTurn(
+        control_index=int(record["control_index"]),
+        next_control=int(record["next_control"]),
+        observed=array_of(record["observed"]),
+        state=array_of(record["state"]),
+        observation=array_of(record["observation"]),
+        monitors=dict(zip(monitors, array_of(list(monitors.values())).tolist(), strict=True)),
+        asset_state=None if state is None else zlib.decompress(base64.b64decode(state)),
     )
-
-
-def _synchronise_folder(folder: Path) -> None:
-    """Flush a folder to the disk, so that a file that is new in it is found again."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # some file systems cannot
-            os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -1,14 +1,19 @@
-"""The mission loop: control, asset, observation, assimilate, predict, decide, control; at its end, smooth."""
+"""The loop of a twin: observe, assimilate, predict, decide, write down, whatever the observations come from.
+
+A mission is the loop with a simulated asset as its source, and at its end the history is smoothed. A watch
+(`twin_master.watch`) is the same loop with a real one.
+"""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reporting.progress import Progress, SilentProgress
-from twin_master.errors import NotResumableError
+from twin_master.errors import ImpossibleObservation, MissionError, NotResumableError
 from twin_master.mission.checkpoint import Checkpoint, FlownTurn
 from twin_master.mission.plant import Plant, PlantRecord
 from twin_master.network.twin import Twin, TwinTurn
@@ -25,6 +30,72 @@ class TurnTiming:
     asset: float
     twin: float
     checkpoint: float
+
+
+@dataclass(frozen=True)
+class Reading:
+    """An observation that is to be assimilated.
+
+    Attributes
+    ----------
+    observed : (G,)
+        What the sensors say, SI; NaN where lost.
+    control : int or None
+        Index of the control in force; None for the one that the twin proposed.
+    revises : int or None
+        The turn that it belongs to, if it came late; None for the next one.
+    """
+
+    observed: Float
+    control: int | None = None
+    revises: int | None = None
+
+
+class Source(Protocol):
+    """Where observations come from: a simulated asset, a file, a broker."""
+
+    def read(self, twin: Twin) -> Reading | None:
+        """Return the next observation of what the twin watches; None where there are no more."""
+
+    def impossible(self, reading: Reading, error: ImpossibleObservation) -> Reading:
+        """Return what is assimilated in the place of an observation that no state allows, or raise."""
+
+
+def operate(
+    twin: Twin, source: Source, keep: Callable[[Reading, TwinTurn], None] | None = None
+) -> Iterator[tuple[Reading, TwinTurn, TurnTiming]]:
+    """Let a twin assimilate and decide until its source ends; each turn is kept before it is given.
+
+    Parameters
+    ----------
+    twin : Twin
+        Which need not be new.
+    source : Source
+        Of its observations.
+    keep : callable, optional
+        Writes down a turn.
+    """
+    while True:
+        begin = time.perf_counter()
+        reading = source.read(twin)
+        if reading is None:
+            return
+        received = time.perf_counter()
+        try:
+            turn = _assimilated(twin, reading)
+        except ImpossibleObservation as error:
+            reading = source.impossible(reading, error)
+            turn = _assimilated(twin, reading)
+        decided = time.perf_counter()
+        if keep is not None:
+            keep(reading, turn)
+        yield reading, turn, TurnTiming(received - begin, decided - received, time.perf_counter() - decided)
+
+
+def _assimilated(twin: Twin, reading: Reading) -> TwinTurn:
+    if reading.revises is not None:
+        return twin.revise(reading.revises, reading.observed, reading.control)
+    return twin.turn(reading.observed, reading.control)
 
 
 @dataclass(frozen=True)
@@ -47,12 +118,14 @@ class Flight:
         p(D_{t+h} | o_0..o_t), h = 1..H.
     decision_probability : (T, U)
         What the control of turn t + 1 was decided by: its mode is flown.
-    truth : PlantRecord
-        What really happened.
+    truth : PlantRecord or None
+        What really happened; None where nobody knows.
     timing : tuple of TurnTiming
         Of the turns flown by this process.
     resumed_at : int
         Turn at which this process took over; 0 for an uninterrupted mission.
+    first_turn : int
+        Number of the first of the T turns.
     """
 
     observed: Float
@@ -62,9 +135,23 @@ class Flight:
     smoothed: Float
     predicted: Float
     decision_probability: Float
-    truth: PlantRecord
+    truth: PlantRecord | None
     timing: tuple[TurnTiming, ...]
     resumed_at: int = 0
+    first_turn: int = 0
+
+    @property
+    def happened(self) -> PlantRecord:
+        """What really happened.
+
+        Raises
+        ------
+        MissionError
+            Nobody knows: a real asset was watched.
+        """
+        if self.truth is None:
+            raise MissionError("what really happened to a watched asset is not known.")
+        return self.truth
 
 
 def fly(
@@ -101,80 +188,109 @@ def fly(
         The decisions of the checkpoint do not follow from its observations.
     """
     steps = scenario.mission.steps
-    controls: list[int] = [scenario.control_names.index(scenario.mission.first_control)]
-    observed: list[Float] = []
-    beliefs = _Beliefs()
+    beliefs = Beliefs()
     timing: list[TurnTiming] = []
     if checkpoint is not None:
         _replay(twin, checkpoint, beliefs)
-        observed = list(checkpoint.observed)
-        controls = checkpoint.control_index.tolist()
         plant.restore(checkpoint.plant, checkpoint.asset_state)
-    resumed_at = len(observed)
+    resumed_at = twin.turns
+
+    def kept(reading: Reading, turn: TwinTurn) -> None:
+        if keep is not None:
+            state, noise_free, monitors = plant.latest()
+            keep(
+                FlownTurn(
+                    control_index=turn.control_index,
+                    next_control=turn.next_control,
+                    observed=reading.observed,
+                    state=state,
+                    observation=noise_free,
+                    monitors=monitors,
+                    asset_state=plant.save_state(),
+                    concluded=turn,
+                )
+            )
+
     unit = f"{scenario.mission.step_name}s"
     with (progress or SilentProgress()).stage("Flying", total=steps, unit=unit) as stage:
         stage.advance(resumed_at)
-        for step in range(resumed_at, steps):
-            begin = time.perf_counter()
-            observation = plant.turn(controls[step], controls[step - 1] if step else None)
-            flown = time.perf_counter()
-            turn = twin.turn(observation, controls[step])
-            decided = time.perf_counter()
-            observed.append(observation)
-            controls.append(turn.next_control)
-            beliefs.add(turn)
-            if keep is not None:
-                state, noise_free, monitors = plant.latest()
-                keep(
-                    FlownTurn(
-                        control_index=controls[step],
-                        next_control=turn.next_control,
-                        observed=observation,
-                        state=state,
-                        observation=noise_free,
-                        monitors=monitors,
-                        asset_state=plant.save_state(),
-                    )
-                )
-            timing.append(TurnTiming(flown - begin, decided - flown, time.perf_counter() - decided))
-            stage.advance(detail=scenario.control_names[controls[step]])
-    return Flight(
-        observed=np.array(observed),
-        control_index=np.array(controls[:steps], dtype=np.int64),
-        filtered=np.array(beliefs.filtered),
-        log_evidence=np.array(beliefs.log_evidence),
-        smoothed=twin.smoothed(),
-        predicted=np.array(beliefs.predicted),
-        decision_probability=np.array(beliefs.decision_probability),
-        truth=plant.record(),
-        timing=tuple(timing),
-        resumed_at=resumed_at,
-    )
+        for reading, turn, seconds in operate(twin, _Flown(plant, steps), kept):
+            beliefs.add(reading.observed, turn)
+            timing.append(seconds)
+            stage.advance(detail=scenario.control_names[turn.control_index])
+    return beliefs.flight(twin.smoothed(), plant.record(), tuple(timing), resumed_at=resumed_at)
+
+
+class _Flown:
+    """A simulated asset as a source: it is flown under the control that the twin proposed."""
+
+    def __init__(self, plant: Plant, steps: int) -> None:
+        self._plant = plant
+        self._steps = steps
+
+    def read(self, twin: Twin) -> Reading | None:
+        if twin.turns == self._steps:
+            return None
+        control = twin.proposed_control
+        before = twin.control_of(twin.turns - 1) if twin.turns else None
+        return Reading(self._plant.turn(control, before), control)
+
+    def impossible(self, reading: Reading, error: ImpossibleObservation) -> Reading:
+        raise error
 
 
 @dataclass
-class _Beliefs:
-    """What is kept of each turn of the twin, for the store."""
+class Beliefs:
+    """What is kept of each turn of a twin, for the store."""
 
+    observed: list[Float] = field(default_factory=list)
+    control_index: list[int] = field(default_factory=list)
     filtered: list[Float] = field(default_factory=list)
     log_evidence: list[float] = field(default_factory=list)
     predicted: list[Float] = field(default_factory=list)
     decision_probability: list[Float] = field(default_factory=list)
 
-    def add(self, turn: TwinTurn) -> None:
+    def add(self, observed: Float, turn: TwinTurn) -> None:
+        """Keep a turn."""
+        self.observed.append(observed)
+        self.control_index.append(turn.control_index)
         self.filtered.append(turn.filtered)
         self.log_evidence.append(turn.log_evidence)
         self.predicted.append(turn.prediction.predicted)
         self.decision_probability.append(turn.decision_probability)
 
+    def flight(
+        self,
+        smoothed: Float,
+        truth: PlantRecord | None,
+        timing: tuple[TurnTiming, ...] = (),
+        *,
+        resumed_at: int = 0,
+        first_turn: int = 0,
+    ) -> Flight:
+        """Return the turns as arrays, see `Flight`."""
+        return Flight(
+            observed=np.array(self.observed),
+            control_index=np.array(self.control_index, dtype=np.int64),
+            filtered=np.array(self.filtered),
+            log_evidence=np.array(self.log_evidence),
+            smoothed=smoothed,
+            predicted=np.array(self.predicted),
+            decision_probability=np.array(self.decision_probability),
+            truth=truth,
+            timing=timing,
+            resumed_at=resumed_at,
+            first_turn=first_turn,
+        )
 
-def _replay(twin: Twin, checkpoint: Checkpoint, beliefs: _Beliefs) -> None:
+
+def _replay(twin: Twin, checkpoint: Checkpoint, beliefs: Beliefs) -> None:
     """Let the twin see again what was observed, and check that it decides as it did."""
     for step, observation in enumerate(checkpoint.observed):
         turn = twin.turn(observation, int(checkpoint.control_index[step]))
         if turn.next_control != checkpoint.control_index[step + 1]:
             raise NotResumableError(
-                f"the checkpoint decided otherwise after turn {step} than this version does: "
+                f"the journal decided otherwise after turn {step} than this version does: "
                 "fly the mission again with --replace."
             )
-        beliefs.add(turn)
+        beliefs.add(observation, turn)

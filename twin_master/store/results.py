@@ -41,8 +41,8 @@ class MissionResult:
         Rewards by state and control.
     plan : PlannedPolicy
         Value iteration.
-    truth : Truth
-        What the sensors really did.
+    truth : Truth or None
+        What the sensors really did; None where nobody knows.
     flight : Flight
         The mission.
     units : dict of str to str
@@ -55,7 +55,7 @@ class MissionResult:
     draws: Float
     rewards: RewardModel
     plan: PlannedPolicy
-    truth: Truth
+    truth: Truth | None
     flight: Flight
     units: Mapping[str, str] = field(default_factory=dict)
 
@@ -103,8 +103,9 @@ def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.Data
                 )
             }
         ).assign_attrs(parameter=result.scenario.calibration.parameter),
-        "truth": _truth(result, labels),
     }
+    if result.truth is not None:
+        groups["truth"] = _truth(result, labels, result.truth)
     return xr.DataTree.from_dict({"/": xr.Dataset(attrs=dict(attributes)), **groups})
 
 
@@ -119,7 +120,9 @@ class _Labels:
         names = scenario.state_names
         self.coordinates: dict[str, xr.Variable] = {
             "step": xr.Variable(
-                "step", np.arange(scenario.mission.steps), {"long_name": "step", "units": "1"}
+                "step",
+                result.flight.first_turn + np.arange(len(result.flight.observed)),
+                {"long_name": "step", "units": "1"},
             ),
             "sensor": xr.Variable(
                 "sensor", np.arange(1, scenario.observation.count + 1), {"long_name": "sensor", "units": "1"}
@@ -305,10 +308,10 @@ def _policy(result: MissionResult, labels: _Labels) -> xr.Dataset:
     )
 
 
-def _truth(result: MissionResult, labels: _Labels) -> xr.Dataset:
-    record, role = result.flight.truth, result.scenario.observation.role
-    status = result.truth.status
-    if result.truth.in_asset:
+def _truth(result: MissionResult, labels: _Labels, truth: Truth) -> xr.Dataset:
+    record, role = result.flight.happened, result.scenario.observation.role
+    status = truth.status
+    if truth.in_asset:
         status = np.where(np.isnan(result.flight.observed), SensorStatus.LOST, status).astype(status.dtype)
     variables: dict[str, Variable] = {
         "state": (

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from twin_master.assets.mismatch import Misfit
 from twin_master.assets.parameter import ParameterDraws
+from twin_master.mission.plant import PlantRecord
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.rewards import REWARD_NAMES
 from twin_master.scenario.schema import FALLBACK_FIGURES, MISFIT_FIGURES, Reference
@@ -147,24 +148,8 @@ def summarise(
     misfit
         Of the twin's model, where the asset is known to be another one.
     """
-    scenario, flight, model = result.scenario, result.flight, result.model
-    first = scenario.control_names.index(scenario.mission.first_control)
-    fallback = find_fallback(
-        model, result.plan.control_index, first, flight.control_index, flight.truth.state
-    )
-    units = {factor.name: factor.unit for factor in scenario.state}
-    figures = _fallback_figures(fallback, units, scenario.mission.step_name)
-    errors = filtered_rms_error(model, flight.filtered, flight.truth.state)
-    for factor, error in zip(scenario.state, errors, strict=True):
-        name, fraction = factor.name, factor.unit == "1"
-        figures.append(
-            Figure(
-                f"filtered_rms_error_{name}",
-                f"filtered rms error of {name}",
-                (100.0 if fraction else 1.0) * float(error),
-                "points" if fraction else factor.unit,
-            )
-        )
+    scenario, flight = result.scenario, result.flight
+    figures = _scored(result, flight.truth) if flight.truth is not None else _watched(result)
     for index, name in enumerate(REWARD_NAMES):
         known = reward_mean[np.isfinite(reward_mean[:, index]), index]
         mean = float(known.mean()) if len(known) else None
@@ -181,7 +166,7 @@ def summarise(
     figures += _sensor_figures(flight.observed, scenario.mission.step_name)
     if misfit is not None:
         figures += _misfit_figures(misfit)
-    bound = flight.truth.monitors.get("strain_error_bound")
+    bound = None if flight.truth is None else flight.truth.monitors.get("strain_error_bound")
     if bound is not None and set(scenario.observation.sensor_units) == {"1"}:
         figures.append(
             Figure(
@@ -190,6 +175,48 @@ def summarise(
         )
     references = {entry.figure: entry for entry in scenario.reference}
     return tuple(_beside(figure, references.get(figure.key)) for figure in figures)
+
+
+def _scored(result: MissionResult, truth: PlantRecord) -> list[Figure]:
+    """Return the figures that need the truth: how the control fell back, and errors of the estimate."""
+    scenario, flight, model = result.scenario, result.flight, result.model
+    first = scenario.control_names.index(scenario.mission.first_control)
+    fallback = find_fallback(model, result.plan.control_index, first, flight.control_index, truth.state)
+    units = {factor.name: factor.unit for factor in scenario.state}
+    figures = _fallback_figures(fallback, units, scenario.mission.step_name)
+    errors = filtered_rms_error(model, flight.filtered, truth.state)
+    for factor, error in zip(scenario.state, errors, strict=True):
+        name, fraction = factor.name, factor.unit == "1"
+        figures.append(
+            Figure(
+                f"filtered_rms_error_{name}",
+                f"filtered rms error of {name}",
+                (100.0 if fraction else 1.0) * float(error),
+                "points" if fraction else factor.unit,
+            )
+        )
+    return figures
+
+
+def _watched(result: MissionResult) -> list[Figure]:
+    """Return the figures of a watched asset: what is believed of it now."""
+    states, belief = result.model.states, result.flight.filtered[-1]
+    figures = []
+    for index, factor in enumerate(result.scenario.state):
+        fraction = factor.unit == "1"
+        for moment, value in (
+            ("mean", states.mean(belief)[index]),
+            ("standard_deviation", states.standard_deviation(belief)[index]),
+        ):
+            figures.append(
+                Figure(
+                    f"last_{moment}_{factor.name}",
+                    f"last {moment.replace('_', ' ')} of {factor.name}",
+                    (100.0 if fraction else 1.0) * float(value),
+                    "%" if fraction else factor.unit,
+                )
+            )
+    return figures
 
 
 def control_changes(controls: Sequence[str], control_index: Index, step_name: str) -> str:

@@ -35,7 +35,7 @@ def tables_of(groups: Mapping[str, xr.Dataset], role: str) -> dict[str, str]:
     tables = {
         "observed": _observations(steps, groups["observed"], role, role),
         "estimated": _observations(steps, groups["filtered"], "quantity_mean", role),
-        "true": _observations(steps, groups["truth"], role, role),
+        **({"true": _observations(steps, groups["truth"], role, role)} if "truth" in groups else {}),
         "health": _health(steps, groups),
         "decisions": _decisions(steps, groups),
         "policy": _policy(groups),
@@ -60,12 +60,14 @@ def _observations(steps: list[str], group: xr.Dataset, variable: str, role: str)
 
 def _health(steps: list[str], groups: Mapping[str, xr.Dataset]) -> Table:
     kinds = [(kind, name) for kind in ("filtered", "smoothed") for name in ("mean", "standard_deviation")]
-    columns = [groups["truth"]["state"].values, *(groups[kind][name].values for kind, name in kinds)]
+    known = [groups["truth"]["state"].values] if "truth" in groups else []
+    columns = [*known, *(groups[kind][name].values for kind, name in kinds)]
     header = ["step"]
     values = np.stack(columns, axis=-1)
-    for index, region in enumerate(_names(groups["truth"]["region"].values)):
+    for index, region in enumerate(_names(groups["filtered"]["region"].values)):
         factor, unit = _edge(groups["policy"][region].attrs["units"], PERCENT, "percent")
-        header += [f"{region}_true_{unit}", *(f"{region}_{kind}_{name}_{unit}" for kind, name in kinds)]
+        header += [f"{region}_true_{unit}"] * len(known)
+        header += [f"{region}_{kind}_{name}_{unit}" for kind, name in kinds]
         values[:, index] *= factor
     stacked = values.reshape(len(steps), -1)
     return header, [[step, *_numbers(row)] for step, row in zip(steps, stacked, strict=True)]
@@ -86,7 +88,7 @@ def _decisions(steps: list[str], groups: Mapping[str, xr.Dataset]) -> Table:
 def _policy(groups: Mapping[str, xr.Dataset]) -> Table:
     policy = groups["policy"]
     names = _names(policy["control"].values)
-    regions = _names(groups["truth"]["region"].values)
+    regions = _names(groups["filtered"]["region"].values)
     edges = [_edge(policy[name].attrs["units"], PERCENT, "percent") for name in regions]
     levels = np.stack(
         [policy[n].values * factor for n, (factor, _) in zip(regions, edges, strict=True)], axis=-1

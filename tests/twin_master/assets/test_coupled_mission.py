@@ -142,7 +142,7 @@ def test_a_resumed_flight_is_bit_identical(
         with pytest.raises(KeyboardInterrupt):
             new_run(loaded, tmp_path / "part")
     resume_run(tmp_path / "part")
-    names = ("run.nc", "config.json", "summary.json", "checkpoint.jsonl", "asset/components/exchanger.fmu")
+    names = ("run.nc", "config.json", "summary.json", "journal.jsonl", "asset/components/exchanger.fmu")
     for name in names:
         assert (tmp_path / "part" / name).read_bytes() == (whole / name).read_bytes(), name
 
@@ -318,7 +318,7 @@ def test_the_shipped_scenario_in_process_in_workers_and_resumed(
         with pytest.raises(KeyboardInterrupt):
             new_run(loaded, tmp_path / "part")
     resume_run(tmp_path / "part")
-    for name in ("run.nc", "config.json", "summary.json", "checkpoint.jsonl"):
+    for name in ("run.nc", "config.json", "summary.json", "journal.jsonl"):
         assert (tmp_path / "part" / name).read_bytes() == (whole / name).read_bytes(), name
     scenarios = [resolve_scenario(loaded, Overrides(seed=seed)) for seed in (7, 8)]
     drawn = [scenario.asset.source(scenario).parameters() for scenario in scenarios]

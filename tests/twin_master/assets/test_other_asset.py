@@ -90,7 +90,7 @@ def test_a_resumed_flight_of_an_fmu_is_bit_identical(
             new_run(loaded, tmp_path / "part")
     # What is flown lies in the run folder: the files that it came from may change or go.
     resume_run(tmp_path / "part")
-    for name in ("run.nc", "config.json", "summary.json", "checkpoint.jsonl", "csv/observed.csv"):
+    for name in ("run.nc", "config.json", "summary.json", "journal.jsonl", "csv/observed.csv"):
         assert (tmp_path / "part" / name).read_bytes() == (whole / name).read_bytes(), name
 
 

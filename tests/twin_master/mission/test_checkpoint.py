@@ -13,7 +13,8 @@ import pytest
 from reporting.errors import DiskFullError
 from twin_master.errors import NotResumableError
 from twin_master.mission import checkpoint
-from twin_master.mission.checkpoint import CHECKPOINT_NAME, Checkpoint, FlownTurn, open_checkpoint
+from twin_master.mission.checkpoint import Checkpoint, FlownTurn, open_checkpoint
+from twin_master.mission.journal import JOURNAL_NAME
 
 STATE = b"state\x00\xff"
 
@@ -34,7 +35,7 @@ def write(folder: Path, turns: list[FlownTurn]) -> bytes:
     with open_checkpoint(folder, "abc") as file:
         for turn in turns:
             file.keep(turn)
-    return (folder / CHECKPOINT_NAME).read_bytes()
+    return (folder / JOURNAL_NAME).read_bytes()
 
 
 def read(folder: Path, config_hash: str = "abc") -> Checkpoint | None:
@@ -65,20 +66,20 @@ def test_a_line_cut_off_anywhere_is_flown_again(tmp_path: Path) -> None:
     whole = write(tmp_path, turns)
     ends = [n + 1 for n, byte in enumerate(whole) if byte == ord("\n")]
     for cut in [0, 1, ends[0] - 1, ends[0], ends[0] + 70, ends[1] - 1, ends[1], ends[3] + 1, ends[4] - 1]:
-        (tmp_path / CHECKPOINT_NAME).write_bytes(whole[:cut])
+        (tmp_path / JOURNAL_NAME).write_bytes(whole[:cut])
         left = sum(end <= cut for end in ends[1:])
         with open_checkpoint(tmp_path, "abc") as file:
             assert file.turns == left
             for turn in turns[left:]:
                 file.keep(turn)
-        assert (tmp_path / CHECKPOINT_NAME).read_bytes() == whole
+        assert (tmp_path / JOURNAL_NAME).read_bytes() == whole
 
 
 def test_a_changed_or_foreign_checkpoint_is_refused(tmp_path: Path) -> None:
     whole = write(tmp_path, flown(3))
     with pytest.raises(NotResumableError, match="another configuration"):
         read(tmp_path, "other")
-    path = tmp_path / CHECKPOINT_NAME
+    path = tmp_path / JOURNAL_NAME
     lines = whole.splitlines(keepends=True)
     strain = str(flown(1)[0].observed[5]).encode()
     for damaged, line in (
@@ -110,7 +111,7 @@ def test_large_states_are_kept_less_often_and_their_turns_flown_again(
     with open_checkpoint(tmp_path, "abc") as file:
         for turn in turns[found.turns :]:
             file.keep(turn)
-    assert (tmp_path / CHECKPOINT_NAME).read_bytes() == whole
+    assert (tmp_path / JOURNAL_NAME).read_bytes() == whole
 
 
 def test_a_full_disk_leaves_the_turns_before(tmp_path: Path) -> None:
@@ -126,4 +127,4 @@ def test_a_full_disk_leaves_the_turns_before(tmp_path: Path) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, ignored)
-    assert (tmp_path / CHECKPOINT_NAME).stat().st_size == size
+    assert (tmp_path / JOURNAL_NAME).stat().st_size == size

@@ -1,0 +1,230 @@
+"""The journal of a run or a watch, `journal.jsonl`: a line for each turn, behind the SHA-256 of it.
+
+The file only grows. A line that was cut off by a kill ends without a line feed and is dropped; any other line
+that does not have its hash was changed. It is read line by line, however long it is.
+"""
+
+import json
+import math
+import os
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reporting.files import write_error
+from twin_master.errors import NotResumableError
+from twin_master.network.twin import TwinTurn
+
+Float = NDArray[np.float64]
+
+JOURNAL_NAME = "journal.jsonl"
+_DIGEST = 64
+_ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(", ", ": "))
+
+
+def plain(values: ArrayLike) -> list[float | None]:
+    """Return numbers for JSON: to the last bit, NaN as null."""
+    numbers: list[float] = np.asarray(values, dtype=np.float64).tolist()
+    return [None if math.isnan(number) else number for number in numbers]
+
+
+def array_of(values: Any) -> Float:
+    """Return numbers of JSON as an array, null as NaN."""
+    return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def belief_record(turn: TwinTurn) -> dict[str, Any]:
+    """Return what a line says of the belief: for people and viewers, who need not filter again."""
+    record: dict[str, Any] = {
+        "decision_probability": turn.decision_probability.tolist(),
+        "filtered": turn.filtered.tolist(),
+        "log_evidence": turn.log_evidence,
+    }
+    if turn.learnt:
+        record["learnt"] = {name: vars(learnt) for name, learnt in turn.learnt.items()}
+    if turn.notices:
+        record["notices"] = [vars(notice) for notice in turn.notices]
+    return record
+
+
+class JournalFile:
+    """A journal, open to be continued.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, which need not exist.
+    config_hash : str
+        SHA-256 of the configuration that it belongs to.
+    flush_seconds : float
+        Seconds after which what was appended is flushed to the disk; 0 flushes after every line. A kill of
+        the process loses nothing either way: only a machine that loses its power needs the flush.
+
+    Raises
+    ------
+    NotResumableError
+        It was changed or is damaged, or belongs to another configuration.
+    """
+
+    def __init__(self, path: Path, config_hash: str, flush_seconds: float = 0.0) -> None:
+        self._path = path
+        self._flush_seconds = flush_seconds
+        self._flushed = time.monotonic()
+        header = line_of({"config_hash": config_hash})
+        size = max((end for _, end in read_lines(path, config_hash)), default=0)
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+        self._size = size
+        os.truncate(self._descriptor, size)
+        if not size:
+            self.append_line(header)
+            self.flush()
+            synchronise_folder(path.parent)
+
+    def truncate(self, size: int) -> None:
+        """Drop what lies beyond a size in bytes, the end of some line."""
+        self._size = size
+        os.truncate(self._descriptor, size)
+
+    def append(self, record: Mapping[str, Any]) -> None:
+        """Add a line; it survives a kill of this process when this returns.
+
+        Raises
+        ------
+        FileNotWrittenError
+            The disk is full or the folder cannot be written; the lines before are still there.
+        """
+        self.append_line(line_of(record))
+
+    def append_line(self, line: bytes) -> None:
+        """Add a line that has its hash, see `append`."""
+        try:
+            written = 0
+            while written < len(line):
+                written += os.write(self._descriptor, line[written:])
+            if time.monotonic() - self._flushed >= self._flush_seconds:
+                self.flush()
+        except OSError as error:
+            with suppress(OSError):
+                os.truncate(self._descriptor, self._size)
+            raise write_error(error, self._path) from error
+        self._size += len(line)
+
+    def flush(self) -> None:
+        """Flush what was appended to the disk."""
+        os.fsync(self._descriptor)
+        self._flushed = time.monotonic()
+
+    def close(self) -> None:
+        """Let go of the file."""
+        with suppress(OSError):
+            os.fsync(self._descriptor)
+        os.close(self._descriptor)
+
+
+@contextmanager
+def open_journal(folder: Path, config_hash: str, flush_seconds: float = 0.0) -> Iterator[JournalFile]:
+    """Open the journal of a run folder that this process holds, see `JournalFile`.
+
+    Raises
+    ------
+    NotResumableError
+        The journal was changed or is damaged, or belongs to another configuration.
+    FileNotWrittenError
+        The disk is full or the folder cannot be written.
+    """
+    path = folder / JOURNAL_NAME
+    try:
+        journal = JournalFile(path, config_hash, flush_seconds)
+    except OSError as error:
+        raise write_error(error, path) from error
+    try:
+        yield journal
+    finally:
+        journal.close()
+
+
+def line_of(record: Mapping[str, Any]) -> bytes:
+    """Return a record as a line with its hash."""
+    text = _ENCODER.encode(record).encode("ascii")
+    return sha256(text).hexdigest().encode("ascii") + b" " + text + b"\n"
+
+
+def read_lines(path: Path, config_hash: str | None) -> Iterator[tuple[bytes, int]]:
+    """Return the JSON text of each whole line with the position of its end in bytes, the header first.
+
+    A journal that does not exist, or whose header was cut off, has no lines.
+
+    Parameters
+    ----------
+    path : Path
+    config_hash : str or None
+        Of the configuration that it must belong to; None takes any.
+
+    Raises
+    ------
+    NotResumableError
+        A line was changed or is damaged, or the journal belongs to another configuration.
+    """
+    if not path.exists():
+        return
+    header = None if config_hash is None else line_of({"config_hash": config_hash})
+    end = 0
+    with path.open("rb") as file:
+        for number, line in enumerate(file):
+            if not line.endswith(b"\n") and (number or header is None or header.startswith(line)):
+                return  # cut off by a kill
+            end += len(line)
+            text = line[_DIGEST + 1 :].rstrip(b"\n")
+            if sha256(text).hexdigest().encode("ascii") != line[:_DIGEST]:
+                raise damaged(path, number, "it does not have the hash that stands before it")
+            if not number and header is not None and line != header:
+                raise NotResumableError(
+                    f"the journal {path} belongs to another configuration than the config.json beside it: "
+                    "begin again with --replace."
+                )
+            yield text, end
+
+
+def read_records(path: Path, config_hash: str | None = None) -> Iterator[tuple[dict[str, Any], int]]:
+    """Return the record of each turn with the position of its end in bytes; the header is left out.
+
+    Raises
+    ------
+    NotResumableError
+        As `read_lines`.
+    """
+    for number, (text, end) in enumerate(read_lines(path, config_hash)):
+        if number:
+            yield record_of(path, number, text), end
+
+
+def record_of(path: Path, number: int, text: bytes) -> dict[str, Any]:
+    """Return the record of a line."""
+    record = json.loads(text)
+    if not isinstance(record, dict):
+        raise damaged(path, number, "it is no record")
+    return record
+
+
+def damaged(path: Path, number: int, why: str) -> NotResumableError:
+    """Return the exception for a line that cannot be believed."""
+    return NotResumableError(
+        f"line {number + 1} of the journal {path} was changed or is damaged ({why}): begin again with "
+        "--replace."
+    )
+
+
+def synchronise_folder(folder: Path) -> None:
+    """Flush a folder to the disk, so that a file that is new in it is found again."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # some file systems cannot
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
