@@ -283,6 +283,9 @@ PICTURES: dict[str, Picture] = {
     "clock_error": Picture(
         {"rate_error": 5e-3, "phase_zero": 0.0}, (ringdown(begin=6.0, end=8.0), backbone("frequency", "time"))
     ),
+    "logger_clock": Picture(
+        {"rate_error": 5e-3}, (ringdown(begin=7.0, end=8.0), ringdown(begin=3.2, end=4.0, trial="pushed"))
+    ),
     "mains_hum": Picture(
         {"cosine_ratio": 0.02, "sine_ratio": 0.0, "frequency_error": 0.0},
         (ringdown("g0", 6.0, 8.0), spectrum("g0", 70.0)),

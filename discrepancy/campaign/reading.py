@@ -93,6 +93,7 @@ def read_campaign(folder: str | Path) -> Campaign:
         reference_temperature=section.reference_temperature,
         parameters={name: (item.mean, item.deviation) for name, item in section.parameters.items()},
         data_hash=hash_record({name: hash_file(folder / name) for name in sorted(names)}),
+        loggers=section.loggers,
         remarks=(*section.remarks, *(remark for remark in remarks if remark not in section.remarks)),
     )
 

@@ -276,6 +276,13 @@ class Trial:
     inputs: tuple[RecordedInput, ...] = ()
 
     @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of what is recorded beside the channels; the force of a forced trial is "force"."""
+        if self.kind is TrialKind.FORCED:
+            return ("force",)
+        return tuple(item.name for item in self.inputs)
+
+    @property
     def is_dynamic(self) -> bool:
         """Whether the rows are samples in time of a motion."""
         return self.kind in (TrialKind.RINGDOWN, TrialKind.FORCED, TrialKind.DRIVEN)
@@ -316,6 +323,9 @@ class Campaign:
         SHA-256 of the campaign's files.
     remarks : tuple of str
         What the reader noticed and did: samples left out and why, a missing noise record.
+    loggers : mapping of str to tuple of str
+        Channels and inputs ("force": that of forced trials) that share a clock, by the logger's name; empty
+        where nothing is said, and one logger is taken to record everything.
     """
 
     name: str
@@ -325,6 +335,7 @@ class Campaign:
     parameters: Mapping[str, tuple[float, float]]
     data_hash: str
     remarks: tuple[str, ...] = field(default=())
+    loggers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def fitted(self) -> tuple[Trial, ...]:

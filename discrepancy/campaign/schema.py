@@ -218,6 +218,14 @@ class CampaignSection(Section):
     input: tuple[InputSection, ...] = ()
     trial: tuple[TrialSection, ...] = Field(min_length=1)
     remarks: tuple[str, ...] = ()
+    loggers: dict[Name, tuple[Name, ...]] = Field(default_factory=dict)
+
+    @field_validator("loggers", mode="before")
+    @classmethod
+    def _member_tuples(cls, value: object) -> object:
+        if not isinstance(value, Mapping):
+            return value
+        return {key: tuple(names) if isinstance(names, list) else names for key, names in value.items()}
 
     @field_validator("channel", "input", "trial", "remarks", mode="before")
     @classmethod
@@ -247,6 +255,7 @@ class CampaignSection(Section):
         scales = {item.unit for item in every if item.quantity is Quantity.TEMPERATURE}
         if len(scales) > 1:
             raise ValueError("temperatures are given in degC and in K: give all of them in one of the two")
+        self._check_loggers()
         known = {item.name for item in self.channel}
         for item in self.trial:
             for name in (*(item.channels or ()), *item.left_out):
@@ -257,6 +266,26 @@ class CampaignSection(Section):
                         f"{', '.join(sorted(known))}"
                     )
         return self
+
+    def _check_loggers(self) -> None:
+        """Refuse a logger of nothing, a name that none or two of them record, and inputs on two of them."""
+        if not self.loggers:
+            return
+        inputs = {item.name for item in self.input}
+        inputs |= {"force"} if any(item.kind is TrialKind.FORCED for item in self.trial) else set()
+        wanted = [*(item.name for item in self.channel), *sorted(inputs)]
+        recorded = [name for names in self.loggers.values() for name in names]
+        for name in recorded:
+            if name not in wanted:
+                raise ValueError(
+                    f"`loggers` names {name!r}, but the channels and inputs are {', '.join(wanted)}"
+                )
+        for name in wanted:
+            if recorded.count(name) != 1:
+                came = "none" if name not in recorded else "more than one"
+                raise ValueError(f"{name!r} must be on one of the `loggers`, and it is on {came}")
+        if sum(bool(inputs & set(names)) for names in self.loggers.values()) > 1:
+            raise ValueError("all inputs must be on one of the `loggers`, and they are on several")
 
 
 def parse_campaign(table: Mapping[str, Any], source: str) -> CampaignSection:

@@ -155,6 +155,10 @@ def _campaign_text(campaign: Campaign, files: list[str], noise_interval: float |
             f"file = {_quoted(NOISE_FILE)}",
             f"interval = {_number(noise_interval)}  # s",
         ]
+    if campaign.loggers:
+        lines += ["", "[loggers]"]
+        for name, members in campaign.loggers.items():
+            lines.append(f"{_quoted(name)} = {_list([_quoted(member) for member in members])}")
     for channel in campaign.channels.values():
         lines += ["", "[[channel]]", *_channel_lines(channel)]
     inputs = {item.name: item for trial in campaign.trials for item in trial.inputs}

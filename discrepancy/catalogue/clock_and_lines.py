@@ -15,9 +15,11 @@ from discrepancy.catalogue.building import (
     trials,
 )
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting
-from fe.runtime.patch import EVERY_CHANNEL, Clock, DecayingLine, Line, ModelPatch
+from fe.runtime.patch import EVERY_CHANNEL, Clock, DecayingLine, Line, LoggerClock, ModelPatch
 
 RINGDOWN = frozenset({TrialKind.RINGDOWN})
+INPUT = frozenset({TrialKind.FORCED, TrialKind.DRIVEN})
+_ONE_LOGGER = "One logger records motion and inputs (`loggers`), so that the motion has no clock of its own."
 ALL = "all "
 """Begins the place that stands for all channels of a quantity."""
 
@@ -28,6 +30,25 @@ ALL = "all "
 def _clock(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
     zero = values["phase_zero"] / setting.scales.angular_frequency
     return ModelPatch((Clock(values["rate_error"], zero),))
+
+
+def _second_clock(setting: Setting) -> str | None:
+    """Return why the motion has no clock of its own, None if it may have one."""
+    return _ONE_LOGGER if len(setting.campaign.loggers) == 1 and trials(setting, *INPUT) else None
+
+
+def logger_names(setting: Setting) -> tuple[str, ...]:
+    """Return the loggers of a campaign; `EVERY_CHANNEL` where one records everything."""
+    loggers = setting.campaign.loggers
+    return tuple(loggers) if len(loggers) > 1 else (EVERY_CHANNEL,)
+
+
+def _logger_places(setting: Setting) -> tuple[str, ...]:
+    return ("",) if logger_names(setting) == (EVERY_CHANNEL,) else logger_names(setting)
+
+
+def _logger_clock(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
+    return ModelPatch((LoggerClock(place or EVERY_CHANNEL, values["rate_error"]),))
 
 
 # ---------------------------------------------------------------- mains hum
@@ -139,8 +160,32 @@ CLOCK_ERROR = Effect(
         ),
     ),
     build=_clock,
-    unavailable=needs(trial_of(DYNAMIC)),
+    unavailable=needs(trial_of(DYNAMIC), _second_clock),
     confusable=("point_mass", "root_compliance", "stiffness_drift"),
+)
+
+LOGGER_CLOCK = Effect(
+    identifier="logger_clock",
+    name="clock rate of the logger",
+    family="clock",
+    equation="t -> (1 + e) t for readings and recorded inputs alike",
+    signature="As if stiffness and load were both (1 + e)^2 times as large and damping (1 + e) times.",
+    reference="Mills 1991, IEEE Trans. Commun. 39 (10), 1482-1493",
+    acts_on=DYNAMIC,
+    parameters=(
+        EffectParameter(
+            "rate_error",
+            "e",
+            "1",
+            "relative error of the logger's clock",
+            Prior("normal", -5e-3, 5e-3),
+            magnitude=True,
+        ),
+    ),
+    build=_logger_clock,
+    places=_logger_places,
+    unavailable=needs(trial_of(INPUT)),
+    confusable=("clock_error", "load_cell"),
 )
 
 MAINS_HUM = Effect(
@@ -232,4 +277,4 @@ UNMODELLED_MODE = Effect(
     spectral="frequency_ratio",
 )
 
-EFFECTS = (CLOCK_ERROR, MAINS_HUM, UNMODELLED_MODE)
+EFFECTS = (CLOCK_ERROR, LOGGER_CLOCK, MAINS_HUM, UNMODELLED_MODE)

@@ -1,5 +1,6 @@
 """What the channels of a trial would show: the response of a model, seen through the sensors of a patch."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,10 +8,10 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
-from discrepancy.models.interface import Conditions, Model
+from discrepancy.models.interface import Conditions, Model, Response
 from discrepancy.models.wrapped import built_in_sensors
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch, Primitive
+from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Primitive
 from fe.runtime.sensors import (
     SensorRecord,
     apply_sensors,
@@ -88,7 +89,14 @@ def observe(
         conditions = replace(conditions, clock=clock)
     bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SENSORS)))
     components = needs_components(patch)
-    response = model.respond(trial, outputs, bare, conditions, components=components, refinement=refinement)
+    loggers = logger_rates(campaign, trial, patch)
+
+    def responded(stamped: Trial, given: Conditions) -> Response:
+        return model.respond(stamped, outputs, bare, given, components=components, refinement=refinement)
+
+    response = (
+        responded(trial, conditions) if loggers is None else _logged(trial, conditions, loggers, responded)
+    )
     if components and (response.transverse is None or response.shear is None):
         raise ModelError(
             f"{model.name} gives no transverse and shear strain, so a turned gauge cannot be computed: leave "
@@ -103,6 +111,67 @@ def observe(
         response.rates,
         response.transverse,
         response.shear,
+    )
+
+
+def logger_rates(campaign: Campaign, trial: Trial, patch: ModelPatch) -> tuple[float, FloatArray] | None:
+    """Return the clock rates of a trial's inputs, and of its channels (C,), less one; None if all are right.
+
+    Raises
+    ------
+    CatalogueError
+        If a patch names a logger that the campaign does not have.
+    """
+    clocks = [item for item in patch if isinstance(item, LoggerClock)]
+    if not clocks or not trial.is_dynamic:
+        return None
+    inputs, channels = 1.0, np.ones(len(trial.channels))
+    for item in clocks:
+        if item.logger == EVERY_CHANNEL:
+            inputs, channels = inputs * (1.0 + item.rate), channels * (1.0 + item.rate)
+            continue
+        members = campaign.loggers.get(item.logger)
+        if members is None:
+            known = ", ".join(map(repr, campaign.loggers)) or "one for all, '*'"
+            raise CatalogueError(f"The campaign has no logger {item.logger!r}; it has {known}.")
+        channels = channels * np.array([1.0 + item.rate * (name in members) for name in trial.channels])
+        if any(name in members for name in trial.input_names):
+            inputs *= 1.0 + item.rate
+    return inputs - 1.0, channels - 1.0
+
+
+def _logged(
+    trial: Trial,
+    conditions: Conditions,
+    loggers: tuple[float, FloatArray],
+    responded: Callable[[Trial, Conditions], Response],
+) -> Response:
+    """Return the response with the inputs at their true times, each channel sampled by its own clock."""
+    inputs, channels = loggers
+    stamped = replace(trial, time=(1.0 + inputs) * trial.time) if inputs else trial
+    values: dict[float, Response] = {}
+    for rate in np.unique(channels).tolist():
+        beside = (1.0 + rate) / (1.0 + inputs) * (1.0 + conditions.clock[0]) - 1.0
+        beside = 0.0 if abs(beside) < 1e-15 else beside
+        values[rate] = responded(stamped, replace(conditions, clock=(beside, conditions.clock[1])))
+
+    def merged(parts: list[FloatArray | None]) -> FloatArray | None:
+        given = [part for part in parts if part is not None]
+        if len(given) < len(parts):
+            return None
+        found = given[0]
+        for rate, part in zip(values, given, strict=True):
+            found = np.where(channels == rate, part, found)
+        return found
+
+    every = list(values.values())
+    shown = merged([one.values for one in every])
+    assert shown is not None  # every response has values
+    return Response(
+        shown,
+        merged([one.rates for one in every]),
+        merged([one.transverse for one in every]),
+        merged([one.shear for one in every]),
     )
 
 

@@ -205,6 +205,19 @@ class Clock(Primitive):
 
 
 @dataclass(frozen=True, slots=True)
+class LoggerClock(Primitive):
+    """The clock of a logger: what it stamps t, readings and recorded inputs alike, was at (1 + `rate`) t.
+
+    `logger` is the name of a logger of the campaign, or `EVERY_CHANNEL` where one logger records everything.
+    """
+
+    kind: ClassVar[str] = "logger_clock"
+    units: ClassVar[dict[str, str]] = {"rate": "1"}
+    logger: str
+    rate: float
+
+
+@dataclass(frozen=True, slots=True)
 class Line(Primitive):
     """A line at `frequency` [Hz] is added: cosine cos + sine sin (2 pi f t), t since the trial's start.
 
@@ -255,7 +268,8 @@ _EVERY: tuple[type[Primitive], ...] = (
     PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature, StiffnessDrift,
     *LAWS,
     LoadPlace, LoadGain, Washout, InertiaRelief,
-    SensorGain, SensorDrift, SensorRotation, ThermalStrain, HighPass, Clock, Line, DecayingLine,
+    SensorGain, SensorDrift, SensorRotation, ThermalStrain, HighPass, Clock, LoggerClock, Line,
+    DecayingLine,
     RunOffset,
 )  # fmt: skip
 PRIMITIVES: dict[str, type[Primitive]] = {primitive.kind: primitive for primitive in _EVERY}
@@ -274,6 +288,7 @@ SENSORS = (
     ThermalStrain,
     HighPass,
     Clock,
+    LoggerClock,
     Line,
     DecayingLine,
     RunOffset,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InvalidPatchError
-from .patch import EVERY_CHANNEL, SENSORS, Clock, HighPass, ModelPatch, SensorRotation
+from .patch import EVERY_CHANNEL, SENSORS, Clock, HighPass, LoggerClock, ModelPatch, SensorRotation
 from .sensors import SensorRecord, apply_sensors
 
 FloatArray = NDArray[np.float64]
@@ -127,7 +127,7 @@ class SensorStream:
         others = [
             item
             for item in self.patch
-            if isinstance(item, SENSORS) and not isinstance(item, SensorRotation | Clock)
+            if isinstance(item, SENSORS) and not isinstance(item, SensorRotation | Clock | LoggerClock)
         ]
         for filtered, group in groupby(others, lambda item: isinstance(item, HighPass)):
             if not filtered:

@@ -1,7 +1,7 @@
 """What sensors make of a response: gain, drift, rotation, thermal strain, high-pass, lines, offset of a run.
 
-Pure functions on arrays for the primitives of `fe.runtime.patch.SENSORS`; `Clock` is not here, because it
-says when the response is taken and so belongs to whoever computes it. Without sensors the input comes back
+Pure functions on arrays for the primitives of `fe.runtime.patch.SENSORS`; clocks are not here, because they
+say when the response is taken and so belong to whoever computes it. Without sensors the input comes back
 untouched.
 
 NumPy and standard library only: this file is copied into the FMU.
@@ -23,6 +23,7 @@ from .patch import (
     DecayingLine,
     HighPass,
     Line,
+    LoggerClock,
     ModelPatch,
     Primitive,
     RunOffset,
@@ -151,7 +152,9 @@ def apply_sensors(
         If a gauge is turned and the components are missing, or a time constant, an order or a drift's time
         is not positive.
     """
-    active = [item for item in patch if isinstance(item, SENSORS) and not isinstance(item, Clock)]
+    active = [
+        item for item in patch if isinstance(item, SENSORS) and not isinstance(item, Clock | LoggerClock)
+    ]
     if not active:
         return values, rates
     values = np.array(values, dtype=np.float64)

@@ -22,7 +22,16 @@ from pathlib import Path
 from typing import Any
 
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import EVERY_CHANNEL, Clock, HighPass, ModelPatch, PortForce, Primitive, RunOffset
+from fe.runtime.patch import (
+    EVERY_CHANNEL,
+    Clock,
+    HighPass,
+    LoggerClock,
+    ModelPatch,
+    PortForce,
+    Primitive,
+    RunOffset,
+)
 from fe.runtime.sensor_stream import needs_structure
 from fe.runtime.sensors import check_channels
 from fmu_asset.errors import PatchFileError
@@ -38,6 +47,7 @@ _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _NO_MEANING = {
     Clock: "inputs and outputs of an FMU belong to the communication points of its master, so there is no "
     "second clock that could be wrong",
+    LoggerClock: "what an FMU is given carries the time of its master, and nothing is logged",
     RunOffset: "an FMU has no runs between which its zero could have moved; a constant offset is a "
     "sensor_drift with exponent 0",
 }
