@@ -188,6 +188,11 @@ class GaussianSensorModel(QuantityModel):
         self._by_control = np.ascontiguousarray(self.value_per_draw.transpose(2, 1, 3, 0))
 
     @property
+    def averages_inside(self) -> bool:
+        """Whether each sensor averages over draws of its own, eq. (32) as printed."""
+        return self._inside
+
+    @property
     def standard_deviation(self) -> Float:
         """Noise standard deviation of each sensor (G,), SI."""
         return self._deviation.copy()
@@ -202,8 +207,14 @@ class GaussianSensorModel(QuantityModel):
         """Noise and model error of each state, control and sensor (S, U, G), SI, read-only."""
         return self._total_deviation
 
-    def _checked(self, observation: ArrayLike) -> Float:
-        """Return observations (..., G) in which NaN stands for a lost sensor."""
+    def checked(self, observation: ArrayLike) -> Float:
+        """Return observations (..., G) in which NaN stands for a lost sensor.
+
+        Raises
+        ------
+        InvalidObservationError
+            The shape is another one, or a value is infinite.
+        """
         observation = np.array(observation, dtype=np.float64, order="C")
         if observation.ndim == 0 or observation.shape[-1] != self.sensor_count:
             raise InvalidObservationError(
@@ -236,7 +247,7 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError, InvalidModelError
             If the shape is another one or a value is infinite; if there is no such control.
         """
-        rows = self.log_likelihood_sequence(self._checked(observation)[None], [control_index])
+        rows = self.log_likelihood_sequence(self.checked(observation)[None], [control_index])
         result: Float = rows[0]
         return result
 
@@ -248,7 +259,7 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError, InvalidModelError
             As `log_likelihood`.
         """
-        observations = self._checked(observations)
+        observations = self.checked(observations)
         control = np.array(control_index, dtype=np.int64)
         if observations.ndim != 2 or control.shape != observations.shape[:1]:
             raise InvalidModelError(
@@ -287,7 +298,7 @@ class GaussianSensorModel(QuantityModel):
 
     def observed_count(self, observations: ArrayLike) -> Index:
         """Return how many sensors report: (..., G) -> (...). Zero flags a step that follows the dynamics."""
-        result: Index = np.sum(~np.isnan(self._checked(observations)), axis=-1)
+        result: Index = np.sum(~np.isnan(self.checked(observations)), axis=-1)
         return result
 
     def predictive_check(self, joint: ArrayLike, observation: ArrayLike) -> PredictiveCheck:
@@ -300,7 +311,7 @@ class GaussianSensorModel(QuantityModel):
         observation : (..., G)
             SI; NaN where the sensor is lost.
         """
-        observation = self._checked(observation)
+        observation = self.checked(observation)
         mean, spread = self.moments(joint)
         if mean.shape != observation.shape:
             raise InvalidModelError(

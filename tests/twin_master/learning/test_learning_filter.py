@@ -1,0 +1,197 @@
+"""What is learnt, against sums over all trajectories, draws and factors, and closed forms."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import multivariate_normal, multivariate_t
+
+from twin_master.errors import InvalidModelError
+from twin_master.learning.learning_filter import LearningFilter, LearntPriors
+from twin_master.learning.posterior import draws_posterior
+from twin_master.network.estimator import Carried, Estimate, ExactFilter
+from twin_master.network.graphical_model import GraphicalModel, worsening_table
+from twin_master.network.sensor_model import GaussianSensorModel
+
+Float = NDArray[np.float64]
+
+STEPS, DRAWS, GAUGES = 5, 3, 2
+FACTORS = (0.5, 1.0, 2.0)
+CONTROLS = [0, 1, 1, 0, 1]
+
+
+def model(factor: float = 1.0, levels: int = 3) -> GraphicalModel:
+    tables = {name: {"z": worsening_table(levels, factor * p)} for name, p in (("slow", 0.1), ("fast", 0.4))}
+    first = np.full(levels, 1.0 / levels)
+    return GraphicalModel.from_tables({"z": range(levels)}, tables, {"z": first})
+
+
+def sensors(levels: int = 3, average: str = "outside") -> GaussianSensorModel:
+    value = np.random.default_rng(1).normal(size=(DRAWS, levels, 2, GAUGES))
+    return GaussianSensorModel(value, [0.7, 1.1], [0.2, 0.5, 0.3], average=average)  # type: ignore[arg-type]
+
+
+def observations() -> Float:
+    seen = np.random.default_rng(2).normal(size=(STEPS, GAUGES))
+    seen[1, 0] = np.nan
+    seen[3] = np.nan
+    return seen
+
+
+def run(learner: LearningFilter, seen: Float, controls: list[int]) -> list[Estimate]:
+    estimates: list[Estimate] = []
+    before: Carried | None = None
+    for turn, (row, control) in enumerate(zip(seen, controls, strict=True)):
+        estimates.append(learner.turn(before, row, control, turn))
+        before = estimates[-1].carried
+    return estimates
+
+
+def likelihood(sensor: GaussianSensorModel, row: Float, draw: int, state: int, control: int) -> float:
+    residual = (row - sensor.value_per_draw[draw, state, control]) / sensor.standard_deviation
+    density = np.exp(-0.5 * residual**2) / (np.sqrt(2.0 * np.pi) * sensor.standard_deviation)
+    return float(np.prod(density[~np.isnan(row)]))
+
+
+def enumerated(turns: int) -> Float:
+    """Return p(path, draw, factor, o) over everything: (paths of S^T, E, R), not normalised."""
+    sensor, seen = sensors(), observations()
+    table = np.zeros((3,) * turns + (DRAWS, len(FACTORS)))
+    for path in product(range(3), repeat=turns):
+        for draw, (place, factor) in product(range(DRAWS), enumerate(FACTORS)):
+            chosen = model(factor)
+            p = chosen.prior[path[0]] * sensor.draw_weight[draw] / len(FACTORS)
+            for t, state in enumerate(path):
+                p *= likelihood(sensor, seen[t], draw, state, CONTROLS[t])
+                if t:
+                    p *= chosen.transition.matrix[CONTROLS[t - 1], path[t - 1], state]
+            table[(*path, draw, place)] = p
+    return table
+
+
+def learner_of_all() -> LearningFilter:
+    priors = LearntPriors("e", [0.9, 1.0, 1.1], transition_factors=FACTORS)
+    return LearningFilter(model(), sensors(), priors, [model(f).transition.matrix for f in FACTORS])
+
+
+def test_states_draws_and_transition_factors_are_those_of_the_sum_over_all_trajectories() -> None:
+    learner = learner_of_all()
+    estimates = run(learner, observations(), CONTROLS)
+    evidence = 0.0
+    for turn, estimate in enumerate(estimates):
+        table = enumerated(turn + 1)
+        evidence += estimate.log_evidence
+        assert evidence == pytest.approx(np.log(table.sum()), abs=1e-12)
+        joint = table.reshape(-1, 3, DRAWS, len(FACTORS)).sum(axis=0) / table.sum()
+        np.testing.assert_allclose(estimate.filtered, joint.sum(axis=(1, 2)), rtol=1e-11)
+        found = np.exp(estimate.carried.arrays["log_belief"]).reshape(len(FACTORS), DRAWS, 3)
+        np.testing.assert_allclose(found, joint.transpose(2, 1, 0), rtol=1e-11)
+        factor = estimate.learnt["transition_factor"]
+        assert factor.mean == pytest.approx(joint.sum(axis=(0, 1)) @ FACTORS, rel=1e-9)
+    table = enumerated(STEPS) / enumerated(STEPS).sum()
+    smoothed = learner.smoothed([estimate.carried for estimate in estimates])
+    for turn in range(STEPS):
+        others = tuple(axis for axis in range(STEPS + 2) if axis != turn)
+        np.testing.assert_allclose(smoothed[turn], table.sum(axis=others), rtol=1e-10)
+
+
+def test_a_filter_that_learns_nothing_is_the_exact_filter() -> None:
+    exact = ExactFilter(model(), sensors())
+    learner = LearningFilter(model(), sensors(), LearntPriors())
+    estimates = run(learner, observations(), CONTROLS)
+    before: Carried | None = None
+    known = []
+    for turn, (row, control) in enumerate(zip(observations(), CONTROLS, strict=True)):
+        step = exact.turn(before, row, control, turn)
+        before = step.carried
+        known.append(before)
+        np.testing.assert_allclose(estimates[turn].filtered, step.filtered, rtol=1e-11)
+        np.testing.assert_allclose(estimates[turn].forecast, step.forecast, rtol=1e-11)
+        assert estimates[turn].log_evidence == pytest.approx(step.log_evidence, abs=1e-12)
+    smoothed = learner.smoothed([estimate.carried for estimate in estimates])
+    np.testing.assert_allclose(smoothed, exact.smoothed(known), rtol=1e-10)
+    assert not estimates[-1].learnt
+
+
+@pytest.mark.parametrize("degrees", [0.0, 6.0])
+@pytest.mark.parametrize(("gain", "offset"), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.5), (0.3, 0.5)])
+def test_noise_gain_and_offset_of_a_gauge_are_a_conjugate_regression(
+    degrees: float, gain: float, offset: float
+) -> None:
+    """With one state the evidence is that of a multivariate Student or normal density, for each draw."""
+    value = np.random.default_rng(3).normal(2.0, 1.0, size=(DRAWS, 1, 2, 1))
+    sensor = GaussianSensorModel(value, 0.7, [0.2, 0.5, 0.3])
+    seen = np.random.default_rng(4).normal(2.0, 1.5, size=(STEPS, 1))
+    seen[2] = np.nan
+    priors = LearntPriors("e", [0.9, 1.0, 1.1], noise_degrees=degrees, gain=gain, offset=offset)
+    estimates = run(LearningFilter(model(levels=1), sensor, priors), seen, CONTROLS)
+    there = ~np.isnan(seen[:, 0])
+    log_density = np.log(sensor.draw_weight)
+    for draw in range(DRAWS):
+        mean = value[draw, 0, CONTROLS, 0][there]
+        shape = 0.49 * np.eye(there.sum()) + gain**2 * np.outer(mean, mean) + offset**2
+        density = multivariate_t(mean, shape, degrees) if degrees else multivariate_normal(mean, shape)
+        # The prior of the coefficients is in units of the noise: N(0, lambda² prior²).
+        log_density[draw] += density.logpdf(seen[there, 0])
+    assert sum(e.log_evidence for e in estimates) == pytest.approx(np.logaddexp.reduce(log_density), abs=1e-10)
+    weight = np.exp(log_density - np.logaddexp.reduce(log_density))
+    np.testing.assert_allclose(np.exp(estimates[-1].carried.arrays["log_belief"][:, 0]), weight, rtol=1e-9)
+
+
+def test_noise_gain_and_offset_are_found_from_many_observations() -> None:
+    random = np.random.default_rng(5)
+    value = np.array([[1.0, 3.0], [3.0, 1.0]])[None, None].repeat(1, axis=0)  # (1, 1, U, G)
+    sensor = GaussianSensorModel(value, 1.0)
+    controls = (np.arange(400) % 2).tolist()
+    seen = value[0, 0, controls] * [1.0, 1.2] + [0.3, 0.0] + random.normal(size=(400, 2)) * [2.0, 0.5]
+    priors = LearntPriors(noise_degrees=5.0, gain=0.3, offset=0.5)
+    learnt = run(LearningFilter(model(levels=1), sensor, priors), seen, controls)[-1].learnt
+    for name, truth in (
+        ("noise_scale[1]", 2.0), ("noise_scale[2]", 0.5), ("gauge_gain[2]", 0.2), ("gauge_offset[1]", 0.3),
+    ):  # fmt: skip
+        found = learnt[name]
+        assert found.lower < found.mean < found.upper
+        assert abs(found.mean - truth) < 3.0 * found.standard_deviation < 0.7, name
+
+
+def test_the_interval_of_a_parameter_does_not_depend_on_where_its_draws_lie() -> None:
+    """Draws wider apart than the posterior: the evidence between them is interpolated."""
+    fine, coarse = np.linspace(-3, 3, 2001), np.linspace(-3, 3, 25)
+
+    def posterior(values: Float) -> tuple[Float, Float]:
+        prior = np.exp(-0.5 * values**2) / np.exp(-0.5 * values**2).sum()
+        weight = prior * np.exp(-0.5 * ((values - 0.61) / 0.08) ** 2)
+        return prior, weight / weight.sum()
+
+    exact = draws_posterior(fine, *posterior(fine))
+    rough = draws_posterior(coarse, *posterior(coarse))
+    assert rough.mean == pytest.approx(exact.mean, abs=0.005)
+    assert rough.standard_deviation == pytest.approx(exact.standard_deviation, rel=0.05)
+    assert (rough.lower, rough.upper) == pytest.approx((exact.lower, exact.upper), abs=0.01)
+    spread = 0.08 / np.sqrt(1 + 0.08**2)
+    assert exact.standard_deviation == pytest.approx(spread, rel=0.01)
+
+
+def test_draws_that_are_the_same_or_few_give_their_own_posterior() -> None:
+    found = draws_posterior([2.0, 1.0, 2.0], [0.25, 0.5, 0.25], [0.4, 0.2, 0.4])
+    assert (found.mean, found.lower, found.upper) == pytest.approx((1.8, 1.0, 2.0))
+    single = draws_posterior([2.0], [1.0], [1.0], "Pa")
+    assert (single.mean, single.standard_deviation, single.unit) == (2.0, 0.0, "Pa")
+
+
+def test_a_belief_that_underflows_comes_back() -> None:
+    """The hypothesis that is right from the second turn on had a weight below the doubles."""
+    value = np.array([0.0, 60.0])[:, None, None, None].repeat(2, axis=2)  # (E, 1, U, 1)
+    learner = LearningFilter(model(levels=1), GaussianSensorModel(value, 1.0), LearntPriors("e", [0, 60]))
+    estimates = run(learner, np.array([[0.0], [60.0], [60.0]]), [0, 0, 0])
+    log_belief = [estimate.carried.arrays["log_belief"][:, 0] for estimate in estimates]
+    np.testing.assert_allclose(log_belief[0][1], -1800.0, rtol=1e-12)
+    np.testing.assert_allclose(log_belief[2][0], -1800.0, rtol=1e-12)
+
+
+def test_an_average_inside_the_product_is_refused() -> None:
+    with pytest.raises(InvalidModelError, match="learning needs"):
+        LearningFilter(model(), sensors(average="inside"), LearntPriors("e", [1, 2, 3]))
+    with pytest.raises(InvalidModelError, match="one transition table for each"):
+        LearningFilter(model(), sensors(), LearntPriors(transition_factors=(1.0, 2.0)))

@@ -1,0 +1,294 @@
+"""The filter that learns: static hypotheses as an axis of the belief, gauges by conjugate regression.
+
+A static hypothesis k is a draw of the calibrated parameter and a factor on the transition probabilities; both
+stay what they are. Each has a filter of its own over the states, and its weight is its evidence:
+
+    p(D_t, k | o_0..o_t)  proportional to  p(o_t | D_t, k, o_0..o_t-1)  sum over i of T_k[i, D_t] p(i, k | o_0..o_t-1),
+
+which is exact. What a gauge g has of its own, given the hypothesis, is a regression with the noise scale:
+
+    o_g = h_g(D_t, k) (1 + gain_g) + offset_g + lambda_g sigma_g noise,
+    lambda_g² ~ inverse gamma(degrees / 2, degrees / 2),  offset_g, gain_g | lambda_g ~ N(0, lambda_g² times prior variance),
+
+so that the predictive density is Student's (Bernardo and Smith 1994, section 5.2). Its sums are exact given the
+path of the state; over the paths they are expected sums, under the filtered belief of each turn.
+"""  # fmt: skip
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import gammaincinv, gammaln
+
+from twin_master.errors import InvalidModelError
+from twin_master.learning.kernels import (
+    forecast_all,
+    gauge_log_likelihood,
+    gauge_statistics,
+    normalise,
+    regression,
+)
+from twin_master.learning.posterior import INTERVAL, draws_posterior
+from twin_master.network.estimator import Carried, Estimate, Learnt
+from twin_master.network.graphical_model import GraphicalModel, SparseTransition
+from twin_master.network.inference import ObservationContext
+from twin_master.network.kernels import backward_pass
+from twin_master.network.sensor_model import GaussianSensorModel
+
+__all__ = ["LearningFilter", "LearntPriors"]
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_NORMAL = 1.6448536269514722
+"""Half-width of the central 90 % of a normal distribution, in standard deviations."""
+
+
+@dataclass(frozen=True)
+class LearntPriors:
+    """What is learnt, with its prior.
+
+    Attributes
+    ----------
+    parameter : str or None
+        Name of the parameter of the draws; None averages over the draws anew in each turn.
+    parameter_unit : str
+    draws : (E,) or None
+        Its values, for the posterior; the draws of the sensor model in their order.
+    noise_degrees : float
+        Degrees of freedom of the noise scale; 0 takes the assumed noise for known.
+    gain, offset : float or (G,)
+        Prior standard deviation of gain error [1] and offset [SI] of each sensor; 0 is not learnt.
+    transition_factors : (R,)
+        Factors on the probabilities to leave a state, equally probable at first.
+    sensor_unit : str
+        Unit of the offset.
+    """
+
+    parameter: str | None = None
+    draws: ArrayLike | None = None
+    parameter_unit: str = "1"
+    noise_degrees: float = 0.0
+    gain: ArrayLike = 0.0
+    offset: ArrayLike = 0.0
+    transition_factors: tuple[float, ...] = (1.0,)
+    sensor_unit: str = "1"
+
+
+class LearningFilter:
+    """Exact filter over states and static hypotheses, with a conjugate regression for each gauge.
+
+    It carries `log_belief` (K, S), the log of p(D_t, k | o_0..o_t), `statistics` (K, G, 6), the sums of the
+    regressions in units of the assumed noise, and `count` (G,), the observations of each sensor.
+
+    Parameters
+    ----------
+    model : GraphicalModel
+        S states, U controls; its transitions are what the twin predicts and plans with.
+    sensor_model : GaussianSensorModel
+        Predictions (E, S, U, G), weights of the draws, and the noise that is assumed.
+    priors : LearntPriors
+    transitions : sequence of (U, S, S), optional
+        Transitions for each of `transition_factors`; those of the model if there is one factor.
+    name : str
+        Name of the twin, for messages.
+
+    Raises
+    ------
+    InvalidModelError
+        The average over the draws stands inside the product over the sensors, or shapes do not fit.
+    """
+
+    def __init__(
+        self,
+        model: GraphicalModel,
+        sensor_model: GaussianSensorModel,
+        priors: LearntPriors,
+        transitions: Sequence[ArrayLike] | None = None,
+        name: str = "twin",
+    ) -> None:
+        if sensor_model.averages_inside:
+            raise InvalidModelError(
+                "learning needs `average_over_draws` = \"outside\": inside, each sensor has a parameter of its own"
+            )
+        matrices = [np.asarray(item) for item in (transitions or [model.transition.matrix])]
+        if len(matrices) != len(priors.transition_factors):
+            raise InvalidModelError(
+                f"expected one transition table for each of {len(priors.transition_factors)} factors, "
+                f"got {len(matrices)}"
+            )
+        self._model, self._sensor_model, self._name = model, sensor_model, name
+        self.priors = priors
+        draws, factors, sensors = sensor_model.draw_count, len(matrices), sensor_model.sensor_count
+        self._sparse = SparseTransition.from_matrix(np.concatenate(matrices))
+        self._draw: Index = np.tile(np.arange(draws), factors)
+        self._factor: Index = np.repeat(np.arange(factors), draws)
+        weight = np.tile(sensor_model.draw_weight / factors, factors)
+        with np.errstate(divide="ignore"):
+            self._log_weight: Float = np.log(weight)
+        self._value = [
+            np.ascontiguousarray(sensor_model.value_per_draw[:, :, control])
+            for control in range(sensor_model.control_count)
+        ]
+        self._inverse = [
+            np.ascontiguousarray(1.0 / sensor_model.total_standard_deviation[:, control])
+            for control in range(sensor_model.control_count)
+        ]
+        self._gain: Float = np.broadcast_to(np.asarray(priors.gain, np.float64), (sensors,)).copy()
+        self._offset: Float = np.broadcast_to(np.asarray(priors.offset, np.float64), (sensors,)).copy()
+        self._regresses = bool(np.any(self._gain > 0.0) or np.any(self._offset > 0.0))
+        self._learns_gauges = self._regresses or priors.noise_degrees > 0.0
+
+    @property
+    def model(self) -> GraphicalModel:
+        """States, controls, prior and transitions."""
+        return self._model
+
+    @property
+    def sensor_model(self) -> GaussianSensorModel:
+        """Predictions and assumed noise."""
+        return self._sensor_model
+
+    def turn(self, before: Carried | None, observation: Float, control_index: int, turn: int) -> Estimate:
+        """Advance belief and what is learnt to turn t, and correct them by an observation.
+
+        See `Estimator.turn`; `learnt` of the estimate holds what is learnt by name: the parameter,
+        `transition_factor`, and `noise_scale[g]`, `gauge_gain[g]`, `gauge_offset[g]` for the sensors g from 1.
+        """
+        seen = self._sensor_model.checked(observation)
+        forecast, statistics, count = self.forecast(before)
+        log_belief = forecast + self.gauge_log_likelihood(seen, control_index, statistics, count).sum(axis=2)
+        filtered = np.empty_like(log_belief)
+        evidence = normalise(log_belief, filtered)
+        if evidence == -np.inf:
+            raise ObservationContext(
+                self._name, turn, lambda _turn: self._sensor_model.worst_residuals(seen, control_index)
+            ).impossible(0)
+        statistics = statistics.copy()
+        if self._learns_gauges:
+            gauge_statistics(
+                seen, self._draw, self._value[control_index], self._inverse[control_index],
+                self._offset, self._gain, log_belief, statistics,
+            )  # fmt: skip
+        count = count + ~np.isnan(seen)
+        arrays = {"log_belief": log_belief, "statistics": statistics, "count": count}
+        return Estimate(
+            forecast=np.exp(forecast).sum(axis=0),
+            filtered=filtered.sum(axis=0),
+            log_evidence=evidence,
+            carried=Carried(control_index, arrays),
+            learnt=self._learnt(filtered, statistics, count),
+        )
+
+    def forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
+        """Return log p(D_t, k | o_0..o_t-1) (K, S), the statistics (K, G, 6) and the counts (G,) until then."""
+        hypotheses, sensors = len(self._draw), self._sensor_model.sensor_count
+        if before is None:
+            forecast = self._log_weight[:, None] + self._model.log_prior
+            return forecast, np.zeros((hypotheses, sensors, 6)), np.zeros(sensors)
+        log_before = before.arrays["log_belief"]
+        forecast = np.empty_like(log_before)
+        size, controls = self._model.states.size, len(self._model.controls)
+        forecast_all(
+            log_before, (self._factor * controls + before.control_index) * size, self._sparse.start,
+            self._sparse.source, self._sparse.probability, self._sparse.log_probability, forecast,
+        )  # fmt: skip
+        if self.priors.parameter is None:
+            forecast = self._averaged_anew(forecast)
+        return forecast, before.arrays["statistics"], before.arrays["count"]
+
+    def gauge_log_likelihood(
+        self, observation: Float, control_index: int, statistics: Float, count: Float
+    ) -> Float:
+        """Return log p(o_g | D_t, k, o_0..o_t-1) for each hypothesis, state and gauge: (K, S, G)."""
+        fitted = np.zeros_like(statistics)
+        if self._learns_gauges:
+            regression(statistics, fitted)
+        result = np.empty((len(self._draw), self._model.states.size, len(observation)))
+        gauge_log_likelihood(
+            observation, self._draw, self._value[control_index], self._inverse[control_index],
+            self._offset, self._gain, fitted, count, self.priors.noise_degrees, result,
+        )  # fmt: skip
+        return result
+
+    def smoothed(self, carried: Sequence[Carried]) -> Float:
+        """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""
+        size, controls = self._model.states.size, len(self._model.controls)
+        result = np.zeros((len(carried), size))
+        if not len(carried):
+            return result
+        rows = np.array([turn.arrays["log_belief"] for turn in carried])  # (n, K, S)
+        control = np.array([turn.control_index for turn in carried], dtype=np.int64)
+        if self.priors.parameter is None and len(self._draw) > 1:
+            rows = np.stack([self._averaged_anew(row) for row in rows])
+        weight = np.exp(rows[-1]).sum(axis=1)
+        for k in np.flatnonzero(weight > 0.0):
+            own = np.ascontiguousarray(rows[:, k])
+            with np.errstate(over="ignore"):
+                own = own - np.logaddexp.reduce(own, axis=1, keepdims=True)
+            part = np.empty_like(own)
+            backward_pass(
+                self._sparse.start, self._sparse.source, self._sparse.probability,
+                self._sparse.log_probability, control + self._factor[k] * controls, np.exp(own), own, part,
+            )  # fmt: skip
+            result += weight[k] * part
+        return result
+
+    def _averaged_anew(self, log_belief: Float) -> Float:
+        """Return a belief (K, S) in which the draws have their first weights again, whatever the state."""
+        factors = len(self.priors.transition_factors)
+        by_factor = log_belief.reshape(factors, -1, log_belief.shape[1])
+        merged = np.logaddexp.reduce(by_factor, axis=1)
+        with np.errstate(divide="ignore"):
+            log_draw = np.log(self._sensor_model.draw_weight)
+        result: Float = (merged[:, None] + log_draw[None, :, None]).reshape(log_belief.shape)
+        return result
+
+    def _learnt(self, filtered: Float, statistics: Float, count: Float) -> Mapping[str, Learnt]:
+        """Return the posterior of everything that is learnt."""
+        weight = filtered.sum(axis=1)  # of each hypothesis
+        result: dict[str, Learnt] = {}
+        factors = np.asarray(self.priors.transition_factors)
+        if self.priors.parameter is not None and self.priors.draws is not None:
+            own = weight.reshape(len(factors), -1).sum(axis=0)
+            result[self.priors.parameter] = draws_posterior(
+                self.priors.draws, self._sensor_model.draw_weight, own, self.priors.parameter_unit
+            )
+        if len(factors) > 1:
+            own = weight.reshape(len(factors), -1).sum(axis=1)
+            result["transition_factor"] = draws_posterior(factors, np.full(len(own), 1.0 / len(own)), own)
+        if self._learns_gauges:
+            result |= self._learnt_of_gauges(weight, statistics, count)
+        return result
+
+    def _learnt_of_gauges(self, weight: Float, statistics: Float, count: Float) -> dict[str, Learnt]:
+        fitted = np.empty_like(statistics)
+        regression(statistics, fitted)
+        degrees = self.priors.noise_degrees
+        result: dict[str, Learnt] = {}
+        scale2 = np.ones_like(fitted[..., 5])
+        if degrees > 0.0:
+            shape, left = 0.5 * (degrees + count), weight @ (degrees + fitted[..., 5])
+            scale2 = (degrees + fitted[..., 5]) / np.maximum(2.0 * shape - 2.0, 1.0)
+            # The square is inverse gamma (shape, left / 2): its quantiles, and the moments of its root.
+            low, high = (np.sqrt(0.5 * left / gammaincinv(shape, level)) for level in INTERVAL[::-1])
+            mean = np.sqrt(0.5 * left) * np.exp(gammaln(shape - 0.5) - gammaln(shape))
+            deviation = np.sqrt(np.maximum(0.5 * left / (shape - 1.0) - mean**2, 0.0))
+            for g in range(len(count)):
+                result[f"noise_scale[{g + 1}]"] = Learnt(
+                    float(mean[g]), float(deviation[g]), float(low[g]), float(high[g])
+                )
+        for column, prior, name, unit in (
+            (0, self._offset, "gauge_offset", self.priors.sensor_unit),
+            (1, self._gain, "gauge_gain", "1"),
+        ):
+            mean = weight @ fitted[..., column]
+            spread = weight @ (fitted[..., column] ** 2 + scale2 * fitted[..., 2 + 2 * column]) - mean**2
+            deviation = np.sqrt(np.maximum(spread, 0.0))
+            for g in np.flatnonzero(prior > 0.0):
+                own, wide = float(mean[g] * prior[g]), float(deviation[g] * prior[g])
+                result[f"{name}[{g + 1}]"] = Learnt(
+                    own, wide, own - _NORMAL * wide, own + _NORMAL * wide, unit
+                )
+        return result
