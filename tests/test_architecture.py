@@ -40,8 +40,8 @@ ROOMS = {
         "identification", "virtual_wing", "wing",
     ),
     "twin_master": (
-        "errors", "seeds", "scenario", "run_folder", "network", "assets", "library", "mission", "store",
-        "report", "workflow", "scenario_check", "study", "command", "__main__",
+        "errors", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library", "mission",
+        "store", "report", "workflow", "scenario_check", "study", "command", "__main__",
     ),
     "discrepancy": (
         "errors", "campaign", "models", "lumped_models", "location", "catalogue", "document_types", "verdict",

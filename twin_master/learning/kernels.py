@@ -8,13 +8,15 @@ from numpy.typing import NDArray
 from fe.compilation import compiled
 from twin_master.network.kernels import SAFE, _exp, _log_forecast
 
-__all__ = ["forecast_all", "gauge_log_likelihood", "gauge_statistics", "normalise", "regression"]
+__all__ = ["forecast_all", "gauge_statistics", "log_likelihood", "normalise", "regression"]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 Unsigned = NDArray[np.uint64]
 
 LOG_TWO_PI = math.log(2.0 * math.pi)
+LARGE = 1e100
+"""A product is taken to the logarithm above this."""
 NEGLIGIBLE_WEIGHT = 1e-30
 """States below this share of a hypothesis add nothing to its statistics that doubles can hold."""
 
@@ -74,11 +76,12 @@ def regression(statistics: Float, result: Float) -> None:
 
 
 @compiled
-def gauge_log_likelihood(
+def log_likelihood(
     observation: Float,
     draw: Index,
     value: Float,
     inverse_deviation: Float,
+    log_scale: Float,
     offset: Float,
     gain: Float,
     fitted: Float,
@@ -86,48 +89,55 @@ def gauge_log_likelihood(
     degrees: float,
     result: Float,
 ) -> None:
-    """Fill result (K, S, G) with log p(o_g | state, hypothesis, what was observed before).
+    """Fill result (K, S) with log p(o | state, hypothesis, what was observed before).
 
-    value is (E, S, G), inverse_deviation (S, G), offset and gain (G,) their prior deviations; fitted (K, G, 6)
-    as `regression` gives it, count (G,) of the observations. Without `degrees` the noise is known, else the
-    predictive density is Student's.
+    value is (E, S, G), inverse_deviation and its logarithm log_scale (S, G), offset and gain (G,) their
+    prior deviations; fitted (K, G, 6) as `regression` gives it, count (G,) of the observations. Without
+    `degrees` the noise is known, else the predictive density of each gauge is Student's. Products of densities
+    of the same degrees of freedom are formed before their logarithm is taken, which is what costs.
     """
-    hypotheses, states, sensors = result.shape
+    hypotheses, states = result.shape
+    sensors = len(observation)
+    constant = np.empty(sensors)
     for g in range(sensors):
-        seen = observation[g]
-        if np.isnan(seen):
-            for k in range(hypotheses):
-                for s in range(states):
-                    result[k, s, g] = 0.0
-            continue
         freedom = degrees + count[g]
-        half = 0.5 * (freedom + 1.0)
-        constant = -0.5 * LOG_TWO_PI
+        constant[g] = -0.5 * LOG_TWO_PI
         if degrees > 0.0:
-            constant = math.lgamma(half) - math.lgamma(0.5 * freedom) - 0.5 * math.log(math.pi)
-        moved = offset[g] > 0.0 or gain[g] > 0.0
-        for k in range(hypotheses):
-            e = draw[k]
-            total = degrees + fitted[k, g, 5]
-            log_total = 0.5 * math.log(total) if degrees > 0.0 else 0.0
-            for s in range(states):
+            constant[g] = math.lgamma(0.5 * (freedom + 1.0)) - math.lgamma(0.5 * freedom)
+            constant[g] -= 0.5 * math.log(math.pi)
+    for k in range(hypotheses):
+        e = draw[k]
+        own = 0.0  # of the hypothesis, whatever the state
+        for g in range(sensors):
+            if not np.isnan(observation[g]):
+                own += constant[g]
+                if degrees > 0.0:
+                    own -= 0.5 * math.log(degrees + fitted[k, g, 5])
+        for s in range(states):
+            total, product, half = own, 1.0, 0.0
+            for g in range(sensors):
+                if np.isnan(observation[g]):
+                    continue
                 scale = inverse_deviation[s, g]
-                x = (seen - value[e, s, g]) * scale
+                x = (observation[g] - value[e, s, g]) * scale
                 spread = 1.0
-                if moved:
+                total += log_scale[s, g]
+                if offset[g] > 0.0 or gain[g] > 0.0:
                     a, c = offset[g] * scale, gain[g] * value[e, s, g] * scale
                     x -= a * fitted[k, g, 0] + c * fitted[k, g, 1]
                     spread += (
                         a * a * fitted[k, g, 2] + 2.0 * a * c * fitted[k, g, 3] + c * c * fitted[k, g, 4]
                     )
-                log_value = constant + math.log(scale)
-                if moved:
-                    log_value -= 0.5 * math.log(spread)
+                    total -= 0.5 * math.log(spread)
                 if degrees > 0.0:
-                    log_value -= log_total + half * math.log1p(x * x / (total * spread))
+                    power = 0.5 * (degrees + count[g] + 1.0)
+                    if power != half or product > LARGE:
+                        total -= half * math.log(product)
+                        product, half = 1.0, power
+                    product *= 1.0 + x * x / ((degrees + fitted[k, g, 5]) * spread)
                 else:
-                    log_value -= 0.5 * x * x / spread
-                result[k, s, g] = log_value
+                    total -= 0.5 * x * x / spread
+            result[k, s] = total - half * math.log(product)
 
 
 @compiled

@@ -3,16 +3,18 @@
 A static hypothesis k is a draw of the calibrated parameter and a factor on the transition probabilities; both
 stay what they are. Each has a filter of its own over the states, and its weight is its evidence:
 
-    p(D_t, k | o_0..o_t)  proportional to  p(o_t | D_t, k, o_0..o_t-1)  sum over i of T_k[i, D_t] p(i, k | o_0..o_t-1),
+    p(D_t, k | o_0..o_t) ~ p(o_t | D_t, k, o_0..o_t-1) sum over i of T_k[i, D_t] p(D_t-1 = i, k | o_0..o_t-1),
 
 which is exact. What a gauge g has of its own, given the hypothesis, is a regression with the noise scale:
 
     o_g = h_g(D_t, k) (1 + gain_g) + offset_g + lambda_g sigma_g noise,
-    lambda_g² ~ inverse gamma(degrees / 2, degrees / 2),  offset_g, gain_g | lambda_g ~ N(0, lambda_g² times prior variance),
+    lambda_g² ~ inverse gamma(degrees / 2, degrees / 2),
+    offset_g, gain_g | lambda_g ~ N(0, lambda_g² times their prior variance),
 
-so that the predictive density is Student's (Bernardo and Smith 1994, section 5.2). Its sums are exact given the
-path of the state; over the paths they are expected sums, under the filtered belief of each turn.
-"""  # fmt: skip
+so that the predictive density is Student's (Gelman et al., Bayesian Data Analysis, 3rd ed., section 14.2).
+Its sums are exact given the path of the state; over the paths they are expected sums, under the filtered
+belief of each turn given the hypothesis.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,8 +26,8 @@ from scipy.special import gammaincinv, gammaln
 from twin_master.errors import InvalidModelError
 from twin_master.learning.kernels import (
     forecast_all,
-    gauge_log_likelihood,
     gauge_statistics,
+    log_likelihood,
     normalise,
     regression,
 )
@@ -53,7 +55,6 @@ class LearntPriors:
     ----------
     parameter : str or None
         Name of the parameter of the draws; None averages over the draws anew in each turn.
-    parameter_unit : str
     draws : (E,) or None
         Its values, for the posterior; the draws of the sensor model in their order.
     noise_degrees : float
@@ -68,7 +69,6 @@ class LearntPriors:
 
     parameter: str | None = None
     draws: ArrayLike | None = None
-    parameter_unit: str = "1"
     noise_degrees: float = 0.0
     gain: ArrayLike = 0.0
     offset: ArrayLike = 0.0
@@ -110,7 +110,8 @@ class LearningFilter:
     ) -> None:
         if sensor_model.averages_inside:
             raise InvalidModelError(
-                "learning needs `average_over_draws` = \"outside\": inside, each sensor has a parameter of its own"
+                "learning needs the average over the draws outside the product over the sensors: inside, each "
+                "sensor has a parameter of its own"
             )
         matrices = [np.asarray(item) for item in (transitions or [model.transition.matrix])]
         if len(matrices) != len(priors.transition_factors):
@@ -135,6 +136,7 @@ class LearningFilter:
             np.ascontiguousarray(1.0 / sensor_model.total_standard_deviation[:, control])
             for control in range(sensor_model.control_count)
         ]
+        self._log_scale = [np.log(scale) for scale in self._inverse]
         self._gain: Float = np.broadcast_to(np.asarray(priors.gain, np.float64), (sensors,)).copy()
         self._offset: Float = np.broadcast_to(np.asarray(priors.offset, np.float64), (sensors,)).copy()
         self._regresses = bool(np.any(self._gain > 0.0) or np.any(self._offset > 0.0))
@@ -153,12 +155,12 @@ class LearningFilter:
     def turn(self, before: Carried | None, observation: Float, control_index: int, turn: int) -> Estimate:
         """Advance belief and what is learnt to turn t, and correct them by an observation.
 
-        See `Estimator.turn`; `learnt` of the estimate holds what is learnt by name: the parameter,
-        `transition_factor`, and `noise_scale[g]`, `gauge_gain[g]`, `gauge_offset[g]` for the sensors g from 1.
+        See `Estimator.turn`; `learnt` of the estimate holds by name the parameter, `transition_factor`,
+        and `noise_scale[g]`, `gauge_gain[g]`, `gauge_offset[g]` for the sensors g from 1.
         """
         seen = self._sensor_model.checked(observation)
-        forecast, statistics, count = self.forecast(before)
-        log_belief = forecast + self.gauge_log_likelihood(seen, control_index, statistics, count).sum(axis=2)
+        forecast, statistics, count = self._forecast(before)
+        log_belief = forecast + self._log_likelihood(seen, control_index, statistics, count)
         filtered = np.empty_like(log_belief)
         evidence = normalise(log_belief, filtered)
         if evidence == -np.inf:
@@ -181,8 +183,8 @@ class LearningFilter:
             learnt=self._learnt(filtered, statistics, count),
         )
 
-    def forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
-        """Return log p(D_t, k | o_0..o_t-1) (K, S), the statistics (K, G, 6) and the counts (G,) until then."""
+    def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
+        """Return log p(D_t, k | o_0..o_t-1) (K, S), and statistics (K, G, 6) and counts (G,) until then."""
         hypotheses, sensors = len(self._draw), self._sensor_model.sensor_count
         if before is None:
             forecast = self._log_weight[:, None] + self._model.log_prior
@@ -198,17 +200,18 @@ class LearningFilter:
             forecast = self._averaged_anew(forecast)
         return forecast, before.arrays["statistics"], before.arrays["count"]
 
-    def gauge_log_likelihood(
+    def _log_likelihood(
         self, observation: Float, control_index: int, statistics: Float, count: Float
     ) -> Float:
-        """Return log p(o_g | D_t, k, o_0..o_t-1) for each hypothesis, state and gauge: (K, S, G)."""
+        """Return log p(o_t | D_t, k, o_0..o_t-1) for each hypothesis and state: (K, S)."""
         fitted = np.zeros_like(statistics)
         if self._learns_gauges:
             regression(statistics, fitted)
-        result = np.empty((len(self._draw), self._model.states.size, len(observation)))
-        gauge_log_likelihood(
+        result = np.empty((len(self._draw), self._model.states.size))
+        log_likelihood(
             observation, self._draw, self._value[control_index], self._inverse[control_index],
-            self._offset, self._gain, fitted, count, self.priors.noise_degrees, result,
+            self._log_scale[control_index], self._offset, self._gain, fitted, count,
+            self.priors.noise_degrees, result,
         )  # fmt: skip
         return result
 
@@ -253,7 +256,7 @@ class LearningFilter:
         if self.priors.parameter is not None and self.priors.draws is not None:
             own = weight.reshape(len(factors), -1).sum(axis=0)
             result[self.priors.parameter] = draws_posterior(
-                self.priors.draws, self._sensor_model.draw_weight, own, self.priors.parameter_unit
+                self.priors.draws, self._sensor_model.draw_weight, own
             )
         if len(factors) > 1:
             own = weight.reshape(len(factors), -1).sum(axis=1)
@@ -286,7 +289,7 @@ class LearningFilter:
             mean = weight @ fitted[..., column]
             spread = weight @ (fitted[..., column] ** 2 + scale2 * fitted[..., 2 + 2 * column]) - mean**2
             deviation = np.sqrt(np.maximum(spread, 0.0))
-            for g in np.flatnonzero(prior > 0.0):
+            for g in np.flatnonzero(prior > 0.0).tolist():
                 own, wide = float(mean[g] * prior[g]), float(deviation[g] * prior[g])
                 result[f"{name}[{g + 1}]"] = Learnt(
                     own, wide, own - _NORMAL * wide, own + _NORMAL * wide, unit

@@ -34,7 +34,8 @@ def draws_posterior(values: ArrayLike, prior: ArrayLike, weight: ArrayLike, unit
     """
     values, prior, weight = (np.asarray(item, dtype=np.float64) for item in (values, prior, weight))
     distinct, place = np.unique(values, return_inverse=True)
-    before, after = np.bincount(place, prior), np.bincount(place, weight)
+    before: Float = np.bincount(place, prior)
+    after: Float = np.bincount(place, weight).astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         evidence = np.log(after) - np.log(before)
     near = np.flatnonzero(evidence >= np.max(evidence[np.isfinite(evidence)]) - _REACH)

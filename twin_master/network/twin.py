@@ -34,11 +34,22 @@ DEFAULT_LAG = 50
 """Turns back that a twin smooths and may be revised."""
 
 
-def build_graphical_model(scenario: Scenario) -> GraphicalModel:
+def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> GraphicalModel:
     """Return states, controls, prior and transitions of a scenario: Kapteyn et al. 2021, eqs. (28)-(29).
 
     The factors of the state move independently given the control, and are independent before the first
     observation.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    leaving : float
+        Factor on the probabilities of each factor of the state to leave a level.
+
+    Raises
+    ------
+    InvalidModelError
+        The factor makes a probability larger than one.
     """
     tables: dict[str, dict[str, Float]] = {}
     for control in scenario.control_names:
@@ -53,10 +64,28 @@ def build_graphical_model(scenario: Scenario) -> GraphicalModel:
                 )
                 for factor in scenario.state
             }
+    if leaving != 1.0:
+        tables = {
+            control: {name: _leaving(table, leaving) for name, table in rows.items()}
+            for control, rows in tables.items()
+        }
     levels = {factor.name: factor.levels for factor in scenario.state}
     return GraphicalModel.from_tables(
         levels, tables, {factor.name: factor.prior for factor in scenario.state}
     )
+
+
+def _leaving(table: Float, factor: float) -> Float:
+    """Return transitions (L, L) whose probabilities to leave a level are multiplied by a factor."""
+    result = factor * np.where(np.eye(len(table), dtype=bool), 0.0, table)
+    stay = 1.0 - result.sum(axis=1)
+    if np.any(stay < 0.0):
+        raise InvalidModelError(
+            f"a factor of {factor:g} on the transition probabilities makes the probability to leave a level "
+            f"{1.0 - float(stay.min()):g}, and at most 1 is possible: take "
+            "smaller `learning.transition_factors`"
+        )
+    return np.asarray(result + np.diag(stay), dtype=np.float64)
 
 
 @dataclass(frozen=True)

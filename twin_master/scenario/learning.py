@@ -1,6 +1,7 @@
 """The table `[learning]` of a scenario: what the twin learns of what does not change in time."""
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Annotated, ClassVar, Self
 
 from pydantic import Field, model_validator
@@ -30,7 +31,7 @@ class Learning(Section):
     @model_validator(mode="after")
     def _check(self) -> Self:
         factors = self.transition_factors
-        if any(b <= a for a, b in zip(factors, factors[1:], strict=False)):
+        if any(b <= a for a, b in pairwise(factors)):
             raise ValueError(f"`learning.transition_factors` must increase, and {short(factors)} came")
         if len(factors) == 1:
             raise ValueError("`learning.transition_factors` needs two or more factors to choose from")

@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, SerializeAsAny, model_validator
 
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
+from twin_master.scenario.learning import Learning
 from twin_master.scenario.section import (
     Count,
     Name,
@@ -167,6 +168,8 @@ class Reference(Section):
     source: str
 
 
+OPTIONAL_TABLES = ("learning",)
+"""Tables without which a scenario says what it said before there were any."""
 CALIBRATION_COPY = "asset/calibration.nc"
 """The calibration file inside a run folder."""
 
@@ -218,6 +221,7 @@ class Scenario(Section):
     belief: SerializeAsAny[BeliefSection]
     calibration: Calibration
     truth: TruthSection
+    learning: Learning | None = None
     reference: tuple[Reference, ...] = ()
 
     @property
@@ -264,7 +268,8 @@ class Scenario(Section):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the scenario as plain data in SI; `Scenario.model_validate` reads it back."""
-        return self.model_dump(mode="json")
+        absent = {name for name in OPTIONAL_TABLES if getattr(self, name) is None}
+        return self.model_dump(mode="json", exclude=absent)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -333,6 +338,13 @@ class Scenario(Section):
         limited = count if chosen == "all" else len(chosen)
         check_one_or_each("rewards.health_limit", self.rewards.health_limit, limited)
         check_one_or_each("rewards.error_scale", self.rewards.error_scale, count)
+        if self.learning is not None:
+            self.learning.check_sensors(count)
+            if self.observation.average_over_draws == "inside":
+                raise ValueError(
+                    "`learning` needs `observation.average_over_draws` `outside`: inside, each sensor has a "
+                    "parameter of its own"
+                )
         check_one_or_each("truth.noise.standard_deviation", self.truth.noise.standard_deviation, count)
 
     def _check_transition(self) -> None:

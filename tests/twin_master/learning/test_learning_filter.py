@@ -134,7 +134,8 @@ def test_noise_gain_and_offset_of_a_gauge_are_a_conjugate_regression(
         density = multivariate_t(mean, shape, degrees) if degrees else multivariate_normal(mean, shape)
         # The prior of the coefficients is in units of the noise: N(0, lambda² prior²).
         log_density[draw] += density.logpdf(seen[there, 0])
-    assert sum(e.log_evidence for e in estimates) == pytest.approx(np.logaddexp.reduce(log_density), abs=1e-10)
+    evidence = sum(estimate.log_evidence for estimate in estimates)
+    assert evidence == pytest.approx(np.logaddexp.reduce(log_density), abs=1e-10)
     weight = np.exp(log_density - np.logaddexp.reduce(log_density))
     np.testing.assert_allclose(np.exp(estimates[-1].carried.arrays["log_belief"][:, 0]), weight, rtol=1e-9)
 

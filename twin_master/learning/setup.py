@@ -1,0 +1,54 @@
+"""The estimator that a scenario asks for."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin_master.learning.learning_filter import LearningFilter, LearntPriors
+from twin_master.network.estimator import Estimator
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.schema import Scenario
+
+__all__ = ["learning_estimator"]
+
+
+def learning_estimator(
+    scenario: Scenario,
+    model: GraphicalModel,
+    sensor_model: GaussianSensorModel,
+    draws: NDArray[np.float64],
+) -> Estimator | None:
+    """Return the filter that learns what the scenario says, or None where it says nothing.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    model : GraphicalModel
+        Its states, controls and transitions.
+    sensor_model : GaussianSensorModel
+        Predictions for each draw, and the noise that is assumed.
+    draws : (E,)
+        Of the calibrated parameter.
+
+    Raises
+    ------
+    InvalidModelError
+        A transition factor makes a probability larger than one.
+    """
+    learning = scenario.learning
+    if learning is None:
+        return None
+    factors = learning.transition_factors or (1.0,)
+    units = set(scenario.observation.sensor_units)
+    priors = LearntPriors(
+        parameter=scenario.calibration.parameter if learning.parameter else None,
+        draws=draws,
+        noise_degrees=learning.noise_degrees if learning.noise else 0.0,
+        gain=learning.gauge_gain,
+        offset=learning.gauge_offset,
+        transition_factors=factors,
+        sensor_unit=units.pop() if len(units) == 1 else "",
+    )
+    tables = [build_graphical_model(scenario, factor).transition.matrix for factor in factors]
+    return LearningFilter(model, sensor_model, priors, tables, scenario.mission.name)
