@@ -110,8 +110,8 @@ class LearningFilter:
     ) -> None:
         if sensor_model.averages_inside:
             raise InvalidModelError(
-                "learning needs the average over the draws outside the product over the sensors: inside, each "
-                "sensor has a parameter of its own"
+                "learning needs the average over the draws outside the product over the sensors: inside, "
+                "each sensor has a parameter of its own"
             )
         matrices = [np.asarray(item) for item in (transitions or [model.transition.matrix])]
         if len(matrices) != len(priors.transition_factors):

@@ -34,7 +34,7 @@ def draws_posterior(values: ArrayLike, prior: ArrayLike, weight: ArrayLike, unit
     """
     values, prior, weight = (np.asarray(item, dtype=np.float64) for item in (values, prior, weight))
     distinct, place = np.unique(values, return_inverse=True)
-    before: Float = np.bincount(place, prior)
+    before: Float = np.bincount(place, prior).astype(np.float64)
     after: Float = np.bincount(place, weight).astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         evidence = np.log(after) - np.log(before)
