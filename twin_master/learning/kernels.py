@@ -93,8 +93,8 @@ def log_likelihood(
 
     value is (E, S, G), inverse_deviation and its logarithm log_scale (S, G), offset and gain (G,) their
     prior deviations; fitted (K, G, 6) as `regression` gives it, count (G,) of the observations. Without
-    `degrees` the noise is known, else the predictive density of each gauge is Student's. Products of densities
-    of the same degrees of freedom are formed before their logarithm is taken, which is what costs.
+    `degrees` the noise is known, else the predictive density of each gauge is Student's. Products of
+    densities of the same degrees of freedom are formed before their logarithm is taken, which is what costs.
     """
     hypotheses, states = result.shape
     sensors = len(observation)
