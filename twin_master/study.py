@@ -1,6 +1,6 @@
 """The same mission under many seeds, without run folders, to see how reliably the twin steers."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,6 +62,19 @@ class Study:
     squared_error: Float
     log_evidence: Float
     credible: Float
+
+    @classmethod
+    def of(cls, seeds: Sequence[int], outcomes: Sequence["Outcome"]) -> "Study":
+        """Return the outcomes of N missions together."""
+        return cls(
+            seeds=tuple(seeds),
+            delay=np.array([outcome.delay for outcome in outcomes]),
+            early=np.array([outcome.early for outcome in outcomes]),
+            error=np.array([outcome.error.mean(axis=0) for outcome in outcomes]),
+            squared_error=np.array([np.mean(outcome.error**2, axis=0) for outcome in outcomes]),
+            log_evidence=np.array([outcome.log_evidence for outcome in outcomes]),
+            credible=np.array([outcome.credible for outcome in outcomes]),
+        )
 
     def within(self, steps: int) -> Estimated:
         """Return the share of the called-for fallbacks that came within some steps; NaN without any."""
@@ -190,31 +203,23 @@ def fly_many(
         scenario, source, chosen[0] if calibration_seed is None else calibration_seed
     )
     asset = source.open()
-    outcomes: list[_Outcome] = []
+    outcomes: list[Outcome] = []
     try:
         start = asset.save_state()
         for index, seed in enumerate(chosen):
             if index:
                 asset.restore_state(start)
             flight = fly(scenario, knowledge.twin(), knowledge.plant(knowledge.truth(seed), asset))
-            outcomes.append(_outcome(knowledge, flight))
+            outcomes.append(mission_outcome(knowledge, flight))
             if watch is not None:
                 watch(seed, flight)
     finally:
         asset.close()
-    return Study(
-        seeds=chosen,
-        delay=np.array([outcome.delay for outcome in outcomes]),
-        early=np.array([outcome.early for outcome in outcomes]),
-        error=np.array([outcome.error.mean(axis=0) for outcome in outcomes]),
-        squared_error=np.array([np.mean(outcome.error**2, axis=0) for outcome in outcomes]),
-        log_evidence=np.array([outcome.log_evidence for outcome in outcomes]),
-        credible=np.array([outcome.credible for outcome in outcomes]),
-    )
+    return Study.of(chosen, outcomes)
 
 
 @dataclass(frozen=True)
-class _Outcome:
+class Outcome:
     """What is kept of a mission; `error` is that of the filtered means, (T, F)."""
 
     delay: float
@@ -224,14 +229,15 @@ class _Outcome:
     credible: float
 
 
-def _outcome(knowledge: Knowledge, flight: Flight) -> _Outcome:
+def mission_outcome(knowledge: Knowledge, flight: Flight) -> Outcome:
+    """Return what is kept of a mission."""
     scenario, model, truth = knowledge.scenario, knowledge.model, flight.happened.state
     first = scenario.control_names.index(scenario.mission.first_control)
     fallback = find_fallback(model, knowledge.plan.control_index, first, flight.control_index, truth)
     delay = float("nan")
     if fallback.called_for_step is not None:
         delay = float("inf") if fallback.delay is None else float(fallback.delay)
-    return _Outcome(
+    return Outcome(
         delay=delay,
         early=fallback.early_step is not None,
         error=model.states.mean(flight.filtered) - truth,

@@ -16,8 +16,9 @@ Its sums are exact given the path of the state; over the paths they are expected
 belief of each turn given the hypothesis.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -74,6 +75,26 @@ class LearntPriors:
     offset: ArrayLike = 0.0
     transition_factors: tuple[float, ...] = (1.0,)
     sensor_unit: str = "1"
+
+
+class _Posteriors(Mapping[str, Learnt]):
+    """Posteriors by name, found when they are first asked for: nobody looks at those of every turn."""
+
+    def __init__(self, find: Callable[[], Mapping[str, Learnt]]) -> None:
+        self._find = find
+
+    @cached_property
+    def _found(self) -> Mapping[str, Learnt]:
+        return self._find()
+
+    def __getitem__(self, name: str) -> Learnt:
+        return self._found[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._found)
+
+    def __len__(self) -> int:
+        return len(self._found)
 
 
 class LearningFilter:
@@ -180,7 +201,7 @@ class LearningFilter:
             filtered=filtered.sum(axis=0),
             log_evidence=evidence,
             carried=Carried(control_index, arrays),
-            learnt=self._learnt(filtered, statistics, count),
+            learnt=_Posteriors(lambda: self._learnt(filtered, statistics, count)),
         )
 
     def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
