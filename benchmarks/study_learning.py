@@ -1,8 +1,8 @@
 """What learning in operation is worth: the paper's mission with wings that were never calibrated.
 
 `python -m benchmarks.study_learning --missions 3000 --first-seed 0` draws e of each wing from the prior of
-the scenario `level_turns_learning` and flies its mission twice from the same seeds: by a twin that learns, and
-by one that averages over e anew in each turn. Exit code 1 if the learning twin misses a target.
+the scenario `level_turns_learning` and flies its mission twice from the same seeds: by a twin that learns,
+and by one that averages over e anew in each turn. Exit code 1 if the learning twin misses a target.
 """
 
 from __future__ import annotations
