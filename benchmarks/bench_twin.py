@@ -11,13 +11,13 @@ import time
 import warnings
 
 import numpy as np
+from scipy import sparse
 
 from benchmarks.measurement import Measurement, median_seconds
 from twin_master.network.graphical_model import (
     Factor,
     GraphicalModel,
     StateSpace,
-    TransitionModel,
     worsening_table,
 )
 from twin_master.network.inference import (
@@ -31,6 +31,7 @@ from twin_master.network.inference import (
 from twin_master.network.planner import value_iteration
 from twin_master.network.rewards import RewardModel, RewardSettings
 from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.network.transition import TransitionModel
 
 STEPS = 50
 HORIZON = 10
@@ -108,6 +109,57 @@ def toolbox_seconds(model: GraphicalModel, reward: np.ndarray) -> float:
         return median_seconds(solve)
 
 
+def many_states() -> list[Measurement]:
+    """Six regions of five levels, 15,625 states, as blocks of regions."""
+    levels, regions = (0.0, 0.2, 0.4, 0.6, 0.8), [f"z{number}" for number in range(1, 7)]
+    tables = {
+        name: {region: worsening_table(5, p) for region in regions} for name, p in (("2g", 0.05), ("3g", 0.1))
+    }
+    model = GraphicalModel.from_tables(dict.fromkeys(regions, levels), tables)
+    rng = np.random.default_rng(3)
+    span = np.linspace(0.0, 1.0, 24)
+    place = np.exp(-(((span[:, None] - np.linspace(0.05, 0.8, 6)) / 0.15) ** 2))
+    strain = (
+        1e-3 * (1.0 - 0.7 * span) / np.prod(1.0 - 0.6 * model.states.coordinates[:, None, :] * place, axis=2)
+    )
+    sensors = GaussianSensorModel(np.stack([2.0 * strain, 3.0 * strain], axis=1)[None], 125e-6)
+    control = np.where(np.arange(STEPS) < 30, 1, 0)
+    truth = model.states.index((0.2, 0.0, 0.4, 0.0, 0.0, 0.2))
+    seen = sensors.mean[truth, control] + 150e-6 * rng.normal(size=(STEPS, 24))
+    rows = sensors.log_likelihood_sequence(seen, control)
+    history = filter_sequence(model, control, rows)
+
+    def step() -> None:
+        filter_step(model, history.log_filtered[-2], int(control[-2]), rows[-1])
+
+    def likelihood() -> None:
+        sensors.log_likelihood(seen[-1], int(control[-1]))
+
+    def mission() -> None:
+        smooth(model, control, filter_sequence(model, control, rows).log_filtered)
+
+    joint = []
+    for name in model.controls:
+        moves = sparse.csr_array(np.ones((1, 1)))
+        for region in regions:
+            moves = sparse.csr_array(sparse.kron(moves, tables[name][region]))
+        joint.append(sparse.csr_array(moves.T))
+    belief = history.filtered[-2]
+    lists = 1e3 * median_seconds(lambda: joint[0] @ belief, repeats=15)
+    alone = "forecast of the joint transitions, scipy.sparse, linear domain"
+    return [
+        Measurement(
+            "filter step, 15,625 states", 1e3 * median_seconds(step, repeats=25), "ms", 1.0, alone, lists
+        ),
+        Measurement(
+            "likelihood of 24 sensors, 15,625 states", 1e3 * median_seconds(likelihood, repeats=25), "ms"
+        ),
+        Measurement(
+            "filter and smooth 50 steps, 15,625 states", median_seconds(mission, repeats=5), "s", 10.0
+        ),
+    ]
+
+
 def run() -> list[Measurement]:
     model, sensors, rewards = mission_model()
     rng = np.random.default_rng(1)
@@ -116,7 +168,7 @@ def run() -> list[Measurement]:
     noise = rng.normal(size=(TWINS, STEPS, 24)) * 150e-6
     observations = sensors.mean[state, control] + noise
     reward = rewards.planning_reward(1.0, 2.5)
-    plan = value_iteration(model.transition.matrix, reward, 0.6)
+    plan = value_iteration(model.transition, reward, 0.6)
     log_likelihood = sensors.log_likelihood_sequence(observations[0], control)
     history = filter_sequence(model, control, log_likelihood)
 
@@ -156,7 +208,7 @@ def run() -> list[Measurement]:
     whole = median_seconds(whole_history, repeats=25, inner=20)
     batch = median_seconds(lambda: smooth_many_twins(model, many_controls, many), repeats=9)
     single = median_seconds(one_by_one, repeats=3)
-    planning = median_seconds(lambda: value_iteration(model.transition.matrix, reward, 0.6), inner=20)
+    planning = median_seconds(lambda: value_iteration(model.transition, reward, 0.6), inner=20)
     mixture = median_seconds(quantities, repeats=5)
     toolbox = toolbox_seconds(model, reward)
     return [
@@ -165,4 +217,5 @@ def run() -> list[Measurement]:
         Measurement("smooth 1,000 twins of 50 steps", 1e3 * batch, "ms", 60.0, "one by one", 1e3 * single),
         Measurement("value iteration", 1e3 * planning, "ms", 0.5, "pymdptoolbox", 1e3 * toolbox),
         Measurement("quantities of 550 beliefs x 24 sensors, 95 % bands", 1e3 * mixture, "ms"),
+        *many_states(),
     ]

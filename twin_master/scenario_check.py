@@ -40,7 +40,7 @@ class ScenarioCheck:
     step_name : str
         What a step is called.
     memory : float
-        Of the twin's arrays: transitions (U, S, S), predictions (E, S, U, G), beliefs [bytes].
+        Of the twin's arrays: transitions, predictions (E, S, U, G), beliefs [bytes].
     """
 
     name: str

@@ -93,7 +93,8 @@ def test_the_command_names_it_too(tmp_path: Path) -> None:
 
 def test_a_model_from_tables_is_the_same_as_from_its_parts() -> None:
     from twin_master.errors import InvalidModelError
-    from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace, TransitionModel
+    from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
+    from twin_master.network.transition import TransitionModel
 
     worse = [[0.9, 0.1], [0.0, 1.0]]
     three = [[0.8, 0.2, 0.0], [0.0, 0.7, 0.3], [0.0, 0.0, 1.0]]

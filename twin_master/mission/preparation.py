@@ -143,7 +143,7 @@ def prepare_knowledge(
         model_error=section.model_error,
     )
     rewards = RewardModel(sensor_model, reward_settings(scenario))
-    transition, discount = model.transition.matrix, scenario.planner.gamma
+    transition, discount = model.transition, scenario.planner.gamma
     reward = rewards.planning_reward(scenario.rewards.health_weight, scenario.rewards.control_weight)
     if policy is None:
         plan = value_iteration(transition, reward, discount)

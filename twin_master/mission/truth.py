@@ -141,7 +141,7 @@ def _random_growth(model: GraphicalModel, uniform: Float) -> StateRule:
         if previous_state is None or previous_control is None:
             row = model.prior
         else:
-            row = model.transition.matrix[previous_control, model.states.index(tuple(previous_state))]
+            row = model.transition.row(previous_control, model.states.index(tuple(previous_state)))
         possible = np.flatnonzero(row > 0.0)
         chosen = int(np.searchsorted(np.cumsum(row[possible]), uniform[step], side="right"))
         state: Float = coordinates[possible[min(chosen, len(possible) - 1)]].copy()

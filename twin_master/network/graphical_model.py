@@ -7,27 +7,23 @@ passes `stochastic_matrix`, which checks it.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import prod
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twin_master.errors import InvalidModelError
 from twin_master.network.distributions import distribution, stochastic_matrix
-from twin_master.network.memory import TRANSITION_COPIES, check_fits, transition_bytes
+from twin_master.network.transition import TransitionModel
 
 __all__ = [
     "Factor",
     "GraphicalModel",
-    "SparseTransition",
     "StateSpace",
-    "TransitionModel",
     "deterministic_policy",
     "worsening_table",
 ]
 
 Float = NDArray[np.float64]
-Unsigned = NDArray[np.uint64]
 
 
 @dataclass(frozen=True)
@@ -157,109 +153,6 @@ class StateSpace:
 
 
 @dataclass(frozen=True)
-class SparseTransition:
-    """The non-zero transitions as predecessor lists.
-
-    Row ``control * S + state`` lists the states from which `state` is reached under `control`. The arrays
-    are for the compiled loops, which never write to them; unsigned indices spare the loops the test for
-    negative ones.
-
-    Attributes
-    ----------
-    start : (U * S + 1,)
-        Where each row begins.
-    source : (non-zeros,)
-        The predecessor.
-    probability, log_probability : (non-zeros,) dimensionless
-        Of the transition from it.
-    """
-
-    start: Unsigned
-    source: Unsigned
-    probability: Float
-    log_probability: Float
-
-    @classmethod
-    def from_matrix(cls, matrix: Float) -> "SparseTransition":
-        """Build the lists from a transition array (U, S, S)."""
-        rows = matrix.transpose(0, 2, 1).reshape(-1, matrix.shape[2])
-        row, source = np.nonzero(rows)
-        start = np.zeros(len(rows) + 1, dtype=np.uint64)
-        np.cumsum(np.bincount(row, minlength=len(rows)), out=start[1:])
-        probability = rows[row, source]
-        return cls(start, source.astype(np.uint64), probability, np.log(probability))
-
-
-@dataclass(frozen=True)
-class TransitionModel:
-    """p(D_t | D_{t-1}, U_{t-1}): one row-stochastic matrix for each control, eqs. (28)-(29).
-
-    Attributes
-    ----------
-    matrix : (U, S, S) dimensionless
-        ``matrix[u, i, j]`` is the probability to go from state i to state j under control u.
-    """
-
-    matrix: Float
-
-    def __post_init__(self) -> None:
-        matrix = stochastic_matrix(self.matrix, name="transition[control, state]")
-        if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2]:
-            raise InvalidModelError(
-                f"transition: expected shape (controls, states, states), got {matrix.shape}"
-            )
-        object.__setattr__(self, "matrix", matrix)
-
-    @classmethod
-    def from_factors(cls, tables: Sequence[Sequence[ArrayLike]]) -> "TransitionModel":
-        """Build the joint transition of factors that change independently, given the control.
-
-        Parameters
-        ----------
-        tables : for each control, for each factor, (levels, levels)
-            Row-stochastic; the joint matrix is their Kronecker product in the order of the factors.
-
-        Raises
-        ------
-        InvalidDistributionError, InvalidModelError
-            A table is none of transitions, the controls have other states, or it does not fit in memory.
-        """
-        joint = []
-        for control, factor_tables in enumerate(tables):
-            checked = [
-                stochastic_matrix(table, name=f"transition of control {control}, factor {factor}")
-                for factor, table in enumerate(factor_tables)
-            ]
-            if not checked or any(t.ndim != 2 or t.shape[0] != t.shape[1] for t in checked):
-                raise InvalidModelError(
-                    f"control {control}: expected a square table for each factor, "
-                    f"got shapes {[table.shape for table in checked]}"
-                )
-            states = prod(len(table) for table in checked)
-            check_fits(
-                {
-                    f"the transitions of {states} states under {len(tables)} controls": TRANSITION_COPIES
-                    * transition_bytes(states, len(tables))
-                },
-                "take fewer levels or state factors",
-            )
-            product: Float = checked[0]
-            for table in checked[1:]:
-                product = np.asarray(np.kron(product, table), dtype=np.float64)
-            joint.append(product)
-        if len({matrix.shape for matrix in joint}) != 1:
-            raise InvalidModelError(
-                f"every control needs the same states, got shapes {[m.shape for m in joint]}"
-            )
-        return cls(np.stack(joint))
-
-    @cached_property
-    def sparse(self) -> SparseTransition:
-        """The non-zero transitions as lists."""
-        return SparseTransition.from_matrix(self.matrix)
-
-
-@dataclass(frozen=True)
 class GraphicalModel:
     """States, controls, prior and transitions: what inference needs beside the log-likelihoods.
 
@@ -272,7 +165,7 @@ class GraphicalModel:
     prior : (S,) dimensionless
         p(D_0).
     transition : TransitionModel
-        (U, S, S).
+        Of the U controls and S states.
     """
 
     states: StateSpace
@@ -289,10 +182,10 @@ class GraphicalModel:
         size = self.states.size
         object.__setattr__(self, "prior", distribution(self.prior, size=size, name="prior"))
         expected = (len(self.controls), size, size)
-        if self.transition.matrix.shape != expected:
+        if self.transition.shape != expected:
             raise InvalidModelError(
                 f"transition: expected shape {expected} for {len(self.controls)} controls and {size} states, "
-                f"got {self.transition.matrix.shape}"
+                f"got {self.transition.shape}"
             )
 
     @classmethod

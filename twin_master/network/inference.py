@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.kernels import backward_pass, forward_pass, smooth_many
+from twin_master.network.product_kernels import product_backward_pass, product_forward_pass
 
 __all__ = [
     "FilterStep",
@@ -164,6 +165,46 @@ def _checked_rows(model: GraphicalModel, control: Index, rows: ArrayLike, *, wha
     return rows
 
 
+def _forward(
+    model: GraphicalModel,
+    control: Index,
+    log_likelihood: Float,
+    first: int,
+    forecast: Float,
+    filtered: Float,
+    log_filtered: Float,
+    log_evidence: Float,
+) -> int:
+    """Fill the rows from `first` on; return -1, or the row whose observation is impossible."""
+    if model.transition.is_product:
+        levels, row, begin, source, probability, power = model.transition.forward_lists.arrays
+        return product_forward_pass(
+            model.log_prior, levels, row, begin, source, probability, power,
+            control, log_likelihood, first, forecast, filtered, log_filtered, log_evidence,
+        )  # fmt: skip
+    sparse = model.transition.sparse
+    return forward_pass(
+        model.log_prior, sparse.start, sparse.source, sparse.probability, sparse.log_probability,
+        control, log_likelihood, first, forecast, filtered, log_filtered, log_evidence,
+    )  # fmt: skip
+
+
+def _backward(
+    model: GraphicalModel, control: Index, filtered: Float, log_filtered: Float, smoothed: Float
+) -> None:
+    """Fill the smoothed rows."""
+    transition = model.transition
+    if transition.is_product:
+        lists = (*transition.forward_lists.arrays, *transition.backward_lists.arrays[1:])
+        product_backward_pass(*lists, control, filtered, log_filtered, smoothed)
+        return
+    sparse = transition.sparse
+    backward_pass(
+        sparse.start, sparse.source, sparse.probability, sparse.log_probability,
+        control, filtered, log_filtered, smoothed,
+    )  # fmt: skip
+
+
 def filter_step(
     model: GraphicalModel,
     previous_log_filtered: ArrayLike | None,
@@ -205,11 +246,7 @@ def filter_step(
     if previous_log_filtered is not None:
         log_filtered[0] = _checked_rows(model, control[0], previous_log_filtered, what="previous log belief")
         np.exp(log_filtered[0], out=filtered[0])
-    sparse = model.transition.sparse
-    failed = forward_pass(
-        model.log_prior, sparse.start, sparse.source, sparse.probability, sparse.log_probability,
-        control, rows, first, forecast, filtered, log_filtered, log_evidence,
-    )  # fmt: skip
+    failed = _forward(model, control, rows, first, forecast, filtered, log_filtered, log_evidence)
     if failed >= 0:
         raise (context or ObservationContext()).impossible(0)
     return FilterStep(forecast[first], filtered[first], log_filtered[first], float(log_evidence[first]))
@@ -244,11 +281,7 @@ def filter_sequence(
     rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
     log_filtered, filtered, forecast = np.empty_like(rows), np.empty_like(rows), np.empty_like(rows)
     log_evidence = np.empty(len(rows))
-    sparse = model.transition.sparse
-    failed = forward_pass(
-        model.log_prior, sparse.start, sparse.source, sparse.probability, sparse.log_probability,
-        control, rows, 0, forecast, filtered, log_filtered, log_evidence,
-    )  # fmt: skip
+    failed = _forward(model, control, rows, 0, forecast, filtered, log_filtered, log_evidence)
     if failed >= 0:
         raise (context or ObservationContext()).impossible(failed)
     return Filtered(forecast, filtered, log_filtered, log_evidence)
@@ -275,11 +308,7 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
         raise InvalidModelError(f"expected one control for each step, got an array of shape {control.shape}")
     rows = _checked_rows(model, control, log_filtered, what="log belief")
     smoothed = np.empty_like(rows)
-    sparse = model.transition.sparse
-    backward_pass(
-        sparse.start, sparse.source, sparse.probability, sparse.log_probability,
-        control, np.exp(rows), rows, smoothed,
-    )  # fmt: skip
+    _backward(model, control, np.exp(rows), rows, smoothed)
     return Smoothed(smoothed)
 
 
@@ -319,14 +348,23 @@ def smooth_many_twins(
     forecast, filtered, log_filtered, smoothed = (np.empty_like(rows) for _ in range(4))
     log_evidence = np.empty(rows.shape[:2])
     failed = np.empty(len(rows), dtype=np.int64)
-    sparse = model.transition.sparse
 
     def run(part: slice) -> None:
-        smooth_many(
-            model.log_prior, sparse.start, sparse.source, sparse.probability, sparse.log_probability,
-            control[part], rows[part], forecast[part], filtered[part], log_filtered[part], log_evidence[part],
-            smoothed[part], failed[part],
-        )  # fmt: skip
+        if not model.transition.is_product:
+            sparse = model.transition.sparse
+            smooth_many(
+                model.log_prior, sparse.start, sparse.source, sparse.probability, sparse.log_probability,
+                control[part], rows[part], forecast[part], filtered[part], log_filtered[part],
+                log_evidence[part], smoothed[part], failed[part],
+            )  # fmt: skip
+            return
+        for twin in range(len(rows))[part]:
+            failed[twin] = _forward(
+                model, control[twin], rows[twin], 0,
+                forecast[twin], filtered[twin], log_filtered[twin], log_evidence[twin],
+            )  # fmt: skip
+            if failed[twin] < 0:
+                _backward(model, control[twin], filtered[twin], log_filtered[twin], smoothed[twin])
 
     count = max(1, min(workers or os.cpu_count() or 1, len(rows)))
     edges = [len(rows) * i // count for i in range(count + 1)]
@@ -378,15 +416,24 @@ def predict(
             f"expected a control index between 0 and {controls - 1} and a horizon of 0 or more steps, "
             f"got {control_index} and {horizon}"
         )
-    matrix = model.transition.matrix
-    closed_loop = policy[:, 0, None] * matrix[0]
-    for control in range(1, controls):
-        closed_loop += policy[:, control, None] * matrix[control]
+    transition = model.transition
     predicted = np.empty((horizon, size))
-    step = matrix[control_index]
-    for h in range(horizon):
-        np.dot(belief, step, out=predicted[h])
-        belief, step = predicted[h], closed_loop
+    if transition.is_product:
+        for h in range(horizon):
+            if h == 0:
+                predicted[h] = transition.forward(control_index, belief)
+                continue
+            flows = (transition.forward(u, predicted[h - 1] * policy[:, u]) for u in range(controls))
+            predicted[h] = sum(flows, np.zeros(size))
+    else:
+        matrix = transition.matrix
+        closed_loop = policy[:, 0, None] * matrix[0]
+        for control in range(1, controls):
+            closed_loop += policy[:, control, None] * matrix[control]
+        step = matrix[control_index]
+        for h in range(horizon):
+            np.dot(belief, step, out=predicted[h])
+            belief, step = predicted[h], closed_loop
     joint = predicted[:, :, None] * policy
     return Predicted(predicted=predicted, control_probability=joint.sum(axis=1), joint=joint)
 

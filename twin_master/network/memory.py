@@ -11,7 +11,7 @@ from twin_master.scenario.schema import Scenario
 NUMBER = 8
 """Bytes of a number."""
 TRANSITION_COPIES = 3
-"""The Kronecker products of the controls, the array of all of them, and the checked copy."""
+"""The tables of the controls, the array of all of them, and the checked copy."""
 _PREDICTION_COPIES = 8
 """The table, the checked copy, the copy ordered for the likelihood, and what the quantiles are taken from."""
 _HISTORY_COPIES = 4
@@ -61,11 +61,13 @@ def scenario_bytes(scenario: Scenario) -> dict[str, float]:
     controls, sensors = len(scenario.control), scenario.observation.count
     steps, ahead = scenario.mission.steps, scenario.mission.prediction_steps
     draws = 1 if scenario.calibration.source == "fixed" else scenario.calibration.draws
-    transitions, belief = transition_bytes(states, controls), NUMBER * (states + sensors)
+    tables = sum(transition_bytes(len(factor.levels), controls) for factor in scenario.state)
+    belief = NUMBER * (states + sensors)
     predictions = NUMBER * draws * states * controls * sensors
     return {
-        f"the transitions of {states} states under {controls} controls": TRANSITION_COPIES * transitions,
-        f"{draws} draws of {sensors} sensors in each of them": _PREDICTION_COPIES * predictions,
+        f"the transitions of {len(scenario.state)} state factors under {controls} controls": TRANSITION_COPIES
+        * tables,
+        f"{draws} draws of {sensors} sensors in {states} states": _PREDICTION_COPIES * predictions,
         f"the beliefs of {steps} steps and {ahead} ahead": _HISTORY_COPIES * belief * (steps + ahead),
     }
 
@@ -86,5 +88,5 @@ def _gigabytes(size: float) -> str:
 
 
 def transition_bytes(states: int, controls: int) -> float:
-    """Return the size of one array of transitions (U, S, S) [bytes]."""
+    """Return the size of one table of transitions (U, S, S) [bytes]."""
     return float(NUMBER * controls * states * states)

@@ -9,6 +9,7 @@ from fe.compilation import compiled
 from twin_master.errors import PlanningError
 from twin_master.network.distributions import stochastic_matrix
 from twin_master.network.graphical_model import deterministic_policy
+from twin_master.network.transition import TransitionModel
 
 __all__ = ["PlannedPolicy", "evaluate_policy", "given_policy", "value_iteration"]
 
@@ -41,14 +42,22 @@ class PlannedPolicy:
     iterations: int
 
 
-def _checked(transition: ArrayLike, reward: ArrayLike, discount: float) -> tuple[Float, Float]:
-    """Return transition (U, S, S) and reward (S, U)."""
-    matrix = stochastic_matrix(transition, name="transition[control, state]")
+def _checked(
+    transition: TransitionModel | ArrayLike, reward: ArrayLike, discount: float
+) -> tuple[TransitionModel, Float]:
+    """Return the transitions and the reward (S, U)."""
+    if not isinstance(transition, TransitionModel):
+        matrix = stochastic_matrix(transition, name="transition[control, state]")
+        if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2]:
+            raise PlanningError(
+                f"expected transitions of shape (controls, states, states), got {matrix.shape}"
+            )
+        transition = TransitionModel((matrix,))
     rewards = np.array(reward, dtype=np.float64, order="C")
-    if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2] or rewards.shape != matrix.shape[1::-1]:
+    if rewards.shape != transition.shape[1::-1]:
         raise PlanningError(
-            "expected transitions of shape (controls, states, states) and rewards of shape "
-            f"(states, controls), got {matrix.shape} and {rewards.shape}"
+            f"expected rewards of shape {transition.shape[1::-1]} (states, controls), as the transitions "
+            f"have, got {rewards.shape}"
         )
     if not np.all(np.isfinite(rewards)):
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(rewards))[0])
@@ -57,7 +66,7 @@ def _checked(transition: ArrayLike, reward: ArrayLike, discount: float) -> tuple
         )
     if not 0.0 <= discount < 1.0:
         raise PlanningError(f"expected a discount factor in [0, 1), got {discount}")
-    return matrix, rewards
+    return transition, rewards
 
 
 @compiled
@@ -90,8 +99,30 @@ def _sweep(
         iterations += 1
 
 
+def _action_value(transition: TransitionModel, reward: Float, discount: float, value: Float) -> Float:
+    """Return the reward of each control first and the value afterwards: (S, U)."""
+    later = [transition.expected(control, value) for control in range(reward.shape[1])]
+    result: Float = reward + discount * np.stack(later, axis=1)
+    return result
+
+
+def _product_sweep(
+    transition: TransitionModel, reward: Float, discount: float, limit: float, max_iterations: int
+) -> tuple[Float, Float, int, float]:
+    """Sweep over a product of tables as `_sweep` over one; return value, action value, sweeps and change."""
+    value: Float = np.zeros(len(reward))
+    change, iterations = np.inf, 0
+    while True:
+        action_value = _action_value(transition, reward, discount, value)
+        if change <= limit or iterations == max_iterations:
+            return value, action_value, iterations, change
+        improved = action_value.max(axis=1)
+        change = float(np.abs(improved - value).max())
+        value, iterations = improved, iterations + 1
+
+
 def value_iteration(
-    transition: ArrayLike,
+    transition: TransitionModel | ArrayLike,
     reward: ArrayLike,
     discount: float,
     *,
@@ -102,7 +133,7 @@ def value_iteration(
 
     Parameters
     ----------
-    transition : (U, S, S) dimensionless
+    transition : TransitionModel, or (U, S, S) dimensionless
         Row-stochastic.
     reward : (S, U)
         Expected reward of one step.
@@ -126,13 +157,18 @@ def value_iteration(
     InvalidDistributionError
         If a row of the transition does not sum to one.
     """
-    matrix, rewards = _checked(transition, reward, discount)
+    model, rewards = _checked(transition, reward, discount)
     scale = float(np.abs(rewards).max()) or 1.0
     # |V_k - V*| <= gamma / (1 - gamma) |V_k - V_{k-1}|; below rounding nothing changes any more.
     limit = max(tolerance * scale * (1.0 - discount), 4e-16 * scale / (1.0 - discount))
-    value = np.zeros(len(rewards))
-    action_value = np.empty_like(rewards)
-    iterations, change = _sweep(discount * matrix, rewards, limit, max_iterations, value, action_value)
+    value, action_value = np.zeros(len(rewards)), np.empty_like(rewards)
+    if model.is_product:
+        value, action_value, iterations, change = _product_sweep(
+            model, rewards, discount, limit, max_iterations
+        )
+    else:
+        discounted = discount * model.matrix
+        iterations, change = _sweep(discounted, rewards, limit, max_iterations, value, action_value)
     if change > limit:
         raise PlanningError(
             f"value iteration still changes by {change:.3g} after {max_iterations} sweeps with discount "
@@ -150,8 +186,10 @@ def value_iteration(
     )
 
 
-def evaluate_policy(transition: ArrayLike, reward: ArrayLike, discount: float, policy: ArrayLike) -> Float:
-    """Return the exact value (S,) of a policy by one linear solve.
+def evaluate_policy(
+    transition: TransitionModel | ArrayLike, reward: ArrayLike, discount: float, policy: ArrayLike
+) -> Float:
+    """Return the exact value (S,) of a policy: one linear solve, or iterated to rounding over a product.
 
     Parameters
     ----------
@@ -160,18 +198,24 @@ def evaluate_policy(transition: ArrayLike, reward: ArrayLike, discount: float, p
     policy : (S, U)
         p(U | D), row-stochastic.
     """
-    matrix, rewards = _checked(transition, reward, discount)
+    model, rewards = _checked(transition, reward, discount)
     rows = stochastic_matrix(policy, name="policy[state]")
     if rows.shape != rewards.shape:
         raise PlanningError(f"expected a policy of shape {rewards.shape}, got {rows.shape}")
-    closed_loop = np.einsum("su,ust->st", rows, matrix)
     expected = np.einsum("su,su->s", rows, rewards)
-    result: Float = np.linalg.solve(np.eye(len(expected)) - discount * closed_loop, expected)
-    return result
+    if not model.is_product:
+        closed_loop = np.einsum("su,ust->st", rows, model.matrix)
+        result: Float = np.linalg.solve(np.eye(len(expected)) - discount * closed_loop, expected)
+        return result
+    value: Float = np.zeros_like(expected)
+    # Each sweep shrinks the error by the discount at least.
+    for _ in range(int(np.ceil(np.log(1e-17) / np.log(discount))) if discount > 0.0 else 1):
+        value = np.einsum("su,su->s", rows, _action_value(model, rewards, discount, value))
+    return value
 
 
 def given_policy(
-    transition: ArrayLike, reward: ArrayLike, discount: float, policy: ArrayLike
+    transition: TransitionModel | ArrayLike, reward: ArrayLike, discount: float, policy: ArrayLike
 ) -> PlannedPolicy:
     """Return a policy that was made elsewhere, with its exact value.
 
@@ -183,7 +227,10 @@ def given_policy(
         p(U | D), row-stochastic; `control_index` is its mode, the first of equals.
     """
     value = evaluate_policy(transition, reward, discount, policy)
-    matrix, rewards = _checked(transition, reward, discount)
+    model, rewards = _checked(transition, reward, discount)
     rows = stochastic_matrix(policy, name="policy[state]")
-    action_value: Float = rewards + discount * np.einsum("ust,t->su", matrix, value)
+    if model.is_product:
+        action_value = _action_value(model, rewards, discount, value)
+    else:
+        action_value = rewards + discount * np.einsum("ust,t->su", model.matrix, value)
     return PlannedPolicy(value, action_value, np.argmax(rows, axis=1).astype(np.int64), rows, 0)

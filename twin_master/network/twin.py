@@ -362,7 +362,7 @@ class Twin:
         prediction = predict(self.model, estimate.filtered, control_index, self.policy, self.prediction_steps)
         decided_on = estimate.filtered
         if self.decide_on == "predicted":
-            decided_on = estimate.filtered @ self.model.transition.matrix[control_index]
+            decided_on = self.model.transition.forward(control_index, estimate.filtered)
         decision_probability: Float = decided_on @ self.policy
         self._proposed = int(np.argmax(decision_probability))
         return TwinTurn(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twin_master.network.transition import TransitionModel
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
 
@@ -178,8 +179,8 @@ class RunRecord:
         return 0 if self.predicted is None else int(self.predicted.mean.shape[1])
 
     @cached_property
-    def transition(self) -> Float | None:
-        """p(D_{t+1} | D_t, u) of the scenario: (U, S, S); None if the folder does not hold it."""
+    def transition(self) -> TransitionModel | None:
+        """p(D_{t+1} | D_t, u) of the scenario; None if the folder does not hold it."""
         if not self.scenario:
             return None
         try:
@@ -187,7 +188,7 @@ class RunRecord:
         except ValueError:
             return None
         fits = model.states.names == self.state_names and model.controls == self.controls
-        return model.transition.matrix if fits else None
+        return model.transition if fits else None
 
     @property
     def decides_on_prediction(self) -> bool:
@@ -214,10 +215,10 @@ def smoothed_until(record: RunRecord, now: int) -> Float | None:
     filtered = record.filtered.probability
     smoothed = filtered[: now + 1].copy()
     for step in range(now - 1, -1, -1):
-        table = transition[record.control_index[step]]
-        forecast = filtered[step] @ table
+        control = int(record.control_index[step])
+        forecast = transition.forward(control, filtered[step])
         ratio = np.divide(smoothed[step + 1], forecast, out=np.zeros_like(forecast), where=forecast > 0.0)
-        smoothed[step] = filtered[step] * (table @ ratio)
+        smoothed[step] = filtered[step] * transition.expected(control, ratio)
         smoothed[step] /= smoothed[step].sum()
     return smoothed
 

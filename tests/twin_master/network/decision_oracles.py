@@ -9,7 +9,8 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 
-from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace, TransitionModel
+from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
+from twin_master.network.transition import TransitionModel
 
 
 def random_model(rng, shape=(2, 2), controls=2, zeros=0.4, sparse_prior=True):
@@ -27,7 +28,7 @@ def random_model(rng, shape=(2, 2), controls=2, zeros=0.4, sparse_prior=True):
         prior[rng.integers(size)] += 0.1
         prior /= prior.sum()
     space = StateSpace(tuple(Factor(f"f{i}", tuple(map(float, range(n)))) for i, n in enumerate(shape)))
-    return GraphicalModel(space, tuple(f"u{i}" for i in range(controls)), prior, TransitionModel(matrix))
+    return GraphicalModel(space, tuple(f"u{i}" for i in range(controls)), prior, TransitionModel((matrix,)))
 
 
 def enumerate_trajectories(model, control, log_likelihood):

@@ -12,10 +12,10 @@ from twin_master.network.graphical_model import (
     Factor,
     GraphicalModel,
     StateSpace,
-    TransitionModel,
     deterministic_policy,
     worsening_table,
 )
+from twin_master.network.transition import TransitionModel
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8)
 SPACE = StateSpace((Factor("z1", LEVELS), Factor("z2", (0.0, 0.5, 1.0))))
@@ -94,7 +94,7 @@ def test_the_row_is_named_in_a_stack_of_matrices_and_in_a_vector():
     stack = np.tile(np.eye(3), (2, 1, 1))
     stack[1, 2, 2] = 0.95
     with pytest.raises(InvalidDistributionError, match=r"row \(1, 2\) does not sum to one \(sum 0.95"):
-        TransitionModel(stack)
+        TransitionModel((stack,))
     with pytest.raises(InvalidDistributionError, match="prior: the distribution does not sum to one"):
         distribution([0.5, 0.4], size=2, name="prior")
     with pytest.raises(InvalidDistributionError, match=r"expected shape \(3,\)"):
@@ -156,7 +156,7 @@ def test_predecessor_lists_hold_every_non_zero_transition_and_no_other():
 
 def test_transition_shapes_are_checked():
     with pytest.raises(InvalidModelError, match="controls, states, states"):
-        TransitionModel(np.full((2, 3, 4), 0.25))
+        TransitionModel((np.full((2, 3, 4), 0.25),))
     with pytest.raises(InvalidModelError, match="same states"):
         TransitionModel.from_factors([[np.eye(2)], [np.eye(3)]])
     with pytest.raises(InvalidModelError, match="square table"):

@@ -14,7 +14,6 @@ from twin_master.network.graphical_model import (
     Factor,
     GraphicalModel,
     StateSpace,
-    TransitionModel,
     deterministic_policy,
     worsening_table,
 )
@@ -27,6 +26,7 @@ from twin_master.network.inference import (
     smooth,
     smooth_many_twins,
 )
+from twin_master.network.transition import TransitionModel
 
 sys.path.insert(0, str(Path(__file__).parent))
 from decision_oracles import (

@@ -14,9 +14,10 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.errors import InvalidModelError, TwinMasterError
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network import memory
-from twin_master.network.graphical_model import TransitionModel, worsening_table
+from twin_master.network.graphical_model import worsening_table
 from twin_master.network.memory import check_scenario_fits, memory_size
 from twin_master.network.sensor_model import check_noise
+from twin_master.network.transition import TransitionModel
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 
 TEXT = scenario_files()["level_turns"].read_text(encoding="utf-8")
@@ -34,6 +35,7 @@ def six_factors() -> LoadedScenario:
     table = tomllib.loads(TEXT)
     table["state"] = [table["state"][0] | {"name": f"z{number}"} for number in range(1, 7)]
     table["mission"]["steps"] = 60
+    table["calibration"]["draws"] = 800
     return LoadedScenario(parse_scenario(table, "x"), scenario_files()["level_turns"], "")
 
 
@@ -52,7 +54,7 @@ def test_too_many_states_are_refused_before_anything_is_built() -> None:
     finally:
         tracemalloc.stop()
     sentence = str(caught.value)
-    for word in ("15625 states", "2 controls", "11.7 GB", "8 GB", "100 draws", "fewer levels"):
+    for word in ("15625 states", "2 controls", "38.4 GB", "8 GB", "800 draws", "fewer levels"):
         assert word in sentence, sentence
     assert "\n" not in sentence
 
@@ -66,10 +68,11 @@ def test_too_many_draws_are_refused_with_their_size() -> None:
 
 
 @pytest.mark.usefixtures("small_machine")
-def test_transitions_built_by_hand_are_refused_too() -> None:
+def test_the_table_of_all_states_is_refused_too() -> None:
     table = worsening_table(5, 0.1)
+    product = TransitionModel.from_factors([[table] * 6] * 2)
     with pytest.raises(InvalidModelError, match="15625 states under 2 controls"):
-        TransitionModel.from_factors([[table] * 6] * 2)
+        _ = product.matrix
     assert TransitionModel.from_factors([[table] * 2] * 2).matrix.shape == (2, 25, 25)
 
 

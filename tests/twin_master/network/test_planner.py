@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.errors import InvalidDistributionError, PlanningError
-from twin_master.network.graphical_model import TransitionModel, worsening_table
+from twin_master.network.graphical_model import worsening_table
 from twin_master.network.planner import evaluate_policy, value_iteration
 from twin_master.network.quantity import QuantityModel
 from twin_master.network.rewards import RewardModel, RewardSettings
+from twin_master.network.transition import TransitionModel
 
 LIBRARY = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_digital_twin"
 

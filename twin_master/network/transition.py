@@ -1,0 +1,285 @@
+"""Transitions between states: one table, or the product of tables of factors that move independently.
+
+A table of S states has S² entries, the tables of its factors together a few hundred. What is small is kept as
+one table, whose loops are the shortest; what is not, as blocks of neighbouring factors, each applied along
+its own axis.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import prod
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twin_master.errors import InvalidModelError
+from twin_master.network.distributions import stochastic_matrix
+from twin_master.network.memory import TRANSITION_COPIES, check_fits, transition_bytes
+
+__all__ = ["ProductTransition", "SparseTransition", "TransitionModel"]
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+Unsigned = NDArray[np.uint64]
+
+JOINT_NON_ZEROS = 8192
+"""Non-zero transitions of a control up to which one table is used: it is applied in some ten microseconds."""
+JOINT_LEVELS = 1024
+"""Joint levels of neighbours up to which they may share a table: it has 8 MB for each control."""
+
+
+@dataclass(frozen=True)
+class SparseTransition:
+    """The non-zero transitions as predecessor lists.
+
+    Row ``control * S + state`` lists the states from which `state` is reached under `control`. The arrays
+    are for the compiled loops, which never write to them; unsigned indices spare the loops the test for
+    negative ones.
+
+    Attributes
+    ----------
+    start : (U * S + 1,)
+        Where each row begins.
+    source : (non-zeros,)
+        The predecessor.
+    probability, log_probability : (non-zeros,) dimensionless
+        Of the transition from it.
+    """
+
+    start: Unsigned
+    source: Unsigned
+    probability: Float
+    log_probability: Float
+
+    @classmethod
+    def from_matrix(cls, matrix: Float) -> "SparseTransition":
+        """Build the lists from a transition array (U, S, S)."""
+        rows = matrix.transpose(0, 2, 1).reshape(-1, matrix.shape[2])
+        row, source = np.nonzero(rows)
+        start = np.zeros(len(rows) + 1, dtype=np.uint64)
+        np.cumsum(np.bincount(row, minlength=len(rows)), out=start[1:])
+        probability = rows[row, source]
+        return cls(start, source.astype(np.uint64), probability, np.log(probability))
+
+
+@dataclass(frozen=True)
+class ProductTransition:
+    """Predecessor lists of several blocks, one after the other, for the compiled loops.
+
+    Attributes
+    ----------
+    levels : (B,)
+        Number of joint levels of each block.
+    first_row : (B,)
+        Where the rows of a block begin: row ``first_row[b] + control * levels[b] + level``.
+    start : (rows + 1,)
+        Where each row begins.
+    source : (non-zeros,)
+        The predecessor of a level within its block.
+    probability, power : (non-zeros,)
+        Of the transition from it: probability * 2^(512 power), with a probability of 2^-256 at least.
+    """
+
+    levels: Index
+    first_row: Index
+    start: Index
+    source: Index
+    probability: Float
+    power: Float
+
+    @property
+    def arrays(self) -> tuple[Index, Index, Index, Index, Float, Float]:
+        """All of them, as the compiled loops take them."""
+        return self.levels, self.first_row, self.start, self.source, self.probability, self.power
+
+    @classmethod
+    def from_blocks(cls, blocks: Sequence[Float]) -> "ProductTransition":
+        """Build the lists from the transition arrays (U, L, L) of the blocks."""
+        lists = [SparseTransition.from_matrix(block) for block in blocks]
+        rows = [len(entry.start) - 1 for entry in lists]
+        counts = np.concatenate([np.diff(entry.start.astype(np.int64)) for entry in lists])
+        probability = np.concatenate([entry.probability for entry in lists])
+        power = np.where(probability < 2.0**-256, np.where(probability < 2.0**-768, -2.0, -1.0), 0.0)
+        return cls(
+            levels=np.array([block.shape[1] for block in blocks], dtype=np.int64),
+            first_row=np.concatenate([[0], np.cumsum(rows)[:-1]]).astype(np.int64),
+            start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+            source=np.concatenate([entry.source for entry in lists]).astype(np.int64),
+            probability=np.ldexp(probability, (-512 * power).astype(np.int32)),
+            power=power,
+        )
+
+
+@dataclass(frozen=True)
+class TransitionModel:
+    """p(D_t | D_{t-1}, U_{t-1}), row-stochastic for each control: Kapteyn et al. 2021, eqs. (28)-(29).
+
+    The joint state is that of the blocks in C order; its transition is the product of theirs.
+
+    Attributes
+    ----------
+    blocks : tuple of (U, L, L), dimensionless
+        ``block[u, i, j]`` is the probability to go from level i to level j of the block under control u. A
+        single block is the table (U, S, S) of all states.
+    """
+
+    blocks: tuple[Float, ...]
+
+    def __post_init__(self) -> None:
+        checked = tuple(stochastic_matrix(block, name="transition[control, state]") for block in self.blocks)
+        for block in checked:
+            if block.ndim != 3 or block.shape[1] != block.shape[2]:
+                raise InvalidModelError(
+                    f"transition: expected shape (controls, states, states), got {block.shape}"
+                )
+        if len({len(block) for block in checked}) != 1:
+            raise InvalidModelError(
+                f"transition: every block needs the same controls, got {[len(block) for block in checked]}"
+            )
+        object.__setattr__(self, "blocks", checked)
+
+    @classmethod
+    def from_factors(cls, tables: Sequence[Sequence[ArrayLike]]) -> "TransitionModel":
+        """Build the joint transition of factors that change independently, given the control.
+
+        Parameters
+        ----------
+        tables : for each control, for each factor, (levels, levels)
+            Row-stochastic; the joint matrix is their Kronecker product in the order of the factors.
+
+        Raises
+        ------
+        InvalidDistributionError, InvalidModelError
+            A table is none of transitions, or the controls have other states.
+        """
+        checked = [
+            [
+                stochastic_matrix(table, name=f"transition of control {control}, factor {factor}")
+                for factor, table in enumerate(factor_tables)
+            ]
+            for control, factor_tables in enumerate(tables)
+        ]
+        for control, row in enumerate(checked):
+            if not row or any(t.ndim != 2 or t.shape[0] != t.shape[1] for t in row):
+                raise InvalidModelError(
+                    f"control {control}: expected a square table for each factor, "
+                    f"got shapes {[table.shape for table in row]}"
+                )
+        if len({tuple(table.shape for table in row) for row in checked}) != 1:
+            raise InvalidModelError(
+                "every control needs the same states, got shapes "
+                f"{[[table.shape for table in row] for row in checked]}"
+            )
+        return cls(tuple(_grouped([np.stack(factor) for factor in zip(*checked, strict=True)])))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Numbers of controls, states and states (U, S, S)."""
+        size = prod(block.shape[1] for block in self.blocks)
+        return len(self.blocks[0]), size, size
+
+    @property
+    def is_product(self) -> bool:
+        """Whether it is the product of several blocks."""
+        return len(self.blocks) > 1
+
+    @cached_property
+    def matrix(self) -> Float:
+        """The table of all states (U, S, S).
+
+        Raises
+        ------
+        InvalidModelError
+            It does not fit in memory.
+        """
+        if not self.is_product:
+            return self.blocks[0]
+        controls, states, _ = self.shape
+        check_fits(
+            {
+                f"the table of {states} states under {controls} controls": TRANSITION_COPIES
+                * transition_bytes(states, controls)
+            },
+            "take fewer levels or state factors, or apply the transition instead",
+        )
+        joint = [_kronecker([block[control] for block in self.blocks]) for control in range(controls)]
+        table = np.stack(joint)
+        table.setflags(write=False)
+        return table
+
+    @cached_property
+    def sparse(self) -> SparseTransition:
+        """The non-zero transitions of all states as lists."""
+        return SparseTransition.from_matrix(self.matrix)
+
+    @cached_property
+    def forward_lists(self) -> ProductTransition:
+        """The predecessors of each level of each block."""
+        return ProductTransition.from_blocks(self.blocks)
+
+    @cached_property
+    def backward_lists(self) -> ProductTransition:
+        """The successors of each level of each block."""
+        return ProductTransition.from_blocks([block.transpose(0, 2, 1) for block in self.blocks])
+
+    def row(self, control: int, state: int) -> Float:
+        """Return p(D_t | D_{t-1} = state, control): (S,)."""
+        levels = np.unravel_index(state, [block.shape[1] for block in self.blocks])
+        rows = [block[control, level] for block, level in zip(self.blocks, levels, strict=True)]
+        return _kronecker(rows)
+
+    def forward(self, control: int, belief: Float) -> Float:
+        """Return the belief (S,) one step later, in the linear domain."""
+        if not self.is_product:
+            moved: Float = belief @ self.blocks[0][control]
+            return moved
+        return self._applied([block[control].T for block in self.blocks], belief)
+
+    def expected(self, control: int, value: Float) -> Float:
+        """Return the mean of a function of the state one step later, from each state: (S,) -> (S,)."""
+        if not self.is_product:
+            mean: Float = self.blocks[0][control] @ value
+            return mean
+        return self._applied([block[control] for block in self.blocks], value)
+
+    def _applied(self, matrices: Sequence[Float], vector: Float) -> Float:
+        inner = len(vector)
+        for matrix in matrices:
+            inner //= len(matrix)
+            vector = np.matmul(matrix, vector.reshape(-1, len(matrix), inner)).ravel()
+        return vector
+
+
+def _kronecker(arrays: Sequence[Float]) -> Float:
+    product = arrays[0]
+    for array in arrays[1:]:
+        product = np.asarray(np.kron(product, array), dtype=np.float64)
+    return product
+
+
+def _grouped(factors: Sequence[Float]) -> Iterator[Float]:
+    """Yield blocks (U, L, L): all factors as one where that is small, else neighbours where it costs no more.
+
+    Applying a block costs its non-zeros for each of the other levels.
+    """
+    counts = [np.count_nonzero(factor, axis=(1, 2)) for factor in factors]
+    states = prod(factor.shape[1] for factor in factors)
+    non_zeros_of_all = np.prod(counts, axis=0, dtype=np.float64).max()
+    if len(factors) == 1 or (states <= JOINT_LEVELS and non_zeros_of_all <= JOINT_NON_ZEROS):
+        yield _joint(factors)
+        return
+    group, count = [factors[0]], counts[0] / factors[0].shape[1]
+    for factor, non_zeros in zip(factors[1:], counts[1:], strict=True):
+        own, levels = non_zeros / factor.shape[1], prod(item.shape[1] for item in [*group, factor])
+        if levels > JOINT_LEVELS or (count * own).max() > (count + own).max():
+            yield _joint(group)
+            group, count = [factor], own
+        else:
+            group, count = [*group, factor], count * own
+    yield _joint(group)
+
+
+def _joint(factors: Sequence[Float]) -> Float:
+    controls = range(len(factors[0]))
+    return np.stack([_kronecker([factor[control] for factor in factors]) for control in controls])
