@@ -34,10 +34,11 @@ from twin_master.learning.kernels import (
 )
 from twin_master.learning.posterior import INTERVAL, draws_posterior
 from twin_master.network.estimator import Carried, Estimate, Learnt
-from twin_master.network.graphical_model import GraphicalModel, SparseTransition
+from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import ObservationContext
 from twin_master.network.kernels import backward_pass
 from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.network.transition import SparseTransition
 
 __all__ = ["LearningFilter", "LearntPriors"]
 
