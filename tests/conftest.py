@@ -32,6 +32,27 @@ settings.register_profile("developer", deadline=None)
 settings.load_profile("ci" if os.environ.get("CI") else "developer")
 
 
+SHARED = ("coarse_reduction", "coarse_patch_arrays", "virtual_model")
+"""Fixtures of several files that take seven to ten seconds each."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Let one worker run all tests that share what is made once, unless they name a group.
+
+    That is all tests of a file, and of all files that use a fixture of `SHARED`.
+    """
+    group: dict[Path, str] = {}
+    for item in items:
+        own = str(item.path.relative_to(config.rootpath))
+        shared = [name for name in SHARED if name in getattr(item, "fixturenames", ())]
+        if shared or item.path not in group:
+            group[item.path] = shared[0] if shared else own
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(group[item.path]))
+
+
 LONGEST_COMPARED = 10_000
 """Items of a sequence; pytest looks for hours for the differences of two files of a megabyte."""
 

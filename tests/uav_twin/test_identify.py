@@ -73,7 +73,7 @@ def test_files_that_are_missing_or_wrong_end_in_one_sentence(
 def test_a_run_leaves_a_design_a_record_and_a_report(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], data: Path, tmp_path: Path
 ) -> None:
-    coarse = load_design().changed(mesh={"refinement": 0.25, "chord_size": 0.2})
+    coarse = load_design().changed(mesh={"refinement": 0.25, "span_size": 0.06, "chord_size": 0.2})
     start = tmp_path / "start.toml"
     start.write_text(design_toml(coarse, {}))
     out = tmp_path / "out"

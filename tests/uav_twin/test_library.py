@@ -37,7 +37,7 @@ def test_from_a_script_to_a_library(
 ) -> None:
     fmu, out = tmp_path / "pump.fmu", tmp_path / "pump.nc"
     assert call(monkeypatch, "fmu", "build", "--script", "gear_pump", "--out", str(fmu)) == 0
-    assert call(monkeypatch, "fmu", "check", str(fmu)) == 0
+    assert call(monkeypatch, "fmu", "check", str(fmu), "--cycles", "5") == 0
     sample = ["library", "sample", "--fmu", str(fmu), "--binding", str(binding_files()["gear_pump"]), *GRID]
     capsys.readouterr()
     assert call(monkeypatch, *sample, "--out", str(out), "--workers", "2") == 0

@@ -85,6 +85,11 @@ def test_every_shipped_scenario_is_sound_or_says_what_it_needs(name: str) -> Non
         ('design = "uav_wing"', 'design = "my_wing.toml"', "my_wing.toml cannot be read"),
         ('binding = "uav_wing"', 'binding = "my_binding.toml"', "my_binding.toml cannot be read"),
         ("steps = 50", "steps = -1", "steps"),
+        (
+            "standard_deviation_microstrain = 125",
+            "standard_deviation = 125",
+            "write `observation.standard_deviation_microstrain = 125`",
+        ),
     ],
 )
 def test_a_fault_is_one_sentence(

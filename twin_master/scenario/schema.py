@@ -29,6 +29,8 @@ from twin_master.scenario.truth import TruthSection
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of probabilities from one, as the graphical model has it."""
+LARGEST_STRAIN_NOISE = 0.1
+"""Standard deviation of a strain gauge beyond which a unit was forgotten [1]."""
 REWARD_NAMES = ("health", "control", "error")
 """The rewards (9)-(11)."""
 FALLBACK_FIGURES = (
@@ -346,6 +348,21 @@ class Scenario(Section):
                     "parameter of its own"
                 )
         check_one_or_each("truth.noise.standard_deviation", self.truth.noise.standard_deviation, count)
+        for key, noise in (("observation", self.observation), ("truth.noise", self.truth.noise)):
+            self._check_strain_noise(f"{key}.standard_deviation", noise.standard_deviation)
+
+    def _check_strain_noise(self, key: str, deviation: float | tuple[float, ...]) -> None:
+        """Refuse noise in microstrain without its suffix; finer slips are seen when predictions are there."""
+        if self.observation.role != "strain":
+            return
+        units = self.observation.sensor_units
+        each = deviation if isinstance(deviation, tuple) else (deviation,) * len(units)
+        for unit, given in zip(units, each, strict=True):
+            if unit == "1" and given > LARGEST_STRAIN_NOISE:
+                raise ValueError(
+                    f"`{key}` is {given:g} as a strain, and no gauge is off by {LARGEST_STRAIN_NOISE:g}: "
+                    f"for microstrain write `{key}_microstrain = {given:g}`"
+                )
 
     def _check_transition(self) -> None:
         transition = self.transition

@@ -241,7 +241,7 @@ def crossing(
             + n * (0.25 * u2 * u2 - u2 * u / 3.0)
         )
         if exponent == 0.0:
-            way -= sign * (strength + max(free, 0.0)) * h * h / 12.0
+            way -= sign * strength * h * h / 12.0
         return 0.0, way, 1.0
     one = exponent + 1.0
     first, rest = u * h, (1.0 - u) * h

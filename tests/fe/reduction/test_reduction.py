@@ -39,7 +39,8 @@ class SmallSystem:
     design_hash: str = "a chain"
 
 
-def chain(count: int = 60, seed: int = 0) -> SmallSystem:
+def chain(count: int = 60, seed: int = 0, root: float = 1.0) -> SmallSystem:
+    """Return the chain, its first spring `root` times as stiff as it would be."""
     random = np.random.default_rng(seed)
     stretch = sparse.csr_array(np.eye(count) - np.eye(count, k=-1))
     kind = np.zeros((4, count))
@@ -48,6 +49,7 @@ def chain(count: int = 60, seed: int = 0) -> SmallSystem:
     kind[2, count // 2 : 4 * count // 5] = 1.0
     kind[0] *= 1 - np.maximum(kind[1], kind[2])
     kind[3] = 0.2 + random.uniform(0, 0.2, count)
+    kind[:, 0] *= root
     terms = tuple((stretch.T @ sparse.diags_array(1e3 * row) @ stretch).tocsr() for row in kind)
     masses = np.zeros((3, count))
     masses[0] = 0.01
@@ -139,6 +141,16 @@ def test_asked_accuracy_is_reached(reduction: Reduction, state: tuple[float, flo
         error = np.abs(reduced.strain - full[:-1]).max()
         largest = np.abs(full[:-1]).max()
         assert error <= reduced.strain_error_bound <= 2 * SETTINGS.bound_tolerance * largest
+
+
+def test_the_rounding_that_was_measured_is_allowed_for(reduction: Reduction) -> None:
+    """On a soft first spring the chain moves far and stretches little: digits of the stretches are lost."""
+    assert reduction.model.rounding_allowance == 5e-6  # the least
+    root = 1e-10
+    model = reduce_model(chain(root=root), replace(SETTINGS, bound_tolerance=1e-2)).model
+    # in doubles a displacement of all is known to 2^-53 of itself, and moves by (pull / stretch) / root
+    assert 5e-6 < model.rounding_allowance < 2.0**-53 / root * 60 * 8
+    assert model.static_response(1.0, (0.0, 0.0), 1.0, 0.0).strain_error_bound > 5e-6
 
 
 def test_pymor_reduces_and_bounds_alike(reduction: Reduction) -> None:

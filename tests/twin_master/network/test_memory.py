@@ -86,10 +86,13 @@ def test_a_noise_whose_unit_was_forgotten_is_refused(
     assert old in TEXT
     path = tmp_path / "blind.toml"
     path.write_text(TEXT.replace(old, f"standard_deviation = {number}"), encoding="utf-8")
+    with pytest.raises(TwinMasterError, match=f"write `{key}_microstrain = {number}`"):  # no strain at all
+        load_scenario(path)
+    path.write_text(TEXT.replace(old, "standard_deviation = 0.05"), encoding="utf-8")
     scenario = resolve_scenario(load_scenario(path), Overrides(strain_library=library_file))
     with pytest.raises(TwinMasterError) as caught:
         prepare_knowledge(scenario, asset_source(scenario), 0)
-    for word in (f"`{key}` is {number}", f"write `{key}_microstrain = {number}`", "sensor 1"):
+    for word in (f"`{key}` is 0.05", f"write `{key}_microstrain = 0.05`", "sensor 1"):
         assert word in str(caught.value), str(caught.value)
 
 
