@@ -42,7 +42,7 @@ ROOMS = {
     ),
     "twin_master": (
         "errors", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library", "mission",
-        "store", "report", "workflow", "scenario_check", "study", "command", "__main__",
+        "store", "report", "viewer", "workflow", "scenario_check", "study", "command", "__main__",
     ),
     "discrepancy": (
         "errors", "campaign", "models", "lumped_models", "location", "catalogue", "document_types", "verdict",

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
+from twin_master.viewer.command import View, shown
 
 if TYPE_CHECKING:
     from twin_master.store.outcome import RunOutcome
+    from twin_master.workflow import Begun
 
 
 Scenario = Annotated[
@@ -65,6 +67,7 @@ def run(
     calibration: Calibration = None,
     library: Library = None,
     in_process: InProcess = False,
+    view: View = False,
     with_scenario: WithScenario = None,
     no_report: terminal.NoReport = False,
     json: terminal.Json = False,
@@ -91,21 +94,27 @@ def run(
                 "a run is continued with what its folder holds: give nothing beside it that would change it.",
                 param_hint="--resume",
             )
-        loaded = None if scenario is None else load_scenario(scenario)
-        outcome = _interruptible(lambda: resume_run(resume, loaded, report=report, progress=progress), resume)
+        folder, loaded = resume, None if scenario is None else load_scenario(scenario)
+
+        def fly(begun: "Begun | None") -> "RunOutcome":
+            return resume_run(resume, loaded, report=report, progress=progress, begun=begun)
     else:
         if scenario is None:
             raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
         loaded = load_scenario(scenario)
         folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
-        outcome = _interruptible(
-            lambda: new_run(loaded, folder, overrides, replace=replace, report=report, progress=progress),
-            folder,
-        )
-    if json:
-        terminal.print_json(_record(outcome))
-    else:
-        show_outcome(outcome)
+
+        def fly(begun: "Begun | None") -> "RunOutcome":
+            return new_run(
+                loaded, folder, overrides, replace=replace, report=report, progress=progress, begun=begun
+            )
+
+    with shown(view) as begun:
+        outcome = _interruptible(lambda: fly(begun), folder)
+        if json:
+            terminal.print_json(_record(outcome))
+        else:
+            show_outcome(outcome)
 
 
 def _record(outcome: "RunOutcome") -> dict[str, Any]:

@@ -20,6 +20,7 @@ __all__ = [
     "ScenarioError",
     "TwinMasterError",
     "UnknownScenarioError",
+    "ViewError",
 ]
 
 
@@ -113,3 +114,7 @@ class NotResumableError(RunFolderError):
 
 class MissionInputError(MissionError, ValueError):
     """Something that a mission was told to use is not there or does not fit."""
+
+
+class ViewError(TwinMasterError, RuntimeError):
+    """A flight cannot be shown on this machine."""

@@ -30,6 +30,7 @@ from twin_master.assets.resolution import (
 from twin_master.errors import NotResumableError
 from twin_master.mission.checkpoint import open_checkpoint
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.kept_knowledge import keep_knowledge
 from twin_master.mission.loop import Flight, fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.network.twin import build_graphical_model
@@ -60,6 +61,10 @@ POLICY_NAME = "policy.npy"
 CALIBRATION_NAME = "calibration.json"
 
 
+Begun = Callable[[Path], None]
+"""Told the run folder once it is there and held, before anything is modelled."""
+
+
 @dataclass
 class _Clock:
     """Wall-clock seconds of the stages."""
@@ -83,6 +88,7 @@ def new_run(
     replace: bool = False,
     report: bool = True,
     progress: Progress | None = None,
+    begun: Begun | None = None,
 ) -> RunOutcome:
     """Fly a scenario into a new run folder.
 
@@ -103,6 +109,8 @@ def new_run(
         Draw the report.
     progress
         Shows the stages.
+    begun
+        Called with the run folder before the first stage.
 
     Raises
     ------
@@ -133,7 +141,7 @@ def new_run(
     lock = create_run_folder(folder, config, files, replace=replace)
     try:
         located = located_scenario(portable_scenario(resolved), folder)
-        return _run(folder, config, located, progress, report=report)
+        return _run(folder, config, located, progress, begun, report=report)
     finally:
         os.close(lock)
 
@@ -144,6 +152,7 @@ def resume_run(
     *,
     report: bool = True,
     progress: Progress | None = None,
+    begun: Begun | None = None,
 ) -> RunOutcome:
     """Continue an interrupted run; the results are those of an uninterrupted one, bit for bit.
 
@@ -157,6 +166,8 @@ def resume_run(
         Draw the report.
     progress
         Shows the stages.
+    begun
+        Called with the run folder before the first stage.
 
     Raises
     ------
@@ -180,7 +191,7 @@ def resume_run(
             progress.note(f"The run in {folder} is finished: nothing is flown again.")
             return finished
         check_versions(folder, config, scenario.mission.seed)
-        return _run(folder, config, located_scenario(scenario, folder), progress, report=report)
+        return _run(folder, config, located_scenario(scenario, folder), progress, begun, report=report)
     finally:
         os.close(lock)
 
@@ -192,9 +203,17 @@ def _restore(folder: Path, progress: Progress) -> None:
 
 
 def _run(
-    folder: Path, config: dict[str, Any], scenario: Scenario, progress: Progress, *, report: bool
+    folder: Path,
+    config: dict[str, Any],
+    scenario: Scenario,
+    progress: Progress,
+    begun: Begun | None,
+    *,
+    report: bool,
 ) -> RunOutcome:
     tidy(folder)
+    if begun is not None:
+        begun(folder)
     clock = _Clock()
     source = asset_source(scenario)
     with _unflown(folder), clock.stage("asset"):
@@ -230,6 +249,7 @@ def _fly_and_store(
         if knowledge.draws.record is not None:
             text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
             atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
+        keep_knowledge(folder, knowledge)
         # A turn without observations on a twin of its own compiles the inner loops before the flight.
         compiling = knowledge.twin()
         compiling.turn(np.full(scenario.observation.count, np.nan), 0)

@@ -136,6 +136,35 @@ def prepare_knowledge(
         ("truth.noise.standard_deviation", scenario.truth.noise.standard_deviation),
     ):
         check_noise(key, deviation, predicted, section.sensor_units)
+    return knowledge_of(scenario, model, draws, predicted, policy)
+
+
+def knowledge_of(
+    scenario: Scenario,
+    model: GraphicalModel,
+    draws: ParameterDraws,
+    predicted: Float,
+    policy: Float | None = None,
+) -> Knowledge:
+    """Return what a twin knows that expects these observations (E, S, U, G), SI.
+
+    Parameters
+    ----------
+    scenario, policy
+        As of `prepare_knowledge`.
+    model : GraphicalModel
+        Of the scenario.
+    draws : ParameterDraws
+        The E draws that the observations are predicted for.
+    predicted : (E, S, U, G)
+        SI.
+
+    Raises
+    ------
+    InvalidModelError
+        The shapes do not fit the scenario.
+    """
+    section = scenario.observation
     sensor_model = GaussianSensorModel(
         predicted,
         section.standard_deviation,

@@ -55,17 +55,23 @@ def observation_scale(record: RunRecord, sensor: int | None = None) -> tuple[flo
 
     Without a sensor those of all sensors; an empty name where they have several.
     """
-    unit = record.observation_unit
     if record.sensor_units:
-        unit = "" if sensor is None else record.sensor_units[sensor]
-    elif record.observation_name == "strain" and unit in {"1", ""}:
-        return 1.0e6, "µε"
-    return 1.0, unit
+        return 1.0, "" if sensor is None else record.sensor_units[sensor]
+    return printed_observation(record.observation_name, record.observation_unit)
+
+
+def printed_observation(name: str, unit: str) -> tuple[float, str]:
+    """Return the factor from the stored unit of an observation to the printed one, and its name."""
+    return (1.0e6, "µε") if name == "strain" and unit in {"1", ""} else (1.0, unit)
 
 
 def state_scale(record: RunRecord, factor: int) -> tuple[float, str]:
     """Return the factor from the stored unit of a state factor to the printed one, and its name."""
-    unit = record.state_units[factor] if factor < len(record.state_units) else "1"
+    return printed_state(record.state_units[factor] if factor < len(record.state_units) else "1")
+
+
+def printed_state(unit: str) -> tuple[float, str]:
+    """Return the factor from the stored unit of a state factor to the printed one, and its name."""
     return (100.0, "%") if unit == "1" else (1.0, unit)
 
 

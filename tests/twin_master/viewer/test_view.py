@@ -1,0 +1,343 @@
+"""The view of a flight: its numbers against those of the run, its protocol, its page in a real browser."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import select
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.client import HTTPConnection
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.browser import CHROMIUM, open_browser
+from fe.wing.design import SHIPPED_DESIGN, load_design
+from reporting.progress import SilentProgress
+from twin_master.assets.design_source import DESIGN_COPY
+from twin_master.assets.resolution import Overrides
+from twin_master.errors import RunFolderError
+from twin_master.mission.journal import JOURNAL_NAME, line_of
+from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME
+from twin_master.report.reading import open_run
+from twin_master.scenario.reading import load_scenario
+from twin_master.viewer.flight import Flight
+from twin_master.viewer.messages import LATEST, Request, Teller, parse_request
+from twin_master.viewer.scene import scene_of
+from twin_master.workflow import new_run
+
+TURNS = 50
+TOLD = {
+    "notices": [
+        {"kind": "alarm", "sentence": "Look at <b>gauge 3</b>.", "sensors": [3], "value": 120.0},
+    ],
+    "learnt": {
+        "e": {"mean": 0.95123, "standard_deviation": 0.006, "lower": 0.94, "upper": 0.96, "unit": "1"},
+    },
+}
+"""What an estimator that learns would have added to a turn."""
+
+
+@pytest.fixture(scope="module")
+def run(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("view") / "run"
+    new_run(
+        load_scenario("level_turns"), folder, Overrides(strain_library=library_file), report=False,
+        progress=SilentProgress(),
+    )  # fmt: skip
+    # The gauges of the library are those of the shipped wing: with its design the page shows them from above.
+    shutil.copy(SHIPPED_DESIGN, folder / DESIGN_COPY)
+    return folder
+
+
+@pytest.fixture
+def lines(run: Path) -> list[bytes]:
+    return (run / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
+
+
+@pytest.fixture
+def begun(run: Path, tmp_path: Path) -> Path:
+    """The run before its first turn."""
+    folder = tmp_path / "begun"
+    shutil.copytree(run, folder)
+    (folder / JOURNAL_NAME).unlink()
+    (folder / "run.nc").unlink()
+    return folder
+
+
+def add(folder: Path, *content: bytes) -> None:
+    with (folder / JOURNAL_NAME).open("ab") as file:
+        file.writelines(content)
+
+
+def whole(folder: Path) -> Flight:
+    flight = Flight(folder)
+    while flight.update():
+        pass
+    return flight
+
+
+def teller_of(flight: Flight) -> Teller:
+    return Teller(flight, scene_of(flight.folder, flight.knowledge))
+
+
+def asked(first: int = 0, end: int = 0, turn: int = LATEST, **changed: int) -> Request:
+    given = {"number": 1, "flight": -1, "shown": -1, "count": -1} | changed
+    return Request(first=first, end=end, turn=turn, **given)
+
+
+def test_every_number_is_that_of_the_run(run: Path) -> None:
+    flight, stored = whole(run), open_run(run)
+    assert flight.turns == TURNS
+    believed, expected = flight.believed(0, TURNS), flight.predicted(28)
+    for belief, group, part in ((believed, "filtered", slice(None)), (expected, "predicted", 28)):
+        values = {name: stored[group][name].values[part] for name in stored[group].data_vars}
+        np.testing.assert_array_equal(belief.state_mean, values["mean"])
+        np.testing.assert_array_equal(belief.state_deviation, values["standard_deviation"])
+        np.testing.assert_array_equal(belief.reward_mean, values["reward_mean"])
+        np.testing.assert_array_equal(belief.reward_deviation, values["reward_standard_deviation"])
+        np.testing.assert_array_equal(belief.sensor_mean, values["quantity_mean"])
+        noise = np.sqrt(belief.sensor_deviation**2 - values["quantity_standard_deviation"] ** 2)
+        np.testing.assert_allclose(noise, 125e-6, rtol=1e-9)
+    decided = stored["filtered"]["decision_probability"].values
+    np.testing.assert_array_equal(believed.control_probability, decided)
+    np.testing.assert_array_equal(
+        expected.control_probability, stored["predicted"]["control_probability"].values[28]
+    )
+    np.testing.assert_array_equal(flight.truth(0, TURNS), stored["truth"]["state"].values)
+
+
+def test_turns_are_seen_as_soon_as_their_lines_are_whole(run: Path, begun: Path, lines: list[bytes]) -> None:
+    flight = Flight(begun)
+    assert not flight.update()
+    add(begun, *lines[:3], lines[3][:40])
+    assert flight.update()
+    assert flight.turns == 2
+    assert not flight.update()
+    add(begun, lines[3][40:], *lines[4:])
+    assert flight.update()
+    assert flight.turns == TURNS
+    np.testing.assert_array_equal(
+        flight.believed(0, TURNS).state_mean, whole(run).believed(0, TURNS).state_mean
+    )
+
+
+def test_turns_that_were_taken_back_are_forgotten(begun: Path, lines: list[bytes]) -> None:
+    add(begun, *lines[:21])
+    flight = whole(begun)
+    number = flight.number
+    (begun / JOURNAL_NAME).write_bytes(b"".join(lines[:11]))  # as a resumed run does
+    flight.update()
+    assert (flight.turns, flight.number) == (10, number + 1)
+    # A viewer that holds the twenty turns is told all ten again.
+    answer = json.loads(str(teller_of(flight).answer(asked(0, 20, flight=number, shown=19, count=20))))
+    assert (answer["first"], answer["count"], len(answer["past"]["control"])) == (0, 10, 10)
+
+
+def test_a_changed_line_ends_the_view_with_its_turn(begun: Path, lines: list[bytes]) -> None:
+    add(begun, *lines[:5], lines[5].replace(b'"turn": 4', b'"turn": 5'), *lines[6:])
+    with pytest.raises(RunFolderError, match=r"line 6 of the journal .* was changed or is damaged"):
+        whole(begun)
+
+
+def test_an_observation_that_came_late_stands_in_its_turn(begun: Path, lines: list[bytes]) -> None:
+    turns = [json.loads(line[65:]) for line in lines[1:]]
+    missed = turns[6] | {"observed": [None] * 24}
+    add(begun, lines[0], *map(line_of, [*turns[:6], missed, *turns[7:10]]))
+    flight = whole(begun)
+    number = flight.number
+    late = turns[9] | {"observation_turn": 6, "observed": turns[6]["observed"]}
+    add(begun, line_of(late | {"filtered": turns[20]["filtered"]}))
+    assert flight.update()
+    assert (flight.turns, flight.number) == (10, number + 1)
+    expected = [turn["observed"] for turn in turns[:10]]
+    np.testing.assert_array_equal(flight.observed(0, 10), np.array(expected, dtype=float))
+    assert [turn.filtered.tolist() for turn in flight.seen(8, 10)] == [
+        turns[8]["filtered"],
+        turns[20]["filtered"],
+    ]
+    add(begun, line_of(turns[30]))
+    with pytest.raises(RunFolderError, match="tells turn 30 where 10 was expected"):
+        flight.update()
+
+
+@pytest.mark.parametrize("content", [None, b"", b"PK\x05\x06" + bytes(18), b"no archive"])
+def test_without_what_the_twin_knew_nothing_is_shown(begun: Path, content: bytes | None) -> None:
+    (begun / KNOWLEDGE_NAME).unlink()
+    if content is not None:
+        (begun / KNOWLEDGE_NAME).write_bytes(content)
+    with pytest.raises(RunFolderError, match=r"twin\.npz is missing, damaged or of another scenario"):
+        Flight(begun)
+
+
+def test_a_viewer_is_told_what_it_misses_and_nothing_else(run: Path) -> None:
+    teller = teller_of(whole(run))
+    everything = json.loads(str(teller.answer(asked())))
+    assert (everything["turn"], everything["first"], everything["count"]) == (TURNS - 1, 0, TURNS)
+    number = everything["flight"]
+    missed = json.loads(str(teller.answer(asked(0, 30, flight=number, shown=29, count=30))))
+    assert missed["first"] == 30
+    assert missed["past"]["state"] == everything["past"]["state"][30:]
+    assert teller.answer(asked(0, TURNS, flight=number, shown=TURNS - 1, count=TURNS)) is None
+    back = json.loads(str(teller.answer(asked(0, TURNS, 7, flight=number, shown=8, count=TURNS))))
+    assert (back["turn"], back["past"]) == (7, None)
+    assert len(back["ahead"]["state"]) == 10
+
+
+def test_printed_units_and_bands(run: Path) -> None:
+    flight = whole(run)
+    answer = json.loads(str(teller_of(flight).answer(asked(turn=28))))
+    past, believed = answer["past"], flight.believed(0, 29)
+    np.testing.assert_allclose(past["state"], 100.0 * believed.state_mean)
+    np.testing.assert_allclose(past["observed"], 1e6 * flight.observed(0, 29))
+    np.testing.assert_allclose(
+        np.subtract(past["sensor_upper"], past["sensor_lower"]),
+        2 * 1.959963984540054e6 * believed.sensor_deviation,
+    )
+    assert np.min(past["state_lower"]) >= 0.0
+    assert np.max(past["state_upper"]) <= 80.0
+    assert answer["ahead"]["reward"][0][2] is None  # no error reward of a turn to come
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"number": 1}', "x" * 100, json.dumps(asked().__dict__ | {"turn": 1.5})]
+)
+def test_a_request_of_another_form_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"request|JSON|Expecting"):
+        parse_request(text)
+
+
+def test_the_wing_stands_in_its_place(run: Path) -> None:
+    flight, design = Flight(run), load_design()
+    planform = scene_of(run, flight.knowledge).planform
+    assert planform is not None
+    chords = planform.outline[:, 1]
+    plan = design.planform
+    assert chords[0] - chords[3] == pytest.approx(plan.root_chord)
+    assert chords[1] - chords[2] == pytest.approx(plan.tip_chord)
+    np.testing.assert_allclose(planform.gauges[:, 0], [span for span, _ in design.gauges.positions])
+    # On the straight chord line every place has the height zero.
+    assert plan.straight_chord_line * chords[2] == pytest.approx((plan.straight_chord_line - 1) * chords[1])
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Run `uav-twin view` as a user does, and end it with Ctrl-C."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "uav_twin", "view", str(folder)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    try:
+        assert select.select([process.stdout], [], [], 120.0)[0]
+        found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
+        assert found
+        yield found.group()
+    finally:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30.0) == 130
+        process.stdout.close()
+
+
+def check_that_only_this_machine_is_served(address: str) -> None:
+    port = int(address.rstrip("/").rpartition(":")[2])
+    for host, status in ((f"127.0.0.1:{port}", 200), (f"localhost:{port}", 200), ("evil.example", 404)):
+        connection = HTTPConnection("127.0.0.1", port)
+        connection.request("GET", "/", headers={"Host": host})
+        assert connection.getresponse().status == status
+        connection.close()
+    own = socket.gethostbyname(socket.gethostname())
+    if not own.startswith("127."):
+        with pytest.raises(OSError, match="refused"):
+            socket.create_connection((own, port), timeout=5.0)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
+def test_the_page_in_a_browser(begun: Path, lines: list[bytes], tmp_path: Path) -> None:
+    add(begun, *lines[:31])
+    with open_browser() as browser, served(begun) as address:
+        check_that_only_this_machine_is_served(address)
+        tabs = [browser.tab() for _ in range(3)]
+        for tab, width in zip(tabs, (1300, 400, 400), strict=True):
+            tab.go(address, width)
+        for tab in tabs:
+            tab.wait("window.painted.at(-1)[0] === 29")
+            assert tab.value("document.documentElement.scrollWidth <= innerWidth")
+            assert tab.value("views.every((view) => view.el.getBoundingClientRect().right <= innerWidth)")
+        first = tabs[0]
+        said = first.value("element('said').textContent")
+        assert re.fullmatch(
+            r"turn 29: z₁ \d+ ± \d+ %, z₂ \d+ ± \d+ %\. Flown 3g; next [23]g with probability [01]\.\d{3}\.",
+            said,
+        )
+        # Keyboard: back by one and by ten, to the start; the others stay where they are.
+        for key, turn in (("ArrowLeft", 28), ("PageUp", 18), ("Home", 0), ("ArrowLeft", 0), ("PageDown", 10)):
+            first.press(key)
+            first.wait(
+                f"state.shown === {turn} && state.wanted === {turn} && window.painted.at(-1)[0] === {turn}"
+            )
+        assert first.value("sources.past.data.turn.length") == 11
+        assert first.value("sources.ahead.data.turn") == list(range(11, 21))
+        assert tabs[1].value("state.shown") == 29
+        before = first.picture(tmp_path / "turn_10.png")
+        # A viewer that was away gets what it missed; one that looks back stays there, and knows of the rest.
+        tabs[2].value("socket.onclose = null; socket.close()")
+        add(begun, *lines[31:-1], line_of(json.loads(lines[-1][65:]) | TOLD))
+        tabs[1].wait("window.painted.at(-1)[0] === 49")
+        first.wait("state.count === 50")
+        assert first.value("state.shown") == 10
+        tabs[2].value("connect()")
+        tabs[2].wait("window.painted.at(-1)[0] === 49 && held.rows.length === 50")
+        expected = 100.0 * whole(begun).believed(0, TURNS).state_mean
+        for tab in tabs[1:]:
+            np.testing.assert_allclose(tab.value("held.rows.map((row) => row.state)"), expected)
+        assert first.value("element('told').hidden && element('learning').hidden")
+        first.press("End")
+        first.wait("window.painted.at(-1)[0] === 49")
+        assert first.value("element('latest').getAttribute('aria-pressed')") == "true"
+        assert first.picture(tmp_path / "turn_49.png") != before
+        assert first.value("element('notices').textContent") == "turn 49: Look at <b>gauge 3</b>."
+        assert first.value("element('learnt').textContent") == "e0.9512 (0.9400 to 0.9600)"
+        # Everything came from this server, and nothing went wrong.
+        for tab in tabs:
+            tab.value("1")
+            assert tab.errors == []
+            assert all(url.startswith((address, "data:", "about:")) for url in tab.requests)
+
+
+def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file: Path, run: Path, tmp_path: Path) -> None:
+    command = ["run", "level_turns", "--out", str(tmp_path / "run"), "--strain-library", str(library_file)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "uav_twin", *command, "--no-report", "--view"],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    assert process.stderr is not None
+    said = ""
+    while "http://127.0.0.1" not in said or "stays until Ctrl-C" not in said:
+        line = process.stderr.readline()
+        assert line, said
+        said += line
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(30.0) == 0, process.stderr.read()
+    process.stderr.close()
+    for name in ("run.nc", JOURNAL_NAME, KNOWLEDGE_NAME, "config.json"):
+        assert (tmp_path / "run" / name).read_bytes() == (run / name).read_bytes(), name
+
+
+def test_a_folder_without_a_run_is_one_sentence(tmp_path: Path) -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "uav_twin", "view", str(tmp_path / "none")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 1
+    assert result.stderr.startswith(f"there is no run folder {tmp_path / 'none'}")
+    assert result.stderr.count("\n") == 1

@@ -1,0 +1,72 @@
+"""What the twin of a run knew before its flight, kept in the run folder: `twin.npz`.
+
+Together with what was observed it gives every belief of the flight again, in any process and while the flight
+still goes on: a view of it costs the flight nothing.
+"""
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from reporting.files import atomic_write_bytes
+from twin_master.assets.parameter import ParameterDraws
+from twin_master.errors import RunFolderError
+from twin_master.mission.preparation import Knowledge, knowledge_of
+from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.schema import Scenario
+
+KNOWLEDGE_NAME = "twin.npz"
+
+
+def keep_knowledge(folder: Path, knowledge: Knowledge) -> None:
+    """Write what a twin knows before its flight; the bytes depend on nothing else.
+
+    The arrays are `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U).
+
+    Raises
+    ------
+    FileNotWrittenError
+        The disk is full or the folder cannot be written.
+    """
+    content = io.BytesIO()
+    np.savez(
+        content,
+        predicted=knowledge.sensor_model.value_per_draw,
+        draws=knowledge.draws.values,
+        policy=knowledge.plan.policy,
+    )
+    atomic_write_bytes(folder / KNOWLEDGE_NAME, content.getvalue())
+
+
+def kept_knowledge(folder: Path, scenario: Scenario) -> Knowledge:
+    """Return what the twin of a run knew before its flight.
+
+    Parameters
+    ----------
+    folder : Path
+        The run folder.
+    scenario : Scenario
+        Of its `config.json`.
+
+    Raises
+    ------
+    RunFolderError
+        The file is missing or damaged, or belongs to another scenario.
+    """
+    path = folder / KNOWLEDGE_NAME
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            predicted, draws, policy = (
+                np.asarray(kept[name], dtype=np.float64) for name in ("predicted", "draws", "policy")
+            )
+        calibration = scenario.calibration
+        parameter = ParameterDraws(
+            calibration.parameter, draws, float(draws.mean()), float(draws.std()), calibration.source
+        )
+        return knowledge_of(scenario, build_graphical_model(scenario), parameter, predicted, policy)
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise RunFolderError(
+            f"{path} is missing, damaged or of another scenario ({error}): fly the run again with --replace."
+        ) from error

@@ -1,0 +1,176 @@
+"""What the page shows of a flight: beliefs, decisions and predictions, from the turns in its journal.
+
+The flight itself computes nothing for its viewers. Beliefs and decisions stand in the journal; what follows
+from them is computed here, as the run does it, so that every number is that of the run.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin_master.errors import RunFolderError
+from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME, kept_knowledge
+from twin_master.mission.preparation import Knowledge
+from twin_master.network.inference import known_control, predict
+from twin_master.run_folder import read_config
+from twin_master.scenario.reading import parse_scenario
+from twin_master.scenario.schema import Scenario
+from twin_master.viewer.journal import GrowingJournal, SeenTurn
+
+Float = NDArray[np.float64]
+
+TURNS_AT_ONCE = 200
+"""Turns that are read before the viewers are answered again."""
+
+
+@dataclass(frozen=True)
+class Belief:
+    """Means and standard deviations under beliefs, SI; the leading axis is that of the turns.
+
+    Attributes
+    ----------
+    state_mean, state_deviation : (n, K)
+        Of each factor of the state.
+    reward_mean, reward_deviation : (n, R)
+        Of each reward; that of the error is NaN where nothing was observed.
+    sensor_mean, sensor_deviation : (n, G)
+        Of what each sensor shows, its noise included.
+    control_probability : (n, U)
+        Of a turn that was flown: what its next control was decided by. Of a predicted one: p(U).
+    """
+
+    state_mean: Float
+    state_deviation: Float
+    reward_mean: Float
+    reward_deviation: Float
+    sensor_mean: Float
+    sensor_deviation: Float
+    control_probability: Float
+
+
+class Flight:
+    """A run or a watch that is looked at: its turns, and what the twin concluded in each when it was there.
+
+    Parameters
+    ----------
+    folder : Path
+        The run folder, with a flight that is finished, goes on, or was interrupted.
+
+    Raises
+    ------
+    NotResumableError, RunFolderError
+        It is no run folder, or damaged, or its flight was not prepared yet (see `is_prepared`).
+
+    Attributes
+    ----------
+    number : int
+        Grows when turns were taken back, as a resumed run may do, or changed, as by an observation that came
+        late: what was told of the flight is then void.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        config = read_config(folder)
+        self.scenario: Scenario = parse_scenario(config["scenario"], str(folder))
+        self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
+        self._journal = GrowingJournal(folder)
+        self._turns: list[SeenTurn] = []
+        self.number = 0
+
+    @property
+    def turns(self) -> int:
+        """Number of turns seen so far."""
+        return len(self._turns)
+
+    def update(self) -> bool:
+        """Take in what is new in the journal, at most `TURNS_AT_ONCE`; return whether there was any.
+
+        Raises
+        ------
+        RunFolderError
+            The journal was changed.
+        """
+        begun_anew = self._journal.begun_anew()
+        if begun_anew:
+            self._turns.clear()
+            self.number += 1
+        news = self._journal.news(TURNS_AT_ONCE)
+        for seen in news:
+            if seen.turn == self.turns:
+                self._turns.append(seen)
+            else:
+                self._revise(seen)
+        return begun_anew or bool(news)
+
+    def _revise(self, seen: SeenTurn) -> None:
+        """Take in an observation that came late: it stands in its turn, and the last belief has changed."""
+        if not 0 <= seen.observation_turn <= seen.turn == self.turns - 1:
+            raise RunFolderError(
+                f"the journal in {self.folder} tells {self.scenario.mission.step_name} {seen.turn} where "
+                f"{self.turns} was expected: it is of another version."
+            )
+        late, last = seen.observation_turn, self._turns[-1]
+        self._turns[-1] = replace(seen, observed=last.observed, control_index=last.control_index)
+        self._turns[late] = replace(
+            self._turns[late], observed=seen.observed, control_index=seen.control_index
+        )
+        self.number += 1
+
+    def seen(self, first: int, end: int) -> list[SeenTurn]:
+        """Return the turns first..end - 1."""
+        return self._turns[first:end]
+
+    def observed(self, first: int, end: int) -> Float:
+        """Return what the sensors said in turns first..end - 1: (n, G), SI; NaN where lost."""
+        return np.array([turn.observed for turn in self._turns[first:end]])
+
+    def truth(self, first: int, end: int) -> Float:
+        """Return the true state of turns first..end - 1: (n, K), SI; NaN where nobody knows it."""
+        unknown = np.full(len(self.scenario.state), np.nan)
+        return np.array([unknown if turn.truth is None else turn.truth for turn in self._turns[first:end]])
+
+    def believed(self, first: int, end: int) -> Belief:
+        """Return what the twin believed of each of the turns first..end - 1 when it was flown."""
+        turns = self._turns[first:end]
+        joint = known_control(
+            np.array([turn.filtered for turn in turns]),
+            [turn.control_index for turn in turns],
+            len(self.knowledge.model.controls),
+        )
+        decided = np.array([turn.decision_probability for turn in turns])
+        return self._belief(joint, self.observed(first, end), decided)
+
+    def predicted(self, turn: int) -> Belief:
+        """Return what the twin expected after a turn of the H turns to come."""
+        model, plan = self.knowledge.model, self.knowledge.plan
+        coming = predict(
+            model,
+            self._turns[turn].filtered,
+            self._turns[turn].control_index,
+            plan.policy,
+            self.scenario.mission.prediction_steps,
+        )
+        return self._belief(coming.joint, None, coming.control_probability)
+
+    def _belief(self, joint: Float, observed: Float | None, control_probability: Float) -> Belief:
+        knowledge = self.knowledge
+        states, sensors = knowledge.model.states, knowledge.sensor_model
+        belief = joint.sum(axis=-1)
+        rewards = knowledge.rewards.expectation(joint, observed)
+        mean, spread = sensors.moments(joint)
+        return Belief(
+            states.mean(belief),
+            states.standard_deviation(belief),
+            rewards.mean,
+            rewards.standard_deviation,
+            mean,
+            np.hypot(spread, sensors.noise(joint)),
+            control_probability,
+        )
+
+
+def is_prepared(folder: Path) -> bool:
+    """Return whether the flight of a run folder can be viewed: all that precedes its first turn is there."""
+    return (folder / KNOWLEDGE_NAME).is_file()

@@ -1,0 +1,134 @@
+"""The turns of a run or a watch, read from its journal while it grows.
+
+This is the one place that knows how a journal tells its turns: see `twin_master.mission.journal`.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin_master.mission.journal import JOURNAL_NAME, array_of, damaged, record_of
+from twin_master.network.estimator import Learnt, Notice
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SeenTurn:
+    """What a line of the journal says.
+
+    Attributes
+    ----------
+    turn : int
+        The turn that the twin was at.
+    observation_turn : int
+        The turn that was observed; an earlier one where the observation came late.
+    control_index : int
+        Control in force in the turn that was observed.
+    observed : (G,)
+        What the sensors said, SI; NaN where lost.
+    truth : (K,) or None
+        True state, SI; None where nobody knows it.
+    filtered : (S,)
+        Belief about the turn that the twin was at.
+    decision_probability : (U,)
+        What its next control was decided by.
+    learnt : dict of str to Learnt
+        Posterior of what is learnt.
+    notices : tuple of Notice
+        What the operator was told.
+    """
+
+    turn: int
+    observation_turn: int
+    control_index: int
+    observed: Float
+    truth: Float | None
+    filtered: Float
+    decision_probability: Float
+    learnt: Mapping[str, Learnt]
+    notices: tuple[Notice, ...]
+
+
+class GrowingJournal:
+    """A journal that grows; each call of `news` gives the lines that were added since the last.
+
+    Parameters
+    ----------
+    folder : Path
+        The run folder; the journal need not be there yet.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / JOURNAL_NAME
+        self._begin()
+
+    def _begin(self) -> None:
+        self._end, self._lines, self._file_number = 0, 0, 0
+
+    def begun_anew(self) -> bool:
+        """Return whether another file took the place of the one read, or lines were taken back.
+
+        What was read is then forgotten, and `news` begins with the first line.
+        """
+        try:
+            found = self._path.stat()
+        except FileNotFoundError:
+            return False
+        if found.st_size >= self._end and self._file_number in (0, found.st_ino):
+            return False
+        self._begin()
+        return True
+
+    def news(self, most: int) -> list[SeenTurn]:
+        """Return the turns of whole new lines, of at most so many.
+
+        Raises
+        ------
+        NotResumableError
+            A line was changed.
+        """
+        found: list[SeenTurn] = []
+        try:
+            if self._path.stat().st_size == self._end:
+                return []
+            with self._path.open("rb") as file:
+                self._file_number = os.fstat(file.fileno()).st_ino
+                file.seek(self._end)
+                for line in file:
+                    if len(found) == most or not line.endswith(b"\n"):  # one that is being written
+                        break
+                    record = self._record(line)
+                    self._end += len(line)
+                    self._lines += 1
+                    if "filtered" in record:  # not the heading, nor what is said of the watch itself
+                        found.append(_seen(record))
+        except FileNotFoundError:
+            pass
+        return found
+
+    def _record(self, line: bytes) -> dict[str, Any]:
+        digest, _, text = line.rstrip(b"\n").partition(b" ")
+        if sha256(text).hexdigest().encode("ascii") != digest:
+            raise damaged(self._path, self._lines, "it does not have the hash that stands before it")
+        return record_of(self._path, self._lines, text)
+
+
+def _seen(record: Mapping[str, Any]) -> SeenTurn:
+    return SeenTurn(
+        turn=record["turn"],
+        observation_turn=record.get("observation_turn", record["turn"]),
+        control_index=record["control_index"],
+        observed=array_of(record["observed"]),
+        truth=array_of(record["state"]) if "state" in record else None,
+        filtered=array_of(record["filtered"]),
+        decision_probability=array_of(record["decision_probability"]),
+        learnt={name: Learnt(**learnt) for name, learnt in record.get("learnt", {}).items()},
+        notices=tuple(Notice(**notice) for notice in record.get("notices", ())),
+    )

@@ -1,0 +1,175 @@
+"""What the page is told: the turns that it has not got, and what was expected after the turn that it shows.
+
+A viewer asks with the turns that it holds and the turn that it shows; the answer follows from these alone.
+One that was away, or is slow, asks for more at once, and nothing is kept for it.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin_master.viewer.flight import Belief, Flight
+from twin_master.viewer.scene import NORMAL_95, Scene
+
+Float = NDArray[np.float64]
+
+WINDOW = 240
+"""Turns that a page shows at once."""
+LATEST = -1
+"""Asked for in the place of a turn: the last one, whichever it is."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a page asks for.
+
+    Attributes
+    ----------
+    number : int
+        Of the request; the answer has it again.
+    flight : int
+        Of which flight the turns are that it holds.
+    first, end : int
+        It holds the turns first..end - 1.
+    turn : int
+        To be shown; `LATEST` for the last.
+    shown, count : int
+        The turn that it shows, and how many it knows of; -1 before the first answer.
+    """
+
+    number: int
+    flight: int
+    first: int
+    end: int
+    turn: int
+    shown: int
+    count: int
+
+
+def parse_request(text: str | bytes) -> Request:
+    """Return what a page asked for.
+
+    Raises
+    ------
+    ValueError
+        It is no such request.
+    """
+    content = json.loads(text)
+    names = Request.__dataclass_fields__
+    if not isinstance(content, dict) or set(content) != set(names):
+        raise ValueError(f"a request is an object with {', '.join(names)}")
+    if not all(type(value) is int for value in content.values()):
+        raise ValueError("a request holds whole numbers only")
+    return Request(**content)
+
+
+class Teller:
+    """Answers of one flight, for any number of viewers.
+
+    Parameters
+    ----------
+    flight : Flight
+        What is watched.
+    scene : Scene
+        Printed units.
+    """
+
+    def __init__(self, flight: Flight, scene: Scene) -> None:
+        self._flight = flight
+        self._scene = scene
+        self._kept: dict[tuple[str, int, int, int], str] = {}
+
+    def answer(self, request: Request) -> str | None:
+        """Return the answer to a request; None while there is nothing new to say."""
+        count = self._flight.turns
+        if not count:
+            return None
+        turn = count - 1 if request.turn == LATEST else min(max(request.turn, 0), count - 1)
+        same = request.flight == self._flight.number
+        if same and request.shown == turn and request.count == count:
+            return None
+        first, end = max(0, turn + 1 - WINDOW), turn + 1
+        if same and request.first <= first <= request.end:  # what is missing follows what it holds
+            first = min(request.end, end)
+        heading = {
+            "number": request.number,
+            "flight": self._flight.number,
+            "count": count,
+            "turn": turn,
+            "first": first,
+        }
+        past = self._text("past", first, end) if first < end else "null"
+        ahead = "null" if same and request.shown == turn else self._text("ahead", turn, turn + 1)
+        return f'{json.dumps(heading)[:-1]}, "past": {past}, "ahead": {ahead}}}'
+
+    def _text(self, what: str, first: int, end: int) -> str:
+        """Return a part of an answer; viewers that follow a flight ask for the same one."""
+        key = (what, self._flight.number, first, end)
+        if key not in self._kept:
+            if len(self._kept) > 8:
+                self._kept.clear()
+            record = self._past(first, end) if what == "past" else self._ahead(first)
+            self._kept[key] = json.dumps(record, allow_nan=False)
+        return self._kept[key]
+
+    def _past(self, first: int, end: int) -> dict[str, Any]:
+        flight, scene = self._flight, self._scene
+        believed, observed = flight.believed(first, end), flight.observed(first, end)
+        scales = np.array([factor.scale for factor in scene.factors])
+        return self._printed(believed, observed) | {
+            "control": [turn.control_index for turn in flight.seen(first, end)],
+            "notices": [[notice.sentence for notice in turn.notices] for turn in flight.seen(first, end)],
+            "learnt": [
+                {name: asdict(learnt) for name, learnt in turn.learnt.items()}
+                for turn in flight.seen(first, end)
+            ],
+            "truth": _plain(scales * flight.truth(first, end)),
+        }
+
+    def _ahead(self, turn: int) -> dict[str, Any]:
+        return self._printed(self._flight.predicted(turn), None)
+
+    def _printed(self, belief: Belief, observed: Float | None) -> dict[str, Any]:
+        """Return lists, a row for each turn, in printed units; None stands for what there is not."""
+        scene = self._scene
+        scales = np.array([factor.scale for factor in scene.factors])
+        levels = np.array([(factor.lowest, factor.highest) for factor in scene.factors]).T
+        mean, reach = scales * belief.state_mean, 2.0 * scales * belief.state_deviation
+        reward, reward_reach = belief.reward_mean, NORMAL_95 * belief.reward_deviation
+        center, spread = belief.sensor_mean, belief.sensor_deviation
+        if scene.sensors.standardised:
+            observed = None if observed is None else (observed - center) / spread
+            center, spread = np.zeros_like(center), np.ones_like(spread)
+        scale, sensor_reach = scene.sensors.scale, NORMAL_95 * spread
+        record = {
+            "state": mean,
+            "state_lower": np.clip(mean - reach, *levels),
+            "state_upper": np.clip(mean + reach, *levels),
+            "state_deviation": 0.5 * reach,
+            "reward": reward,
+            "reward_lower": reward - reward_reach,
+            "reward_upper": reward + reward_reach,
+            "sensor": scale * center,
+            "sensor_lower": scale * (center - sensor_reach),
+            "sensor_upper": scale * (center + sensor_reach),
+            "probability": belief.control_probability,
+        }
+        if observed is not None:
+            record["observed"] = scale * observed
+        return {name: _plain(values) for name, values in record.items()}
+
+
+def scene_record(scene: Scene) -> dict[str, Any]:
+    """Return what the page must know before its first request, ready for JSON."""
+    record = asdict(scene)
+    del record["planform"]
+    return record | {"window": WINDOW, "latest": LATEST}
+
+
+def _plain(values: Float) -> list[Any]:
+    plain = values.astype(object)
+    plain[~np.isfinite(values)] = None
+    return list(plain.tolist())

@@ -1,0 +1,185 @@
+"""The server of the page: on the loopback only, everything from the package, nothing from outside."""
+
+import asyncio
+import json
+import os
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+
+from bokeh.util.paths import bokehjs_path
+from tornado.httpserver import HTTPServer
+from tornado.ioloop import PeriodicCallback
+from tornado.netutil import bind_sockets
+from tornado.web import Application, RequestHandler, StaticFileHandler
+from tornado.websocket import WebSocketClosedError, WebSocketHandler
+
+from reporting.errors import ReportingError
+from twin_master.errors import TwinMasterError, ViewError
+from twin_master.viewer.flight import Flight
+from twin_master.viewer.messages import Request, Teller, parse_request, scene_record
+from twin_master.viewer.page import TALLEST_BAR, page_html
+from twin_master.viewer.scene import scene_of
+
+ADDRESS = "127.0.0.1"
+POLL_MILLISECONDS = 15.0
+"""How often the run folder is looked at; a look takes some microseconds."""
+_SECONDS_BETWEEN = 0.5
+LONGEST_REQUEST = 4096
+"""Bytes."""
+
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; connect-src 'self' ws:; img-src 'self' data: blob:; "
+    "style-src 'self' 'unsafe-inline'; script-src 'self'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
+
+
+class _Viewers:
+    """The pages that are open, and what each waits for."""
+
+    def __init__(self, flight: Flight, teller: Teller) -> None:
+        self._flight = flight
+        self._teller = teller
+        self._waiting: dict[_Turns, Request] = {}
+        self._fault = ""
+
+    def ask(self, viewer: "_Turns", request: Request) -> None:
+        """Answer a viewer now or as soon as there is something new; a newer request replaces an older one."""
+        self._waiting[viewer] = request
+        self._answer(viewer)
+
+    def leave(self, viewer: "_Turns") -> None:
+        """Forget a viewer."""
+        self._waiting.pop(viewer, None)
+
+    def look(self) -> None:
+        """Take in what was flown, and answer those who wait for it."""
+        if self._fault:
+            return
+        try:
+            if not self._flight.update():
+                return
+        except (TwinMasterError, ReportingError) as error:
+            self._fault = str(error)
+        for viewer in list(self._waiting):
+            self._answer(viewer)
+
+    def _answer(self, viewer: "_Turns") -> None:
+        if self._fault:
+            viewer.tell(json.dumps({"error": self._fault}))
+        answer = self._teller.answer(self._waiting[viewer])
+        if answer is not None:
+            del self._waiting[viewer]
+            viewer.tell(answer)
+
+
+class _Turns(WebSocketHandler):
+    """One open page."""
+
+    def initialize(self, viewers: _Viewers) -> None:
+        self._viewers = viewers
+
+    def on_message(self, message: str | bytes) -> None:
+        try:
+            self._viewers.ask(self, parse_request(message))
+        except ValueError as error:
+            self.close(1003, str(error)[:100])
+
+    def on_close(self) -> None:
+        self._viewers.leave(self)
+
+    def tell(self, text: str) -> None:
+        try:
+            self.write_message(text)
+        except WebSocketClosedError:
+            self._viewers.leave(self)
+
+
+class _Text(RequestHandler):
+    """A text of the package."""
+
+    def initialize(self, text: str, kind: str) -> None:
+        self._text, self._kind = text, kind
+
+    def set_default_headers(self) -> None:
+        for name, value in _HEADERS.items():
+            self.set_header(name, value)
+
+    def get(self) -> None:
+        self.set_header("Content-Type", f"{self._kind}; charset=utf-8")
+        self.write(self._text)
+
+
+def _application(flight: Flight, viewers: _Viewers) -> Application:
+    scene = scene_of(flight.folder, flight.knowledge)
+    page = page_html(scene, scene_record(scene) | {"tallest_bar": TALLEST_BAR})
+    package = resources.files(__package__)
+    texts = [
+        ("/", page, "text/html"),
+        *(
+            (f"/{name}", package.joinpath(name).read_text(encoding="utf-8"), kind)
+            for name, kind in (("view.js", "text/javascript"), ("view.css", "text/css"))
+        ),
+    ]
+    application = Application(websocket_max_message_size=LONGEST_REQUEST, websocket_ping_interval=20)
+    # A page of another site that lets its name point here would come with that name.
+    application.add_handlers(
+        r"(localhost|127\.0\.0\.1)(:\d+)?",
+        [
+            *((path, _Text, {"text": text, "kind": kind}) for path, text, kind in texts),
+            ("/turns", _Turns, {"viewers": viewers}),
+            ("/bokeh/(bokeh.min.js)", StaticFileHandler, {"path": str(Path(bokehjs_path()) / "js")}),
+        ],
+    )
+    return application
+
+
+async def _serve(flight: Flight, port: int, ready: Callable[[str], None], wanted: Callable[[], bool]) -> None:
+    teller = Teller(flight, scene_of(flight.folder, flight.knowledge))
+    viewers = _Viewers(flight, teller)
+    server = HTTPServer(_application(flight, viewers), max_body_size=LONGEST_REQUEST)
+    try:
+        sockets = bind_sockets(port, ADDRESS)
+    except OSError as error:
+        raise ViewError(
+            f"port {port} of {ADDRESS} cannot be taken ({os.strerror(error.errno or 0)}): "
+            "choose another --port."
+        ) from error
+    server.add_sockets(sockets)
+    looking = PeriodicCallback(viewers.look, POLL_MILLISECONDS)
+    looking.start()
+    ready(f"http://{ADDRESS}:{sockets[0].getsockname()[1]}/")
+    try:
+        while wanted():
+            await asyncio.sleep(_SECONDS_BETWEEN)
+    finally:
+        looking.stop()
+        server.stop()
+
+
+def serve(
+    folder: Path, port: int, ready: Callable[[str], None], wanted: Callable[[], bool] = lambda: True
+) -> None:
+    """Show the flight of a run folder to browsers of this machine, until the process is interrupted.
+
+    Parameters
+    ----------
+    folder : Path
+        With a flight that is finished or goes on.
+    port : int
+        0 for any that is free.
+    ready : callable
+        Called with the address once it answers.
+    wanted : callable
+        Asked now and then; once it says no, the server ends.
+
+    Raises
+    ------
+    NotResumableError, RunFolderError
+        There is no such run, or it is damaged.
+    ViewError
+        The port is taken.
+    """
+    asyncio.run(_serve(Flight(folder), port, ready, wanted))
