@@ -6,6 +6,7 @@ from enum import StrEnum
 from math import nan
 
 from .document_types import Number, Patch
+from .location.change_points import GapWindow
 
 
 class VerdictKind(StrEnum):
@@ -263,6 +264,9 @@ class Verdict:
         Of the best hypothesis.
     not_fitted : tuple of NotFitted
         Effects of the catalogue that were not.
+    windows : tuple of GapWindow
+        Since when and until when there is a gap in each record: of the model as it was, and of what the best
+        hypothesis leaves.
     """
 
     kind: VerdictKind
@@ -281,3 +285,4 @@ class Verdict:
     explained: ExplainedShare | None = None
     remainders: tuple[RemainderEstimate, ...] = ()
     not_fitted: tuple[NotFitted, ...] = ()
+    windows: tuple[GapWindow, ...] = ()

@@ -29,6 +29,8 @@ from discrepancy.judgement.look_alikes import look_alike_remark, with_untested
 from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
+from discrepancy.judgement.when import begins_inside, when_sentence
+from discrepancy.location.change_points import GapWindow, gap_windows
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.models.interface import Model
@@ -189,9 +191,13 @@ def investigate(
         before = residual_set(problem, search.none, sensitivities=thorough)
         after = residual_set(problem, fit, sensitivities=False) if fit is not search.none else before
     location = None
+    windows: tuple[GapWindow, ...] = ()
     if thorough:
         with stage("Locating the gap", "locate"):
             location = locate(before, seed=seed)
+            windows = location.windows
+            if after is not before:
+                windows += gap_windows(after, seed=seed, with_effect=True)
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     proof = None
@@ -203,12 +209,20 @@ def investigate(
         with stage("Looking for the next experiment", "next"):
             experiments = next_experiments(problem, open_hypotheses(search))
     verdict = replace(
-        verdict, remarks=tuple(remarks), next_experiments=experiments,
-        not_fitted=not_fitted(problem.setting, catalogue, search),
+        verdict, sentence=_dated(verdict, windows), remarks=tuple(remarks), next_experiments=experiments,
+        not_fitted=not_fitted(problem.setting, catalogue, search), windows=windows,
     )  # fmt: skip
     return Investigation(
         campaign, model, faults, verdict, location, proof, before, after, problem, search, fit, seconds
     )
+
+
+def _dated(verdict: Verdict, windows: tuple[GapWindow, ...]) -> str:
+    """Return the sentence of a verdict, with when the gap is there where that tells something."""
+    known = verdict.kind is VerdictKind.NOTHING_MISSING or verdict.kind is VerdictKind.BELOW_LIMIT
+    if known or not (begins_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED):
+        return verdict.sentence
+    return f"{verdict.sentence} {when_sentence(windows)}".strip()
 
 
 def _remarks(

@@ -235,6 +235,7 @@ def _packing(choice: "ModelChoice", progress: "Progress") -> "Pack":
 
 def _show(found: "Investigation", folder: Path, console: "Console") -> None:
     from discrepancy.files.patch import PATCH_NAME, read_patch
+    from discrepancy.judgement.when import when_sentence
     from discrepancy.report.sizes import size_sentence
     from discrepancy.report.text import (
         estimate_text,
@@ -257,6 +258,9 @@ def _show(found: "Investigation", folder: Path, console: "Console") -> None:
     for sentence in (shares_sentence(verdict), remainders_sentence(verdict)):
         if sentence:
             console.print(sentence, soft_wrap=True)
+    when = when_sentence(verdict.windows)
+    if when and when not in verdict.sentence:
+        console.print(when, soft_wrap=True)
     if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
         against = f", ln Bayes factor against nothing missing {verdict.log_bayes_factor:.1f}"
         none = verdict.kind is VerdictKind.NOTHING_MISSING

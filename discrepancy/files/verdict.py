@@ -16,7 +16,7 @@ VERDICT_SCHEMA = "uav-twin verdict 2"
 """Value of the key `schema`; files of number 1 are read too."""
 FIRST_SCHEMA = "uav-twin verdict 1"
 VERDICT_NAME = "verdict.json"
-LATER_KEYS: dict[str, Any] = {"explained": None, "remainders": [], "not_fitted": []}
+LATER_KEYS: dict[str, Any] = {"explained": None, "remainders": [], "not_fitted": [], "windows": []}
 """Keys of the verdict that files of number 1 lack."""
 
 

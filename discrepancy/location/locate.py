@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.noise_tests import holm, variance_p_value
 from discrepancy.errors import FitError
+from discrepancy.location.change_points import GapWindow, gap_windows
 from discrepancy.location.dependence import (
     Explanation,
     explanations,
@@ -95,6 +96,8 @@ class Location:
     remarks : tuple of str
         Limits: a missing noise record, noise that is not white, residuals smaller than the noise, a map by
         the residuals' own scale.
+    windows : tuple of GapWindow
+        Since when and until when there is a gap in the records in time, those held out too.
     """
 
     disagrees: bool
@@ -104,6 +107,7 @@ class Location:
     explanations: tuple[Explanation, ...]
     disagreements: tuple[Disagreement, ...]
     remarks: tuple[str, ...]
+    windows: tuple[GapWindow, ...] = ()
 
 
 def locate(
@@ -162,6 +166,7 @@ def locate(
         explanations=explained,
         disagreements=_disagreements(fitted, white, explained, patterns, frequencies) if disagrees else (),
         remarks=(*coloured.values(), *_noise_remarks(fitted), *own),
+        windows=gap_windows(residuals, seed=seed),
     )
 
 

@@ -22,6 +22,7 @@ from discrepancy.report.motion_figures import (
 )
 from discrepancy.report.residual_figures import heat_figure, load_figure, planform_figure
 from discrepancy.report.text import listing
+from discrepancy.report.time_line import time_line_figure
 from discrepancy.workflow import Investigation
 from reporting.figures import to_svg
 
@@ -65,6 +66,15 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
             "Static trials and flights, all channels of a quantity in one panel; open marks are held-out "
             "trials. A "
             "slope is a stiffness or a gain, an offset a zero, a bend a nonlinearity.",
+        )  # fmt: skip
+        windows = content.investigation.verdict.windows
+        left = " The thin bars below are what the hypothesis leaves." if any(
+            item.with_effect for item in windows
+        ) else ""  # fmt: skip
+        add(
+            "time_line", time_line_figure(windows), "When the gap is there",
+            "Bars: the residual of a record is more than noise; the colour is its root mean square over the "
+            f"noise. Brackets are 90 % intervals of begin and end.{left}",
         )  # fmt: skip
         _add_worst_record(before, after, add)
         _add_motion(before, after, add)

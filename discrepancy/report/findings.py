@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from math import isfinite, isnan
 
 from discrepancy.judgement.conclusion import named_effects
+from discrepancy.judgement.when import when_sentence
 from discrepancy.report.content import ReportInput
 from discrepancy.report.sizes import definite_unit, size_sentence
 from discrepancy.report.text import (
@@ -188,6 +189,8 @@ def add_next(page: Page, investigation: Investigation) -> None:
         "the mutual "
         "information of hypothesis and data, by simulation; ln 2 = 0.69 nat decides between two equals."
     )
+    if sentence := when_sentence(investigation.verdict.windows):
+        page.add_paragraph(sentence)
     page.add_table(
         Table(
             (

@@ -58,7 +58,7 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
         add_next(page, investigation)
     page.add_section("Where the gap is")
     add_location(page, investigation)
-    show("residual_map", "residual_table")
+    show("residual_map", "residual_table", "time_line")
     page.add_section("What it looks like")
     show("history", "backbone", "restoring_force", "spectrum", "load")
     page.add_section("Why this verdict")

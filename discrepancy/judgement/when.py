@@ -1,0 +1,50 @@
+"""Since when, until when: the windows of a gap in words."""
+
+from collections.abc import Sequence
+from math import floor, log10
+
+from discrepancy.location.change_points import GapWindow, Moment
+
+TOLD = 3
+"""Windows told in a sentence; the others are in the file."""
+
+
+def moment_text(moment: Moment) -> str:
+    """Return a time with its 90 % interval, by two digits of its width."""
+    width = moment.high - moment.low
+    places = max(0, 1 - floor(log10(width))) if width > 0.0 else 6
+    low, high = f"{moment.low:.{places}f}", f"{moment.high:.{places}f}"
+    return f"{moment.value:.{places}f} s ({low} to {high})"
+
+
+def window_text(window: GapWindow) -> str:
+    """Return since when and until when, in words."""
+    if window.begin is None and window.end is None:
+        return "throughout the record"
+    if window.begin is None:
+        assert window.end is not None
+        return f"from the first sample until {moment_text(window.end)}"
+    if window.end is None:
+        return f"since {moment_text(window.begin)}, to the end of the record"
+    return f"since {moment_text(window.begin)} until {moment_text(window.end)}"
+
+
+def when_sentence(windows: Sequence[GapWindow]) -> str:
+    """Return when the gap of the model as it was is there, in one sentence; empty without a gap in time."""
+    found = [window for window in windows if not window.with_effect]
+    if not found:
+        return ""
+    if all(window.begin is None and window.end is None for window in found):
+        return "The gap is there throughout the records."
+    told = sorted(found, key=lambda window: (window.begin is None, -window.size))[:TOLD]
+    parts = [
+        f"in {window.trial!r} {window_text(window)}, {window.size:.2g} times the noise" for window in told
+    ]
+    more = len(found) - len(told)
+    rest = f"; and {more} more" if more else ""
+    return f"The gap is there {'; '.join(parts)}{rest}."
+
+
+def begins_inside(windows: Sequence[GapWindow]) -> bool:
+    """Whether the gap of the model as it was has a begin in a record: something happened there."""
+    return any(window.begin is not None for window in windows if not window.with_effect)

@@ -1,0 +1,81 @@
+"""The time line of the gap: when each record holds one, as the model was and with the effect."""
+
+from collections.abc import Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+from discrepancy.location.change_points import GapWindow, Moment
+from discrepancy.report.residual_figures import scale_of
+from reporting.figures import LEVELS, OBSERVED, REFERENCE, new_figure, publication_style
+
+MOST_RECORDS = 12
+"""Records that are drawn; those with the largest gaps go first."""
+LONGEST_NAME = 26
+_WIDTH = 6.0  # inches: narrower than other figures, so that its letters are larger on a small screen
+
+
+def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
+    """Draw the windows of the records with the largest gaps; None without a window."""
+    if not windows:
+        return None
+    sizes: dict[str, float] = {}
+    for window in windows:
+        sizes[window.trial] = max(sizes.get(window.trial, 0.0), window.size)
+    largest = set(sorted(sizes, key=lambda name: -sizes[name])[:MOST_RECORDS])
+    trials = [name for name in sizes if name in largest]
+    norm = scale_of([window.size for window in windows])
+    both = any(window.with_effect for window in windows)
+    height = 0.42 * len(trials) + 1.15
+    with publication_style():
+        figure = new_figure(height, _WIDTH)
+        figure.set_layout_engine("constrained")
+        axes = figure.add_subplot()
+        for row, name in enumerate(trials):
+            own = [window for window in windows if window.trial == name]
+            _draw_record(axes, row, own, norm, both=both)
+        axes.set_yticks(range(len(trials)), [_short(name) for name in trials], fontsize=9.0)
+        axes.set_ylim(len(trials) - 0.4, -0.6)
+        axes.tick_params(axis="y", length=0)
+        axes.tick_params(axis="x", labelsize=9.0)
+        axes.spines["left"].set_visible(False)
+        axes.set_xlabel("time since the start of the trial, s", fontsize=9.0)
+        bar = figure.colorbar(ScalarMappable(norm, LEVELS), ax=axes, fraction=0.045, pad=0.02, aspect=14)
+        bar.set_label("rms / noise", fontsize=9.0)
+        top = float(norm.vmax or 1.0)
+        bar.ax.yaxis.set_major_locator(LogLocator(10.0, (1.0, 3.0) if top < 50.0 else (1.0,)))
+        bar.ax.yaxis.set_minor_locator(NullLocator())
+        bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        bar.outline.set_linewidth(0.5)
+    return figure
+
+
+def _draw_record(axes: Axes, row: int, windows: Sequence[GapWindow], norm: Normalize, *, both: bool) -> None:
+    first, last = windows[0].first, windows[0].last
+    for middle in (row - 0.14, row + 0.2) if both else (row,):
+        axes.plot([first, last], [middle, middle], color=REFERENCE, lw=1.0, zorder=1)
+    for window in windows:
+        begin = first if window.begin is None else window.begin.value
+        end = last if window.end is None else window.end.value
+        low, height = (row + 0.1, 0.2) if window.with_effect else (row - 0.34, 0.4 if both else 0.68)
+        colour = ScalarMappable(norm, LEVELS).to_rgba(window.size)
+        axes.broken_barh(
+            [(begin, end - begin)], (low, height), facecolor=colour, edgecolor="#333333", lw=0.5, zorder=2
+        )
+        for moment in (window.begin, window.end):
+            if moment is not None:
+                _draw_moment(axes, moment, low + 0.5 * height, height)
+
+
+def _draw_moment(axes: Axes, moment: Moment, middle: float, height: float) -> None:
+    axes.plot([moment.low, moment.high], [middle, middle], color="white", lw=2.6, zorder=3)
+    axes.plot([moment.low, moment.high], [middle, middle], color=OBSERVED, lw=1.2, zorder=4)
+    for at in (moment.low, moment.high):
+        axes.plot([at, at], [middle - 0.3 * height, middle + 0.3 * height], color=OBSERVED, lw=0.9, zorder=4)
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}\N{HORIZONTAL ELLIPSIS}"
