@@ -108,6 +108,9 @@ class SearchSettings:
     """Prior deviations beyond which a shared unknown says the same."""
     beginning: float = 4.0
     """Periods of the first mode that are fitted before the whole record: phases have not slipped yet."""
+    telling: float = 100.0
+    """Excess of the sum of squares [sigma^2] by which a gap has begun: until then the model is right, and a
+    record that ended there would tell nothing of any effect."""
     least_samples: int = 60
     """Samples that a beginning has at least."""
     promising: float = 0.3

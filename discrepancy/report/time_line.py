@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -61,7 +62,7 @@ def _draw_record(axes: Axes, row: int, windows: Sequence[GapWindow], norm: Norma
         begin = first if window.begin is None else window.begin.value
         end = last if window.end is None else window.end.value
         low, height = (row + 0.1, 0.2) if window.with_effect else (row - 0.34, 0.4 if both else 0.68)
-        colour = ScalarMappable(norm, LEVELS).to_rgba(window.size)
+        colour = colormaps[LEVELS](float(norm(window.size)))
         axes.broken_barh(
             [(begin, end - begin)], (low, height), facecolor=colour, edgecolor="#333333", lw=0.5, zorder=2
         )

@@ -26,6 +26,13 @@ from .starting_points import starts
 FloatArray = NDArray[np.float64]
 
 
+def gap_row(residual: FloatArray) -> int:
+    """Return the row of a residual (N, C) by which it has more than noise to tell; N where it has not."""
+    excess = np.cumsum(np.sum(residual**2 - (residual != 0.0), axis=1))
+    told = np.flatnonzero(excess > SEARCH.telling)
+    return int(told[0]) if len(told) else len(residual)
+
+
 class Beginnings:
     """A problem beside itself with the beginnings of its dynamic records only.
 
@@ -35,23 +42,28 @@ class Beginnings:
         With whole records.
     tell : callable
         Takes a few words on what is fitted, and how much is left.
+    residuals : sequence of (N, C) ndarray, optional
+        Of the model as it is, by trial. A record whose gap begins late, or whose first rows are blank, is
+        followed until so long after the gap has begun.
     """
 
-    def __init__(self, problem: Problem, tell: Tell = in_silence) -> None:
-        self.problem, self._tell = problem, tell
+    def __init__(
+        self, problem: Problem, tell: Tell = in_silence, residuals: Sequence[FloatArray] = ()
+    ) -> None:
+        self.problem, self._tell, self.residuals = problem, tell, residuals
 
     @cached_property
     def short(self) -> Problem:
         """The problem with the beginnings of its dynamic records."""
         period = 2.0 * np.pi / self.problem.setting.scales.angular_frequency
         trials = []
-        for data in self.problem.trials:
+        for number, data in enumerate(self.problem.trials):
             trial = data.trial
             count = len(trial.time)
             if trial.is_dynamic:
-                count = min(
-                    count, max(SEARCH.least_samples, ceil(SEARCH.beginning * period / trial.interval))
-                )
+                least = max(SEARCH.least_samples, ceil(SEARCH.beginning * period / trial.interval))
+                late = gap_row(self.residuals[number]) if self.residuals else 0
+                count = min(count, least if late < least else late + least)
             trials.append(shortened(trial, count))
         return self.problem.with_trials(tuple(trials))
 

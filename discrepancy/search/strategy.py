@@ -41,7 +41,7 @@ class Search(Hypotheses):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.beginnings = Beginnings(self.problem, self.tell)
+        self.beginnings = Beginnings(self.problem, self.tell, self.none.residuals)
 
     def screened(self, base: CandidateFit, effects: Iterable[Effect]) -> dict[str, list[Change]]:
         """Return for each effect its most promising changes, best first, at different places or values."""

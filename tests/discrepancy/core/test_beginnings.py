@@ -8,7 +8,7 @@ import pytest
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.linearisation import Point
-from discrepancy.search.growing_records import Beginnings
+from discrepancy.search.growing_records import Beginnings, gap_row
 from discrepancy.search.starting_points import are_related
 
 
@@ -39,3 +39,11 @@ def test_a_relative_is_reached_from_what_is_taken_for_it(bench, catalogue, hidde
     first = min(found, key=lambda item: item.objective)
     assert first.candidate.identifiers == (hidden,)
     assert first.objective == pytest.approx(best.objective, abs=0.1)
+
+
+def test_a_record_is_followed_until_its_gap_has_begun() -> None:
+    residual = np.random.default_rng(1).standard_normal((500, 2))
+    residual[:40] = 0.0  # blanks
+    assert gap_row(residual) == 500
+    residual[300:, 1] += 6.0
+    assert 300 <= gap_row(residual) <= 305
