@@ -145,6 +145,12 @@ class SearchSettings:
     """Explained share within which it does, if held-out data do not tell the two apart."""
     least_share: float = 0.5
     """Lower end of the explained share that a name in part needs."""
+    told_by_data: float = 0.8
+    """Prior deviations below which a shape is known from the data, so that a verdict tells it."""
+    sliver: float = 0.004
+    """Share of the gap below which one more effect has to earn its place against a remainder."""
+    sliver_gain: float = 10.0
+    """By how much the evidence of a set with such an effect must be above that of the set without it."""
     stand_in_range: float = 3.0
     """Prior deviations beyond which a stand-in (clock, gain, drift, line) names nothing in part."""
     least_periods: float = 3.0

@@ -172,6 +172,31 @@ def _held_ports(preferred: tuple[str, ...], setting: Setting) -> tuple[str, ...]
     return tuple(port for port in _ports(preferred, setting) if port not in free)
 
 
+ONE_WAY = "No port has a motion that turns: one that goes one way shows no memory and no zero."
+
+
+def turning(places: Places) -> Places:
+    """Return those of `places` whose motion turns or is held, for forces with a memory or a zero.
+
+    What moves one way only, a body that falls, cannot tell such a force from drag: speed and way grow as one.
+    """
+    return partial(_turning, places)
+
+
+def _turning(places: Places, setting: Setting) -> tuple[str, ...]:
+    ports = setting.scales.ports
+    return tuple(name for name in places(setting) if name not in ports or ports[name].turns)
+
+
+def turns_somewhere(places: Places) -> Check:
+    """Return the check that one of the places turns; where there is none at all, others say so."""
+    return partial(_goes_one_way, places)
+
+
+def _goes_one_way(places: Places, setting: Setting) -> str | None:
+    return ONE_WAY if places(setting) and not _turning(places, setting) else None
+
+
 def over_the_planform(*beside: str) -> Places:
     """Return the places of a force that is spread over the structure, and of the like at ports `beside`.
 

@@ -10,6 +10,8 @@ from discrepancy.catalogue.building import (
     needs,
     port_scale,
     removed_stiffness,
+    turning,
+    turns_somewhere,
 )
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting, ShapeParameter
 from fe.runtime.patch import BoucWen, MicroSlip, ModelPatch
@@ -68,8 +70,8 @@ JOINT_MICRO_SLIP = Effect(
             "chi", "chi", "exponent of the density of slip displacements", -0.5, Prior("uniform", -0.95, 0.0)
         ),
     ),
-    places=at_ports("root", "tip"),
-    unavailable=needs(carried(MicroSlip), has_port),
+    places=turning(at_ports("root", "tip")),
+    unavailable=needs(carried(MicroSlip), has_port, turns_somewhere(at_ports())),
     confusable=(
         "bouc_wen_hysteresis",
         "quadratic_damping",
@@ -106,8 +108,8 @@ BOUC_WEN_HYSTERESIS = Effect(
     ),
     build=_bouc_wen,
     shape=(ShapeParameter("order", "n", "sharpness of the yield", 1.0, Prior("uniform", 0.5, 4.0)),),
-    places=at_ports("root", "tip"),
-    unavailable=needs(carried(BoucWen), has_port),
+    places=turning(at_ports("root", "tip")),
+    unavailable=needs(carried(BoucWen), has_port, turns_somewhere(at_ports())),
     confusable=("joint_micro_slip", "quadratic_damping", "coulomb_friction", "cubic_stiffness"),
 )
 

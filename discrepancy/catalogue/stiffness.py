@@ -19,6 +19,8 @@ from discrepancy.catalogue.building import (
     somewhere,
     trial_of,
     trials,
+    turning,
+    turns_somewhere,
 )
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting, ShapeParameter
 from fe.runtime.patch import FreePlay, ModelPatch, PowerStiffness, RunOffset, StiffnessDrift
@@ -111,8 +113,8 @@ CUBIC_STIFFNESS = Effect(
             Prior("uniform", -1.0, 1.0),
         ),
     ),
-    places=over_the_planform("tip"),
-    unavailable=needs(carried(PowerStiffness), has_port),
+    places=turning(over_the_planform("tip")),
+    unavailable=needs(carried(PowerStiffness), has_port, turns_somewhere(at_ports())),
     confusable=("breathing_crack", "free_play", "stiffness_drift", "joint_micro_slip"),
 )
 
@@ -137,7 +139,7 @@ BREATHING_CRACK = Effect(
     build=_breathing_crack,
     shape=(ShapeParameter("exponent", "n", "exponent of the displacement", 1.0, Prior("uniform", 0.4, 3.0)),),
     places=_skins,
-    unavailable=needs(carried(PowerStiffness), has_port),
+    unavailable=needs(carried(PowerStiffness), has_port, turns_somewhere(at_ports())),
     confusable=("cubic_stiffness", "free_play", "root_compliance"),
 )
 
@@ -167,8 +169,8 @@ FREE_PLAY = Effect(
         ),
     ),
     build=_free_play,
-    places=at_ports("root"),
-    unavailable=needs(carried(FreePlay), has_port),
+    places=turning(at_ports("root")),
+    unavailable=needs(carried(FreePlay), has_port, turns_somewhere(at_ports())),
     confusable=("seating_offset", "cubic_stiffness", "breathing_crack", "coulomb_friction"),
 )
 

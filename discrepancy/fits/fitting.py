@@ -279,11 +279,12 @@ class _Descent:
         parts: list[Linearisation] = []
         residuals, responses = [], []
         for number in range(len(problem.trials)):
-            part = problem.linearise(
-                number, point, self.candidate, self.base, derivatives=derivatives,
-                known=None if known is None else known[number], effect_steps=self.deviation,
-                central=self.central,
-            )  # fmt: skip
+            with np.errstate(over="ignore", invalid="ignore"):  # a step too long, which is taken back
+                part = problem.linearise(
+                    number, point, self.candidate, self.base, derivatives=derivatives,
+                    known=None if known is None else known[number], effect_steps=self.deviation,
+                    central=self.central,
+                )  # fmt: skip
             parts.append(part)
             responses.append(part.response)
             residuals.append(problem.residual(number, point, part.response))
@@ -293,14 +294,8 @@ class _Descent:
         for data, u in zip(problem.trials, point.local, strict=True):
             prior += 0.5 * float(data.unknowns.precision @ u**2)
         objective = problem.misfit(sums) + problem.log_determinant(point) + prior
-        return _State(
-            point,
-            objective if np.isfinite(objective) else np.inf,
-            tuple(residuals),
-            tuple(responses),
-            sums,
-            tuple(parts),
-        )
+        objective = objective if np.isfinite(objective) else np.inf
+        return _State(point, objective, tuple(residuals), tuple(responses), sums, tuple(parts))
 
     def step(self, state: _State, damping: float) -> tuple[Point, float]:
         """Return the step and the decrease it promises [nat]."""
@@ -362,6 +357,8 @@ def _step(
         gradient_part = block.shared_gradient - block.cross.T @ inner_gradient
         np.add.at(gradient, block.index, gradient_part)
         eliminated.append((inner, inner_gradient))
+    if not (np.all(np.isfinite(matrix)) and np.all(np.isfinite(gradient))):
+        raise FitError("The model gives derivatives that are not finite where a fit has come to.")
     try:
         effect = np.eye(size)[:, shared_size:]
         variance = np.diag(cho_solve(cho_factor(matrix), effect)[shared_size:])

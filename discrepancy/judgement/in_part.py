@@ -5,34 +5,26 @@ then counts independent samples. A set of effects is named in part that is proba
 of the gap on trials that it did not see, where no other set does as well.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
-from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate, is_noise_colour, prior_tests
-from discrepancy.fits.other_optima import free_shape
-from discrepancy.fits.predictive import residual_set
+from discrepancy.fits.gates import ABSOLUTE_LEVEL, absolute_gate, is_noise_colour, prior_tests
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.remainder_inference import RemainderPrior, with_remainder
-from discrepancy.location.residuals import ResidualSet
 from discrepancy.search.honest_evidence import weigh_with_remainders
-from discrepancy.search.hypotheses import Key, key_of
-from discrepancy.search.starting_points import acts_within
+from discrepancy.search.hypotheses import key_of
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, NamedEffect, RemainderEstimate, Verdict, VerdictKind
-from fe.runtime.patch import DecayingLine, Line
 
-from .conclusion import Conclusion, family_words, named_effects
+from .conclusion import Conclusion, named_effects
 from .consistency_gate import consistency_gate
 from .explained_share import Shares
+from .practical_size import small_terms
 from .proof import held_out_gate
-
-LEAST_SHOWN = 0.1
-"""Share of the gap from which a hypothesis is shown as the best one where none is named."""
+from .trial_by_trial import sizes_by_trial
+from .weighed import Weighed, plain
 
 Outcome = tuple[Verdict, Search, CandidateFit]
 
@@ -55,7 +47,7 @@ def judged_with_remainder(problem: Problem, found: Search, first: Verdict) -> Ou
         As `naming.name` returns them; the fit is that of the best hypothesis for an unexplained gap too.
     """
     weigh_with_remainders(found)
-    weighed = _Weighed(problem, found)
+    weighed = Weighed(problem, found)
     weighed.leave_out_stand_ins()
     best = found.best()
     probabilities = found.set_probabilities()
@@ -72,7 +64,7 @@ def judged_with_remainder(problem: Problem, found: Search, first: Verdict) -> Ou
         return _unexplained(told, weighed, best, first), found, weighed.shown(best)
     probability = weighed.probability(best)
     plain = not best.candidate.is_family and weighed.freed(best) is None
-    if plain and probability >= SEARCH.sure and _is_coloured(best):
+    if plain and probability >= SEARCH.sure and _is_coloured(best) and weighed.slimmer(best) is best:
         gates = (
             absolute_gate(problem, best), consistency_gate(problem, best),
             held_out_gate(weighed.residuals(replace_remainder(best))),
@@ -84,170 +76,42 @@ def judged_with_remainder(problem: Problem, found: Search, first: Verdict) -> Ou
     return verdict, found, weighed.shown(best) if verdict.kind is VerdictKind.UNEXPLAINED else best
 
 
+def without_sliver(problem: Problem, found: Search, first: Verdict, fit: CandidateFit) -> Outcome:
+    """Return the verdict on a set that was named, one of whose effects may explain next to nothing.
+
+    Where what is left is nearly noise, such an effect stands for what is left as well as a remainder does. It
+    stays if the evidence of the whole set is above that of the set without it and a remainder by far.
+
+    Parameters
+    ----------
+    problem, found, first
+        As of `judged_with_remainder`.
+    fit : CandidateFit
+        Of the set that was named.
+    """
+    weighed = Weighed(problem, found)
+    names, share = set(plain(fit)), weighed.shares(fit).value
+    small = small_terms(problem, fit)
+    kept = {name for name, size in zip(plain(fit), small, strict=True) if size is None}
+    singles = [item for item in found.exact.values() if item.candidate.terms and set(plain(item)) < names]
+    closing = [item for item in singles if weighed.shares(item).value > share - SEARCH.sliver]
+    if not closing and kept == names:
+        return first, found, fit
+    weigh_with_remainders(found)
+    weighed = Weighed(problem, found)
+    whole = found.judged.get(key_of(fit.candidate), fit)
+    best = weighed.slimmer(whole, kept)
+    if best is whole:
+        found.judge({})
+        return first, found, fit
+    verdict = _in_part(Conclusion.of(problem, found, best, found.set_probabilities()), weighed, best,
+                       weighed.probability(best), "", first)  # fmt: skip
+    return verdict, found, weighed.shown(best) if verdict.kind is VerdictKind.UNEXPLAINED else best
+
+
 def replace_remainder(found: CandidateFit) -> CandidateFit:
     """Return a fit whose predictions have the noise alone about them."""
     return replace(found, point=replace(found.point, remainder=None)) if found.point.remainder else found
-
-
-@dataclass
-class _Weighed:
-    """Hypotheses with their remainders, and what each explains of the gap."""
-
-    problem: Problem
-    found: Search
-    left_out: list[CandidateFit] = field(default_factory=list)
-    _residuals: dict[Key, ResidualSet] = field(default_factory=dict)
-    _shares: dict[Key, Shares] = field(default_factory=dict)
-
-    def residuals(self, item: CandidateFit) -> ResidualSet:
-        """Return fitted and held-out trials beside their predictions."""
-        return residual_set(self.problem, item, sensitivities=False)
-
-    def shares(self, item: CandidateFit) -> Shares:
-        """Return what a hypothesis explains of the gap."""
-        key = key_of(item.candidate)
-        if key not in self._shares:
-            if () not in self._residuals:
-                self._residuals[()] = self.residuals(self.found.none)
-            best = self.found.best()
-            left = 1.0 / self.problem.precisions(best.sums)
-            noise = np.where(self.problem.freedom > 0.0, 1.0, left)
-            named: Mapping[str, float] = dict(zip(self.problem.channel_names, noise.tolist(), strict=True))
-            self._shares[key] = Shares.of(self._residuals[()], self.residuals(item), named)
-        return self._shares[key]
-
-    def describes_better(self, best: CandidateFit) -> bool:
-        """Whether a stand-in that is as long as a set of laws was left out, and is more probable by far."""
-        return any(
-            len(item.candidate.terms) == len(best.candidate.terms)
-            and item.log_evidence > best.log_evidence + SEARCH.rival
-            for item in self.left_out
-        )
-
-    def shown(self, best: CandidateFit) -> CandidateFit:
-        """Return the best set if it closes a part of the gap, else the most probable one that does."""
-        if best.candidate.terms and self.shares(best).value > LEAST_SHOWN:
-            return best
-        return self.leading()
-
-    def leading(self) -> CandidateFit:
-        """Return the most probable set that closes a part of the gap, else the fit without effect."""
-        ranked = sorted(self.found.judged.values(), key=lambda item: -self.found.score(item))
-        closing = (item for item in ranked if item.candidate.terms and self.shares(item).value > LEAST_SHOWN)
-        return next(closing, self.found.none)
-
-    def leave_out_stand_ins(self) -> None:
-        """Take sets with a stand-in out of the comparison where a law explains as much, or it may not be.
-
-        Clocks, gains, zeros, drifts and lines describe readings; they do not cause. They never stand before a
-        law of the structure that explains the same share.
-        """
-        kept = dict(self.found.judged)
-        laws = {key: item for key, item in kept.items() if key and not self._stands_in(item)}
-        for key, item in self.found.judged.items():
-            if not key or key in laws:
-                continue
-            share = self.shares(item).value
-            beaten = any(
-                len(law.candidate.terms) <= len(item.candidate.terms)
-                and self.shares(law).value > share - SEARCH.rival_share
-                for law in laws.values()
-            )
-            if not self._may_stand_in(item):
-                del kept[key]
-            elif beaten:
-                del kept[key]
-                self.left_out.append(item)
-        self.found.judge(kept)
-
-    def _stands_in(self, item: CandidateFit) -> bool:
-        return any(not acts_within(term.effect, self.problem.setting) for term in item.candidate.terms)
-
-    def is_mixed(self, item: CandidateFit) -> bool:
-        """Whether a set holds a stand-in beside others."""
-        return len(item.candidate.terms) > 1 and self._stands_in(item)
-
-    def _may_stand_in(self, item: CandidateFit) -> bool:
-        """Whether stand-ins are within their range, and lines have periods enough in the longest record."""
-        longest = max(
-            (float(np.ptp(data.trial.time)) for data in self.problem.trials if data.trial.is_dynamic),
-            default=0.0,
-        )
-        parts = item.candidate.parts(item.point.effect)
-        for term, part in zip(item.candidate.terms, parts, strict=True):
-            if acts_within(term.effect, self.problem.setting):
-                continue
-            if np.abs(part).max(initial=0.0) > SEARCH.stand_in_range:
-                return False
-            patch = Candidate((term,)).patch(self.problem.setting, part)
-            lines = [item.frequency for item in patch if isinstance(item, Line | DecayingLine)]
-            if lines and min(lines) * longest < SEARCH.least_periods:
-                return False
-        return True
-
-    def probability(self, item: CandidateFit) -> float:
-        """Return the probability of a set with all that hold it."""
-        names = set(_plain(item))
-        found = self.found.all().values()
-        scores = np.array([self.found.score(other) for other in found])
-        holds = np.array([names <= set(_plain(other)) for other in found])
-        weights = np.exp(scores - scores.max())
-        return float(weights[holds].sum() / weights.sum())
-
-    def nameable(self, best: CandidateFit) -> tuple[CandidateFit, float, str]:
-        """Return the set that may be named, its probability, and its family where its shape is its own.
-
-        The best set, or one within it that explains as much but for a little. Stand-ins beside laws take up
-        what is left, whatever it is: they are no part of a name.
-        """
-        names = set(_plain(best))
-        share = self.shares(best).value
-        mixed = self.is_mixed(best)
-        for item in sorted(self.found.judged.values(), key=lambda other: len(other.candidate.terms)):
-            if not item.candidate.terms or not set(_plain(item)) < names:
-                continue
-            close = self.shares(item).value > share - 0.5 * SEARCH.rival_share
-            if close or (mixed and not self._stands_in(item)):
-                best = item
-                break
-        probability = self.probability(best)
-        terms = best.candidate.terms
-        if len(terms) == 1 and self.shares(best).value > SEARCH.least_share and terms[0].effect.shape:
-            free = best if best.candidate.is_family else self.freed(best)
-            if free is not None:
-                family, _ = family_words(named_effects(self.problem, free))
-                return free, probability, family
-        return best, probability, ""
-
-    def freed(self, best: CandidateFit) -> CandidateFit | None:
-        """Return the family of a single law where a shape of its own gains enough."""
-        if len(best.candidate.terms) != 1:
-            return None
-        free = free_shape(self.problem, best, 0)
-        if free is None:
-            return None
-        free = with_remainder(self.problem, free, RemainderPrior.of(self.problem, self.found.none), rounds=3)
-        if free is None or free.log_evidence - best.log_evidence <= SHAPE_GAIN:
-            return None
-        return free if self.shares(free).value >= self.shares(best).value - 0.02 else None
-
-    def rivals(self, best: CandidateFit) -> list[CandidateFit]:
-        """Return other sets of the same length that data or held-out trials do not tell from it."""
-        own, found = self.shares(best), []
-        for item in self.found.judged.values():
-            same = len(item.candidate.terms) == len(best.candidate.terms)
-            if not same or set(_plain(item)) == set(_plain(best)):
-                continue
-            share = self.shares(item)
-            close = item.log_evidence > best.log_evidence - SEARCH.rival
-            alike = share.value > own.value - SEARCH.rival_share and not own.told_from(share)
-            if (close or alike) and share.value > SEARCH.least_share:
-                found.append(item)
-        return found
-
-
-def _plain(item: CandidateFit) -> tuple[str, ...]:
-    return tuple(term.effect.identifier for term in item.candidate.terms)
 
 
 def _is_coloured(item: CandidateFit) -> bool:
@@ -291,7 +155,7 @@ def _named(told: Conclusion, best: CandidateFit, probability: float, gates: tupl
 
 def _in_part(
     told: Conclusion,
-    weighed: _Weighed,
+    weighed: Weighed,
     best: CandidateFit,
     probability: float,
     family: str,
@@ -300,6 +164,9 @@ def _in_part(
     """Return the verdict named in part, or a group with shares; unexplained where neither may be said."""
     problem = told.problem
     explained = weighed.shares(best).summary()
+    following = [item.sentence() for item in sizes_by_trial(problem, best) if item.follows]
+    if following:
+        return _unexplained(told, weighed, best, first, why=" ".join(following))
     tests = prior_tests(problem, best)
     beside = any(p * len(tests) < ABSOLUTE_LEVEL for _, p in tests)
     if explained.low < SEARCH.least_share or beside or weighed.is_mixed(best):
@@ -327,7 +194,7 @@ def _in_part(
         return told.verdict(
             VerdictKind.GROUP, sentence, sum(weighed.probability(item) for item in members),
             effects=tuple(effect for item in members for effect in named_effects(problem, item)),
-            group=tuple(" + ".join(sorted(_plain(item))) for item in members), **more,
+            group=tuple(" + ".join(sorted(plain(item))) for item in members), **more,
         )  # fmt: skip
     if rivals or probability < SEARCH.sure or weighed.describes_better(best):
         return _unexplained(told, weighed, best, first)
@@ -336,17 +203,35 @@ def _in_part(
     sentence = (
         f"{what[0].upper()}{what[1:]} closes {_share_words(weighed.shares(best))} of the gap on "
         f"{explained.trials} trials (probability {_certain(probability)}); {left}."
+        f"{_exponents(problem, weighed, best)}"
     )
     return told.verdict(
         VerdictKind.NAMED_IN_PART, sentence, probability, effects=named, family=family, **more
     )
 
 
-def _unexplained(told: Conclusion, weighed: _Weighed, leading: CandidateFit, first: Verdict) -> Verdict:
+def _exponents(problem: Problem, weighed: Weighed, best: CandidateFit) -> str:
+    """Return the sentence on the shape of a single law, its own or freed for it, with intervals."""
+    free = best if best.candidate.is_family else weighed.free(best)
+    if free is None:
+        return ""
+    (effect,) = named_effects(problem, free)
+    spread = np.sqrt(np.diag(free.effect_covariance))[-len(effect.shape) :]
+    told_of = [
+        f"{item.description.split(' (')[0]} {item.value:.2g} ({item.low:.2g} to {item.high:.2g})"
+        for item, deviation in zip(effect.shape, spread, strict=True)
+        if deviation < SEARCH.told_by_data
+    ]
+    return f" With a shape of its own: {', '.join(told_of)}." if told_of else ""
+
+
+def _unexplained(
+    told: Conclusion, weighed: Weighed, leading: CandidateFit, first: Verdict, *, why: str = ""
+) -> Verdict:
     """Return the verdict that there is a gap without a name, and how much the best hypothesis explains."""
     leading, sentence, explained = weighed.shown(leading), first.sentence, None
     failed = next((gate.reason for gate in first.gates if gate.passed is False), "")
-    nearest = sorted(first.resembles) == sorted(_plain(leading))  # else it would name two as the nearest
+    nearest = sorted(first.resembles) == sorted(plain(leading))  # else it would name two as the nearest
     if first.kind is not VerdictKind.UNEXPLAINED or (failed and not nearest):
         sentence = f"There is a gap that no effect of the catalogue fits. {failed}".strip()
     if leading.candidate.terms:
@@ -356,9 +241,10 @@ def _unexplained(told: Conclusion, weighed: _Weighed, leading: CandidateFit, fir
             f" The best hypothesis, {words}, closes {_share_words(weighed.shares(leading))} of the gap on "
             f"{explained.trials} trials."
         )
+    sentence += f" {why}" if why else ""
     return told.verdict(
         VerdictKind.UNEXPLAINED, sentence, first.probability, gates=first.gates,
-        resembles=_plain(leading) or first.resembles, explained=explained,
+        resembles=plain(leading) or first.resembles, explained=explained,
         remainders=remainder_estimates(told.problem, leading),
     )  # fmt: skip
 

@@ -21,7 +21,8 @@ from fe.runtime.patch import INTERNAL_FORCES
 
 from .conclusion import Conclusion, best_of, named_effects, plain_names
 from .consistency_gate import consistency_gate
-from .in_part import judged_with_remainder
+from .in_part import judged_with_remainder, without_sliver
+from .practical_size import LEAST_SIZE, small_terms
 from .proof import held_out_gate
 
 
@@ -57,11 +58,40 @@ def name(
         said = f" {gate.reason}" if gate.passed is False else ""
         verdict = replace(verdict, sentence=verdict.sentence + said, gates=(*verdict.gates, gate))
         stands = stands and gate.passed is not False
+    if verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP) and _all_small(problem, found, verdict, fit):
+        return _nuisance(verdict), found, found.none
+    if stands and len(verdict.effects) > 1:
+        verdict, _, fit = without_sliver(problem, found, verdict, fit)
+        return verdict, found, fit
     misfits = any(gate.name == "absolute fit" and gate.passed is False for gate in verdict.gates)
     open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
     if stands or not (misfits or verdict.kind in open_kinds):
         return verdict, found, fit
     return judged_with_remainder(problem, found, verdict)
+
+
+def _all_small(problem: Problem, found: Search, verdict: Verdict, fit: CandidateFit) -> bool:
+    """Whether all that a verdict names is too small to be a cause."""
+    if verdict.kind is VerdictKind.NAMED:
+        return None not in small_terms(problem, fit)
+    members = [item for item in found.exact.values() if " + ".join(_sorted(item)) in verdict.group]
+    return bool(members) and all(None not in small_terms(problem, item) for item in members)
+
+
+def _sorted(item: CandidateFit) -> list[str]:
+    return list(plain_names(item.candidate.identifiers))
+
+
+def _nuisance(verdict: Verdict) -> Verdict:
+    """Return the verdict where all that is missing is below what counts as a cause."""
+    what = " or ".join(dict.fromkeys(effect.name for effect in verdict.effects))
+    return replace(
+        verdict,
+        kind=VerdictKind.NOTHING_MISSING,
+        sentence=f"The model explains the data but for {what} below {100.0 * LEAST_SIZE:g} % of what it acts "
+        "on, which is a nuisance of the instruments and no name.",
+        effects=(), group=(),
+    )  # fmt: skip
 
 
 def _as_recorded(problem: Problem, found: Search) -> tuple[Verdict, Search, CandidateFit]:

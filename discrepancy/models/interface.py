@@ -61,6 +61,8 @@ class PortScale:
         force that is spread over the wing acts on the motion of each place, and A is the mean's.
     free : bool
         Whether nothing holds the port (a body that falls or rolls), so that no place is its zero.
+    turns : bool
+        Whether its motion turns in a trial, or may: one that goes one way shows no memory.
     """
 
     displacement: float
@@ -70,6 +72,7 @@ class PortScale:
     largest_displacement: float | None = None
     spread: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
     free: bool = False
+    turns: bool = True
 
     def mean_power(self, exponent: float) -> float:
         """Return the mean of |motion / A|^exponent over the places where a force at the port acts."""

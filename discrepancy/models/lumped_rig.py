@@ -302,6 +302,10 @@ def state_sizes(lumped: LumpedRig, campaign: Campaign, trial: Trial, conditions:
     return np.asarray(np.where(found > 0.0, found, max(float(found.max(initial=0.0)), 1e-9)))
 
 
+TURNS = 1e-3
+"""Share of the largest speed of a port that both directions must reach, for a motion that turns."""
+
+
 class PortSizes:
     """What the ports of a model saw in a campaign, for scales that the structure does not have.
 
@@ -312,11 +316,14 @@ class PortSizes:
     ----------
     lumped : LumpedRig
         The model at its prior mean.
+    driven_only : bool
+        Whether all trials are followed in time from known inputs, so that what was not seen to turn does not.
     """
 
-    def __init__(self, lumped: LumpedRig) -> None:
-        self._rig = lumped.rig()
+    def __init__(self, lumped: LumpedRig, *, driven_only: bool = False) -> None:
+        self._rig, self._driven_only = lumped.rig(), driven_only
         self._sizes = {name: np.zeros(4) for name in self._rig.ports}
+        self._turns = dict.fromkeys(self._rig.ports, False)
 
     def add(self, motion: RigMotion, measured: float, fitted: bool) -> None:
         """Take up the motion of a trial, and the largest force that was measured in it [N]."""
@@ -331,6 +338,8 @@ class PortSizes:
             force = max(float(np.max(item)) for item in forces) / lent if lent > 0.0 else measured
             x, v = (float(np.max(np.abs(item @ modal))) for item in (motion.q, motion.velocity))
             self._sizes[name] = np.maximum(self._sizes[name], (x * fitted, x, v, force))
+            speed = motion.velocity @ modal
+            self._turns[name] |= bool(np.min(speed) < -TURNS * v and np.max(speed) > TURNS * v)
 
     def scale(self, name: str) -> PortScale:
         """Return the natural scales of a port."""
@@ -347,15 +356,17 @@ class PortSizes:
             return PortScale(amount, w**2 / float(weight[first]), w, still, largest or 1.0)
         free = not np.any(frequency[seen] > 0.0)
         return PortScale(
-            amount, (force or 1.0) / amount, (speed or 1.0) / amount, None, largest or amount, free=free
-        )
+            amount, (force or 1.0) / amount, (speed or 1.0) / amount, None, largest or amount, free=free,
+            turns=self._turns[name] or not (free and self._driven_only and np.any(seen)),
+        )  # fmt: skip
 
 
 def rig_scales(
     lumped: LumpedRig, parameters: FloatArray, campaign: Campaign, stations: tuple[float, float] | None
 ) -> Scales:
     """Return the natural scales of a rig under a campaign, at its prior mean."""
-    conditions, ports = Conditions(parameters), PortSizes(lumped)
+    driven_only = all(trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN for trial in campaign.trials)
+    conditions, ports = Conditions(parameters), PortSizes(lumped, driven_only=driven_only)
     rig, description = lumped.rig(), lumped.description
     force, peak, speed, weight = 0.0, 0.0, 0.0, 0.0
     for trial in campaign.trials:

@@ -166,7 +166,7 @@ def _add_highlights(page: Page, investigation: Investigation) -> None:
                 f"χ²/dof on {where} trials, before and after",
             )
         )
-        if isfinite(proof.gap_closed):
+        if isfinite(proof.gap_closed) and verdict.explained is None:  # whose share says nearly the same
             items.append((f"{percent(proof.gap_closed)} %", "of the gap closed on held-out trials"))
     elif judged := [
         gate

@@ -21,6 +21,10 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
+from discrepancy.catalogue.damping import QUADRATIC_DAMPING
+from discrepancy.catalogue.entry import Setting
+from discrepancy.catalogue.hysteresis import BOUC_WEN_HYSTERESIS, JOINT_MICRO_SLIP
+from discrepancy.catalogue.stiffness import BREATHING_CRACK, CUBIC_STIFFNESS, FREE_PLAY
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
@@ -436,3 +440,18 @@ def test_wrong_inputs_are_named() -> None:
         shown(model, trial(time, RecordedInput("hose", Quantity.VOLTAGE, time)), {"lower": Quantity.LEVEL})
     with pytest.raises(ModelError, match=r"'pump' .* is voltage, but the trial .* records flow"):
         shown(model, trial(time, RecordedInput("pump", Quantity.FLOW, time)), {"lower": Quantity.LEVEL})
+
+
+def test_a_port_whose_motion_goes_one_way_shows_no_memory() -> None:
+    """A body that falls shows drag and no hysteresis; one that is pushed to and fro may show both."""
+    model, time = model_of(FALL), np.linspace(0.0, 1.0, 101)
+    channel = Channel("height", Quantity.DISPLACEMENT, "height", None)
+    falls = trial(time)
+    given = Campaign("", {"height": channel}, (falls,), None, {}, "")
+    setting = Setting(given, model, model.scales(given))
+    assert not setting.scales.ports["air"].turns
+    for effect in (JOINT_MICRO_SLIP, BOUC_WEN_HYSTERESIS, CUBIC_STIFFNESS, FREE_PLAY, BREATHING_CRACK):
+        assert "motion that turns" in (effect.unavailable(setting) or "")
+    assert QUADRATIC_DAMPING.unavailable(setting) is None
+    still = replace(given, trials=(falls, replace(falls, name="load", kind=TrialKind.STATIC)))
+    assert model.scales(still).ports["air"].turns

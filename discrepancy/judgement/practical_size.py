@@ -1,0 +1,33 @@
+"""What is too small to be a name: a gain of half a thousandth is a nuisance of instruments, not a cause."""
+
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.problem import Problem
+from fe.runtime.patch import Clock, LoadGain, Primitive, SensorGain
+
+LEAST_SIZE = 1e-3
+"""Size of a gain, tare or clock error over what it acts on, below which it is a nuisance and no name."""
+
+
+def small_terms(problem: Problem, found: CandidateFit) -> tuple[float | None, ...]:
+    """Return for each effect of a fit its size over what it acts on where that is too small, else None."""
+    sizes: list[float | None] = []
+    for term, part in zip(found.candidate.terms, found.candidate.parts(found.point.effect), strict=True):
+        patch = Candidate((term,)).patch(problem.setting, part)
+        known = [_size(problem, item) for item in patch]
+        largest = max((size for size in known if size is not None), default=None)
+        small = largest is not None and None not in known and largest < LEAST_SIZE
+        sizes.append(largest if small else None)
+    return tuple(sizes)
+
+
+def _size(problem: Problem, item: Primitive) -> float | None:
+    """Return the size of an error of an instrument over what it acts on, None of anything else."""
+    scales = problem.setting.scales
+    if isinstance(item, LoadGain):
+        return max(abs(item.gain), abs(item.tare) / scales.force if scales.force > 0.0 else 0.0)
+    if isinstance(item, SensorGain):
+        return abs(item.gain)
+    if isinstance(item, Clock):
+        return max(abs(item.rate), abs(item.zero) * scales.angular_frequency)
+    return None
