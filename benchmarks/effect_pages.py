@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.effect_pictures import draw, picture_of, picture_patch, picture_setting
+from discrepancy.catalogue import outflow
 from discrepancy.catalogue.building import KIND_NAMES
 from discrepancy.catalogue.entry import Effect, Prior, Setting
 from discrepancy.catalogue.library import library
@@ -46,6 +47,8 @@ def rounded(value: Any) -> Any:
 
 def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
     """Return the page of an effect."""
+    tank = effect in outflow.EFFECTS
+    on, what = ("on the tank", "A tank") if tank else ("on the cantilever", "A uniform cantilever")
     names = {other.identifier: other.name for other in library()}
     kinds = [name for kind, name in KIND_NAMES.items() if kind in effect.acts_on]
     places = effect.places(setting)
@@ -89,18 +92,18 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         ]
     lines += ["## Where it acts", f"Trials: {', '.join(kinds)}."]
     if places != ("",):
-        lines.append(
-            f"Places, on the cantilever of the picture: {', '.join(f'`{name}`' for name in places)}."
-        )
+        lines.append(f"Places, {on} of the picture: {', '.join(f'`{name}`' for name in places)}.")
     shown = ", ".join(f"{name} = {value:g}" for name, value in values.items())
     lines += [
         "",
         "## Signature",
         effect.signature,
         "",
-        f"![{effect.name} on a cantilever](images/{effect.identifier}.png)",
+        f"![{effect.name} {on}](images/{effect.identifier}.png)".replace(
+            " on the cantilever", " on a cantilever"
+        ),
         "",
-        f"A uniform cantilever with {shown}" + (f", place `{place}`." if place else "."),
+        f"{what} with {shown}" + (f", place `{place}`." if place else "."),
         "",
         "## Easily confused with",
         *(f"- [{names[other]}]({other}.md): {text['tell'][other]}" for other in effect.confusable),
@@ -142,23 +145,28 @@ def readme() -> str:
 
 def pages() -> dict[str, str]:
     """Return every page by its file name."""
-    texts, setting = paragraphs(), picture_setting()
+    texts, beam = paragraphs(), picture_setting()
     made = {
-        f"{effect.identifier}.md": page(effect, texts[effect.identifier], setting) for effect in library()
+        f"{effect.identifier}.md": page(
+            effect, texts[effect.identifier], picture_setting(effect) if effect in outflow.EFFECTS else beam
+        )
+        for effect in library()
     }
     return {"README.md": readme(), **made}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--only", help="the picture of this effect alone")
     parser.add_argument("--no-pictures", action="store_true", help="leave the pictures as they are")
     arguments = parser.parse_args()
     for name, text in pages().items():
         atomic_write_text(FOLDER / name, text)
     if not arguments.no_pictures:
-        setting = picture_setting()
         for effect in library():
-            data = draw(effect, setting)
+            if arguments.only not in (None, effect.identifier):
+                continue
+            data = draw(effect, picture_setting(effect))
             atomic_write_bytes(FOLDER / "images" / f"{effect.identifier}.png", data)
             print(f"{effect.identifier:32s}{len(data) / 1024:6.1f} kB")
 

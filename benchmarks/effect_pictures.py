@@ -11,7 +11,9 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from benchmarks.cantilever import Cantilever, campaign
+from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import Quantity, Trial
+from discrepancy.catalogue import outflow
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe
@@ -22,7 +24,11 @@ FloatArray = NDArray[np.float64]
 RESOLUTION = 88.0
 
 # Factor and unit of each quantity in a picture.
-UNITS = {Quantity.DISPLACEMENT: (1e3, "mm"), Quantity.STRAIN: (1e6, "microstrain")}
+UNITS = {
+    Quantity.DISPLACEMENT: (1e3, "mm"),
+    Quantity.STRAIN: (1e6, "microstrain"),
+    Quantity.LEVEL: (1.0, "m"),
+}
 
 
 @dataclass(frozen=True)
@@ -230,6 +236,8 @@ class Picture:
 
 FREQUENCY, DAMPING = backbone("frequency"), backbone("damping")
 
+FILLED = ringdown("level", 0.0, 300.0, "filled and drained")
+
 PICTURES: dict[str, Picture] = {
     "point_mass": Picture({"mass_ratio": 0.1, "station_ratio": 1.0}, (ringdown(end=1.2), load_line())),
     "root_compliance": Picture({"compliance_share": 0.15}, (load_line("tip"), load_line("g0"))),
@@ -280,6 +288,11 @@ PICTURES: dict[str, Picture] = {
     ),
     "washout": Picture({"washout": 0.1}, (flight(("g2", "g0"), share=True), flight(("g0", "g2")))),
     "inertia_relief": Picture({"relief": 0.2}, (flight(("g0", "g2")), ratios("up", "flight"))),
+    "outflow": Picture({"flow_ratio": 0.3}, (FILLED, ringdown("level", 240.0, 300.0, "filled and drained"))),
+    "overflow": Picture(
+        {"level_ratio": 0.7, "flow_ratio": 0.3},
+        (FILLED, ringdown("level", 40.0, 100.0, "filled and drained")),
+    ),
     "clock_error": Picture(
         {"rate_error": 5e-3, "phase_zero": 0.0}, (ringdown(begin=6.0, end=8.0), backbone("frequency", "time"))
     ),
@@ -305,8 +318,10 @@ def picture_of(effect: Effect) -> Picture:
     return PICTURES.get(effect.identifier, Picture(values, (ringdown(), load_line())))
 
 
-def picture_setting() -> Setting:
-    """Return the setting of all pictures."""
+def picture_setting(effect: Effect | None = None) -> Setting:
+    """Return the setting of a picture: the cantilever, or for flows a tank."""
+    if effect in outflow.EFFECTS:
+        return tank_setting()
     given, model = campaign(), Cantilever()
     return Setting(given, model, model.scales(given))
 

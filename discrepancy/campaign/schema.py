@@ -97,6 +97,7 @@ class InputSection(ColumnSection):
     """`[[input]]`: a recorded input of driven trials."""
 
     hold: Hold | None = Field(default=None, strict=False)
+    reference: bool = False
     offset_deviation: NotNegative = 0.0
 
     @model_validator(mode="after")
@@ -110,17 +111,18 @@ class InputSection(ColumnSection):
             raise ValueError(
                 f"the column {self.table_column!r} is reserved: give the input {self.name!r} another column"
             )
-        if self.quantity.moving and self.hold not in (None, Hold.SMOOTH):
+        if self.quantity.moving and not self.reference and self.hold not in (None, Hold.SMOOTH):
             raise ValueError(
                 f"the input {self.name!r} is a motion, which no drive makes in steps or corners: leave "
-                "`hold` out, or say smooth"
+                "`hold` out, or say smooth, or reference = true where it is what a controller shall follow"
             )
         return self
 
     @property
     def holds(self) -> Hold:
         """What it does between its samples: a motion is smooth, the rest linear unless it is said."""
-        return self.hold or (Hold.SMOOTH if self.quantity.moving else Hold.LINEAR)
+        moved = self.quantity.moving and not self.reference
+        return self.hold or (Hold.SMOOTH if moved else Hold.LINEAR)
 
 
 class ReleaseSection(Section):

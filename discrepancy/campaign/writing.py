@@ -11,7 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.reading import CAMPAIGN_FILE
-from discrepancy.campaign.records import Campaign, Channel, RecordedInput, Release, Start, Trial, TrialKind
+from discrepancy.campaign.records import (
+    Campaign,
+    Channel,
+    Hold,
+    RecordedInput,
+    Release,
+    Start,
+    Trial,
+    TrialKind,
+)
 from discrepancy.campaign.schema import FORMAT, INPUT_COLUMNS
 from discrepancy.campaign.units import UNITS, in_unit, sum_text
 from discrepancy.errors import CampaignFileError
@@ -212,6 +221,8 @@ def _input_lines(item: RecordedInput) -> list[str]:
         f"unit = {_quoted(UNITS[item.quantity].si)}",
         f"hold = {_quoted(item.hold.value)}",
     ]
+    if item.quantity.moving and item.hold is not Hold.SMOOTH:
+        lines.append("reference = true")
     return [
         *lines,
         *([f"offset_deviation = {_number(item.offset_deviation)}"] if item.offset_deviation else []),

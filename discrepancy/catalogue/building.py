@@ -158,8 +158,14 @@ def at_ports(*preferred: str) -> Places:
 
 
 def _ports(preferred: tuple[str, ...], setting: Setting) -> tuple[str, ...]:
-    known = setting.model.ports()
+    flows = state_ports(setting)
+    known = tuple(port for port in setting.model.ports() if port not in flows)
     return tuple(port for port in preferred if port in known) or known
+
+
+def state_ports(setting: Setting) -> tuple[str, ...]:
+    """Return the ports of states, at which laws are flows."""
+    return tuple(name for name, scale in setting.scales.ports.items() if scale.of_state)
 
 
 def at_held_ports(*preferred: str) -> Places:
@@ -266,9 +272,11 @@ def _cannot_carry(primitives: tuple[type[Primitive], ...], setting: Setting) -> 
 
 def has_port(setting: Setting) -> str | None:
     """Return why no internal force can act, None if one can."""
-    if setting.model.ports():
-        return None
-    return f"The model {setting.model.name!r} {NO_PORT}."
+    if not setting.model.ports():
+        return f"The model {setting.model.name!r} {NO_PORT}."
+    if not _ports((), setting):
+        return f"All ports of the model {setting.model.name!r} are of states, where flows act and no forces."
+    return None
 
 
 def has_stations(setting: Setting) -> str | None:

@@ -5,7 +5,16 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
-from discrepancy.catalogue import clock_and_lines, damping, hysteresis, loads, sensors, stiffness, structure
+from discrepancy.catalogue import (
+    clock_and_lines,
+    damping,
+    hysteresis,
+    loads,
+    outflow,
+    sensors,
+    stiffness,
+    structure,
+)
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, ShapeParameter
 from discrepancy.catalogue.user_entries import effects_of_entry_points, effects_of_file
 from discrepancy.errors import CatalogueError
@@ -20,6 +29,7 @@ def library() -> tuple[Effect, ...]:
         *damping.EFFECTS,
         *stiffness.EFFECTS,
         *hysteresis.EFFECTS,
+        *outflow.EFFECTS,
         *sensors.EFFECTS,
         *loads.EFFECTS,
         *clock_and_lines.EFFECTS,

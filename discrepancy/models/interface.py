@@ -63,6 +63,9 @@ class PortScale:
         Whether nothing holds the port (a body that falls or rolls), so that no place is its zero.
     turns : bool
         Whether its motion turns in a trial, or may: one that goes one way shows no memory.
+    of_state : bool
+        Whether it is a port of a state (a level, a temperature), at which laws are flows: `displacement`
+        times `angular_frequency` is then its largest value, `displacement` times `stiffness` the flow scale.
     """
 
     displacement: float
@@ -73,6 +76,7 @@ class PortScale:
     spread: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
     free: bool = False
     turns: bool = True
+    of_state: bool = False
 
     def mean_power(self, exponent: float) -> float:
         """Return the mean of |motion / A|^exponent over the places where a force at the port acts."""

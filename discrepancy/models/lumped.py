@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
-from discrepancy.models.lumped_file import Damping, LumpedDescription, load_lumped, matrix_of
+from discrepancy.models.lumped_file import LumpedDescription, load_lumped, matrix_of
 from discrepancy.models.lumped_patch import sorted_lumped
-from discrepancy.models.lumped_rig import LumpedRig, rig_scales, state_sizes
+from discrepancy.models.lumped_rig import LumpedRig
+from discrepancy.models.lumped_scales import rig_scales, state_sizes
+from discrepancy.models.lumped_sections import Damping
 from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
 from fe.runtime.errors import InvalidPatchError
@@ -203,6 +205,7 @@ class LumpedModel:
         acting = trial.force * (1.0 + gain) + tare * (trial.force != 0.0) if gain or tare else trial.force
         if self._as_rig(trial):
             lumped = self._rig(conditions.parameters, structure, float(trial.temperature[0]))
+            laws = laws_of(lumped.own_laws + forces, self._ports) if len(lumped.own_laws) else laws
             place = self._moved_place(lumped, trial, along_span, along_chord)
             return lumped.response(trial, outputs, laws, conditions, (gain, tare, place), refinement)
         rows = np.array([self._outputs[output] for output, _ in outputs]).reshape(-1, self.description.size)

@@ -1,28 +1,33 @@
 """A lumped model as a TOML file: matrices, named vectors and calibrated parameters, checked strictly."""
 
 from collections.abc import Mapping, Sequence
-from math import isfinite
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from discrepancy.campaign.records import Quantity
 from discrepancy.errors import ModelError
-from discrepancy.models.model_file import (
-    ModelDescription,
-    Name,
-    NotNegative,
-    Number,
-    ParameterSection,
-    Positive,
-    Section,
-    check_unique,
+from discrepancy.models.lumped_sections import (
+    ControllerSection,
+    CouplingSection,
+    Damping,
+    InputSection,
+    LawSection,
+    LoadSection,
+    Matrix,
+    NamedVector,
+    OutputSection,
+    PartSection,
+    PlaceSection,
+    PortSection,
+    RootSection,
+    ScaledParameter,
 )
-from reporting.section import checked, shown
+from discrepancy.models.model_file import ModelDescription, Positive, check_unique
+from reporting.section import checked
 from reporting.toml_file import read_toml
 from reporting.words import counted
 
@@ -30,157 +35,6 @@ FloatArray = NDArray[np.float64]
 
 SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"
 """Models that come with the package, by file name without the ending."""
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
-
-
-def _numbers(value: object) -> tuple[float, ...]:
-    """Return one number, or a list of them, as numbers: with one unknown nobody needs brackets."""
-    found = value if isinstance(value, list | tuple) else (value,)
-    if not found or not all(_is_number(item) for item in found):
-        raise ValueError(
-            f"a list of finite numbers such as [1.0, 0.0] is expected, or one number, but {shown(value)} came"
-        )
-    return tuple(float(item) for item in found)
-
-
-def _matrix(value: object) -> tuple[tuple[float, ...], ...] | tuple[float, ...]:
-    """Return a matrix by rows, a diagonal, or one number as what it is."""
-    if isinstance(value, list | tuple) and value and all(isinstance(row, list | tuple) for row in value):
-        if all(row and all(_is_number(item) for item in row) for row in value):
-            return tuple(tuple(float(item) for item in row) for row in value)
-    elif not isinstance(value, list | tuple) or value:
-        found = value if isinstance(value, list | tuple) else (value,)
-        if all(_is_number(item) for item in found):
-            return tuple(float(item) for item in found)
-    raise ValueError(
-        "a matrix of finite numbers by rows such as [[2.0, -1.0], [-1.0, 2.0]] is expected, or its diagonal, "
-        f"or one number, but {shown(value)} came"
-    )
-
-
-Vector = Annotated[tuple[Number, ...], BeforeValidator(_numbers)]
-Matrix = Annotated[tuple[tuple[Number, ...], ...] | tuple[Number, ...], BeforeValidator(_matrix)]
-
-
-Ratio = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=3.0)]
-"""Share of critical damping; overdamped modes are carried, but far above one a percentage was meant."""
-
-
-class Damping(Section):
-    """`[damping]`: exactly one of modal ratios, a matrix, or Rayleigh coefficients alpha M + beta K."""
-
-    ratios: Annotated[tuple[Ratio, ...], BeforeValidator(_numbers)] | None = None
-    matrix: Matrix | None = None
-    alpha: NotNegative | None = None
-    beta: NotNegative | None = None
-
-    @model_validator(mode="after")
-    def _one_kind(self) -> Self:
-        rayleigh = self.alpha is not None or self.beta is not None
-        if sum((self.ratios is not None, self.matrix is not None, rayleigh)) != 1:
-            raise ValueError("give exactly one of ratios, matrix, or alpha and beta")
-        return self
-
-
-class PartSection(Section):
-    """`[[mass_part]]` and the like: a part that a parameter can scale, added to the base matrix."""
-
-    name: Name
-    matrix: Matrix
-
-
-class NamedVector(Section):
-    """A row of the unknowns with a name."""
-
-    name: Name
-    vector: Vector
-
-
-class InputSection(NamedVector):
-    """`[[input]]`: what acts along a vector, and how this changes when the place of a force moves [1/m].
-
-    A motion (displacement, velocity, acceleration, of an angle too) is prescribed to vector . u; anything
-    else is a load, vector times its value, or with `through` the part of that name times vector times it.
-    """
-
-    quantity: Annotated[Quantity, Field(strict=False)] = Quantity.FORCE
-    through: Name | None = None
-    station_derivative: Vector | None = None
-    chord_derivative: Vector | None = None
-
-
-class OutputSection(Section):
-    """`[[output]]`: what can be measured; velocity and acceleration come from a displacement.
-
-    vector . u + constant, or the force by which a prescribed motion is made (`reaction`, an input's name).
-    """
-
-    name: Name
-    vector: Vector | None = None
-    quantity: Annotated[Quantity, Field(strict=False)] = Quantity.DISPLACEMENT
-    reaction: Name | None = None
-    constant: Number = 0.0
-
-    @model_validator(mode="after")
-    def _one_kind(self) -> Self:
-        if (self.vector is None) == (self.reaction is None):
-            raise ValueError(f"the output {self.name!r} needs either a vector or a reaction")
-        if self.reaction is not None and self.quantity not in (Quantity.FORCE, Quantity.TORQUE):
-            raise ValueError(
-                f'the output {self.name!r} is a reaction: give it quantity = "force" or "torque"'
-            )
-        return self
-
-
-class LoadSection(NamedVector):
-    """`[[load]]`: a constant load; with `through` the part or matrix of that name times the vector."""
-
-    through: Name | None = None
-
-
-class CouplingSection(Section):
-    """`[coupling]` between n displacements and m states."""
-
-    force_of_states: Matrix | None = None
-    flow_of_speeds: Matrix | None = None
-    flow_of_displacements: Matrix | None = None
-
-
-class PortSection(NamedVector):
-    """`[[port]]`: where an internal force can act, between the structure and the ground or within it."""
-
-
-class PlaceSection(NamedVector):
-    """`[[place]]`: where a mass can sit; places with a station [m] make a line along the structure."""
-
-    station: Number
-
-
-class RootSection(Section):
-    """`[root]`: motion of the unknowns when the root turns by one radian as a rigid body [m/rad]."""
-
-    lever: Vector
-
-
-class ScaledParameter(ParameterSection):
-    """`[[parameter]]`: a factor of the terms named."""
-
-    terms: Name | tuple[Name, ...]
-    mean: Number = 1.0
-
-    @property
-    def scaled(self) -> tuple[str, ...]:
-        """Names of the terms."""
-        return (self.terms,) if isinstance(self.terms, str) else self.terms
-
-    @model_validator(mode="after")
-    def _in_range(self) -> Self:
-        if not 0.0 < self.low <= self.mean <= self.high:
-            raise ValueError("a factor needs 0 < low <= mean <= high")
-        return self
 
 
 class LumpedDescription(ModelDescription):
@@ -225,6 +79,8 @@ class LumpedDescription(ModelDescription):
     port: tuple[PortSection, ...] = ()
     place: tuple[PlaceSection, ...] = ()
     root: RootSection | None = None
+    law: tuple[LawSection, ...] = ()
+    controller: tuple[ControllerSection, ...] = ()
     parameter: tuple[ScaledParameter, ...] = ()
 
     @property
@@ -242,6 +98,7 @@ class LumpedDescription(ModelDescription):
         """Whether it is a structure at rest on springs under one force at a time."""
         motion = any(item.quantity.moving or item.through for item in self.input)
         further = self.states or self.free or self.load or self.damping_part or motion
+        further = further or self.law or self.controller or any(item.acts for item in self.port)
         reads = any(item.reaction or item.constant for item in self.output)
         return not (further or reads)
 
@@ -256,8 +113,10 @@ class LumpedDescription(ModelDescription):
             ("port", self.port),
             ("place", self.place),
             ("load", self.load),
+            ("controller", self.controller),
         ):
             self._check_vectors(kind, items)
+        self._check_laws_and_controllers()
         self._check_root_and_ratios()
         self._check_parameters()
         return self
@@ -311,11 +170,15 @@ class LumpedDescription(ModelDescription):
             whole = whole + factors.get(part.name, 1.0) * matrix_of(part.matrix)
         return np.asarray(whole * factors.get(name, 1.0))
 
-    def _check_vectors(self, kind: str, items: Sequence[NamedVector] | Sequence[OutputSection]) -> None:
+    def _check_vectors(
+        self,
+        kind: str,
+        items: Sequence[NamedVector] | Sequence[OutputSection] | Sequence[ControllerSection],
+    ) -> None:
         """Refuse vectors of another length, zero ones and names that are there twice."""
         n = self.size + self.states
         for item in items:
-            for key in ("vector", "station_derivative", "chord_derivative"):
+            for key in ("vector", "acts", "station_derivative", "chord_derivative"):
                 vector = getattr(item, key, None)
                 if vector is not None and len(vector) != n:
                     came = counted(len(vector), "entry", "entries")
@@ -343,6 +206,53 @@ class LumpedDescription(ModelDescription):
                     "prescribes a motion"
                 )
 
+    def _check_laws_and_controllers(self) -> None:
+        """Refuse laws at no port, flows that feed their own store, and controllers that cannot be."""
+        ports = {item.name: item for item in self.port}
+        check_unique("law", [item.name for item in self.law])
+        for law in self.law:
+            if law.port not in ports:
+                known = ", ".join(ports) or "none"
+                raise ValueError(f"the law {law.name!r} acts on the port {law.port!r}, but there are {known}")
+        n = self.size
+        for port in self.port:
+            if port.acts is None:
+                continue
+            row, push = np.array(port.vector), np.array(port.acts)
+            if (
+                any(row[:n])
+                or any(push[:n])
+                or row[n:] @ np.linalg.solve(self.whole("capacity"), push[n:]) <= 0.0
+            ):
+                raise ValueError(
+                    f"`acts` of the port {port.name!r} is for states, and must take from what its vector sees"
+                )
+        for item in self.controller:
+            self._check_controller(item)
+        names = [item.reference for item in self.controller if item.reference]
+        check_unique("input or reference", [*(item.name for item in self.input), *names])
+        known = [item.name for item in self.controller]
+        for output in self.output:
+            if output.controller is not None and output.controller not in known:
+                raise ValueError(
+                    f"the output {output.name!r} is what {output.controller!r} gives, but controllers are "
+                    f"{', '.join(known) or 'none'}"
+                )
+
+    def _check_controller(self, item: ControllerSection) -> None:
+        of_states = any(item.vector[self.size :])
+        speed = bool(item.quantity.moving) and item.quantity is item.quantity.moving[1]
+        if of_states and any(item.vector[: self.size]):
+            raise ValueError(f"the controller {item.name!r} measures displacements or states, not both")
+        if item.quantity.moving and item.quantity is item.quantity.moving[2]:
+            raise ValueError(f"the controller {item.name!r} cannot follow an acceleration")
+        if item.derivative and (of_states or speed):
+            what = "a state" if of_states else "a speed"
+            raise ValueError(
+                f"the controller {item.name!r} measures {what}, whose derivative it cannot take: "
+                "leave `derivative` out"
+            )
+
     @property
     def terms(self) -> dict[str, Matrix | None]:
         """Matrices by what a parameter or `through` calls them; None for those that have parts."""
@@ -368,7 +278,9 @@ class LumpedDescription(ModelDescription):
         check_unique("part", [*parts, "mass", "stiffness", "damping", "capacity", "conductance"])
         check_unique("parameter", [item.name for item in self.parameter])
         known = list(self.terms)
-        known += [item.name for item in (*self.input, *self.load) if item.name not in known]
+        more = [item.name for item in (*self.input, *self.load, *self.law, *self.controller)]
+        more += [f"{item.name}.{gain}" for item in self.controller for gain in GAINS]
+        known += [name for name in more if name not in known]
         if self.is_plain:
             known = list(self.terms)
         for parameter in self.parameter:
@@ -379,6 +291,8 @@ class LumpedDescription(ModelDescription):
                     )
 
 
+GAINS = ("proportional", "derivative", "integral")
+"""Gains of a controller; NAME.proportional is what a parameter scales."""
 _PARTS = ("mass_part", "stiffness_part", "damping_part")
 _STATE_PARTS = ("capacity_part", "conductance_part")
 _LOOSE = (

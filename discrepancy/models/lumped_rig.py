@@ -2,18 +2,23 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from discrepancy.campaign.records import Campaign, Hold, Quantity, RecordedInput, Start, Trial, TrialKind
+from discrepancy.campaign.records import Hold, Quantity, RecordedInput, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.input_course import Course, Drive
-from discrepancy.models.interface import Conditions, PortScale, Response, Scales
-from discrepancy.models.lumped_file import InputSection, LumpedDescription, matrix_of
-from discrepancy.models.rig import Acting, Rig, RigMotion, Shown, order_of
-from fe.runtime.motion import NO_LAWS, Laws
+from discrepancy.models.interface import Conditions, Response
+from discrepancy.models.lumped_controllers import loops
+from discrepancy.models.lumped_file import LumpedDescription, matrix_of
+from discrepancy.models.lumped_sections import InputSection
+from discrepancy.models.rig import Rig, RigMotion, order_of
+from discrepancy.models.rig_records import Acting, Shown
+from fe.runtime.motion import NO_LAWS, Laws, laws_of
+from fe.runtime.patch import ModelPatch
 
 FloatArray = NDArray[np.float64]
 
@@ -40,6 +45,8 @@ class LumpedRig:
     ) -> None:
         self.description, self.factors = description, factors
         self._inputs = {item.name: item for item in description.input}
+        self._loops = loops(description.controller, description.size, description.states, factors)
+        self._integrals = sum(loop.state is not None for loop in self._loops)
         self._parts = {
             "mass": mass,
             "stiffness": stiffness,
@@ -50,8 +57,20 @@ class LumpedRig:
         self._rigs: dict[tuple[str, ...], Rig] = {}
         self._constant = sum(
             (self._vector(item.vector, item.through, item.name) for item in description.load),
-            np.zeros(description.size + description.states),
+            np.zeros(self.width),
         )
+        own = ModelPatch(tuple(item.scaled(factors.get(item.name, 1.0)) for item in description.law))
+        self.own_laws = own
+        self._laws = laws_of(own, {item.name for item in description.port}) if len(own) else NO_LAWS
+
+    @property
+    def width(self) -> int:
+        """Displacements, states and integrals of controllers."""
+        return self.description.size + self.description.states + self._integrals
+
+    def _padded(self, row: Sequence[float] | FloatArray) -> FloatArray:
+        """Return a row of the file with the integrals of controllers after it."""
+        return np.pad(np.array(row, dtype=np.float64), (0, self.width - len(row)))
 
     def _damping(self, mass: FloatArray, stiffness: FloatArray) -> FloatArray:
         given, factor = self.description.damping, self.factors.get("damping", 1.0)
@@ -72,7 +91,7 @@ class LumpedRig:
 
     def _vector(self, vector: Sequence[float] | FloatArray, through: str | None, name: str) -> FloatArray:
         """Return the vector (n + m,) of a load, through a matrix where it says so, times its own factor."""
-        row = np.array(vector)
+        row = self._padded(vector)
         if through is not None:
             n, whole = self.description.size, np.zeros(len(row))
             part = self.description.terms[through]
@@ -83,7 +102,7 @@ class LumpedRig:
             matrix = (
                 self._parts[through] if part is None else self.factors.get(through, 1.0) * matrix_of(part)
             )
-            at = slice(n, None) if of_states else slice(0, n)
+            at = slice(n, n + self.description.states) if of_states else slice(0, n)
             whole[at] = matrix @ row[at]
             row = whole
         return np.asarray(self.factors.get(name, 1.0) * row)
@@ -95,24 +114,33 @@ class LumpedRig:
             found = self._rigs[drives] = self._made(drives)
         return found
 
-    def _made(self, drives: tuple[str, ...]) -> Rig:
+    def open(self) -> Rig:
+        """Return the rig without its controllers."""
+        return self._made((), closed=False)
+
+    def _made(self, drives: tuple[str, ...], *, closed: bool = True) -> Rig:
         n, m = self.description.size, self.description.states
-        mass, damping, stiffness = np.zeros((3, n + m, n + m))
-        mass[:n, :n], mass[n:, n:] = self._parts["mass"], self._parts["capacity"]
-        damping[:n, :n], damping[n:, n:] = self._parts["damping"], self._parts["conductance"]
+        own = slice(n, n + m)
+        mass, damping, stiffness = np.zeros((3, self.width, self.width))
+        mass[n:, n:] = np.eye(self.width - n)
+        mass[:n, :n], mass[own, own] = self._parts["mass"], self._parts["capacity"]
+        damping[:n, :n], damping[own, own] = self._parts["damping"], self._parts["conductance"]
         stiffness[:n, :n] = self._parts["stiffness"]
         coupling = self.description.coupling
         for content, into, rows, columns in (
-            (coupling.force_of_states, damping, slice(0, n), slice(n, None)),
-            (coupling.flow_of_speeds, damping, slice(n, None), slice(0, n)),
-            (coupling.flow_of_displacements, stiffness, slice(n, None), slice(0, n)),
+            (coupling.force_of_states, damping, slice(0, n), own),
+            (coupling.flow_of_speeds, damping, own, slice(0, n)),
+            (coupling.flow_of_displacements, stiffness, own, slice(0, n)),
         ):
             if content is not None:
                 into[rows, columns] = -np.atleast_2d(np.array(content))
+        for loop in self._loops if closed else ():
+            loop.close(damping, stiffness)
         return Rig(
             mass, damping, stiffness, n,
-            {item.name: np.array(item.vector) for item in self.description.port},
-            np.array([self._inputs[name].vector for name in drives]).reshape(len(drives), n + m),
+            {item.name: self._padded(item.vector) for item in self.description.port},
+            np.array([self._padded(self._inputs[name].vector) for name in drives]).reshape(-1, self.width),
+            {item.name: self._padded(item.acts) for item in self.description.port if item.acts is not None},
         )  # fmt: skip
 
     # ------------------------------------------------------------ trials
@@ -139,11 +167,25 @@ class LumpedRig:
             if item.quantity.moving and name in reactions and name not in named
         ]
         drives, loads, names = [], [], list[str]()
+        references: dict[str, tuple[tuple[FloatArray, Course], ...]] = {}
         offsets = (*conditions.offset, *(0.0,) * len(recorded))
         for item, offset in zip(recorded, offsets, strict=False):
+            following = [loop for loop in self._loops if loop.section.reference == item.name]
+            for loop in following:
+                pushed = loop.loads(trial, item, offset)
+                loads += pushed
+                references[loop.section.name] = tuple(pushed)
+            if following:
+                continue
             section = self._section(trial, item)
             values = item.values + offset if offset else item.values
             if section.quantity.moving:
+                if item.hold is not Hold.SMOOTH:
+                    raise ModelError(
+                        f"The input {item.name!r} of the trial {trial.name!r} is a motion that "
+                        f"{self.description.name!r} prescribes, which no drive makes in steps or corners: "
+                        "leave `reference` and `hold` out."
+                    )
                 names.append(item.name)
                 order = order_of(item.quantity)
                 drives.append(Drive(trial.time, self.factors.get(item.name, 1.0) * values, order))
@@ -164,6 +206,7 @@ class LumpedRig:
             trial.begins,
             conditions.initial.ravel(),
             conditions.clock,
+            references,
         )
         return self.rig(prescribed), acts, prescribed
 
@@ -223,12 +266,15 @@ class LumpedRig:
                 'is free, driven or has states; say kind = "driven" and begins = "unknown".'
             )
         if trial.kind is TrialKind.STATIC:
-            row = self._vector(self._inputs[self.recorded(trial)[0].name].vector, None, "")
+            row = self._padded(self._inputs[self.recorded(trial)[0].name].vector)
+            place = place if place is None else self._padded(place)
             force = trial.force * (1.0 + gain) + tare * (trial.force != 0.0)
             return self._static(trial, force, row if place is None else place, self.shown(outputs), laws)
         rig, acting, drives = self.acting(trial, conditions, gain, tare, place)
         try:
-            return rig.motion(acting, laws, refinement).response(self.shown(outputs, drives))
+            return rig.motion(acting, laws, refinement).response(
+                self.shown(outputs, drives, acting.references)
+            )
         except ModelError as cause:
             raise ModelError(f"The trial {trial.name!r} of {name!r}: {cause}") from cause
 
@@ -250,14 +296,18 @@ class LumpedRig:
         return Response(np.stack(values, axis=1))
 
     def moving(self, trial: Trial, conditions: Conditions, *, still: bool = False) -> RigMotion:
-        """Return the motion of a dynamic trial without laws; `still`: from rest under nothing."""
+        """Return the motion of a dynamic trial under the model's own laws; `still`: from rest."""
         rig, acting, _ = self.acting(trial, conditions, 0.0, 0.0, None)
-        return rig.motion(replace(acting, begins=Start.STILL) if still else acting, NO_LAWS)
+        return rig.motion(replace(acting, begins=Start.STILL) if still else acting, self._laws)
 
-    def shown(self, outputs: Sequence[tuple[str, Quantity]], drives: Sequence[str] = ()) -> list[Shown]:
+    def shown(
+        self,
+        outputs: Sequence[tuple[str, Quantity]],
+        drives: Sequence[str] = (),
+        references: Mapping[str, Sequence[tuple[FloatArray, Course]]] = MappingProxyType({}),
+    ) -> list[Shown]:
         """Return what each output shows of a rig with some motions prescribed."""
         known = {item.name: item for item in self.description.output}
-        size = self.description.size + self.description.states
         found = []
         for name, quantity in outputs:
             item = known[name]
@@ -268,142 +318,15 @@ class LumpedRig:
                         f"The output {name!r} of {self.description.name!r} is the reaction of "
                         f"{item.reaction!r}, whose motion this trial does not prescribe."
                     )
-                found.append(Shown(np.zeros(size), reaction=list(drives).index(item.reaction)))
+                found.append(Shown(np.zeros(self.width), reaction=list(drives).index(item.reaction)))
                 continue
-            row = np.array(item.vector)
+            if item.controller is not None:
+                (loop,) = (loop for loop in self._loops if loop.section.name == item.controller)
+                effort = loop.effort(references.get(item.controller, ()))
+                found.append(Shown(np.zeros(self.width), effort=effort))
+                continue
+            row = self._padded(item.vector or ())
             found.append(
                 Shown(row, order_of(item.quantity) + further, further, constant=item.constant * (not further))
             )
         return found
-
-
-def state_sizes(lumped: LumpedRig, campaign: Campaign, trial: Trial, conditions: Conditions) -> FloatArray:
-    """Return natural sizes (L,) of a state at the begin of a trial: of motion from rest, and of data."""
-    rig, _, drives = lumped.acting(trial, conditions, 0.0, 0.0, None)
-    count, moving = len(rig.angular_frequency), rig.moving
-    moved = lumped.moving(trial, conditions, still=True)
-    x, v = (np.max(np.abs(item[:, :count]), axis=0) for item in (moved.q, moved.velocity))
-    pace = np.maximum(rig.angular_frequency[:moving], 1.0 / float(trial.time[-1] - trial.time[0]))
-    n, shapes = rig.displacements, rig.shapes[:, :count]
-    channels = [campaign.channels[name] for name in trial.channels]
-    shown = lumped.shown([(channel.output, channel.quantity) for channel in channels], drives)
-    for column, item in enumerate(shown):
-        kept = trial.values[trial.used[:, column], column] - item.constant
-        if item.reaction is not None or not kept.size:
-            continue
-        size = float(np.max(np.abs(kept)))
-        of_u, of_x = item.row[:n] @ shapes[:n, :moving], item.row[n:] @ shapes[n:, moving:]
-        if np.any(of_u):
-            at = size / float(np.linalg.norm(of_u)) / pace**item.order
-            x[:moving], v[:moving] = np.maximum(x[:moving], at), np.maximum(v[:moving], at * pace)
-        if np.any(of_x):
-            v[moving:] = np.maximum(v[moving:], size / float(np.linalg.norm(of_x)))
-    found = np.concatenate((x[:moving], v))
-    return np.asarray(np.where(found > 0.0, found, max(float(found.max(initial=0.0)), 1e-9)))
-
-
-TURNS = 1e-3
-"""Share of the largest speed of a port that both directions must reach, for a motion that turns."""
-
-
-class PortSizes:
-    """What the ports of a model saw in a campaign, for scales that the structure does not have.
-
-    Where no stiffness holds a port, its stiffness is the peak force over the peak displacement, and its
-    angular frequency the peak speed over it: effects are measured by what acts and moves.
-
-    Parameters
-    ----------
-    lumped : LumpedRig
-        The model at its prior mean.
-    driven_only : bool
-        Whether all trials are followed in time from known inputs, so that what was not seen to turn does not.
-    """
-
-    def __init__(self, lumped: LumpedRig, *, driven_only: bool = False) -> None:
-        self._rig, self._driven_only = lumped.rig(), driven_only
-        self._sizes = {name: np.zeros(4) for name in self._rig.ports}
-        self._turns = dict.fromkeys(self._rig.ports, False)
-
-    def add(self, motion: RigMotion, measured: float, fitted: bool) -> None:
-        """Take up the motion of a trial, and the largest force that was measured in it [N]."""
-        rig = motion.rig
-        count = len(rig.angular_frequency)
-        drag = motion.velocity[:, :count] @ rig.free.damping.T
-        for name, row in rig.ports.items():
-            modal = row @ rig.shapes
-            own = modal[:count]
-            lent = float(own @ own)
-            forces = np.abs(motion.acceleration[:, :count] @ own), np.abs(drag @ own)
-            force = max(float(np.max(item)) for item in forces) / lent if lent > 0.0 else measured
-            x, v = (float(np.max(np.abs(item @ modal))) for item in (motion.q, motion.velocity))
-            self._sizes[name] = np.maximum(self._sizes[name], (x * fitted, x, v, force))
-            speed = motion.velocity @ modal
-            self._turns[name] |= bool(np.min(speed) < -TURNS * v and np.max(speed) > TURNS * v)
-
-    def scale(self, name: str) -> PortScale:
-        """Return the natural scales of a port."""
-        usual, largest, speed, force = self._sizes[name].tolist()
-        rig = self._rig
-        along = (rig.ports[name] @ rig.shapes)[: rig.moving]
-        frequency, weight = rig.angular_frequency[: rig.moving], along**2
-        seen = weight > 1e-6 * float(weight.sum())
-        amount = usual or largest or 1.0
-        if np.any(seen) and np.all(frequency[seen] > 0.0):
-            first = int(np.flatnonzero(seen)[0])
-            still = 1.0 / float(np.sum(weight[seen] / frequency[seen] ** 2))
-            w = float(frequency[first])
-            return PortScale(amount, w**2 / float(weight[first]), w, still, largest or 1.0)
-        free = not np.any(frequency[seen] > 0.0)
-        return PortScale(
-            amount, (force or 1.0) / amount, (speed or 1.0) / amount, None, largest or amount, free=free,
-            turns=self._turns[name] or not (free and self._driven_only and np.any(seen)),
-        )  # fmt: skip
-
-
-def rig_scales(
-    lumped: LumpedRig, parameters: FloatArray, campaign: Campaign, stations: tuple[float, float] | None
-) -> Scales:
-    """Return the natural scales of a rig under a campaign, at its prior mean."""
-    driven_only = all(trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN for trial in campaign.trials)
-    conditions, ports = Conditions(parameters), PortSizes(lumped, driven_only=driven_only)
-    rig, description = lumped.rig(), lumped.description
-    force, peak, speed, weight = 0.0, 0.0, 0.0, 0.0
-    for trial in campaign.trials:
-        pushes = [
-            float(np.max(np.abs(trial.values[trial.used[:, column], column]), initial=0.0))
-            for column, name in enumerate(trial.channels)
-            if campaign.channels[name].quantity in (Quantity.FORCE, Quantity.TORQUE)
-        ]
-        force = max(force, float(np.max(np.abs(trial.force))))
-        if not trial.is_dynamic or trial.kind is TrialKind.RINGDOWN:
-            continue
-        try:
-            motion = lumped.moving(trial, conditions)
-        except ModelError:
-            motion = lumped.moving(trial, conditions, still=True)
-        ports.add(motion, max(pushes, default=0.0), not trial.held_out)
-        here = motion.q @ motion.rig.shapes.T[:, : description.size]
-        pace = motion.velocity @ motion.rig.shapes.T[:, : description.size]
-        peak = max(peak, float(np.max(np.abs(here), initial=0.0)))
-        speed = max(speed, float(np.max(np.abs(pace), initial=0.0)))
-        weight = max(weight, float(np.max(np.abs(motion.rig.load_at(motion.acting, motion.time)))))
-    dynamic = [trial for trial in campaign.trials if trial.is_dynamic]
-    duration = max((float(trial.time[-1] - trial.time[0]) for trial in dynamic), default=1.0)
-    elastic = rig.angular_frequency[rig.angular_frequency > 0.0]
-    begins = [trial.start + (trial.time[0] if trial.is_dynamic else 0.0) for trial in campaign.trials]
-    ends = [trial.start + (trial.time[-1] if trial.is_dynamic else 0.0) for trial in campaign.trials]
-    frequency = float(elastic[0]) if len(elastic) else speed / peak if peak > 0.0 < speed else 1.0 / duration
-    mass = float(np.trace(rig.mass)) / max(len(rig.mass), 1)
-    stiffness = weight / peak if peak > 0.0 < weight else mass * frequency**2
-    return Scales(
-        length=description.characteristic_length or (max(map(abs, stations)) if stations else 0.0) or 1.0,
-        tip_stiffness=stiffness,
-        modal_mass=mass,
-        angular_frequency=frequency,
-        force=force or weight,
-        load_factor=0.0,
-        duration=duration,
-        campaign_time=max(max(ends) - min(begins), 0.0) or 1.0,
-        ports={item.name: ports.scale(item.name) for item in description.port},
-    )

@@ -18,8 +18,8 @@ from scipy.linalg import eigh, null_space
 from discrepancy.campaign.records import Quantity, Start
 from discrepancy.errors import ModelError
 from discrepancy.models.compiled_motion import compiled_kernel
-from discrepancy.models.input_course import Course, Drive
 from discrepancy.models.interface import Response
+from discrepancy.models.rig_records import Acting, Effort, Shown
 from discrepancy.models.stepwise import Boundaries, CoupledModes, ExactSteps, advance, exact_steps, substeps
 from fe.runtime.errors import SolutionError
 from fe.runtime.motion import Laws, static_solution
@@ -32,51 +32,6 @@ SMOOTH_PARTS = 8
 """Steps of an interval under an input that is a spline; straight lines on them err by 1e-6 of it."""
 LEAST_PIVOT = 1e-9
 """A rig whose equilibrium is determined worse than this has none of its own."""
-
-
-@dataclass(frozen=True)
-class Acting:
-    """What acts in a trial.
-
-    Attributes
-    ----------
-    time : (N,) ndarray
-        Stamps of the inputs and of the samples [s].
-    loads : sequence of ((n + m,) ndarray, Course)
-        Vector and course of each load.
-    constant : (n + m,) ndarray
-        Constant load.
-    drives : sequence of Drive
-        Prescribed motions, in the order of `Rig.drives`.
-    begins : Start
-        How it began.
-    initial : (L,) ndarray
-        State at the first stamp, where it is unknown: displacements and speeds of the modes, then the states.
-    clock : tuple of float
-        Rate and zero of the samples beside the inputs.
-    """
-
-    time: FloatArray
-    loads: Sequence[tuple[FloatArray, Course]]
-    constant: FloatArray
-    drives: Sequence[Drive] = ()
-    begins: Start = Start.SETTLED
-    initial: FloatArray = field(default_factory=lambda: np.zeros(0))
-    clock: tuple[float, float] = (0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class Shown:
-    """What an output shows: row . u and row . x, or the reaction of a drive (its number), and a constant.
-
-    `order` is how often u is derived, `further` how often x.
-    """
-
-    row: FloatArray
-    order: int = 0
-    further: int = 0
-    reaction: int | None = None
-    constant: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +48,8 @@ class Rig:
         Rows where internal forces act, on displacements or on states.
     drives : (P, n + m) ndarray
         Rows whose motion is prescribed.
+    actions : mapping of str to (n + m,) ndarray
+        Rows along which laws at ports act, where that is not how they see.
     """
 
     mass: FloatArray
@@ -101,6 +58,12 @@ class Rig:
     displacements: int
     ports: Mapping[str, FloatArray]
     drives: FloatArray
+    actions: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    @cached_property
+    def acting_rows(self) -> dict[str, FloatArray]:
+        """Rows (n + m,) along which laws at the ports act."""
+        return {**self.ports, **self.actions}
 
     @cached_property
     def lift(self) -> FloatArray:
@@ -177,6 +140,9 @@ class Rig:
             np.concatenate((self.angular_frequency, np.zeros(whole - count))), damping,
             {name: np.asarray(row @ self.shapes) for name, row in self.ports.items()},
             stiffness_matrix=stiffness,
+            actions={
+                name: np.asarray(row @ self.shapes) for name, row in self.acting_rows.items()
+            } if self.actions else {},
         )  # fmt: skip
 
     # ------------------------------------------------------------ rest
@@ -387,7 +353,7 @@ class RigMotion:
         if self.laws.rate != 0.0:
             found[:, :count] -= self.laws.rate * self.time[:, None] * (q @ stiffness.T)
         if len(self.laws):
-            rows = self.laws.rows(rig.modal.ports, self.q.shape[1])
+            rows = self.laws.rows(rig.modal.actions or rig.modal.ports, self.q.shape[1])
             found[:, :count] -= self.port_forces @ rows[:, :count]
         for number, drive in enumerate(self.acting.drives):
             found[:, count + number] = np.sqrt(rig._heavy) * drive.at(self.time, 2)
@@ -401,7 +367,16 @@ class RigMotion:
         for matrix, coordinates in pairs:
             total += coordinates @ (along @ matrix @ rig.shapes)
         if len(self.laws):
-            total += self.port_forces @ (self.laws.rows(rig.ports, len(rig.mass)) @ along)
+            total += self.port_forces @ (self.laws.rows(rig.acting_rows, len(rig.mass)) @ along)
+        return np.asarray(total)
+
+    def effort(self, effort: Effort) -> FloatArray:
+        """Return what a controller gives (N,)."""
+        n, shapes = self.rig.displacements, self.rig.shapes
+        total = self.q @ (effort.by_displacement @ shapes[:n])
+        total += self.velocity @ (effort.by_speed @ shapes[:n] + effort.by_state @ shapes[n:])
+        for factor, course in effort.courses:
+            total += factor * course.at(self.time)
         return np.asarray(total)
 
     def displacements(self, rows: FloatArray) -> FloatArray:
@@ -419,6 +394,10 @@ class RigMotion:
         for column, item in enumerate(shown):
             if item.reaction is not None:
                 values[:, column] = self.reaction(item.reaction)
+                rates[:, column] = np.gradient(values[:, column], self.time)
+                continue
+            if item.effort is not None:
+                values[:, column] = self.effort(item.effort)
                 rates[:, column] = np.gradient(values[:, column], self.time)
                 continue
             if max(item.order, item.further + 1) >= 2 and motion[3] is None:

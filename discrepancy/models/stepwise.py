@@ -4,7 +4,8 @@ The linear step of each length is the exponential of one matrix (Van Loan 1978),
 squaring, all lengths at once. Lengths that differ by less than `ALIKE` of the usual one are one.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -37,9 +38,12 @@ class CoupledModes(ModalSystem):
     ----------
     stiffness_matrix : (M, M) ndarray, optional
         S [1/s^2]; the squared angular frequencies where it is left out.
+    actions : mapping of str to (M,) ndarray
+        Rows along which laws at ports act, where that is not how they see; empty: everywhere the same.
     """
 
     stiffness_matrix: FloatArray | None = None
+    actions: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @cached_property
     def coupled(self) -> bool:
@@ -279,7 +283,8 @@ def advance(
     state = State(np.array(q, dtype=float), np.array(v, dtype=float), result.memory, np.zeros(len(laws)))
     ports = laws.at(
         laws.rows(system.ports, modes), port_flexibility(system, laws), system.relaxation,
-        np.zeros((2, len(laws))),
+        np.zeros((2, len(laws))), laws.rows(system.actions, modes) if isinstance(system, CoupledModes) and
+        system.actions else None,
     )  # fmt: skip
     out = Samples(result.q, result.v, result.port_forces, result.lagged)
     compiled_steps()(given, tuple(structure), tuple(ports), tuple(state), tuple(out))

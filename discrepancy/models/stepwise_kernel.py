@@ -92,7 +92,7 @@ def integrate_steps(
     )  # fmt: skip
     laws = Ports(
         given.rows, given.numbers, given.of_speed, given.values, given.elements, given.flexibility,
-        given.relaxation, np.zeros((2, count)),
+        given.relaxation, np.zeros((2, count)), given.acts,
     )  # fmt: skip
     laws.feed[1, :] = go.feed[0]
     h = go.length[go.which[0]]

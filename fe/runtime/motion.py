@@ -85,7 +85,14 @@ class Laws:
         """Return the memory (J, 5 + E) of laws that have never been loaded."""
         return np.zeros((len(self), HEAD + self.elements.shape[1]))
 
-    def at(self, rows: FloatArray, flexibility: FloatArray, relaxation: float, feed: FloatArray) -> Ports:
+    def at(
+        self,
+        rows: FloatArray,
+        flexibility: FloatArray,
+        relaxation: float,
+        feed: FloatArray,
+        acts: FloatArray | None = None,
+    ) -> Ports:
         """Return the laws at ports, for the loops; what is given is that of `Ports`."""
         return Ports(
             rows,
@@ -96,6 +103,7 @@ class Laws:
             flexibility,
             float(relaxation),
             feed,
+            rows if acts is None else acts,
         )
 
 

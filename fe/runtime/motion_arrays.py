@@ -57,7 +57,7 @@ class Ports(NamedTuple):
     Attributes
     ----------
     rows : (J, M) ndarray
-        Row of the port of each law.
+        Row of the port of each law: what it sees.
     numbers : (J,) ndarray of int
         Laws.
     of_speed : (J,) ndarray of int
@@ -71,6 +71,8 @@ class Ports(NamedTuple):
         beta of that flexibility [s].
     feed : (2, J) ndarray
         What the modes do not hold of the ports' positions by the force f = 1, and by the constant force.
+    acts : (J, M) ndarray
+        Row along which each law acts; that of its port, but for flows from one store into another.
     """
 
     rows: FloatArray
@@ -81,6 +83,7 @@ class Ports(NamedTuple):
     flexibility: FloatArray
     relaxation: float
     feed: FloatArray
+    acts: FloatArray
 
 
 class State(NamedTuple):
@@ -104,7 +107,7 @@ class Acting(NamedTuple):
     springs : (J,) ndarray of int
         Room for the leaders of the laws of position alone.
     weight : (J,) ndarray
-        p . p.
+        p . b, what the law's port sees of its own push.
     strength : (J,) ndarray
         Of a law of speed, for the port's speed.
     give : (J,) ndarray

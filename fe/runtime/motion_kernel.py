@@ -102,12 +102,12 @@ def find_routes(ports: Ports, acting: Acting) -> None:
         moves = False
         for m in range(modes):
             moves = moves or ports.rows[j, m] != 0.0
-            acting.weight[j] += ports.rows[j, m] * ports.rows[j, m]
+            acting.weight[j] += ports.rows[j, m] * ports.acts[j, m]
         if acting.weight[j] == 0.0:
             acting.route[j] = STILL
             continue
         for m in range(modes):
-            acting.pull[j, m] = ports.rows[j, m] / acting.weight[j]
+            acting.pull[j, m] = ports.acts[j, m] / acting.weight[j]
         if moves and ports.flexibility[j] > 0.0:
             acting.route[j] = FLEXIBLE
             for k in range(j, -1, -1):
@@ -126,7 +126,7 @@ def find_answer(linear: Linear, ports: Ports, acting: Acting, j: int) -> None:
     for m in range(2 * modes):
         acting.answer[j, m] = 0.0
         for k in range(modes):
-            acting.answer[j, m] += linear.transition[m, modes + k] * ports.rows[j, k]
+            acting.answer[j, m] += linear.transition[m, modes + k] * ports.acts[j, k]
     acting.give[j] = 0.0
     for m in range(modes):
         acting.give[j] += ports.rows[j, m] * acting.answer[j, m]
@@ -183,7 +183,7 @@ def first_half(
     for j in range(count):
         if state.current[j] != 0.0:
             for m in range(modes):
-                state.v[m] -= ports.rows[j, m] * state.current[j] * half
+                state.v[m] -= ports.acts[j, m] * state.current[j] * half
     if linear.rate != 0.0:
         for m in range(modes):
             state.v[m] -= half * linear.rate * time * linear.stiffness[m] * state.q[m]
@@ -253,7 +253,7 @@ def second_half(
         advance(ports.numbers[j], ports.values[j], ports.elements[j], state.memory[j], x, 1)
         state.current[j] = force(ports.numbers[j], ports.values[j], state.memory[j], x)
         for m in range(modes):
-            state.v[m] -= ports.rows[j, m] * state.current[j] * half
+            state.v[m] -= ports.acts[j, m] * state.current[j] * half
     if linear.rate != 0.0:
         for m in range(modes):
             state.v[m] -= half * linear.rate * (time + h) * linear.stiffness[m] * state.q[m]
@@ -303,8 +303,8 @@ def slopes_at_port(
             first -= linear.damping[m, k] * before.v[k]
             last -= linear.damping[m, k] * state.v[k]
         for k in range(count):
-            first -= ports.rows[k, m] * before.forces[k]
-            last -= ports.rows[k, m] * state.current[k]
+            first -= ports.acts[k, m] * before.forces[k]
+            last -= ports.acts[k, m] * state.current[k]
         at_begin += ports.rows[j, m] * first
         at_end += ports.rows[j, m] * last
     return at_begin, at_end
@@ -358,7 +358,7 @@ def record(
                     push -= linear.damping[m, k] * state.v[k]
                 for k in range(count):
                     if acting.route[k] != SPEED:
-                        push -= ports.rows[k, m] * state.current[k]
+                        push -= ports.acts[k, m] * state.current[k]
                 need += ports.rows[j, m] * push / acting.weight[j]
             out.forces[sample, j] = (
                 min(max(need, -most), most) if dry(ports.numbers[j], ports.values[j]) else need

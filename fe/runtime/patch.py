@@ -17,8 +17,10 @@ from .laws.bouc_wen import BoucWen as BoucWen
 from .laws.free_play import FreePlay as FreePlay
 from .laws.interface import PortForce as PortForce
 from .laws.micro_slip import MicroSlip as MicroSlip
+from .laws.overflow import Overflow as Overflow
 from .laws.power_damping import PowerDamping as PowerDamping
 from .laws.power_stiffness import PowerStiffness as PowerStiffness
+from .laws.sine_force import SineForce as SineForce
 from .primitive import Primitive as Primitive
 
 EVERY_CHANNEL = "*"

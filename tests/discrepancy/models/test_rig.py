@@ -29,6 +29,7 @@ from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import parse_lumped
+from discrepancy.models.lumped_scales import FORCES
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness, Primitive
 
 FloatArray = NDArray[np.float64]
@@ -398,7 +399,7 @@ def test_scales_come_from_what_acts_and_moves() -> None:
     scales = model_of(FALL).scales(campaign)
     port = scales.ports["air"]
     assert port.displacement == pytest.approx(0.5 * 9.81 * time[-1] ** 2)
-    assert port.stiffness * port.displacement == pytest.approx(2.0 * 9.81)
+    assert port.stiffness * port.displacement == pytest.approx(FORCES * 2.0 * 9.81)
     assert port.angular_frequency * port.displacement == pytest.approx(9.81 * time[-1])
 
 
@@ -422,7 +423,7 @@ def test_scales_come_from_what_acts_and_moves() -> None:
             "is the reaction of 'hand', which is no input",
         ),
         (DAMPER, 'quantity = "force"', 'quantity = "level"', "is a reaction: give it quantity"),
-        (DAMPER, 'reaction = "actuator"\n', "", "needs either a vector or a reaction"),
+        (DAMPER, 'reaction = "actuator"\n', "", "needs one of a vector, a reaction and a controller"),
         (BASE, "vector = [-1.0, 1.0]", "vector = [1.0]", "has 1 entry, but the model has 2 unknowns"),
     ],
 )

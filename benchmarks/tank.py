@@ -1,0 +1,66 @@
+"""A tank that is filled and drains, as a setting for the pictures of flows."""
+
+import tomllib
+
+import numpy as np
+
+from discrepancy.campaign.records import (
+    Campaign,
+    Channel,
+    Hold,
+    NoiseRecord,
+    Quantity,
+    RecordedInput,
+    Start,
+    Trial,
+    TrialKind,
+)
+from discrepancy.catalogue.entry import Setting
+from discrepancy.models.interface import Conditions
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.lumped_file import parse_lumped
+from discrepancy.models.sensing import observe
+from fe.runtime.patch import ModelPatch
+
+MODEL = """
+format = 1
+name = "Tank"
+capacity = 2.0
+conductance = 0.05
+[[input]]
+name = "pump"
+vector = 1.0
+quantity = "flow"
+[[output]]
+name = "level"
+vector = 1.0
+quantity = "level"
+[[port]]
+name = "outlet"
+vector = 1.0
+[[parameter]]
+name = "conductance_factor"
+terms = "conductance"
+deviation = 0.1
+low = 0.1
+high = 10.0
+"""
+
+
+def tank_setting() -> Setting:
+    """Return a driven trial of a tank as it is, without noise."""
+    model = LumpedModel(parse_lumped(tomllib.loads(MODEL)))
+    time = np.arange(0.0, 300.0, 2.0)
+    zero, pair = np.zeros(len(time)), np.zeros((len(time), 2))
+    pump = RecordedInput("pump", Quantity.FLOW, 0.15 * (np.sin(0.04 * time) > 0.0), Hold.ZERO_ORDER)
+    trial = Trial(
+        name="filled and drained", kind=TrialKind.DRIVEN, channels=("level",),
+        values=np.zeros((len(time), 1)),
+        used=np.ones((len(time), 1), dtype=bool), time=time, force=zero, load_factor=zero,
+        load_place="tip_load", temperature=zero, start=0.0, run="", health=pair, health_deviation=pair,
+        begins=Start.STILL, inputs=(pump,),
+    )  # fmt: skip
+    channel = Channel("level", Quantity.LEVEL, "level", NoiseRecord(0.01, np.inf))
+    campaign = Campaign("Tank", {"level": channel}, (trial,), None, {}, "")
+    trial.values[:] = observe(model, campaign, trial, ModelPatch(), Conditions(np.ones(1))).values
+    return Setting(campaign, model, model.scales(campaign))

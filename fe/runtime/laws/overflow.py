@@ -1,0 +1,109 @@
+"""What begins at a level, an overflow or a relief valve: F = c ((v - l) / v0)^n where v is above l.
+
+Of speed, so that at a port of a state it is a flow out of what is full: v is the level. Parameters: c, n, l,
+v0. Alone at a port of speed s it takes s' = -strength (s - l)^n, which has a closed form. NumPy and relative
+imports only: this file is copied into the FMU.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from .interface import FloatArray, PortForce, power
+
+
+@dataclass(frozen=True, slots=True)
+class Overflow(PortForce):
+    """F = coefficient ((v - level) / v0)^exponent where v > level, v0 = `reference_velocity`; else zero."""
+
+    kind: ClassVar[str] = "overflow"
+    of_speed: ClassVar[bool] = True
+    proportional: ClassVar[tuple[str, ...]] = ("coefficient",)
+    units: ClassVar[dict[str, str]] = {
+        "coefficient": "N or N m", "exponent": "1", "level": "m/s or rad/s",
+        "reference_velocity": "m/s or rad/s",
+    }  # fmt: skip
+    coefficient: float
+    exponent: float
+    level: float
+    reference_velocity: float
+
+    @property
+    def row(self) -> tuple[float, ...]:
+        """c, n, l, v0."""
+        return self.coefficient, self.exponent, self.level, self.reference_velocity
+
+    @property
+    def magnitude(self) -> float:
+        """Flow at v0 above the level."""
+        return self.coefficient
+
+    def check(self) -> None:
+        """Raise `InvalidPatchError` where a number cannot be."""
+        self.require(
+            positive={"reference_velocity": self.reference_velocity, "exponent": self.exponent},
+            least_zero={"coefficient": self.coefficient, "level": self.level},
+        )
+
+
+def pull(
+    law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, h: float, least: int
+) -> tuple[float, float]:
+    """Return force and slope at `x`, the speed being that of the way."""
+    above = (x - memory[1]) / h - law[2]
+    if above <= 0.0:
+        return 0.0, 0.0
+    size = law[0] * power(above / law[3], law[1])
+    return size, size * law[1] / (above * h)
+
+
+def settle(
+    law: FloatArray, elements: FloatArray, memory: FloatArray, y: float, r: float, h: float, about: float
+) -> float:
+    """Return F of x + r F((x - last) / h) = y, and carry the memory to that x."""
+    low, high = memory[1] + h * law[2], y
+    found = 0.0
+    if high > low:
+        for _ in range(80):
+            x = 0.5 * (low + high)
+            found = pull(law, elements, memory, x, h, 1)[0]
+            if x + r * found > y:
+                high = x
+            else:
+                low = x
+        y = 0.5 * (low + high)
+    memory[1] = y
+    memory[4] = found
+    return float(found)
+
+
+# ---------------------------------------------------------------- as a law of speed
+
+
+def strength(law: FloatArray, weight: float) -> float:
+    """Return the strength for a port whose speed a unit impulse changes by `weight`."""
+    return float(weight * law[0] / power(law[3], law[1]))
+
+
+def steady(law: FloatArray, x: float, speed: float) -> float:
+    """Return the flow at a level."""
+    return float(law[0] * power(max(speed - law[2], 0.0) / law[3], law[1]))
+
+
+def resistance(law: FloatArray, unit: float, speed: float) -> float:
+    """Return the size of the flow at a level."""
+    return unit * power(max(speed - law[2], 0.0), law[1]) if speed > law[2] else 0.0
+
+
+def kick(law: FloatArray, speed: float, strength: float, duration: float, through: bool) -> float:
+    """Return the level after s' = -strength (s - l)^n alone."""
+    above, n = speed - law[2], law[1]
+    if above <= 0.0:
+        return speed
+    if n == 1.0:
+        return float(law[2] + above * np.exp(-strength * duration))
+    root = power(above, 1.0 - n) - (1.0 - n) * strength * duration
+    if root <= 0.0:
+        return float(law[2])
+    return float(law[2] + power(root, 1.0 / (1.0 - n)))

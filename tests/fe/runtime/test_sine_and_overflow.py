@@ -1,0 +1,42 @@
+"""Laws that are a sine of position, and that begin at a level: closed forms and what they must not do."""
+
+import numpy as np
+import pytest
+
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.laws import overflow, sine_force
+from fe.runtime.motion import laws_of
+from fe.runtime.patch import ModelPatch, Overflow, SineForce
+
+
+@pytest.mark.parametrize("y", [-2.0, 0.3, 5.0])
+def test_a_sine_settles_where_flexibility_and_force_meet(y: float) -> None:
+    law = np.array([*SineForce("p", 2.0, 3.0, 0.4).row, 0.0, 0.0])
+    memory = np.zeros(5)
+    found = sine_force.settle(law, np.zeros(1), memory, y, 0.1, 0.01, y)
+    x = memory[1]
+    assert x + 0.1 * found == pytest.approx(y, abs=1e-12)
+    assert found == pytest.approx(2.0 * np.sin(3.0 * x + 0.4), abs=1e-12)
+    step = 1e-6
+    slope = (sine_force.force(law, memory, x + step) - sine_force.force(law, memory, x - step)) / (2.0 * step)
+    assert sine_force.slope(law, np.zeros(1), memory, x) == pytest.approx(slope, rel=1e-6)
+
+
+@pytest.mark.parametrize("exponent", [0.5, 1.0, 1.5])
+def test_an_overflow_empties_to_its_level_as_its_equation_says(exponent: float) -> None:
+    law = np.array([*Overflow("p", 0.7, exponent, 2.0, 1.3).row, 0.0])
+    strength = overflow.strength(law, 0.4)
+    level, count = 3.5, 20000
+    whole = overflow.kick(law, level, strength, 2.0, False)
+    for _ in range(count):
+        half = level - 0.5 * (2.0 / count) * 0.4 * overflow.steady(law, 0.0, level)
+        level -= (2.0 / count) * 0.4 * overflow.steady(law, 0.0, half)
+    assert whole == pytest.approx(level, abs=1e-6)
+    assert overflow.kick(law, 1.9, strength, 2.0, False) == 1.9
+    assert overflow.steady(law, 0.0, 1.9) == 0.0
+    assert overflow.kick(law, 3.5, strength, 1e3, False) == pytest.approx(2.0, abs=1e-2)
+
+
+def test_numbers_that_cannot_be_are_refused() -> None:
+    with pytest.raises(InvalidPatchError, match="level of 'overflow' must not be negative"):
+        laws_of(ModelPatch((Overflow("p", 1.0, 1.0, -1.0, 1.0),)), ("p",))
