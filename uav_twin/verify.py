@@ -268,8 +268,10 @@ def plate_checks(operators: "AffineOperators", *, limited: bool = True) -> Itera
         for name, difference in (
             ("gauges", found.strain),
             ("d ln strain / d ln e", found.strain_slope),
-            (f"strain ratio, z1 = {DAMAGE:g}", found.damage_ratio[0]),
-            (f"strain ratio, z2 = {DAMAGE:g}", found.damage_ratio[1]),
+            *(
+                (f"strain ratio, {name} = {DAMAGE:g}", difference)
+                for name, difference in zip(operators.regions, found.damage_ratio, strict=True)
+            ),
         ):
             for kind, gauges, limit in (
                 ("rms", np.arange(len(difference)), 0.03),
@@ -297,7 +299,8 @@ def calculix_checks(operators: "AffineOperators", jobs: Path) -> Iterator[Check]
     from fe.runtime.state import DigitalState
     from fe.verification.calculix_comparison import modal_agreement, static_agreement
 
-    for health, loss in (("healthy", (0.0, 0.0)), ("damaged", DAMAGED)):
+    damaged = tuple(DAMAGED[number % 2] for number in range(len(operators.regions)))
+    for health, loss in (("healthy", ()), ("damaged", damaged)):
         group = f"CalculiX, {health}"
         for case in static_agreement(operators, jobs / health, 1.0, loss):
             yield Check(group, f"{case.load}: displacement of all nodes", case.displacement, 1e-5)

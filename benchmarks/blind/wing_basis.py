@@ -34,7 +34,6 @@ from fe.full.operators import (
 from fe.full.statics import Factorisation
 from fe.full.turn_load import STANDARD_GRAVITY
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
-from fe.wing.mesh import DEFECT_1, DEFECT_2, SKIN
 
 FloatArray = NDArray[np.float64]
 
@@ -288,7 +287,7 @@ def _region_stiffness(operators: AffineOperators, region: int) -> tuple[list[spa
     inside = (mesh.centres[:, 1] > start) & (mesh.centres[:, 1] < end)
     elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
     parts = []
-    for term in (SKIN, DEFECT_1, DEFECT_2):
+    for term in range(3):
         cells = np.flatnonzero(inside & (mesh.region == term))
         if cells.size:
             matrix = grid.stiffness(cells, elasticity[cells], variation[cells])

@@ -137,7 +137,7 @@ def calibrate_dynamics(
         )
 
     def frequencies(factor: float, servo: float, pitot: float) -> tuple[float, float]:
-        modes = model.modes(factor, (0.0, 0.0), servo, pitot)
+        modes = model.modes(factor, (), servo, pitot)
         first, second = modes.flapwise
         return float(modes.frequency[first]), float(modes.frequency[second])
 

@@ -27,7 +27,7 @@ _NOTES = {
     "masses": "nominal; calibrated later",
     "gauges": "(distance from the root, chord fraction); row A is gauges 1-16, row B gauges 17-24",
     "lift": "net load on the half-wing at the load factor",
-    "defects": "upper skin; the first loses z1, the second z2",
+    "defects": "upper skin; the first loses z1, the second z2 and so on",
 }
 
 

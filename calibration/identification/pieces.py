@@ -16,7 +16,6 @@ from fe.full.assembly import Discretisation
 from fe.full.gauges import gauge_output
 from fe.full.operators import (
     ROOT_UNKNOWNS,
-    STIFFNESS_TERM_NAMES,
     cell_density,
     cell_elasticity,
     modulus_variation,
@@ -26,7 +25,7 @@ from fe.full.operators import (
 )
 from fe.full.turn_load import inertia_relief, lift_load
 from fe.wing.design import WingDesign
-from fe.wing.mesh import DEFECT_1, DEFECT_2, SKIN, WingMesh, build_mesh
+from fe.wing.mesh import WingMesh, build_mesh
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -41,13 +40,13 @@ class ReducedTerms(NamedTuple):
 
     Attributes
     ----------
-    stiffness : (4, N, N)
+    stiffness : (K + 2, N, N)
         Terms of the affine stiffness.
     lift, tip : (N,)
         Load at load factor 1, and a unit force at the place of the static test.
     gauges : (G, N)
         Gauge strains.
-    modal_stiffness : (4, m, m)
+    modal_stiffness : (K + 2, m, m)
     modal_mass : (3, m, m)
         Structure, 1 kg in each servo, 1 kg in the pitot.
     """
@@ -79,7 +78,7 @@ class WingPieces:
     elasticity, variation, density : (nc, 6, 6), (nc, 27), (nc,)
         Of the cells.
     term : (nc,)
-        Which of the four stiffness terms a cell belongs to.
+        Which stiffness term a cell belongs to.
     expansion : csr (full, n)
         Free to all unknowns.
     springs : (3,)
@@ -165,7 +164,7 @@ def wing_pieces(design: WingDesign, base: WingPieces | None = None) -> WingPiece
         elasticity=cell_elasticity(mesh),
         variation=modulus_variation(mesh),
         density=density,
-        term=np.select([mesh.region == region for region in (SKIN, DEFECT_1, DEFECT_2)], [0, 1, 2], 3),
+        term=mesh.stiffness_term,
         expansion=expansion,
         springs=np.array([root.transverse_spring, root.flap_spring, root.yaw_spring]),
         lift=lift,
@@ -230,7 +229,7 @@ def reduced_difference(
 
 def _cell_terms(pieces: WingPieces, cells: IntArray, static: FloatArray, modal: FloatArray) -> ReducedTerms:
     """Stiffness of the cells and mass of the structure on the expanded bases (full, N) and (full, m)."""
-    terms, N, m = len(STIFFNESS_TERM_NAMES), static.shape[1], modal.shape[1]
+    terms, N, m = len(pieces.design.regions) + 2, static.shape[1], modal.shape[1]
     both = np.hstack([static, modal])
     stiffness = np.zeros((terms, N, N))
     modal_stiffness = np.zeros((terms, m, m))
@@ -275,7 +274,7 @@ def _rigid_part(points: FloatArray, local: FloatArray) -> FloatArray:
 
 def _other_terms(pieces: WingPieces, static: FloatArray, modal: FloatArray) -> ReducedTerms:
     """Springs, point masses, loads and outputs on bases of free unknowns."""
-    terms, N, m = len(STIFFNESS_TERM_NAMES), static.shape[1], modal.shape[1]
+    terms, N, m = len(pieces.design.regions) + 2, static.shape[1], modal.shape[1]
     stiffness, modal_stiffness, mass = np.zeros((terms, N, N)), np.zeros((terms, m, m)), np.zeros((3, m, m))
     root = slice(-ROOT_UNKNOWNS, None)
     stiffness[-1] = static[root].T @ (pieces.springs[:, None] * static[root])

@@ -15,6 +15,7 @@ from scipy.linalg import cho_factor, cho_solve, eigh
 from calibration.errors import IdentificationError
 from calibration.published_strains import LIBRARY_FACTOR
 from fe.full.operators import AffineOperators
+from fe.runtime.state import Losses
 
 from .pieces import ReducedTerms
 from .targets import LEVELS, LOAD_FACTOR, MASS_TOTAL, REFERENCE_PITOT
@@ -83,8 +84,15 @@ class ReducedWing:
     def _parameter_count(self) -> int:
         return len(self.derivatives.lift)
 
-    def _solution(self, factor: float, loss: tuple[float, float]) -> "_State":
-        theta = AffineOperators.theta(factor, loss)
+    def _theta(self, factor: float, loss: Losses = ()) -> FloatArray:
+        """Coefficients (K + 2,) of the stiffness terms; regions beyond those of `loss` are healthy."""
+        theta = np.ones(len(self.terms.stiffness))
+        theta[0] = factor
+        theta[1 : 1 + len(loss)] -= loss
+        return theta
+
+    def _solution(self, factor: float, loss: Losses) -> "_State":
+        theta = self._theta(factor, loss)
         matrix = np.tensordot(theta, self.terms.stiffness, axes=1)
         try:
             factors = cho_factor(matrix)
@@ -94,7 +102,7 @@ class ReducedWing:
             ) from None
         return _State(theta, factors)
 
-    def strain(self, factor: float, loss: tuple[float, float]) -> Value:
+    def strain(self, factor: float, loss: Losses) -> Value:
         """Gauge strains (G,) at `LOAD_FACTOR`."""
         state, own, change = self._solution(factor, loss), self.terms, self.derivatives
         u = LOAD_FACTOR * state.solve(own.lift)
@@ -104,7 +112,7 @@ class ReducedWing:
 
     def strain_slope(self, factor: float) -> Value:
         """D ln strain / d ln e (G,) of the healthy wing."""
-        state, own, change = self._solution(factor, (0.0, 0.0)), self.terms, self.derivatives
+        state, own, change = self._solution(factor, ()), self.terms, self.derivatives
         skin = own.stiffness[0]
         u = LOAD_FACTOR * state.solve(own.lift)
         du = -state.solve(skin @ u)
@@ -121,7 +129,7 @@ class ReducedWing:
 
     def tip_stiffness(self, factor: float = 1.0) -> Value:
         """Tip stiffness [N/m] and d ln k / d ln e, (2,)."""
-        state, own, change = self._solution(factor, (0.0, 0.0)), self.terms, self.derivatives
+        state, own, change = self._solution(factor, ()), self.terms, self.derivatives
         skin = own.stiffness[0]
         u = state.solve(own.tip)
         flexibility, energy = float(own.tip @ u), float(u @ skin @ u)
@@ -144,7 +152,7 @@ class ReducedWing:
         parameters = self._parameter_count
         value, gradient = np.empty((len(factor), MODES)), np.empty((len(factor), MODES, parameters))
         for row, (e, servo, pitot) in enumerate(zip(factor, servo_mass, pitot_mass, strict=True)):
-            theta, mass_theta = AffineOperators.theta(e, (0.0, 0.0)), AffineOperators.mass_theta(servo, pitot)
+            theta, mass_theta = self._theta(e), AffineOperators.mass_theta(servo, pitot)
             stiffness = np.tensordot(theta, own.modal_stiffness, axes=1)
             mass = np.tensordot(mass_theta, own.modal_mass, axes=1)
             values, shapes = eigh(stiffness, mass)

@@ -136,5 +136,5 @@ def _frequencies(model: ReducedModel, point: NDArray[np.float64]) -> NDArray[np.
         min(max(value, low), high)  # a node may leave the range by a rounding error
         for value, (low, high) in zip(point.tolist(), (model.validity[name] for name in _NAMES), strict=True)
     )
-    modes = model.modes(factor, (0.0, 0.0), servo, pitot)
+    modes = model.modes(factor, (), servo, pitot)
     return modes.frequency[list(modes.flapwise)]

@@ -46,7 +46,6 @@ _AXIS_TITLES = {
     "damping_ratio_2": r"$\zeta_2$ (%)",
 }
 _FACES = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
-_SKIN = 2  # regions up to this one are skin, see `fe.reduction.fields.FieldBasis`
 
 
 def corner_figure(joint: Float, paper: Float) -> Figure:
@@ -227,7 +226,8 @@ def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Fig
 def _upper_faces(fields: WingFields) -> NDArray[np.int64]:
     """Return the corners of the outer faces of the upper skin, (F, 4)."""
     basis = fields.basis
-    skin = basis.cells[basis.region <= _SKIN][:, :8]
+    # the skin and the damage regions in it, see `fe.reduction.fields.FieldBasis`
+    skin = basis.cells[basis.region <= len(fields.model.regions)][:, :8]
     height = basis.points[skin][:, :, 2]
     skin = skin[height.mean(axis=1) > 0.0]
     candidates = skin[:, np.array(_FACES)]

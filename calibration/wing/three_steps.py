@@ -221,7 +221,7 @@ def quantities_of(model: ReducedModel, samples: Float) -> Float:
                 f"{low:g} to {high:g}; check the measurements."
             )
     for row, (factor, servo, pitot, alpha, beta) in enumerate(samples.tolist()):
-        modes = model.modes(factor, (0.0, 0.0), servo, pitot)
+        modes = model.modes(factor, (), servo, pitot)
         frequency = modes.frequency[list(modes.flapwise)]
         found[row, 0] = model.tip_stiffness(factor)
         found[row, 1:3] = frequency

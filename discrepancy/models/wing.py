@@ -41,7 +41,7 @@ from fe.runtime.patch import (
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import LOAD_PLACE, PORTS, PatchedWing
 from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
-from fe.runtime.reduced_arrays import PARAMETER_NAMES
+from fe.runtime.reduced_arrays import parameter_names
 from fe.wing.design import load_design
 
 FloatArray = NDArray[np.float64]
@@ -83,7 +83,7 @@ class WingModel:
         self.wing = PatchedWing(arrays)
         self._name = name
         prior = prior or SHIPPED_PRIOR
-        box = dict(zip(PARAMETER_NAMES, arrays.validity_box.tolist(), strict=True))
+        box = dict(zip(parameter_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
         limits = {key: (low, high) for key, (low, high) in box.items()} | DAMPING_LIMITS
         self._parameters = tuple(
             ModelParameter(item.name, *prior[item.name], item.unit, *limits[item.name]) for item in STATE
@@ -162,8 +162,8 @@ class WingModel:
         """Return the natural scales under a campaign, by the unpatched wing."""
         values = np.array([campaign.parameters.get(p.name, (p.mean, 0.0))[0] for p in self._parameters])
         empty = ModelPatch()
-        static = self._structure.stiffness(values, (0.0, 0.0), empty, 0.0)
-        moved = self._structure.moving(values, (0.0, 0.0), empty, 0.0, LOAD_PLACE)
+        static = self._structure.stiffness(values, (), empty, 0.0)
+        moved = self._structure.moving(values, (), empty, 0.0, LOAD_PLACE)
         tip = self.wing.arrays.load_tip
         first, shape = float(moved.system.angular_frequency[0]), moved.basis @ moved.system.shapes[:, 0]
         motions = {

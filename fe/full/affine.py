@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
+from fe.runtime.state import Losses, losses_of
+
 FloatArray = NDArray[np.float64]
 
 
@@ -16,8 +18,10 @@ class AffineSystem:
 
     Attributes
     ----------
+    regions : tuple of str
+        Names of the K damage regions.
     stiffness_terms : tuple of csr (n, n)
-        Skin without defects, defect 1, defect 2, and the rest with the root springs [N/m].
+        Skin without the damage regions, each of these, and the rest with the root springs [N/m].
     mass_terms : tuple of csr (n, n)
         Structure [kg]; 1 kg in each servo; 1 kg in the pitot [1].
     load_lift : (n,) N
@@ -34,6 +38,7 @@ class AffineSystem:
         Hash of the design.
     """
 
+    regions: tuple[str, ...]
     stiffness_terms: tuple[sparse.csr_array, ...]
     mass_terms: tuple[sparse.csr_array, ...]
     load_lift: FloatArray
@@ -53,20 +58,18 @@ class AffineSystem:
         """Upward displacement (n,) at the place of the static test [1]."""
         return self.load_tip
 
-    @staticmethod
-    def theta(young_modulus_factor: float, stiffness_loss: tuple[float, float]) -> FloatArray:
-        """Coefficients (4,) of the stiffness terms at e and (z1, z2)."""
-        return np.array([young_modulus_factor, 1.0 - stiffness_loss[0], 1.0 - stiffness_loss[1], 1.0])
+    def theta(self, young_modulus_factor: float, stiffness_loss: Losses) -> FloatArray:
+        """Coefficients (K + 2,) of the stiffness terms at e and the losses z."""
+        loss = losses_of(stiffness_loss, self.regions)
+        return np.array([young_modulus_factor, *(1.0 - z for z in loss), 1.0])
 
     @staticmethod
     def mass_theta(servo_mass: float, pitot_mass: float) -> FloatArray:
         """Coefficients (3,) of the mass terms at masses [kg] of one servo and of the pitot."""
         return np.array([1.0, servo_mass, pitot_mass])
 
-    def stiffness(
-        self, young_modulus_factor: float = 1.0, stiffness_loss: tuple[float, float] = (0.0, 0.0)
-    ) -> sparse.csr_array:
-        """Stiffness (n, n) [N/m] at e and (z1, z2)."""
+    def stiffness(self, young_modulus_factor: float = 1.0, stiffness_loss: Losses = ()) -> sparse.csr_array:
+        """Stiffness (n, n) [N/m] at e and the losses z."""
         return affine_sum(self.theta(young_modulus_factor, stiffness_loss), self.stiffness_terms)
 
     def mass(self, servo_mass: float, pitot_mass: float) -> sparse.csr_array:

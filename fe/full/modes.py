@@ -10,6 +10,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, norm
 
 from fe.runtime.errors import SolutionError
+from fe.runtime.state import Losses
 
 from .operators import ROOT_UNKNOWNS, AffineOperators
 from .statics import Factorisation
@@ -121,7 +122,7 @@ def flapwise_bending_modes(operators: AffineOperators, shapes: FloatArray, mass:
 def eigenmodes(
     operators: AffineOperators,
     young_modulus_factor: float,
-    stiffness_loss: tuple[float, float],
+    stiffness_loss: Losses,
     servo_mass: float,
     pitot_mass: float,
     count: int = 6,

@@ -1,7 +1,7 @@
 """Affine operators of the wing: the full finite element model as a few matrices.
 
-K(e, z) = e K_skin + (1 - z1) K_1 + (1 - z2) K_2 + K_0 and M(m) = M_0 + m_servo M_s + m_pitot M_p, where
-K_skin is the skin without the two defect regions: in the published model the factor e does not scale them.
+K(e, z) = e K_skin + (1 - z1) K_1 + ... + K_0 and M(m) = M_0 + m_servo M_s + m_pitot M_p, where K_skin is the
+skin without the damage regions: in the published model the factor e does not scale them.
 The root is a rigid rib on three springs; its held motions are eliminated, so that all matrices act on the
 free unknowns: those of the nodes outside the root section, then root heave [m], flap [rad] and yaw [rad].
 """
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.wing.design import WingDesign
-from fe.wing.mesh import DEFECT_1, DEFECT_2, SKIN, SurfacePoint, WingMesh, build_mesh
+from fe.wing.mesh import SurfacePoint, WingMesh, build_mesh
 from fe.wing.parts import PointMassPlace
 
 from .affine import AffineSystem
@@ -32,7 +32,6 @@ from .turn_load import inertia_relief, lift_load
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-STIFFNESS_TERM_NAMES: tuple[str, ...] = ("skin", "defect_1", "defect_2", "base")
 MASS_TERM_NAMES: tuple[str, ...] = ("base", "servo", "pitot")
 ROOT_UNKNOWNS = 3
 
@@ -233,10 +232,10 @@ def assemble(design: WingDesign) -> AffineOperators:
 
     elasticity, density, variation = cell_elasticity(mesh), cell_density(mesh), modulus_variation(mesh)
     terms = []
-    for regions in ((SKIN,), (DEFECT_1,), (DEFECT_2,)):
-        cells = np.flatnonzero(np.isin(mesh.region, regions))
+    for term in range(len(design.regions) + 1):
+        cells = np.flatnonzero(mesh.stiffness_term == term)
         terms.append(reduced(discretisation.stiffness(cells, elasticity[cells], variation[cells])))
-    cells = np.flatnonzero(mesh.region > DEFECT_2)
+    cells = np.flatnonzero(mesh.stiffness_term == len(design.regions) + 1)
     springs = np.zeros(expansion.shape[1])
     root = design.root
     springs[-ROOT_UNKNOWNS:] = root.transverse_spring, root.flap_spring, root.yaw_spring
@@ -272,6 +271,7 @@ def assemble(design: WingDesign) -> AffineOperators:
     if design.lift.inertia_relief:
         lift = lift + inertia_relief(design, discretisation, density, weights, lift)
     return AffineOperators(
+        regions=design.regions,
         stiffness_terms=tuple(terms),
         mass_terms=tuple(reduced(mass) for mass in masses),
         load_lift=np.asarray(restriction @ lift),

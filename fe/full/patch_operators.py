@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.wing.design import WingDesign
-from fe.wing.mesh import DEFECT_1, DEFECT_2, SKIN
 
 from .assembly import Discretisation, point_jacobians
 from .gauges import gauge_output
@@ -32,8 +31,6 @@ from .turn_load import STANDARD_GRAVITY
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-SKIN_REGIONS = (SKIN, DEFECT_1, DEFECT_2)
-"""Regions of the skin, in the order of the first three stiffness terms."""
 LEAST_LINE_DISTANCE = 0.1
 """Least distance between lines of a section, as a fraction of the chord."""
 
@@ -92,7 +89,7 @@ class PatchOperators:
     strip_stiffness : tuple of csr (n, n) N/m
         Parts of the stiffness terms of the skin that lie in the strips.
     strip_of, term_of : (T,)
-        Strip, and stiffness term (skin, defect 1, defect 2), of each of these parts.
+        Strip, and stiffness term (skin, damage regions), of each of these parts.
     flap : int
         Unknown that is the flapping rotation of the root.
     flap_spring : float
@@ -182,8 +179,8 @@ def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) 
     elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
     parts, strip_of, term_of = [], [], []
     for strip in range(len(edges) - 1):
-        for term, region in enumerate(SKIN_REGIONS):
-            cells = np.flatnonzero((strips == strip) & (mesh.region == region))
+        for term in range(len(design.regions) + 1):
+            cells = np.flatnonzero((strips == strip) & (mesh.stiffness_term == term))
             if cells.size:
                 matrix = discretisation.stiffness(cells, elasticity[cells], variation[cells])
                 parts.append(sparse.csr_array(restriction @ (matrix @ expansion)))

@@ -8,6 +8,7 @@ from scipy import sparse
 from scipy.sparse.linalg import norm
 
 from fe.runtime.errors import SolutionError
+from fe.runtime.state import Losses
 
 from .cholesky import Cholesky
 from .operators import AffineOperators
@@ -104,7 +105,7 @@ class StaticSolution:
 def solve_static(
     operators: AffineOperators,
     young_modulus_factor: float = 1.0,
-    stiffness_loss: tuple[float, float] = (0.0, 0.0),
+    stiffness_loss: Losses = (),
     load_factor: float = 1.0,
     tip_force: float = 0.0,
 ) -> StaticSolution:
@@ -144,7 +145,7 @@ def static_outputs(operators: AffineOperators, displacement: FloatArray) -> Stat
 def tip_stiffness(
     operators: AffineOperators,
     young_modulus_factor: float = 1.0,
-    stiffness_loss: tuple[float, float] = (0.0, 0.0),
+    stiffness_loss: Losses = (),
 ) -> float:
     """Stiffness [N/m] of the static test: force near the tip over the displacement there."""
     solution = solve_static(operators, young_modulus_factor, stiffness_loss, load_factor=0.0, tip_force=1.0)

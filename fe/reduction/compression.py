@@ -37,15 +37,13 @@ def compressed(model: ReducedModel, directions: FloatArray) -> ReducedModel:
         static_load=model.static_load @ directions,
         static_output=model.static_output @ directions,
         residual_load=np.ascontiguousarray(factor[:, :2]),
-        residual_stiffness=np.ascontiguousarray(factor[:, 2:].reshape(len(factor), 4, -1)),
+        residual_stiffness=np.ascontiguousarray(factor[:, 2:].reshape(len(factor), len(stiffness), -1)),
         dual_correction=model.dual_correction @ orthonormal,
         cross_mass=model.cross_mass @ directions,
     )
 
 
-def fewest_directions(
-    model: ReducedModel, states: list[tuple[float, float, float]], tolerance: float
-) -> FloatArray:
+def fewest_directions(model: ReducedModel, states: list[tuple[float, ...]], tolerance: float) -> FloatArray:
     """Return the fewest singular directions of the reduced solutions that keep the bound below a tolerance.
 
     Parameters
@@ -53,7 +51,7 @@ def fewest_directions(
     model : ReducedModel
         The model that the greedy search made.
     states : list of tuple
-        States (e, z1, z2) to look at.
+        States (e, z1, ...) to look at.
     tolerance : float
         Relative bound wanted.
 
@@ -63,9 +61,9 @@ def fewest_directions(
         Orthonormal combinations of its static basis vectors; all of them if fewer do not suffice.
     """
     solutions = []
-    for e, z1, z2 in states:
+    for e, *losses in states:
         for load in ((1.0, 0.0), (0.0, 1.0)):
-            coordinates = model.static_response(e, (z1, z2), *load).coordinates
+            coordinates = model.static_response(e, tuple(losses), *load).coordinates
             solutions.append(coordinates / np.linalg.norm(coordinates))
     directions = np.linalg.svd(np.array(solutions).T)[0]
     low, high = 2, directions.shape[1]
@@ -79,11 +77,11 @@ def fewest_directions(
     return np.asarray(directions[:, :low])
 
 
-def relative_bound(model: ReducedModel, parameters: tuple[float, float, float]) -> float:
+def relative_bound(model: ReducedModel, parameters: tuple[float, ...]) -> float:
     """Return the larger certified strain error bound of the two loads, relative to the largest strain."""
-    e, z1, z2 = parameters
+    e, *losses = parameters
     worst = 0.0
     for load in ((1.0, 0.0), (0.0, 1.0)):
-        response = model.static_response(e, (z1, z2), *load)
+        response = model.static_response(e, tuple(losses), *load)
         worst = max(worst, response.strain_error_bound / float(np.abs(response.strain).max()))
     return worst

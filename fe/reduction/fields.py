@@ -15,6 +15,7 @@ import numpy.typing as npt
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.kept_arrays import KeptArrays
 from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import Losses
 
 if TYPE_CHECKING:
     from fe.full.operators import AffineOperators
@@ -55,7 +56,7 @@ class FieldBasis(KeptArrays):
     cells : (C, 20) ndarray
         Nodes of the cells in VTK's order, with positive Jacobians.
     region : (C,) ndarray
-        0 skin, 1 first and 2 second defect region, 3 webs, 4 ribs.
+        0 skin, 1 to K the damage regions, K + 1 webs, K + 2 ribs.
     static_displacement : (P, 3, N) ndarray
         Static basis vectors [m per unit coordinate].
     static_strain : (C, 6, N) ndarray
@@ -160,7 +161,7 @@ def write_wing_vtu(
     wing: WingFields,
     *,
     young_modulus_factor: float,
-    stiffness_loss: tuple[float, float],
+    stiffness_loss: Losses,
     load_factor: float,
     tip_force: float = 0.0,
 ) -> None:
@@ -196,7 +197,7 @@ def write_wing_vtu(
     basis = wing.basis
     strain = basis.static_strain @ coordinates
     loss = np.zeros(len(basis.region))
-    for number, value in enumerate(stiffness_loss, start=1):
+    for number, value in enumerate(wing.model.losses(stiffness_loss), start=1):
         loss[basis.region == number] = value
     _write(
         Path(path),
@@ -216,7 +217,7 @@ def write_modes_vtu(
     wing: WingFields,
     *,
     young_modulus_factor: float,
-    stiffness_loss: tuple[float, float],
+    stiffness_loss: Losses,
     servo_mass: float,
     pitot_mass: float,
 ) -> None:

@@ -19,6 +19,8 @@ from fe.runtime.errors import ReductionError
 FloatArray = npt.NDArray[np.float64]
 
 START_ITERATIONS = 4
+MOST_GRID_REGIONS = 3
+"""Regions up to which the states that are looked at form a full grid; with more, they are chosen."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,8 @@ class _WorkingBasis:
     def __init__(self, system: AffineSystem, norm: Norm) -> None:
         self.system, self.norm = system, norm
         self.basis = OrthonormalBasis(len(system.load_lift), norm, drop=1e-6)
-        self.stiffness = np.empty((4, 0, 0))
-        self.mass = np.empty((3, 0, 0))
+        self.stiffness = np.empty((len(system.stiffness_terms), 0, 0))
+        self.mass = np.empty((len(system.mass_terms), 0, 0))
 
     def extend(self, vectors: FloatArray) -> None:
         """Add vectors (n, k) and project the terms on them."""
@@ -92,35 +94,60 @@ def eigenmodes(
     return np.asarray(values), np.asarray(vectors)
 
 
-def sampled_states(box: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the states at which the working basis is refined: the corners of z, with e and masses mixed in.
+def loss_corners(regions: int) -> list[tuple[int, ...]]:
+    """Return which end of its range each loss takes, (K,) of 0 and 1, where modes are computed.
 
-    Each entry holds the coefficients of the stiffness terms (4,) and of the mass terms (3,).
+    All corners up to `MOST_GRID_REGIONS`; beyond, all healthy, all damaged, each region alone damaged, and
+    each alone healthy.
     """
-    (e, z1, z2), (servo, pitot) = box[:3], box[5:7]
+    if regions <= MOST_GRID_REGIONS:
+        return list(itertools.product((0, 1), repeat=regions))
+    alone = [tuple(int(number == chosen) for number in range(regions)) for chosen in range(regions)]
+    others = [tuple(1 - end for end in corner) for corner in alone]
+    return [(0,) * regions, *alone, *others, (1,) * regions]
+
+
+def sampled_states(box: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the states at which the working basis is refined: `loss_corners`, with e and masses mixed in.
+
+    Each entry holds the coefficients of the stiffness terms (K + 2,) and of the mass terms (3,).
+    """
+    e, losses, (servo, pitot) = box[0], box[1:-4], box[-2:]
     states = []
-    for number, (i, j) in enumerate(itertools.product((0, 1), (0, 1))):
+    for number, ends in enumerate(loss_corners(len(losses))):
+        remaining = [1.0 - loss[end] for loss, end in zip(losses, ends, strict=True)]
         for flip in (0, 1):
             corner = (number + flip) % 2
             states.append(
                 (
-                    np.array((e[(i + j + flip) % 2], 1.0 - z1[i], 1.0 - z2[j], 1.0)),
+                    np.array((e[(sum(ends) + flip) % 2], *remaining, 1.0)),
                     np.array((1.0, servo[corner], pitot[(corner + number // 2 + flip) % 2])),
                 )
             )
-    middle = np.array((e.mean(), 1.0 - z1.mean(), 1.0 - z2.mean(), 1.0))
+    middle = np.array((e.mean(), *(1.0 - loss.mean() for loss in losses), 1.0))
     states.append((middle, np.array((1.0, servo.mean(), pitot.mean()))))
     return states
 
 
 def compression_states(box: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the states whose modes are compressed together: a grid over the whole box."""
-    (e, z1, z2), (servo, pitot) = box[:3], box[5:7]
+    """Return the states whose modes are compressed together: a grid over the whole box.
+
+    With more than `MOST_GRID_REGIONS` the losses are `loss_corners`, the same halfway.
+    """
+    e, losses, (servo, pitot) = box[0], box[1:-4], box[-2:]
+    levels = [(loss[0], loss.mean(), loss[1]) for loss in losses]
+    if len(losses) <= MOST_GRID_REGIONS:
+        choices = list(itertools.product((0, 1, 2), repeat=len(losses)))
+    else:
+        corners = loss_corners(len(losses))
+        choices = sorted({tuple(end * level for end in ends) for ends in corners for level in (1, 2)})
     return [
-        (np.array((a, 1.0 - b, 1.0 - c, 1.0)), np.array((1.0, s, p)))
+        (
+            np.array((a, *(1.0 - level[i] for level, i in zip(levels, chosen, strict=True)), 1.0)),
+            np.array((1.0, s, p)),
+        )
         for a in e
-        for b in (z1[0], z1.mean(), z1[1])
-        for c in (z2[0], z2.mean(), z2[1])
+        for chosen in choices
         for s in servo
         for p in (pitot[0], pitot.mean(), pitot[1])
     ]
@@ -143,10 +170,10 @@ def reduce_modes(
         The full model.
     norm : Norm
         Energy norm at `reference`.
-    reference : (3,) ndarray
-        (e, 1 - z1, 1 - z2) of the norm.
-    box : (7, 2) ndarray
-        Validity box, `fe.runtime.reduced_arrays.PARAMETER_NAMES`.
+    reference : (K + 1,) ndarray
+        (e, 1 - z1, ...) of the norm.
+    box : (K + 5, 2) ndarray
+        Validity box, `fe.runtime.reduced_arrays.parameter_names`.
     nominal_masses : tuple of float
         Servo and pitot mass at which the flapwise modes are named, at e = 1 and no loss [kg].
     settings : ModalSettings
@@ -166,7 +193,7 @@ def reduce_modes(
             f"{settings.mode_count} modes cannot be had from {unknowns} unknowns; ask for fewer or refine."
         )
     working = _WorkingBasis(system, norm)
-    matrix = affine_sum((1.0, *np.mean(box[5:7], axis=1)), system.mass_terms)
+    matrix = affine_sum((1.0, *np.mean(box[-2:], axis=1)), system.mass_terms)
     # inverse iteration on a block; what it leaves is refined below
     vectors = np.random.default_rng(1).normal(size=(unknowns, count + 4))
     for _ in range(START_ITERATIONS):
@@ -246,7 +273,11 @@ def _flapwise(data: ModalData, system: AffineSystem, nominal_masses: tuple[float
     They are the two modes that contribute most to the compliance under the tip force.
     """
     square, shapes = eigenmodes(
-        data.stiffness, data.mass, np.ones(4), np.array((1.0, *nominal_masses)), data.mode_count
+        data.stiffness,
+        data.mass,
+        np.ones(len(data.stiffness)),
+        np.array((1.0, *nominal_masses)),
+        data.mode_count,
     )
     contribution = (system.load_tip @ data.basis @ shapes) ** 2 / square
     chosen = np.sort(np.argsort(contribution)[-2:])

@@ -24,8 +24,8 @@ from .settings import ReductionSettings
 
 FloatArray = npt.NDArray[np.float64]
 
-DAMAGED_ANCHOR = (0.7, 0.7)
-"""Stiffness losses of the second state of health at which the full model is solved."""
+DAMAGED_ANCHOR = 0.7
+"""Stiffness loss of every damage region in the second state of health at which the full model is solved."""
 LIFT_MOMENTS = 6
 """Courses of the lift along the span for which the full model is solved: Legendre polynomials."""
 MODES = 8
@@ -41,7 +41,7 @@ class PatchSettings:
     Attributes
     ----------
     ranges : ReductionSettings
-        Ranges of e, z1, z2 and the masses, those of the reduced model.
+        Ranges of e, the losses and the masses, those of the reduced model.
     strip_count : int
         Largest number of strips of the skin; by default each row of cells along the span is one.
     vectors : int
@@ -90,8 +90,8 @@ def reduce_patches(
     settings = settings or PatchSettings()
     with stage_of(progress, "Solving the wing for changes"):
         full = assemble_patch_operators(operators, settings.strip_count)
-        healthy = Norm(operators.stiffness(1.0, (0.0, 0.0)))
-        damaged = Norm(operators.stiffness(1.0, DAMAGED_ANCHOR))
+        healthy = Norm(operators.stiffness())
+        damaged = Norm(operators.stiffness(1.0, (DAMAGED_ANCHOR,) * len(operators.regions)))
         snapshots = np.concatenate(
             [_responses(full, healthy, settings, main=True), _responses(full, damaged, settings, main=False)],
             axis=1,
@@ -198,7 +198,8 @@ def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) ->
     span, place = design.planform.semi_span, design.planform.semi_span - design.tip_load.distance_from_tip
     return PatchArrays(
         design_hash=operators.design_hash,
-        validity_box=settings.ranges.validity_box(),
+        region_names=" ".join(operators.regions),
+        validity_box=settings.ranges.validity_box(len(operators.regions)),
         largest_loss=settings.largest_loss,
         largest_compliance=settings.compliance_share * compliance / place**2,
         largest_mass=settings.largest_mass,
@@ -347,12 +348,11 @@ def _patched_state(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return stiffness, mass and loads (N, 3 + 2 L) of a random state; `plain`: of the wing as it was."""
     ranges, span = settings.ranges, arrays.semi_span
-    e, z1, z2, servo, pitot = (
+    e, *losses, servo, pitot = (
         float(generator.uniform(*pair))
         for pair in (
             ranges.young_modulus_factor,
-            ranges.stiffness_loss_1,
-            ranges.stiffness_loss_2,
+            *(ranges.stiffness_loss,) * len(arrays.regions),
             ranges.servo_mass,
             ranges.pitot_mass,
         )
@@ -368,7 +368,7 @@ def _patched_state(
     if plain:
         e, servo, pitot = 1.0, *settings.ranges.nominal_masses
         with_damage = with_box = with_compliance = with_mass = False
-    theta = np.array((e, 1.0 - z1, 1.0 - z2, 1.0)) if with_damage else np.array((e, 1.0, 1.0, 1.0))
+    theta = np.array((e, *(1.0 - z if with_damage else 1.0 for z in losses), 1.0))
     stiffness = np.tensordot(theta, arrays.stiffness, 1)
     if with_box:
         overlap = np.minimum(lines[1:], start + length) - np.maximum(lines[:-1], start)

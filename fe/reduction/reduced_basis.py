@@ -86,7 +86,7 @@ class Reduction:
     modal_basis : (n, Nm) ndarray
         Modal basis vectors.
     snapshots : tuple of tuple
-        Parameters (e, z1, z2) of the full solutions, in the order of the search.
+        Parameters (e, z1, ...) of the full solutions, in the order of the search.
     bound_history : tuple of float
         Largest relative bound on the training set before each of them and at the end.
     """
@@ -94,13 +94,13 @@ class Reduction:
     model: ReducedModel
     static_basis: FloatArray
     modal_basis: FloatArray
-    snapshots: tuple[tuple[float, float, float], ...]
+    snapshots: tuple[tuple[float, ...], ...]
     bound_history: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class _DualData:
-    """Approximate dual solutions: products with X (A1, A2, n, G + 1) and factors of their residuals."""
+    """Approximate dual solutions: products with X (A, n, G + 1) and factors of their residuals."""
 
     products: FloatArray
     factors: FloatArray
@@ -119,6 +119,7 @@ class _StaticReduction:
     ) -> None:
         self.advance = advance
         self.system, self.settings, self.norm, self.reference = system, settings, norm, reference
+        self.counts = settings.anchors(len(system.regions))
         self.loads = np.stack((system.load_lift, system.load_tip), axis=1)
         self.outputs = np.concatenate(
             (
@@ -129,24 +130,27 @@ class _StaticReduction:
         )
         n = len(system.load_lift)
         self.basis = OrthonormalBasis(n, norm, drop=1e-7)
-        self.images = [np.empty((n, 0)) for _ in range(4)]  # stiffness terms times basis vectors
+        self.images = [
+            np.empty((n, 0)) for _ in system.stiffness_terms
+        ]  # stiffness terms times basis vectors
         self.rounding = 0.0
         self.residual_basis = OrthonormalBasis(n, norm, drop=1e-8, functionals=True)
         self.residual_basis.extend(norm.riesz(self.loads), self.loads)
         self.dual = self._approximate_duals()
-        self.snapshots: list[tuple[float, float, float]] = []
+        self.snapshots: list[tuple[float, ...]] = []
 
     def _approximate_duals(self) -> _DualData:
         """Solve the dual problems at the anchors, and prepare the norms of their residuals elsewhere."""
         system, settings = self.system, self.settings
-        levels_1 = remaining_levels(settings.stiffness_loss_1, settings.dual_anchors[0])
-        levels_2 = remaining_levels(settings.stiffness_loss_2, settings.dual_anchors[1])
-        n, count = self.outputs.shape
-        products = np.empty((len(levels_1), len(levels_2), n, count))
-        factors = np.empty((len(levels_1), len(levels_2), count, 4, 4))
+        anchors = list(
+            itertools.product(*(remaining_levels(settings.stiffness_loss, count) for count in self.counts))
+        )
+        terms, (n, count) = len(system.stiffness_terms), self.outputs.shape
+        products = np.empty((len(anchors), n, count))
+        factors = np.empty((len(anchors), count, terms, terms))
         at_reference = self.norm.riesz(self.outputs)
-        for (i, level_1), (j, level_2) in itertools.product(enumerate(levels_1), enumerate(levels_2)):
-            theta = np.array((self.reference[0], level_1, level_2, 1.0))
+        for number, levels in enumerate(anchors):
+            theta = np.array((self.reference[0], *levels, 1.0))
             # a rough solution will do: the norm of what it leaves is computed, not assumed
             dual = conjugate_gradients(
                 affine_sum(theta, system.stiffness_terms),
@@ -156,21 +160,21 @@ class _StaticReduction:
                 tolerance=DUAL_TOLERANCE,
             )
             images = [np.asarray(term @ dual) for term in system.stiffness_terms]
-            lifted = [self.norm.riesz(image) for image in images[:3]]
+            lifted = [self.norm.riesz(image) for image in images[:-1]]
             # X^-1 K_base dual, since X is the sum of all terms at the reference
             base = dual - sum(t * part for t, part in zip(self.reference, lifted, strict=True))
-            factors[i, j] = triangular_factors(
+            factors[number] = triangular_factors(
                 np.stack((at_reference - base, *lifted), axis=2),
-                np.stack((self.outputs - images[3], *images[:3]), axis=2),
+                np.stack((self.outputs - images[-1], *images[:-1]), axis=2),
             )
-            products[i, j] = self.norm.product(dual)
+            products[number] = self.norm.product(dual)
             self.advance(1, "dual solutions")
         return _DualData(products, factors)
 
-    def add_snapshot(self, parameters: tuple[float, float, float]) -> None:
+    def add_snapshot(self, parameters: tuple[float, ...]) -> None:
         """Solve the full model for both loads and extend the bases."""
-        e, z1, z2 = parameters
-        theta = np.array((e, 1.0 - z1, 1.0 - z2, 1.0))
+        e, *losses = parameters
+        theta = np.array((e, *(1.0 - z for z in losses), 1.0))
         matrix = affine_sum(theta, self.system.stiffness_terms)
         start = np.zeros_like(self.loads)
         if self.basis.size:
@@ -188,7 +192,7 @@ class _StaticReduction:
             raise ExtensionError  # rounding is reached; what the search reached is judged after it
         images = [np.asarray(term @ new) for term in self.system.stiffness_terms]
         self.images = [np.concatenate(pair, axis=1) for pair in zip(self.images, images, strict=True)]
-        varying = np.concatenate(images[:3], axis=1)
+        varying = np.concatenate(images[:-1], axis=1)
         self.residual_basis.extend(
             np.concatenate((new, self.norm.riesz(varying)), axis=1),
             np.concatenate((self.basis.products[:, before:], varying), axis=1),
@@ -214,7 +218,8 @@ class _StaticReduction:
         stiffness = np.stack([basis.T @ image for image in self.images])
         return ReducedModel(
             design_hash=self.system.design_hash,
-            validity_box=settings.validity_box(),
+            region_names=" ".join(self.system.regions),
+            validity_box=settings.validity_box(len(self.system.regions)),
             static_stiffness=0.5 * (stiffness + stiffness.transpose(0, 2, 1)),
             static_load=self.loads.T @ basis,
             static_output=self.outputs.T @ basis,
@@ -226,9 +231,9 @@ class _StaticReduction:
             * float(np.sqrt(self.residual_basis.dropped_square))
             + 1e-7,
             rounding_allowance=max(ROUNDING_FACTOR * self.rounding, LEAST_ROUNDING),
-            dual_split_1=loss_splits(settings.stiffness_loss_1, settings.dual_anchors[0]),
-            dual_split_2=loss_splits(settings.stiffness_loss_2, settings.dual_anchors[1]),
-            dual_correction=np.swapaxes(self.dual.products, 2, 3) @ residual,
+            dual_counts=np.array(self.counts, dtype=np.int64),
+            dual_split=np.concatenate([loss_splits(settings.stiffness_loss, count) for count in self.counts]),
+            dual_correction=np.swapaxes(self.dual.products, 1, 2) @ residual,
             dual_residual=self.dual.factors,
             modal_stiffness=modal.stiffness,
             modal_mass=modal.mass,
@@ -244,8 +249,8 @@ class _StaticReduction:
 
         The residual is f - X u - sum (theta_q - reference_q) K_q u, and the basis was offered X u and K_q u.
         """
-        e, z1, z2 = self.settings.validity_box()[:3]
-        ends = np.array((e, 1.0 - z1, 1.0 - z2))
+        e, *losses = self.settings.validity_box(len(self.system.regions))[: len(self.reference)]
+        ends = np.array((e, *(1.0 - z for z in losses)))
         farthest = np.abs(ends - self.reference[:, np.newaxis]).max(axis=1)
         return float(np.sqrt(1.0 + farthest @ farthest))
 
@@ -275,13 +280,8 @@ def reduce_model(
         If the full model cannot be solved.
     """
     settings = settings or ReductionSettings()
-    reference = np.array(
-        (
-            np.mean(settings.young_modulus_factor),
-            remaining_levels(settings.stiffness_loss_1, 1)[0],
-            remaining_levels(settings.stiffness_loss_2, 1)[0],
-        )
-    )
+    regions = len(system.regions)
+    reference = settings.reference(regions)
     with stage_of(progress, "Factorising the wing"):
         norm = Norm(affine_sum((*reference, 1.0), system.stiffness_terms))
     with stage_of(progress, "Reducing the modes") as stage:
@@ -289,7 +289,7 @@ def reduce_model(
             system,
             norm,
             reference,
-            settings.validity_box(),
+            settings.validity_box(regions),
             settings.nominal_masses,
             settings.modal,
             stage.advance,
@@ -304,7 +304,7 @@ def reduce_model(
             f"the largest strain, but {settings.bound_tolerance:.2g} was asked for; "
             "allow more snapshots or a looser tolerance."
         )
-    directions = fewest_directions(model, training_set(settings), settings.bound_tolerance)
+    directions = fewest_directions(model, training_set(settings, regions), settings.bound_tolerance)
     return Reduction(
         compressed(model, directions),
         static.basis.vectors @ directions,
@@ -333,20 +333,20 @@ def _greedy(static: _StaticReduction, modal: ModalData) -> list[float]:
             worst = int(bounds.argmax())
             return float(bounds[worst]), mus[worst]
 
-        def extend(self, mu: tuple[float, float, float]) -> None:
+        def extend(self, mu: tuple[float, ...]) -> None:
             """Add the full solutions at the worst state."""
             static.add_snapshot(mu)
             static.advance(1, f"full solution {len(static.snapshots)}")
 
-    settings = static.settings
+    settings, regions = static.settings, len(static.system.regions)
     result = weak_greedy(
         Surrogate(),
-        training_set(settings),
+        training_set(settings, regions),
         atol=SEARCH_MARGIN * settings.bound_tolerance,
         max_extensions=settings.most_snapshots,
     )
     bounds = [float(value) for value in result["max_errs"][1:]]
     if len(bounds) < len(static.snapshots):  # stopped by the limit: the last bound was not evaluated
         model = static.model(modal)
-        bounds.append(max(relative_bound(model, mu) for mu in training_set(settings)))
+        bounds.append(max(relative_bound(model, mu) for mu in training_set(settings, regions)))
     return bounds

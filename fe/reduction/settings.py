@@ -1,13 +1,17 @@
 """Where a reduced model is to hold and how well, and the states at which that is looked at."""
 
+import itertools
 from dataclasses import dataclass, field
+from math import prod
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import qmc
 
-from fe.runtime.reduced_arrays import PARAMETER_NAMES
+from fe.runtime.errors import ReductionError
+from fe.runtime.reduced_arrays import MOST_ANCHORS
 
-from .modal_basis import ModalSettings
+from .modal_basis import MOST_GRID_REGIONS, ModalSettings
 
 FloatArray = npt.NDArray[np.float64]
 Range = tuple[float, float]
@@ -19,8 +23,8 @@ class ReductionSettings:
 
     Attributes
     ----------
-    young_modulus_factor, stiffness_loss_1, stiffness_loss_2 : tuple of float
-        Ranges of e, z1 and z2 [1].
+    young_modulus_factor, stiffness_loss : tuple of float
+        Ranges of e and of the loss of every damage region [1].
     load_factor, tip_force : tuple of float
         Ranges of the loads [1], [N]; the model is linear in them.
     servo_mass, pitot_mass : tuple of float
@@ -33,14 +37,13 @@ class ReductionSettings:
     most_snapshots : int
         Limit of the greedy search.
     dual_anchors : tuple of int
-        How many approximate dual solutions along z1 and z2.
+        How many approximate dual solutions along each loss; empty: `default_anchors`.
     modal : ModalSettings
         Accuracy and number of modes.
     """
 
     young_modulus_factor: Range = (0.9, 1.1)
-    stiffness_loss_1: Range = (0.0, 0.8)
-    stiffness_loss_2: Range = (0.0, 0.8)
+    stiffness_loss: Range = (0.0, 0.8)
     load_factor: Range = (-4.0, 6.0)
     tip_force: Range = (-100.0, 100.0)
     servo_mass: Range = (0.05, 0.30)
@@ -48,21 +51,42 @@ class ReductionSettings:
     nominal_masses: tuple[float, float] = (0.169, 0.134)
     bound_tolerance: float = 6e-4
     most_snapshots: int = 24
-    dual_anchors: tuple[int, int] = (2, 2)
+    dual_anchors: tuple[int, ...] = ()
     modal: ModalSettings = field(default_factory=ModalSettings)
 
-    def validity_box(self) -> FloatArray:
-        """Return the ranges in the order of `fe.runtime.reduced_arrays.PARAMETER_NAMES`, (7, 2)."""
-        ranges = {
-            "young_modulus_factor": self.young_modulus_factor,
-            "z1": self.stiffness_loss_1,
-            "z2": self.stiffness_loss_2,
-            "load_factor": self.load_factor,
-            "tip_force": self.tip_force,
-            "servo_mass": self.servo_mass,
-            "pitot_mass": self.pitot_mass,
-        }
-        return np.array([ranges[name] for name in PARAMETER_NAMES], dtype=np.float64)
+    def validity_box(self, regions: int) -> FloatArray:
+        """Return the ranges (K + 5, 2) for K regions, as `fe.runtime.reduced_arrays.parameter_names`."""
+        losses = (self.stiffness_loss,) * regions
+        loads_and_masses = (self.load_factor, self.tip_force, self.servo_mass, self.pitot_mass)
+        return np.array((self.young_modulus_factor, *losses, *loads_and_masses), dtype=np.float64)
+
+    def reference(self, regions: int) -> FloatArray:
+        """Return the values (K + 1,) of (e, 1 - z1, ...) whose stiffness is the norm of the error bound."""
+        return np.array(
+            (np.mean(self.young_modulus_factor), *(remaining_levels(self.stiffness_loss, 1)[0],) * regions)
+        )
+
+    def anchors(self, regions: int) -> tuple[int, ...]:
+        """Return the number of approximate dual solutions along each of the losses.
+
+        Raises
+        ------
+        ReductionError
+            If `dual_anchors` does not fit the regions, or is more than a model holds.
+        """
+        counts = self.dual_anchors or default_anchors(regions)
+        if len(counts) != regions or min(counts) < 1 or prod(counts) > MOST_ANCHORS:
+            raise ReductionError(
+                f"dual_anchors must be {regions} numbers, one for each damage region, whose product is at "
+                f"most {MOST_ANCHORS}, but is {counts}."
+            )
+        return counts
+
+
+def default_anchors(regions: int) -> tuple[int, ...]:
+    """Return two approximate dual solutions along each loss, for as many regions as a model holds them."""
+    twice = MOST_ANCHORS.bit_length() - 1
+    return tuple(2 if number < twice else 1 for number in range(regions))
 
 
 def remaining_levels(loss: Range, count: int) -> FloatArray:
@@ -77,17 +101,32 @@ def loss_splits(loss: Range, count: int) -> FloatArray:
     return np.asarray(1.0 - high * (low / high) ** (np.arange(1, count) / count))
 
 
-def training_set(settings: ReductionSettings) -> list[tuple[float, float, float]]:
-    """Return the states (e, z1, z2) on which the greedy search looks for the largest bound."""
+TRAINING_LEVELS = 7
+"""Losses of each region on the training set, while that is a grid."""
+CHOSEN_STATES = 512
+"""States inside the box on the training set, where that is no grid."""
+
+
+def training_set(settings: ReductionSettings, regions: int) -> list[tuple[float, ...]]:
+    """Return the states (e, z1, ...) on which the greedy search looks for the largest bound.
+
+    A full grid up to `MOST_GRID_REGIONS`; beyond, the corners of the losses with either end of e and points
+    of a Halton sequence between them. The bound itself is certified wherever it is evaluated.
+    """
     low, high = settings.young_modulus_factor
+    span = settings.stiffness_loss
+    top, bottom = 1.0 - span[0], 1.0 - span[1]
 
-    def losses(span: Range) -> FloatArray:
-        top, bottom = 1.0 - span[0], 1.0 - span[1]
-        return np.asarray(np.clip(1.0 - top * (bottom / top) ** np.linspace(0.0, 1.0, 7), *span))
+    def loss_at(share: FloatArray) -> FloatArray:
+        return np.asarray(np.clip(1.0 - top * (bottom / top) ** share, *span))
 
-    return [
-        (float(e), float(z1), float(z2))
-        for e in (low, 0.5 * (low + high), high)
-        for z1 in losses(settings.stiffness_loss_1)
-        for z2 in losses(settings.stiffness_loss_2)
+    if regions <= MOST_GRID_REGIONS:
+        losses = loss_at(np.linspace(0.0, 1.0, TRAINING_LEVELS)).tolist()
+        moduli = (float(low), float(0.5 * (low + high)), float(high))
+        return [(e, *loss) for e in moduli for loss in itertools.product(losses, repeat=regions)]
+    corners = [
+        (float(e), *loss) for e in (low, high) for loss in itertools.product(map(float, span), repeat=regions)
     ]
+    points = qmc.Halton(regions + 1, scramble=False).random(CHOSEN_STATES)
+    inside = np.column_stack((low + (high - low) * points[:, 0], loss_at(points[:, 1:])))
+    return [*corners, *(tuple(state) for state in inside.tolist())]

@@ -7,7 +7,7 @@ import io
 import os
 import tempfile
 import zipfile
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -86,10 +86,15 @@ def arrays_from_bytes(
         raise ReducedModelFileError(
             f"{where} is not a sound archive of plain arrays ({reason}); delete it and build it anew."
         ) from cause
+    require_arrays(arrays, where, wanted)
+    return arrays
+
+
+def require_arrays(arrays: Mapping[str, npt.NDArray[Any]], where: str, wanted: Iterable[str]) -> None:
+    """Raise `ReducedModelFileError` if one of the `wanted` names is not among the arrays of `where`."""
     missing = [name for name in wanted if name not in arrays]
     if missing:
         raise ReducedModelFileError(f"{where} lacks {', '.join(missing)}; build it anew.")
-    return arrays
 
 
 def write_bytes_atomically(path: Path, content: bytes) -> None:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import numpy.typing as npt
 
-from .archive import arrays_from_bytes, arrays_to_bytes, write_bytes_atomically
+from .archive import arrays_from_bytes, arrays_to_bytes, require_arrays, write_bytes_atomically
 from .errors import ReducedModelFileError
 
 
@@ -83,12 +83,13 @@ class KeptArrays:
         where = where or f"The {cls.what.removeprefix('a ')}"
         kept = [item for item in fields(cls) if item.init]
         layout = () if cls.layout is None else (cls.layout[0],)
-        arrays = arrays_from_bytes(content, where, (*layout, *(item.name for item in kept)))
+        arrays = arrays_from_bytes(content, where, layout)
         if cls.layout is not None and arrays[cls.layout[0]].tolist() != cls.layout[1]:
             raise ReducedModelFileError(
                 f"{where} has the format {arrays[cls.layout[0]]}, but this version reads {cls.layout[1]}; "
                 "build it anew."
             )
+        require_arrays(arrays, where, (item.name for item in kept))
         try:
             values: dict[str, Any] = {
                 item.name: item.type(arrays[item.name])

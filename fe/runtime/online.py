@@ -13,7 +13,7 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class DualArrays:
-    """Approximate dual solutions at one anchor: `correction` (G + 1, R) and `factor` (4 (G + 1), 4)."""
+    """Approximate dual solutions at one anchor: `correction` (G + 1, R) and `factor` (T (G + 1), T)."""
 
     correction: FloatArray
     factor: FloatArray
@@ -26,21 +26,21 @@ class OnlineArrays:
     ----------
     square : tuple of int
         (N, N).
-    stiffness : (4, N N) ndarray
+    stiffness : (T, N N) ndarray
         Stiffness terms, flat.
-    residual : (R, 2 + 4 N) ndarray
+    residual : (R, 2 + T N) ndarray
         Times the loads, then the stiffness coefficients times the coordinates: the residual.
-    limits : tuple of float
-        Validity limits of e, z1, z2, load factor and tip force, least and largest in turn.
+    limits : tuple of (float, float)
+        Validity limits of e, of the losses, of load factor and tip force.
     reference : tuple of float
         `bound_reference`.
-    split_1, split_2 : list of float
-        `dual_split_1`, `dual_split_2`.
-    dual : list of list of DualArrays
+    splits : tuple of list of float
+        `dual_split` of each region.
+    dual : list of DualArrays
         Approximate dual solutions by anchor.
     """
 
-    __slots__ = ("dual", "limits", "reference", "residual", "split_1", "split_2", "square", "stiffness")
+    __slots__ = ("dual", "limits", "reference", "residual", "splits", "square", "stiffness")
 
     def __init__(
         self,
@@ -50,24 +50,24 @@ class OnlineArrays:
         bound_reference: FloatArray,
         residual_load: FloatArray,
         residual_stiffness: FloatArray,
-        splits: tuple[FloatArray, FloatArray],
+        dual_counts: npt.NDArray[np.int64],
+        dual_split: FloatArray,
         dual_correction: FloatArray,
         dual_residual: FloatArray,
     ) -> None:
         self.square = static_stiffness.shape[1:]
-        self.stiffness = np.ascontiguousarray(static_stiffness.reshape(4, -1))
+        self.stiffness = np.ascontiguousarray(static_stiffness.reshape(len(static_stiffness), -1))
         self.residual = np.concatenate(
             (residual_load, -residual_stiffness.reshape(len(residual_load), -1)), axis=1
         )
-        self.limits = tuple(float(value) for value in validity_box[:5].ravel())
+        self.limits = tuple((float(low), float(high)) for low, high in validity_box[:-2])
         self.reference = tuple(float(value) for value in bound_reference)
-        self.split_1, self.split_2 = ([float(value) for value in split] for split in splits)
-        # to be multiplied by (e, 1 - z1, 1 - z2, 1), as the stiffness
+        ends = np.cumsum(dual_counts - 1)[:-1]
+        self.splits = tuple([float(value) for value in split] for split in np.split(dual_split, ends))
+        # to be multiplied by (e, 1 - z1, ..., 1), as the stiffness
         factors = np.concatenate((-dual_residual[..., 1:], dual_residual[..., :1]), axis=-1)
+        terms = len(static_stiffness)
         self.dual = [
-            [
-                DualArrays(np.ascontiguousarray(correction), np.ascontiguousarray(factor.reshape(-1, 4)))
-                for correction, factor in zip(correction_row, factor_row, strict=True)
-            ]
-            for correction_row, factor_row in zip(dual_correction, factors, strict=True)
+            DualArrays(np.ascontiguousarray(correction), np.ascontiguousarray(factor.reshape(-1, terms)))
+            for correction, factor in zip(dual_correction, factors, strict=True)
         ]

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import ReducedModelFileError
-from .kept_arrays import KeptArrays
-from .reduced_arrays import PARAMETER_NAMES
+from .reduced_arrays import RegionArrays, parameter_names
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -29,18 +28,18 @@ SCALARS = (
 
 
 @dataclass(frozen=True, repr=False)
-class PatchArrays(KeptArrays):
+class PatchArrays(RegionArrays):
     """Dense matrices and rows of a wing in a basis of n vectors, made for changes of `fe.runtime.patch`.
 
     Attributes
     ----------
-    validity_box : (7, 2) ndarray
-        Least and largest value of each of `fe.runtime.reduced_arrays.PARAMETER_NAMES`, SI units.
+    validity_box : (K + 5, 2) ndarray
+        Least and largest value of each of `fe.runtime.reduced_arrays.parameter_names`, SI units.
     largest_loss, largest_compliance, largest_mass : float
         Stiffness loss of a strip [1], root compliance [rad/(N m)] and point mass [kg] up to which the basis
         was made; the accuracy falls slowly beyond.
-    stiffness : (4, n, n) ndarray
-        Stiffness terms: skin, first defect, second defect, the rest.
+    stiffness : (K + 2, n, n) ndarray
+        Stiffness terms: skin, the K damage regions, the rest.
     mass : (3, n, n) ndarray
         Mass terms: structure, 1 kg in each servo, 1 kg in the pitot.
     strip_lines : (S + 1,) ndarray
@@ -88,7 +87,7 @@ class PatchArrays(KeptArrays):
     """
 
     what = "a wing for patches"
-    layout = ("patch_format", 1)
+    layout = ("patch_format", 2)
     kinds: ClassVar = {"strip_stiffness": np.float32, "strip_of": np.int64, "term_of": np.int64}
 
     validity_box: FloatArray
@@ -142,7 +141,9 @@ class PatchArrays(KeptArrays):
             )
         strips = len(self.strip_lines) - 1
         if len(self.strip_of) and not (
-            self.strip_of.min() >= 0 and self.strip_of.max() < strips and set(self.term_of) <= {0, 1, 2}
+            self.strip_of.min() >= 0
+            and self.strip_of.max() < strips
+            and set(self.term_of) <= set(range(len(self.regions) + 1))
         ):
             raise ReducedModelFileError(
                 "The strips of a wing for patches do not fit its strip lines; build it anew."
@@ -155,8 +156,8 @@ class PatchArrays(KeptArrays):
     def _expected_shapes(self) -> dict[str, tuple[int, ...]]:
         n, p, t = self.stiffness.shape[-1], len(self.stations), len(self.strip_of)
         return {
-            "validity_box": (len(PARAMETER_NAMES), 2),
-            "stiffness": (4, n, n),
+            "validity_box": (len(parameter_names(self.regions)), 2),
+            "stiffness": (len(self.regions) + 2, n, n),
             "mass": (3, n, n),
             "strip_lines": (len(self.strip_lines),),
             "strip_stiffness": (t, n * (n + 1) // 2),

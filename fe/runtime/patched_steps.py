@@ -20,6 +20,7 @@ from .patch import LOADS, LoadGain, ModelPatch, PointMass
 from .patched_structure import Modes, PatchedStructure
 from .patched_wing import LOAD_PLACE, ON_MODES, PatchedWing
 from .reduced import ReducedModel
+from .state import Losses
 from .transient import ModalIntegrator, TransientState
 
 FloatArray = npt.NDArray[np.float64]
@@ -75,7 +76,7 @@ class PatchedSteps:
         wing: PatchedWing,
         *,
         young_modulus_factor: float,
-        stiffness_loss: tuple[float, float],
+        stiffness_loss: Losses,
         servo_mass: float,
         pitot_mass: float,
         damping_alpha: float,

@@ -23,7 +23,7 @@ HELD = 1e-7
 class StructureTerms(NamedTuple):
     """What the matrices of a structure are the sum of."""
 
-    theta: FloatArray  # (4,) of the stiffness terms
+    theta: FloatArray  # (K + 2,) of the stiffness terms
     strips: tuple[tuple[float, FloatArray], ...]  # what is added of a strip's part, its stiffness (n, n)
     spring: float  # added to the root's flapping spring
     masses: tuple[float, float]  # servo, pitot

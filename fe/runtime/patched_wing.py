@@ -27,6 +27,7 @@ from .patch import (
 from .patch_arrays import PatchArrays
 from .patched_structure import PatchedStructure, StructureTerms
 from .planform_forces import PLANFORM, STATION_PORTS, PlanformStations, at_stations, planform_stations
+from .state import Losses
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -90,7 +91,7 @@ class PatchedWing:
     def structure(
         self,
         young_modulus_factor: float,
-        stiffness_loss: tuple[float, float],
+        stiffness_loss: Losses,
         servo_mass: float,
         pitot_mass: float,
         patch: ModelPatch = EMPTY,
@@ -122,11 +123,11 @@ class PatchedWing:
                 compliance += item.compliance
             elif isinstance(item, PointMass):
                 points.append((item.mass, self._along(item.station)))
-        theta = np.array((e, 1.0 - stiffness_loss[0], 1.0 - stiffness_loss[1], 1.0))
+        theta = np.array((e, *(1.0 - z for z in arrays.losses(stiffness_loss)), 1.0))
         if not (isfinite(e) and theta.min() > 0.0):
             raise InvalidPatchError(
-                f"The factors on the stiffness of skin and defect regions must be positive, but are "
-                f"{theta[0]:g}, {theta[1]:g} and {theta[2]:g}; lessen the losses or the coefficient."
+                f"The factors on the stiffness of skin and damage regions must be positive, but are "
+                f"{', '.join(f'{factor:g}' for factor in theta[:-1])}; lessen the losses or the coefficient."
             )
         spring = 0.0
         if compliance != 0.0:
@@ -360,11 +361,12 @@ class PatchedWing:
     @cached_property
     def _skin_share(self) -> FloatArray:
         """Share (G,) of the bending stiffness at each gauge that the skin has, as the strain shows it."""
-        softer = np.array((0.7, 0.7, 0.7, 1.0))
+        terms = len(self.arrays.stiffness)
+        softer = np.append(np.full(terms - 1, 0.7), 1.0)
         whole, less = (
             self.arrays.strain_rows[0]
             @ np.linalg.solve(np.tensordot(theta, self.arrays.stiffness, 1), self.arrays.load_lift)
-            for theta in (np.ones(4), softer)
+            for theta in (np.ones(terms), softer)
         )
         return np.asarray((1.0 - whole / less) / (1.0 - softer[0]))
 

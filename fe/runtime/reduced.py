@@ -16,10 +16,11 @@ from numpy.linalg import solve
 
 from .errors import OutsideModelError
 from .online import OnlineArrays
-from .reduced_arrays import PARAMETER_NAMES, ReducedArrays
+from .reduced_arrays import ReducedArrays, parameter_names
 from .responses import Modes, StaticResponse
+from .state import Losses
 
-__all__ = ["PARAMETER_NAMES", "Modes", "ReducedModel", "StaticResponse"]
+__all__ = ["Modes", "ReducedModel", "StaticResponse"]
 
 FloatArray = npt.NDArray[np.float64]
 multiply_outer = np.multiply.outer
@@ -46,7 +47,8 @@ class ReducedModel(ReducedArrays):
                 bound_reference=self.bound_reference,
                 residual_load=self.residual_load,
                 residual_stiffness=self.residual_stiffness,
-                splits=(self.dual_split_1, self.dual_split_2),
+                dual_counts=self.dual_counts,
+                dual_split=self.dual_split,
                 dual_correction=self.dual_correction,
                 dual_residual=self.dual_residual,
             ),
@@ -55,8 +57,8 @@ class ReducedModel(ReducedArrays):
     def __repr__(self) -> str:
         return (
             f"ReducedModel(design_hash={self.design_hash!r}, gauges={self.gauge_count}, "
-            f"static_basis={len(self.static_load.T)}, modal_basis={len(self.modal_load.T)}, "
-            f"modes={self.mode_count})"
+            f"regions={self.regions}, static_basis={len(self.static_load.T)}, "
+            f"modal_basis={len(self.modal_load.T)}, modes={self.mode_count})"
         )
 
     @property
@@ -65,11 +67,16 @@ class ReducedModel(ReducedArrays):
         return int(self.static_output.shape[0]) - 1
 
     @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the rows of `validity_box`."""
+        return parameter_names(self.regions)
+
+    @property
     def validity(self) -> Mapping[str, tuple[float, float]]:
         """Least and largest value for which the model was made, by parameter name (SI units)."""
         return {
             name: (float(low), float(high))
-            for name, (low, high) in zip(PARAMETER_NAMES, self.validity_box, strict=True)
+            for name, (low, high) in zip(self.parameter_names, self.validity_box, strict=True)
         }
 
     def check_validity(self, **values: float) -> None:
@@ -78,15 +85,16 @@ class ReducedModel(ReducedArrays):
         Parameters
         ----------
         **values : float
-            Values by the names of `PARAMETER_NAMES`.
+            Values by the names of `parameter_names`.
 
         Raises
         ------
         OutsideModelError
             If a value lies outside; the sentence names it and its range.
         """
+        validity = self.validity
         for name, value in values.items():
-            low, high = self.validity_box[PARAMETER_NAMES.index(name)]
+            low, high = validity[name]
             if not (isfinite(value) and low <= value <= high):
                 raise OutsideModelError(
                     f"{name} must lie between {low:g} and {high:g}, the range of the reduced model, but is "
@@ -96,7 +104,7 @@ class ReducedModel(ReducedArrays):
     def static_response(
         self,
         young_modulus_factor: float,
-        stiffness_loss: tuple[float, float],
+        stiffness_loss: Losses,
         load_factor: float,
         tip_force: float = 0.0,
     ) -> StaticResponse:
@@ -117,22 +125,15 @@ class ReducedModel(ReducedArrays):
             If a value lies outside the validity box or is not finite.
         """
         e = young_modulus_factor
-        z1, z2 = stiffness_loss
         online = self._online
-        e_low, e_high, z1_low, z1_high, z2_low, z2_high, n_low, n_high, f_low, f_high = online.limits
-        if not (
-            e_low <= e <= e_high
-            and z1_low <= z1 <= z1_high
-            and z2_low <= z2 <= z2_high
-            and n_low <= load_factor <= n_high
-            and f_low <= tip_force <= f_high
-        ):
-            self.check_validity(
-                young_modulus_factor=e, z1=z1, z2=z2, load_factor=load_factor, tip_force=tip_force
-            )
-        remaining_1, remaining_2 = 1.0 - z1, 1.0 - z2
-        values = np.array((e, remaining_1, remaining_2, 1.0, load_factor, tip_force))
-        theta, load = values[:4], values[4:]
+        loss = stiffness_loss if len(stiffness_loss) == len(online.splits) else self.losses(stiffness_loss)
+        given = (e, *loss, load_factor, tip_force)
+        for value, (low, high) in zip(given, online.limits, strict=True):
+            if not low <= value <= high:
+                self.check_validity(**dict(zip(self.parameter_names, given, strict=False)))
+        remaining = [1.0 - value for value in loss]
+        values = np.array((e, *remaining, 1.0, load_factor, tip_force))
+        theta, load = values[:-2], values[-2:]
         stiffness = (theta @ online.stiffness).reshape(online.square)
         coordinates = np.asarray(solve(stiffness, load @ self.static_load), dtype=np.float64)
         output = self.static_output @ coordinates
@@ -142,12 +143,16 @@ class ReducedModel(ReducedArrays):
         # |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha, norms dual to bound_reference
         coefficients = np.empty(online.residual.shape[1])
         coefficients[:2] = load
-        multiply_outer(theta, coordinates, out=coefficients[2:].reshape(4, -1))
+        multiply_outer(theta, coordinates, out=coefficients[2:].reshape(theta.size, -1))
         residual = online.residual @ coefficients
-        anchor = online.dual[bisect_right(online.split_1, z1)][bisect_right(online.split_2, z2)]
-        dual = (anchor.factor @ theta).reshape(-1, 4)
-        reference_e, reference_1, reference_2 = online.reference
-        coercivity = min(e / reference_e, remaining_1 / reference_1, remaining_2 / reference_2, 1.0)
+        number = 0
+        for split, value in zip(online.splits, loss, strict=True):
+            number = number * (len(split) + 1) + bisect_right(split, value)
+        anchor = online.dual[number]
+        dual = (anchor.factor @ theta).reshape(-1, theta.size)
+        coercivity = 1.0
+        for value, reference in zip((e, *remaining), online.reference, strict=True):
+            coercivity = min(coercivity, value / reference)
         outside = self.residual_allowance * sqrt(coordinates @ coordinates)
         remainder = (sqrt(residual @ residual) + outside) / coercivity
         bound = remainder * np.sqrt(einsum("ij,ij->i", dual, dual)) + np.abs(anchor.correction @ residual)
@@ -173,8 +178,8 @@ class ReducedModel(ReducedArrays):
         ----------
         young_modulus_factor : (B,) array_like
             e of each state [1]; scalars are broadcast, here and below.
-        stiffness_loss : (B, 2) array_like
-            (z1, z2) of each state, fractions.
+        stiffness_loss : (B, K) array_like
+            Losses of each state in the order of `regions`, fractions.
         load_factor : (B,) array_like
             Load factor of each state [1].
         tip_force : (B,) array_like
@@ -193,32 +198,29 @@ class ReducedModel(ReducedArrays):
             If the shapes do not fit.
         """
         loss = np.atleast_2d(np.asarray(stiffness_loss, dtype=np.float64))
-        if loss.ndim != 2 or loss.shape[1] != 2:
+        regions = len(self.regions)
+        if loss.ndim != 2 or loss.shape[1] != regions:
             raise ValueError(
-                f"stiffness_loss must have the shape (B, 2), but has {np.shape(stiffness_loss)}."
+                f"stiffness_loss must have the shape (B, {regions}), but has {np.shape(stiffness_loss)}."
             )
         columns: tuple[FloatArray, ...] = np.broadcast_arrays(
             np.asarray(young_modulus_factor, dtype=np.float64),
-            loss[:, 0],
-            loss[:, 1],
+            *loss.T,
             np.asarray(load_factor, dtype=np.float64),
             np.asarray(tip_force, dtype=np.float64),
         )
-        for name, column in zip(PARAMETER_NAMES, columns, strict=False):
-            low, high = self.validity_box[PARAMETER_NAMES.index(name)]
+        for name, (low, high), column in zip(self.parameter_names, self.validity_box, columns, strict=False):
             bad = np.flatnonzero(~((column >= low) & (column <= high)))
             if bad.size:
                 self.check_validity(**{name: float(column[bad[0]])})
-        e, z1, z2, n, f = columns
-        theta = np.stack((e, 1.0 - z1, 1.0 - z2, np.ones_like(e)), axis=1)
+        e, *lost, n, f = columns
+        theta = np.stack((e, *(1.0 - z for z in lost), np.ones_like(e)), axis=1)
         stiffness = (theta @ self._online.stiffness).reshape(-1, *self._online.square)
         load = np.stack((n, f), axis=1) @ self.static_load
         coordinates = solve(stiffness, load[:, :, np.newaxis])[:, :, 0]
         return np.asarray(coordinates @ self.static_output[:-1].T)
 
-    def tip_stiffness(
-        self, young_modulus_factor: float, stiffness_loss: tuple[float, float] = (0.0, 0.0)
-    ) -> float:
+    def tip_stiffness(self, young_modulus_factor: float, stiffness_loss: Losses = ()) -> float:
         """Return the tip stiffness: the tip force over the displacement of its point of application.
 
         Kapteyn et al. 2021, eq. (14), where it is a straight line in e.
@@ -244,7 +246,7 @@ class ReducedModel(ReducedArrays):
     def modes(
         self,
         young_modulus_factor: float,
-        stiffness_loss: tuple[float, float],
+        stiffness_loss: Losses,
         servo_mass: float,
         pitot_mass: float,
     ) -> Modes:
@@ -260,17 +262,16 @@ class ReducedModel(ReducedArrays):
         OutsideModelError
             If a value lies outside the validity box or is not finite.
         """
-        z1, z2 = stiffness_loss
+        loss = self.losses(stiffness_loss)
         self.check_validity(
             young_modulus_factor=young_modulus_factor,
-            z1=z1,
-            z2=z2,
+            **dict(zip(self.regions, loss, strict=True)),
             servo_mass=servo_mass,
             pitot_mass=pitot_mass,
         )
         size = self.modal_stiffness.shape[1:]
-        theta = np.array((young_modulus_factor, 1.0 - z1, 1.0 - z2, 1.0))
-        stiffness = (theta @ self.modal_stiffness.reshape(4, -1)).reshape(size)
+        theta = np.array((young_modulus_factor, *(1.0 - z for z in loss), 1.0))
+        stiffness = (theta @ self.modal_stiffness.reshape(len(theta), -1)).reshape(size)
         mass = self._modal_mass(servo_mass, pitot_mass)
         # M x = K x / omega^2: the stiffness is well conditioned in this basis, the mass is not, and the low
         # modes are the largest eigenvalues, which keep all their digits.

@@ -3,58 +3,98 @@
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import isfinite
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from .errors import ReducedModelFileError
 from .kept_arrays import KeptArrays
+from .state import MOST_REGIONS, Losses, losses_of
 
 FloatArray = npt.NDArray[np.float64]
 
-PARAMETER_NAMES = ("young_modulus_factor", "z1", "z2", "load_factor", "tip_force", "servo_mass", "pitot_mass")
-"""The rows of `ReducedModel.validity_box`, in this order."""
+MOST_ANCHORS = 16
+"""Largest number of approximate dual solutions of a reduced model."""
+
+
+def parameter_names(regions: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of the rows of `ReducedModel.validity_box`, in their order."""
+    return ("young_modulus_factor", *regions, "load_factor", "tip_force", "servo_mass", "pitot_mass")
 
 
 @dataclass(frozen=True, repr=False)
-class ReducedArrays(KeptArrays):
+class RegionArrays(KeptArrays):
+    """Arrays of a structure with K damage regions, 1 to 8.
+
+    Attributes
+    ----------
+    region_names : str
+        Names of the damage regions in the order of their stiffness terms, parted by spaces.
+    """
+
+    region_names: str
+
+    @property
+    def regions(self) -> tuple[str, ...]:
+        """Names of the K damage regions."""
+        return tuple(self.region_names.split())
+
+    def losses(self, stiffness_loss: Mapping[str, float] | Iterable[float]) -> Losses:
+        """Return one stiffness loss for each region, in their order; see `fe.runtime.state.losses_of`."""
+        return losses_of(stiffness_loss, self.regions)
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.regions) <= MOST_REGIONS:
+            raise ReducedModelFileError(
+                f"{self.what.capitalize()} must have 1 to {MOST_REGIONS} damage regions, but names "
+                f"{len(self.regions)}; build it anew."
+            )
+        super().__post_init__()
+
+
+@dataclass(frozen=True, repr=False)
+class ReducedArrays(RegionArrays):
     """Affine dense matrices, outputs, modal data, error bound and validity of a reduced wing.
 
-    Terms of the stiffness, in this order: skin (times e), first defect region (times 1 - z1), second defect
-    region (times 1 - z2), everything else (times 1). Terms of the mass: structure, servos (times servo
-    mass), pitot (times pitot mass). Loads: lift at load factor 1, tip force of 1 N. Output rows: the G
+    Terms of the stiffness, T = K + 2 for K damage regions, in this order: skin (times e), the damage regions
+    (each times 1 - z of its own), everything else (times 1). Terms of the mass: structure, servos (times
+    servo mass), pitot (times pitot mass). Loads: lift at load factor 1, tip force of 1 N. Output rows: the G
     gauges [1], then the tip displacement [m].
 
     Attributes
     ----------
-    validity_box : (7, 2) ndarray
-        Least and largest value of each of `PARAMETER_NAMES`, SI units.
-    static_stiffness : (4, N, N) ndarray
+    validity_box : (K + 5, 2) ndarray
+        Least and largest value of each of `parameter_names`, SI units.
+    static_stiffness : (T, N, N) ndarray
         Stiffness terms in the static basis.
     static_load : (2, N) ndarray
         Loads in the static basis.
     static_output : (G + 1, N) ndarray
         Outputs of the static basis vectors.
-    bound_reference : (3,) ndarray
-        The values of (e, 1 - z1, 1 - z2) whose stiffness is the norm of the error bound.
+    bound_reference : (K + 1,) ndarray
+        The values of (e, 1 - z1, ...) whose stiffness is the norm of the error bound.
     residual_load : (R, 2) ndarray
         Loads in an orthonormal basis of the residuals (norm dual to the one of `bound_reference`).
-    residual_stiffness : (R, 4, N) ndarray
+    residual_stiffness : (R, T, N) ndarray
         Stiffness terms times static basis vectors, in the same basis.
     residual_allowance : float
         Bound of what that basis leaves out of a residual, per unit length of the reduced coordinates.
     rounding_allowance : float
         Part of the norm of the strains, and of the tip displacement, added to the bounds for rounding: a
         multiple of the difference seen where the reduced model holds the full solution itself.
-    dual_split_1, dual_split_2 : (A1 - 1,), (A2 - 1,) ndarray
-        Values of z1 and z2 at which the next approximate dual solution takes over.
-    dual_correction : (A1, A2, G + 1, R) ndarray
-        Approximate dual solutions, applied to the basis of the residuals.
-    dual_residual : (A1, A2, G + 1, 4, 4) ndarray
-        Factors of the dual residuals: their norm is that of the factor times (1, -e, z1 - 1, z2 - 1).
-    modal_stiffness : (4, Nm, Nm) ndarray
+    dual_counts : (K,) ndarray of int64
+        Number of approximate dual solutions along each loss; their product is A, at most 16.
+    dual_split : (sum of dual_counts less K,) ndarray
+        Values of the losses at which the next approximate dual solution takes over, region by region.
+    dual_correction : (A, G + 1, R) ndarray
+        Approximate dual solutions, applied to the basis of the residuals; the last region's change first.
+    dual_residual : (A, G + 1, T, T) ndarray
+        Factors of the dual residuals: their norm is that of the factor times (1, -e, z1 - 1, ...).
+    modal_stiffness : (T, Nm, Nm) ndarray
         Stiffness terms in the modal basis.
     modal_mass : (3, Nm, Nm) ndarray
         Mass terms in the modal basis.
@@ -71,7 +111,8 @@ class ReducedArrays(KeptArrays):
     """
 
     what = "a reduced model"
-    layout = ("format", 1)
+    layout = ("format", 2)
+    kinds: ClassVar = {"dual_counts": np.int64}
 
     validity_box: FloatArray
     static_stiffness: FloatArray
@@ -82,8 +123,8 @@ class ReducedArrays(KeptArrays):
     residual_stiffness: FloatArray
     residual_allowance: float
     rounding_allowance: float
-    dual_split_1: FloatArray
-    dual_split_2: FloatArray
+    dual_counts: npt.NDArray[np.int64]
+    dual_split: FloatArray
     dual_correction: FloatArray
     dual_residual: FloatArray
     modal_stiffness: FloatArray
@@ -95,6 +136,16 @@ class ReducedArrays(KeptArrays):
     mode_count: int
 
     def __post_init__(self) -> None:
+        counts = self.dual_counts
+        if (
+            counts.dtype != np.int64
+            or counts.ndim != 1
+            or not 1 <= counts.min(initial=1) <= counts.prod() <= MOST_ANCHORS
+        ):
+            raise ReducedModelFileError(
+                f"A reduced model must have 1 to {MOST_ANCHORS} approximate dual solutions, at least one "
+                f"along each loss, but has {counts.tolist()}; build it anew."
+            )
         super().__post_init__()
         if not 1 <= self.mode_count <= self.modal_stiffness.shape[1]:
             raise ReducedModelFileError(
@@ -114,20 +165,21 @@ class ReducedArrays(KeptArrays):
             self.static_output.shape[0],
             self.residual_load.shape[0],
         )
-        a1, a2, m = self.dual_split_1.size + 1, self.dual_split_2.size + 1, self.modal_stiffness.shape[-1]
+        k, m = len(self.regions), self.modal_stiffness.shape[-1]
+        terms, anchors = k + 2, int(self.dual_counts.prod())
         return {
-            "validity_box": (len(PARAMETER_NAMES), 2),
-            "static_stiffness": (4, n, n),
+            "validity_box": (len(parameter_names(self.regions)), 2),
+            "static_stiffness": (terms, n, n),
             "static_load": (2, n),
             "static_output": (outputs, n),
-            "bound_reference": (3,),
+            "bound_reference": (k + 1,),
             "residual_load": (r, 2),
-            "residual_stiffness": (r, 4, n),
-            "dual_split_1": (a1 - 1,),
-            "dual_split_2": (a2 - 1,),
-            "dual_correction": (a1, a2, outputs, r),
-            "dual_residual": (a1, a2, outputs, 4, 4),
-            "modal_stiffness": (4, m, m),
+            "residual_stiffness": (r, terms, n),
+            "dual_counts": (k,),
+            "dual_split": (int(self.dual_counts.sum()) - k,),
+            "dual_correction": (anchors, outputs, r),
+            "dual_residual": (anchors, outputs, terms, terms),
+            "modal_stiffness": (terms, m, m),
             "modal_mass": (3, m, m),
             "modal_load": (2, m),
             "modal_output": (outputs, m),

@@ -4,12 +4,53 @@ Standard library only, relative imports only: this file is copied into the FMU.
 """
 
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from .errors import InvalidStateError
 
-STIFFNESS_LOSS_NAMES: tuple[str, str] = ("z1", "z2")
-"""Names of the stiffness losses of the two defect regions, in the order of `DigitalState.stiffness_loss`."""
+Losses = tuple[float, ...]
+"""Stiffness losses of the damage regions, in their order."""
+
+MOST_REGIONS = 8
+"""Largest number of damage regions of a structure."""
+
+
+def region_names(count: int) -> tuple[str, ...]:
+    """Return the names of damage regions that bear none of their own: z1, z2 and so on."""
+    return tuple(f"z{number}" for number in range(1, count + 1))
+
+
+def losses_of(stiffness_loss: Mapping[str, float] | Iterable[float], regions: tuple[str, ...]) -> Losses:
+    """Return one stiffness loss for each region, in their order.
+
+    Parameters
+    ----------
+    stiffness_loss : mapping of str to float, or iterable of float
+        Fractions by name, where regions that are left out are healthy; or in the order of the regions, where
+        none at all means that all are healthy.
+    regions : tuple of str
+        Names of the regions.
+
+    Raises
+    ------
+    InvalidStateError
+        If a name is none of a region, or there are more or fewer values than regions.
+    """
+    if isinstance(stiffness_loss, Mapping):
+        for name in stiffness_loss:
+            if name not in regions:
+                raise InvalidStateError(
+                    f"There is no damage region {name!r}; the regions are {', '.join(regions)}."
+                )
+        return tuple(float(stiffness_loss.get(name, 0.0)) for name in regions)
+    loss = tuple(stiffness_loss) or (0.0,) * len(regions)
+    if len(loss) != len(regions):
+        raise InvalidStateError(
+            f"stiffness_loss must hold {len(regions)} fractions, one for each of {', '.join(regions)}, but "
+            f"{len(loss)} were given."
+        )
+    return loss
 
 
 def _require_positive(name: str, value: float) -> None:
@@ -67,8 +108,8 @@ class DigitalState:
     damping_beta : float
         Stiffness-proportional Rayleigh coefficient, eq. (17) [s].
     stiffness_loss : tuple of float
-        (z1, z2), the fractions of stiffness that the two defect regions have lost [1]; 0 is healthy,
-        1 would be no stiffness at all and is refused.
+        z, the fractions of stiffness that the damage regions have lost, in the order of the design [1]; 0 is
+        healthy, 1 would be no stiffness at all and is refused. Empty: all regions are healthy.
 
     Raises
     ------
@@ -82,20 +123,20 @@ class DigitalState:
     pitot_mass: float = 0.134
     damping_alpha: float = 1.0735
     damping_beta: float = 7.3124e-4
-    stiffness_loss: tuple[float, float] = (0.0, 0.0)
+    stiffness_loss: Losses = ()
 
     def __post_init__(self) -> None:
         _require_positive("young_modulus_factor", self.young_modulus_factor)
         for name in ("servo_mass", "pitot_mass", "damping_alpha", "damping_beta"):
             _require_not_negative(name, getattr(self, name))
-        if len(self.stiffness_loss) != len(STIFFNESS_LOSS_NAMES):
+        if len(self.stiffness_loss) > MOST_REGIONS:
             raise InvalidStateError(
-                f"stiffness_loss must hold {len(STIFFNESS_LOSS_NAMES)} fractions, one for each of "
-                f"{', '.join(STIFFNESS_LOSS_NAMES)}, but {len(self.stiffness_loss)} were given."
+                f"stiffness_loss must hold at most {MOST_REGIONS} fractions, one for each damage region, but "
+                f"{len(self.stiffness_loss)} were given."
             )
-        for name, loss in zip(STIFFNESS_LOSS_NAMES, self.stiffness_loss, strict=True):
+        for number, loss in enumerate(self.stiffness_loss, start=1):
             if not (math.isfinite(loss) and 0.0 <= loss < 1.0):
                 raise InvalidStateError(
-                    f"stiffness_loss {name} must be a fraction from 0 to below 1 (not percent), "
+                    f"stiffness_loss {number} must be a fraction from 0 to below 1 (not percent), "
                     f"but {loss!r} was given."
                 )

@@ -19,6 +19,7 @@ from .damping import rayleigh_damping_ratio
 from .errors import InvalidStateError
 from .reduced import ReducedModel
 from .responses import Modes, StaticResponse
+from .state import Losses
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -155,7 +156,7 @@ class ModalIntegrator:
         model: ReducedModel,
         *,
         young_modulus_factor: float,
-        stiffness_loss: tuple[float, float],
+        stiffness_loss: Losses,
         servo_mass: float,
         pitot_mass: float,
         damping_alpha: float,

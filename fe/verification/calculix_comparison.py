@@ -11,7 +11,7 @@ from fe.full.modes import eigenmodes
 from fe.full.operators import AffineOperators
 from fe.full.statics import Factorisation, static_outputs
 from fe.runtime.errors import CalculixError
-from fe.runtime.state import DigitalState
+from fe.runtime.state import DigitalState, Losses
 
 from .calculix_input import INTEGRATION_POINTS, CalculixModel
 from .calculix_job import read_frequencies, read_tables, run_calculix
@@ -61,7 +61,7 @@ def static_agreement(
     operators: AffineOperators,
     folder: Path,
     young_modulus_factor: float = 1.0,
-    stiffness_loss: tuple[float, float] = (0.0, 0.0),
+    stiffness_loss: Losses = (),
 ) -> tuple[StaticAgreement, StaticAgreement]:
     """Compare the static test and the lift of the design in one state of health.
 

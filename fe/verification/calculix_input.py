@@ -16,7 +16,7 @@ from skfem import ElementHexS2
 
 from fe.full.assembly import cell_axes, rotate_elasticity
 from fe.full.operators import ROOT_UNKNOWNS, AffineOperators, cell_density, cell_elasticity
-from fe.wing.mesh import DEFECT_1, DEFECT_2, SKIN
+from fe.runtime.state import Losses
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -49,7 +49,7 @@ class CalculixModel:
 
     operators: AffineOperators
     young_modulus_factor: float = 1.0
-    stiffness_loss: tuple[float, float] = (0.0, 0.0)
+    stiffness_loss: Losses = ()
     servo_mass: float = 0.169
     pitot_mass: float = 0.134
     damping_alpha: float = 0.0
@@ -149,10 +149,7 @@ class CalculixModel:
         axes = cell_axes(mesh.corners)
         # Constants in the cell's own axes; CalculiX turns them by the orientation.
         local = rotate_elasticity(cell_elasticity(mesh), np.swapaxes(axes, 1, 2))
-        factor = np.ones(len(mesh.cells))
-        factor[mesh.region == SKIN] = self.young_modulus_factor
-        for region, loss in zip((DEFECT_1, DEFECT_2), self.stiffness_loss, strict=True):
-            factor[mesh.region == region] = 1.0 - loss
+        factor = self.operators.theta(self.young_modulus_factor, self.stiffness_loss)[mesh.stiffness_term]
         constants = np.column_stack([local[:, row, column] for row, column in _ORTHOTROPIC])
         constants *= factor[:, None]
         density = cell_density(mesh)

@@ -9,6 +9,7 @@ from fe.full.affine import AffineSystem
 from fe.full.modes import cantilever_bending, cantilever_bending_shapes, lowest_eigenpairs, track
 from fe.full.operators import AffineOperators, assemble
 from fe.full.statics import Factorisation
+from fe.runtime.state import Losses
 from fe.wing.design import WingDesign
 
 from .plate import FIELDS, B, W
@@ -191,7 +192,7 @@ def wing_results(model: AffineSystem, design: WingDesign, bending_shapes: FloatA
     def strain(found: FloatArray) -> FloatArray:
         return np.asarray(model.gauge_output @ found[:, 1])
 
-    def damaged(loss: tuple[float, float]) -> FloatArray:
+    def damaged(loss: Losses) -> FloatArray:
         return strain(Factorisation(model.stiffness(1.0, loss)).solve(loads))
 
     factors = Factorisation(model.stiffness())
@@ -212,7 +213,9 @@ def wing_results(model: AffineSystem, design: WingDesign, bending_shapes: FloatA
         second_bending=float(second),
         strain=healthy,
         strain_slope=strain(slope) / healthy,
-        damage_ratio=np.stack([damaged(loss) / healthy for loss in ((DAMAGE, 0.0), (0.0, DAMAGE))]),
+        damage_ratio=np.stack(
+            [damaged(tuple(loss)) / healthy for loss in DAMAGE * np.eye(len(model.regions))]
+        ),
     )
 
 

@@ -3,7 +3,7 @@
 Skins are the faces, at the section's height; webs, ribs and the leading-edge wall are solid cores where they
 stand. Between them there is no core: the deflection runs straight from web to web along the chord, and the
 skins bend on their own only as the beams of a frame (`fe.verification.plate_frame`). Every number is the
-design's own. The operators are affine as those of the box, K(e, z) = e K_skin + (1 - z1) K_1 + (1 - z2) K_2
+design's own. The operators are affine as those of the box, K(e, z) = e K_skin + (1 - z1) K_1 + ...
 + K_0, with the same three root unknowns last.
 """
 
@@ -89,6 +89,7 @@ def assemble_plate(design: WingDesign, *, straight_section: bool = False) -> Pla
         for distance in (load_place, plan.semi_span)
     )
     return PlateOperators(
+        regions=design.regions,
         stiffness_terms=(*skins, (base + sparse.diags_array(springs)).tocsr()),
         mass_terms=tuple(reduced(term) for term in _mass_terms(layout)),
         load_lift=np.asarray(restriction @ _lift(layout)),
@@ -142,19 +143,19 @@ def _expansion(layout: PlateLayout) -> tuple[sparse.csr_array, NDArray[np.int64]
 
 
 def _stiffness_terms(layout: PlateLayout) -> tuple[sparse.csr_array, ...]:
-    """Stiffness of the skin without defects, of both defects, and of the rest, all (5 N, 5 N)."""
+    """Stiffness of the skin without damage regions, of each of these, and of the rest, all (5 N, 5 N)."""
     design, plate, skin = layout.design, layout.plate, layout.design.skin
     every = np.arange(plate.mesh.nelements)
     modulus = layout.skin_modulus
     sheet = plane_stress(modulus, skin.poisson_ratio, skin.in_plane_shear_ratio * modulus)
     upper = layout.surface(plate.points, 0.5 * skin.thickness)
     lower = Surface(-upper.height, -upper.slope_x, -upper.slope_y)
-    first, second = layout.defect(0), layout.defect(1)
+    regions = [layout.defect(number) for number in range(len(design.defects))]
 
     def upper_skin(where: BoolArray) -> sparse.csr_array:
         return plate.face_stiffness(every, upper, skin.thickness, sheet * where[..., None, None])
 
-    whole = upper_skin(~(first | second)) + plate.face_stiffness(every, lower, skin.thickness, sheet)
+    whole = upper_skin(~np.any(regions, axis=0)) + plate.face_stiffness(every, lower, skin.thickness, sheet)
     whole = whole + frame_stiffness(layout)
     half_height = layout.surface(plate.points, skin.thickness).height
     wall = np.flatnonzero(layout.wall)
@@ -182,7 +183,7 @@ def _stiffness_terms(layout: PlateLayout) -> tuple[sparse.csr_array, ...]:
         flat = np.ones_like(height)
         elasticity = plane_stress(young * flat, poisson, shear * flat)
         rest = rest + plate.core_stiffness(cells, height, elasticity, np.full((*flat.shape, 2), shear))
-    return whole.tocsr(), upper_skin(first), upper_skin(second), (rest + _rods(layout)).tocsr()
+    return whole.tocsr(), *(upper_skin(region) for region in regions), (rest + _rods(layout)).tocsr()
 
 
 def _rods(layout: PlateLayout) -> sparse.csr_array:

@@ -11,10 +11,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from fe.runtime.errors import DesignFileError, InvalidDesignError
-from fe.runtime.state import STIFFNESS_LOSS_NAMES, Geometry
+from fe.runtime.reduced_arrays import parameter_names
+from fe.runtime.state import MOST_REGIONS, Geometry, region_names
 from reporting.section import checked
 from reporting.toml_file import read_toml
 
@@ -42,6 +43,10 @@ SHIPPED_DESIGN = Path(__file__).parents[1] / "designs" / "uav_wing.toml"
 """The design of the wing of Kapteyn et al. 2021."""
 
 
+TAKEN_NAMES = frozenset((*parameter_names(()), "skin", "webs", "ribs"))
+"""Names that mean something else where the names of damage regions stand."""
+
+
 class WingDesign(Part):
     """A wing: everything that decides its model. Construct it with `load_design` or `parse_design`.
 
@@ -63,26 +68,22 @@ class WingDesign(Part):
     masses: Masses
     point_masses: tuple[PointMassPlace, ...] = ()
     gauges: Gauges
-    defects: tuple[Defect, ...]
+    defects: tuple[Defect, ...] = Field(min_length=1, max_length=MOST_REGIONS)
     lift: Lift
     tip_load: TipLoad
     mesh: MeshSettings
-
-    @field_validator("defects")
-    @classmethod
-    def _one_defect_per_loss(cls, defects: tuple[Defect, ...]) -> tuple[Defect, ...]:
-        if len(defects) != len(STIFFNESS_LOSS_NAMES):
-            raise ValueError(
-                f"exactly {len(STIFFNESS_LOSS_NAMES)} defect regions are expected, for "
-                f"{' and '.join(STIFFNESS_LOSS_NAMES)}, but {len(defects)} were given"
-            )
-        return defects
 
     @model_validator(mode="after")
     def _parts_fit_together(self) -> "WingDesign":
         for check in (_check_webs, _check_ribs, _check_regions, _check_gauges, _check_places):
             check(self)
         return self
+
+    @property
+    def regions(self) -> tuple[str, ...]:
+        """Names of the damage regions, those of `defects`, in their order."""
+        numbered = region_names(len(self.defects))
+        return tuple(defect.name or name for defect, name in zip(self.defects, numbered, strict=True))
 
     @property
     def geometry(self) -> Geometry:
@@ -93,7 +94,11 @@ class WingDesign(Part):
     @property
     def hash(self) -> str:
         """SHA-256 of the content, 64 hexadecimal digits; comments and key order do not count."""
-        content = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        whole = self.model_dump(mode="json")
+        for defect, name in zip(whole["defects"], region_names(len(self.defects)), strict=True):
+            if defect["name"] in (None, name):  # a name that says nothing does not count
+                del defect["name"]
+        content = json.dumps(whole, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(content.encode()).hexdigest()
 
     @property
@@ -173,11 +178,19 @@ def _check_regions(design: WingDesign) -> None:
                 f"{where} covers chord {defect.chord_start:g} to {defect.chord_end:g}, outside the skin of "
                 f"the box from {design.front_chord:g} to {design.rear_chord:g}"
             )
-    one, two = design.defects
-    if min(one.span_end, two.span_end) > max(one.span_start, two.span_start) and min(
-        one.chord_end, two.chord_end
-    ) > max(one.chord_start, two.chord_start):
-        raise ValueError("defects[0] and defects[1] overlap")
+    for (first, one), (second, two) in itertools.combinations(enumerate(design.defects), 2):
+        if min(one.span_end, two.span_end) > max(one.span_start, two.span_start) and min(
+            one.chord_end, two.chord_end
+        ) > max(one.chord_start, two.chord_start):
+            raise ValueError(f"defects[{first}] and defects[{second}] overlap")
+        if design.regions[first] == design.regions[second]:
+            raise ValueError(
+                f"defects[{first}] and defects[{second}] are both named {design.regions[first]!r}; give each "
+                "a name of its own"
+            )
+    for index, name in enumerate(design.regions):
+        if name in TAKEN_NAMES:
+            raise ValueError(f"defects[{index}] is named {name!r}, which is taken; give it another name")
     for index, added in enumerate(design.added_density):
         if added.end <= added.start:
             raise ValueError(f"added_density[{index}] must end behind its start")

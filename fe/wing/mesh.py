@@ -23,9 +23,8 @@ from .grid import ChordLine, chord_lines, span_lines, web_faces
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-REGION_NAMES: tuple[str, ...] = ("skin", "defect_1", "defect_2", "webs", "ribs")
-"""Names of the regions; `WingMesh.region` holds indices into it."""
-SKIN, DEFECT_1, DEFECT_2, WEBS, RIBS = range(5)
+SKIN = 0
+"""Index of the skin in `WingMesh.region_names`; the damage regions follow, then webs and ribs."""
 
 # Corners of a cell in the local order of scikit-fem's reference hexahedron.
 _CORNERS = np.array([(1, 1, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)])
@@ -60,7 +59,7 @@ class WingMesh:
     grid_index : (nc, 3)
         (i, j, k) of each cell.
     region : (nc,)
-        Index into `REGION_NAMES`.
+        Index into `region_names`.
     web, rib : (nc,)
         Which web or rib of the design the cell belongs to, -1 for none.
     leading_edge : (nc,) bool
@@ -90,6 +89,16 @@ class WingMesh:
     def corners(self) -> FloatArray:
         """Corner coordinates of the cells (nc, 8, 3) [m]."""
         return self.points[self.cells]
+
+    @property
+    def region_names(self) -> tuple[str, ...]:
+        """Names of the regions: skin, the damage regions of the design, webs, ribs."""
+        return ("skin", *self.design.regions, "webs", "ribs")
+
+    @property
+    def stiffness_term(self) -> IntArray:
+        """Stiffness term (nc,) that each cell belongs to: the skin, a damage region, or the rest."""
+        return np.minimum(self.region, len(self.design.regions) + 1)
 
     @property
     def centres(self) -> FloatArray:
@@ -170,9 +179,10 @@ class WingMesh:
         MeshError
             If there is no such region.
         """
-        if name not in REGION_NAMES:
-            raise MeshError(f"there is no region '{name}'; the regions are {', '.join(REGION_NAMES)}.")
-        return np.flatnonzero(self.region == REGION_NAMES.index(name))
+        names = self.region_names
+        if name not in names:
+            raise MeshError(f"there is no region '{name}'; the regions are {', '.join(names)}.")
+        return np.flatnonzero(self.region == names.index(name))
 
     def skin_cells(self, *, upper: bool) -> IntArray:
         """Numbers of the cells of the upper or lower skin, defect regions included."""
@@ -285,7 +295,8 @@ def build_mesh(design: WingDesign) -> WingMesh:
     shell = is_skin | wall
     web = np.where(shell, -1, web_column[cell_index[:, 0]])
     rib = np.where(shell | (web >= 0), -1, rib_row[cell_index[:, 1]])
-    region = np.select([web >= 0, rib >= 0], [WEBS, RIBS], SKIN)
+    webs = len(design.regions) + 1
+    region = np.select([web >= 0, rib >= 0], [webs, webs + 1], SKIN)
     _mark_defects(design, across, along, cell_index, region)
 
     corner = cell_index[:, None, :] + _CORNERS
@@ -316,7 +327,7 @@ def _mark_defects(
     chord_middle = 0.5 * (places[1:] + places[:-1])[index[:, 0]]
     span_middle = 0.5 * (across[1:] + across[:-1])[index[:, 1]]
     upper = index[:, 2] == index[:, 2].max()
-    for number, defect in zip((DEFECT_1, DEFECT_2), design.defects, strict=True):
+    for number, defect in enumerate(design.defects, start=1):
         inside = (
             upper
             & (span_middle > defect.span_start)
@@ -344,7 +355,7 @@ def _check_nothing_vanished(mesh: WingMesh) -> None:
             raise MeshError(
                 f"webs[{index}] at chord {design.webs[index].chord:g} found no cells in the mesh."
             )
-    for number, defect in zip((DEFECT_1, DEFECT_2), design.defects, strict=True):
+    for number, defect in enumerate(design.defects, start=1):
         inside = mesh.region == number
         length = float(thickness[inside].sum() / max(1, len(np.unique(mesh.grid_index[inside, 0]))))
         if abs(length - (defect.span_end - defect.span_start)) > 1e-6:

@@ -203,8 +203,13 @@ class Gauges(Part):
 
 
 class Defect(Part):
-    """Region of the upper skin that may lose stiffness: distances from the root [m], chord fractions."""
+    """Region of the upper skin that may lose stiffness: distances from the root [m], chord fractions.
 
+    Its name is that of its loss everywhere: in states, FMU variables and scenarios. Without one it is z and
+    its number, from 1.
+    """
+
+    name: str | None = Field(default=None, max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
     span_start: float = Field(ge=0.0)
     span_end: float = Field(gt=0.0)
     chord_start: Fraction

@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterable, Sequence
 
 from fmu_asset.description import LOG_CATEGORIES
-from fmu_asset.slaves.variables import ENUMERATIONS, INPUTS, FmuVariable
+from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable
 
 _NOTE = "/* Made by the build of the FMU from its table of variables; a change here is lost. */\n"
 
@@ -38,7 +38,7 @@ def _header(table: Sequence[FmuVariable], guid: str, content_tag: str) -> str:
     outputs = [row for row in table if row.causality == "output"]
     counts = {
         "VARIABLE_COUNT": len(table),
-        "INPUT_COUNT": len(INPUTS),
+        "INPUT_COUNT": sum(row.causality == "input" for row in table),
         "FIRST_OUTPUT": outputs[0].reference,
         "GAUGE_COUNT": sum(row.name.startswith("strain[") for row in outputs),
         "OUTPUT_MODES": sum(row.name.startswith("frequency[") for row in outputs),

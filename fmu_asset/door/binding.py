@@ -294,6 +294,18 @@ class Binding(Section):
             f"The binding {self.name} has no observation {name!r}; it has {_listed(self.observation)}."
         )
 
+    def with_regions(self, regions: Sequence[str]) -> "Binding":
+        """Return the binding for a wing with these damage regions: their health inputs, and no others.
+
+        An input that the binding has for a region stays as it is; the others have the names of their regions.
+        """
+        bound = {entry.variable: (name, entry) for name, entry in self.health.items()}
+        health = dict(
+            bound.get(variable, (region, Input(variable=variable, unit="1")))
+            for region, variable in ((region, f"health.{region}") for region in regions)
+        )
+        return self.model_copy(update={"health": health})
+
     def with_arrays(self, elements: Callable[[str], Sequence[str]]) -> "Binding":
         """Return the binding with every array that is observed or recorded as its elements.
 

@@ -13,7 +13,7 @@ from typing import Literal
 
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import STIFFNESS_LOSS_NAMES, DigitalState
+from fe.runtime.state import DigitalState
 from fmu_asset.compiled.package import DATA_FILE, binary_of, compiled_members
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.slaves.effect_variables import effect_rows, switch_of, units_of
@@ -42,7 +42,7 @@ FmuKind = Literal["python", "compiled", "source"]
 
 DESCRIPTION = (
     "Structure of a UAV half-wing: strains, tip displacement and modes from a reduced finite element model "
-    "under load factor and tip force, with two regions that can lose stiffness."
+    "under load factor and tip force, with regions that can lose stiffness."
 )
 
 _IMPORTS = """from .slaves.wing_contents import load_contents
@@ -118,10 +118,14 @@ def fmu_bytes(
     arrays: PatchArrays | None = None,
 ) -> tuple[bytes, str]:
     """Return the archive and its content hash; see `build_fmu`."""
-    start = start_values(state or DigitalState())
+    start = start_values(model, state or DigitalState())
     mode_count = min(MODE_COUNT, model.mode_count)
     table = variable_table(
-        gauge_count=model.gauge_count, mode_count=mode_count, validity=model.validity, start=start
+        gauge_count=model.gauge_count,
+        mode_count=mode_count,
+        regions=model.regions,
+        validity=model.validity,
+        start=start,
     )
     check_start(table)
     effects = []
@@ -177,9 +181,9 @@ def check_kind(kind: FmuKind) -> None:
         )
 
 
-def start_values(state: DigitalState) -> dict[str, float]:
+def start_values(model: ReducedModel, state: DigitalState) -> dict[str, float]:
     """Return the start values of the FMU's variables that a digital state gives, by variable name."""
-    losses = zip(STIFFNESS_LOSS_NAMES, state.stiffness_loss, strict=True)
+    losses = zip(model.regions, model.losses(state.stiffness_loss), strict=True)
     return {
         "young_modulus_factor": float(state.young_modulus_factor),
         "damping.alpha": float(state.damping_alpha),

@@ -60,8 +60,8 @@ class Moment(NamedTuple):
 class WingBehaviour:
     """The wing in time: what it remembers, and how a step changes it.
 
-    A step either completes or raises and leaves everything as it was. Inputs are load factor, z1, z2 and
-    tip force [N], in this order, and are held over the step.
+    A step either completes or raises and leaves everything as it was. Inputs are load factor, the
+    losses of the damage regions and tip force [N], in this order, and are held over the step.
 
     Parameters
     ----------
@@ -80,6 +80,11 @@ class WingBehaviour:
         self._transient: TransientState | None = None
         self._bound: float | None = None
 
+    @property
+    def input_count(self) -> int:
+        """Number of inputs."""
+        return len(self._model.regions) + 2
+
     def start(
         self, parameters: WingParameters, inputs: Sequence[float], moment: Moment | None = None
     ) -> Response:
@@ -92,7 +97,7 @@ class WingBehaviour:
             self._integrator, self._transient = None, None
         else:
             integrator = self._make_integrator(parameters, inputs)
-            load_factor, _, _, tip_force = inputs
+            load_factor, *_, tip_force = inputs
             transient = integrator.released(parameters.initial_tip_displacement, load_factor, tip_force)
             response = self._read(integrator, transient)
             self._integrator, self._transient, self._bound = integrator, transient, None
@@ -108,10 +113,10 @@ class WingBehaviour:
             response = self._equilibrium(parameters, inputs)
         else:
             integrator, transient = before, self._transient
-            if tuple(inputs[1:3]) != self._inputs[1:3]:
+            if tuple(inputs[1:-1]) != self._inputs[1:-1]:
                 integrator = self._make_integrator(parameters, inputs)
                 transient = integrator.take_over(transient, before)
-            load = (inputs[0], inputs[3])
+            load = (inputs[0], inputs[-1])
             transient = integrator.advance(transient, duration, load)
             response = self._read(integrator, transient)
             self._integrator, self._transient, self._bound = integrator, transient, None
@@ -132,9 +137,9 @@ class WingBehaviour:
             raise RuntimeError("the wing was not initialised")
         if self._integrator is not None and self._transient is not None:
             return self._integrator.load_point_displacement(self._transient)
-        load_factor, z1, z2, tip_force = self._inputs
+        load_factor, *losses, tip_force = self._inputs
         static = self._model.static_response(
-            self._parameters.young_modulus_factor, (z1, z2), load_factor, tip_force
+            self._parameters.young_modulus_factor, tuple(losses), load_factor, tip_force
         )
         return float(self._model.static_load[1] @ static.coordinates)
 
@@ -146,9 +151,9 @@ class WingBehaviour:
         if self._integrator is not None:
             frequency, ratio = self._integrator.modes.frequency, self._integrator.damping_ratio
         else:
-            _, z1, z2, _ = self._inputs
+            losses = self._inputs[1:-1]
             modes = self._model.modes(
-                parameters.young_modulus_factor, (z1, z2), parameters.servo_mass, parameters.pitot_mass
+                parameters.young_modulus_factor, losses, parameters.servo_mass, parameters.pitot_mass
             )
             frequency = modes.frequency
             ratio = rayleigh_damping_ratio(parameters.damping_alpha, parameters.damping_beta, frequency)
@@ -157,25 +162,25 @@ class WingBehaviour:
     def state(self) -> list[float]:
         """Return all that is remembered as plain floats; parameters are kept by the slave."""
         head = [float(self._parameters is not None), float(self._transient is not None)]
-        inputs = list(self._inputs) or [0.0] * 4
+        inputs = list(self._inputs) or [0.0] * self.input_count
         return [*head, *inputs, *([] if self._transient is None else self._transient.to_list())]
 
     def restore(self, parameters: WingParameters, values: Sequence[float]) -> None:
         """Take back what `state` returned; `parameters` are those of that moment."""
         started, moving = values[0] != 0.0, values[1] != 0.0
-        inputs = tuple(values[2:6])
+        inputs = tuple(values[2 : 2 + self.input_count])
         integrator, transient = None, None
         if moving:
             integrator = self._make_integrator(parameters, inputs)
-            transient = TransientState.from_list(values[6:])
+            transient = TransientState.from_list(values[2 + self.input_count :])
         self._parameters = parameters if started else None
         self._inputs = inputs if started else ()
         self._integrator, self._transient, self._bound = integrator, transient, None
 
     def _equilibrium(self, parameters: WingParameters, inputs: Sequence[float]) -> Response:
-        load_factor, z1, z2, tip_force = inputs
+        load_factor, *losses, tip_force = inputs
         static = self._model.static_response(
-            parameters.young_modulus_factor, (z1, z2), load_factor, tip_force
+            parameters.young_modulus_factor, tuple(losses), load_factor, tip_force
         )
         self._bound = static.strain_error_bound
         return Response(static.strain, static.tip_displacement)
@@ -184,7 +189,7 @@ class WingBehaviour:
         return ModalIntegrator(
             self._model,
             young_modulus_factor=parameters.young_modulus_factor,
-            stiffness_loss=(inputs[1], inputs[2]),
+            stiffness_loss=tuple(inputs[1:-1]),
             servo_mass=parameters.servo_mass,
             pitot_mass=parameters.pitot_mass,
             damping_alpha=parameters.damping_alpha,

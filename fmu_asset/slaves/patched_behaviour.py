@@ -119,7 +119,7 @@ class PatchedBehaviour(WingBehaviour):
         if len(applied):
             patch = self._patch_of(applied)
             if self._needs_steps(patch):
-                steps = self._make_steps(parameters, base[2:6], patch, applied)
+                steps = self._make_steps(parameters, base[2 : 2 + self.input_count], patch, applied)
         super().restore(parameters, base)
         self._applied, self._patch, self._start, self._steps = tuple(applied), patch, start, steps
         self._motion = list(motion)
@@ -150,7 +150,7 @@ class PatchedBehaviour(WingBehaviour):
         if not self._needs_steps(patch):
             return self._show(super().start(parameters, inputs), parameters, 0.0, moment)
         steps = self._make_steps(parameters, inputs, patch, applied)
-        n, force = inputs[0], inputs[3]
+        n, force = inputs[0], inputs[-1]
         if parameters.response == TRANSIENT:
             self._motion = steps.released(parameters.initial_tip_displacement, n, force)
         else:
@@ -177,7 +177,7 @@ class PatchedBehaviour(WingBehaviour):
             self._steps, self._motion, self._applied = None, [], applied
             return self._show(super().advance(inputs, duration), parameters, duration, moment)
         steps = before
-        if steps is None or applied != self._applied or tuple(inputs[1:3]) != self._inputs[1:3]:
+        if steps is None or applied != self._applied or tuple(inputs[1:-1]) != self._inputs[1:-1]:
             steps = self._make_steps(parameters, inputs, patch, applied)
             if before is not None:
                 self._motion = steps.take_over(self._motion, before, moving=moved)
@@ -185,7 +185,7 @@ class PatchedBehaviour(WingBehaviour):
                 self._motion = steps.take_over_unpatched(self._transient, self._integrator)
             else:
                 self._motion = []
-        n, force = inputs[0], inputs[3]
+        n, force = inputs[0], inputs[-1]
         if moved:
             self._motion = steps.advance(
                 self._motion, duration, n, force, moment.time - duration - self._start
@@ -251,13 +251,13 @@ class PatchedBehaviour(WingBehaviour):
     ) -> PatchedSteps:
         if self._steps_of is None:
             raise RuntimeError("this FMU holds no arrays for effects of structure and loads")
-        key = (parameters, inputs[1], inputs[2], tuple(applied))
+        key = (parameters, tuple(inputs[1:-1]), tuple(applied))
         if self._made is not None and self._made[0] == key:
             return self._made[1]
         value = dict(zip(self._names, applied, strict=True))
         steps = self._steps_of(
             young_modulus_factor=parameters.young_modulus_factor,
-            stiffness_loss=(inputs[1], inputs[2]),
+            stiffness_loss=tuple(inputs[1:-1]),
             servo_mass=parameters.servo_mass,
             pitot_mass=parameters.pitot_mass,
             damping_alpha=parameters.damping_alpha,

@@ -6,7 +6,7 @@ Standard library only: the file is copied into the FMU.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -132,9 +132,6 @@ class FmuVariable:
     enumeration: str | None = None
 
 
-INPUTS = ("load_factor", "health.z1", "health.z2", "tip_force")
-"""The inputs, in the order of the table."""
-
 # Linear kinematics: half a metre at the tip of a wing of 1.8 m is already generous.
 TIP_DISPLACEMENT_LIMIT = 0.5
 
@@ -143,6 +140,7 @@ def variable_table(
     *,
     gauge_count: int,
     mode_count: int,
+    regions: Sequence[str],
     validity: Mapping[str, tuple[float, float]],
     start: Mapping[str, float],
 ) -> tuple[FmuVariable, ...]:
@@ -154,9 +152,11 @@ def variable_table(
         Number of strain gauges.
     mode_count : int
         Number of modes of which frequency and damping ratio are given.
+    regions : sequence of str
+        Names of the damage regions, in their order.
     validity : mapping of str to (float, float)
-        The validity box of the reduced model: young_modulus_factor, z1, z2, load_factor, tip_force [N],
-        servo_mass [kg], pitot_mass [kg].
+        The validity box of the reduced model: young_modulus_factor, the losses of the regions, load_factor,
+        tip_force [N], servo_mass [kg], pitot_mass [kg].
     start : mapping of str to float
         Start values by variable name; a missing name starts at its default.
 
@@ -200,9 +200,9 @@ def variable_table(
         "load_factor", "input", "Load factor of the turn, lift over weight",
         unit="1", box=validity["load_factor"], default=1.0,
     )  # fmt: skip
-    for region in ("z1", "z2"):
+    for number, region in enumerate(regions, start=1):
         add(
-            f"health.{region}", "input", f"Stiffness that defect region {region[1]} has lost, as a fraction",
+            f"health.{region}", "input", f"Stiffness that damage region {number} has lost, as a fraction",
             unit="1", display="%", box=validity[region],
         )  # fmt: skip
     add(

@@ -21,7 +21,11 @@ def load_contents(resources: Path) -> Contents:
     setting = _read(resources / "start.json")
     count, start = setting["mode_count"], setting["start"]
     table = variable_table(
-        gauge_count=model.gauge_count, mode_count=count, validity=model.validity, start=start
+        gauge_count=model.gauge_count,
+        mode_count=count,
+        regions=model.regions,
+        validity=model.validity,
+        start=start,
     )
     if not (resources / "effects.json").is_file():
         return Contents(table, lambda: WingBehaviour(model, count))

@@ -22,13 +22,19 @@ NODES = 16
 GAUGES = 24
 
 
-def chain_model(stiffness: float = 9.0e4) -> ReducedModel:
+PLACES = (slice(3, 6), slice(9, 12), slice(6, 8), slice(13, 15))
+"""Springs of the chain that may lose stiffness."""
+
+
+def chain_model(stiffness: float = 9.0e4, regions: tuple[str, ...] = ("z1", "z2")) -> ReducedModel:
     """Return a chain of 16 springs and masses as a reduced model: exact, so its error bound is zero."""
     difference = np.eye(NODES) - np.eye(NODES, k=-1)
-    region = np.zeros((4, NODES))
-    region[1, 3:6] = region[2, 9:12] = 1.0
-    region[0] = 1.0 - region[1] - region[2]
-    region[3] = 0.05
+    count = len(regions)
+    region = np.zeros((count + 2, NODES))
+    for number, place in enumerate(PLACES[:count], start=1):
+        region[number, place] = 1.0
+    region[0] = 1.0 - region[1:-1].sum(axis=0)
+    region[-1] = 0.05
     terms = np.stack([difference.T @ np.diag(stiffness * row) @ difference for row in region])
     mass = np.stack([0.06 * np.eye(NODES), np.zeros((NODES, NODES)), np.zeros((NODES, NODES))])
     mass[1, 10, 10] = mass[1, 14, 14] = mass[2, 15, 15] = 1.0
@@ -41,19 +47,20 @@ def chain_model(stiffness: float = 9.0e4) -> ReducedModel:
     allowances = {item.name: 0.0 for item in fields(ReducedModel) if item.name.endswith("_allowance")}
     return ReducedModel(
         design_hash="chain",
+        region_names=" ".join(regions),
         validity_box=np.array(
-            [[0.85, 1.15], [0.0, 0.85], [0.0, 0.85], [-1.0, 4.0], [-20.0, 20.0], [0.1, 0.25], [0.1, 0.2]]
+            [[0.85, 1.15], *[[0.0, 0.85]] * count, [-1.0, 4.0], [-20.0, 20.0], [0.1, 0.25], [0.1, 0.2]]
         ),
         static_stiffness=terms,
         static_load=load,
         static_output=output,
-        bound_reference=np.ones(3),
+        bound_reference=np.ones(count + 1),
         residual_load=np.zeros((32, 2)),
-        residual_stiffness=np.zeros((32, 4, NODES)),
-        dual_split_1=np.array([0.4]),
-        dual_split_2=np.array([0.4]),
-        dual_correction=np.zeros((2, 2, outputs, 32)),
-        dual_residual=np.zeros((2, 2, outputs, 4, 4)),
+        residual_stiffness=np.zeros((32, count + 2, NODES)),
+        dual_counts=np.full(count, 2),
+        dual_split=np.full(count, 0.4),
+        dual_correction=np.zeros((2**count, outputs, 32)),
+        dual_residual=np.zeros((2**count, outputs, count + 2, count + 2)),
         modal_stiffness=terms,
         modal_mass=mass,
         modal_load=load,
@@ -122,12 +129,13 @@ def chain_arrays(model: ReducedModel, span: float = 1.6) -> PatchArrays:
     stations = span * np.arange(NODES + 1) / NODES
     place = np.vstack((np.zeros(NODES), np.eye(NODES)))
     difference = np.eye(NODES) - np.eye(NODES, k=-1)
-    spring = float(model.static_stiffness[3, -1, -1]) / 0.05
+    spring = float(model.static_stiffness[-1, -1, -1]) / 0.05
     region = np.zeros(NODES, dtype=int)
-    region[3:6], region[9:12] = 1, 2
+    for number, place_of in enumerate(PLACES[: len(model.regions)], start=1):
+        region[place_of] = number
     parts, strip_of, term_of = [], [], []
     for strip in range(4):
-        for term in range(3):
+        for term in range(len(model.regions) + 1):
             inside = (np.arange(NODES) // 4 == strip) & (region == term)
             if inside.any():
                 matrix = difference.T @ np.diag(spring * inside) @ difference
@@ -141,6 +149,7 @@ def chain_arrays(model: ReducedModel, span: float = 1.6) -> PatchArrays:
     shares = np.arange(NODES + 1, 0.0, -1.0)
     return PatchArrays(
         design_hash=model.design_hash,
+        region_names=model.region_names,
         validity_box=model.validity_box,
         largest_loss=0.7,
         largest_compliance=1e-3,

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from calibration.wing.result import CalibrationResult
     from fe.runtime.reduced import ReducedModel
     from fe.wing.design import WingDesign
+    from fmu_asset.door.binding import Binding
 
 Float = NDArray[np.float64]
 
@@ -192,8 +193,9 @@ class WingFmuSource(FmuSource):
 
         check_calibration(self._scenario.calibration)
         self.files()
-        gauges = len(self._of.design().gauges.positions)
-        binding = load_binding(self._section.binding_path)
+        design = self._of.design()
+        gauges = len(design.gauges.positions)
+        binding = load_binding(self._section.binding_path).with_regions(design.regions)
         effects: tuple[str, ...] = ()
         if self._of.patch_path is not None:
             from twin_master.assets.patches import effect_names
@@ -202,6 +204,10 @@ class WingFmuSource(FmuSource):
         self._check_names(binding, effects)
         self._observed(binding)
         self._inner_roles(binding)
+
+    def binding(self) -> "Binding":
+        """Return the binding with the damage regions of the design, once prepared."""
+        return super().binding().with_regions(self._of.design().regions)
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the design and pack the FMU."""
@@ -287,8 +293,9 @@ class DesignSource:
 
         check_calibration(self._scenario.calibration)
         self.files()
-        gauges = len(self._of.design().gauges.positions)
-        check_wing_scenario(self._scenario, gauges)
+        design = self._of.design()
+        gauges = len(design.gauges.positions)
+        check_wing_scenario(self._scenario, design.regions, gauges)
         if self._of.patch_path is not None:
             from fmu_asset.packing.patch_file import load_patch
             from twin_master.assets.patches import check_model_patch
@@ -369,16 +376,17 @@ def write_design_field(
     """
     from fe.reduction.fields import write_wing_vtu
     from fe.reduction.model_cache import wing_fields
+    from fe.runtime.state import losses_of
     from reporting.files import write_error
 
-    if {*state} != {"z1", "z2"} or {*control} != {"load_factor"}:
+    if {*state} != {*design.regions} or {*control} != {"load_factor"}:
         return False
     try:
         write_wing_vtu(
             path,
             wing_fields(design),
             young_modulus_factor=scenario.asset.true_parameters.get("young_modulus_factor", mean),
-            stiffness_loss=(state["z1"], state["z2"]),
+            stiffness_loss=losses_of(state, design.regions),
             load_factor=control["load_factor"],
             tip_force=scenario.asset.constant_load.get("tip_force", 0.0),
         )

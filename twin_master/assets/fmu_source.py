@@ -313,7 +313,7 @@ class FmuSource:
 
         return FmiAsset(
             self._path(FMU_COPY),
-            self._path(BINDING_COPY),
+            self.binding(),
             isolated=self._section.isolated,
             step_timeout=self._section.step_timeout,
             parameters=self.parameters(),

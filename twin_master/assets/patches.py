@@ -71,7 +71,7 @@ def model_observation_table(
     """
     if patch_file is None:
         return wing_observation_table(wing, scenario, draws, model)
-    check_wing_scenario(scenario, wing.gauge_count)
+    check_wing_scenario(scenario, wing.regions, wing.gauge_count)
     patch = load_patch(patch_file)
     check_model_patch(patch, wing.gauge_count, str(patch_file))
     effects = plain_effects(patch.for_outputs(output_channels(wing.gauge_count)))
@@ -80,7 +80,7 @@ def model_observation_table(
     behaviour = patched_behaviour(wing, effects, steps)
     moment = Moment(0.0, 0.0, effect_values(effects, active=True))
     states, controls = model.states.coordinates, scenario.control
-    first, second = (scenario.state_names.index(name) for name in ("z1", "z2"))
+    order = [scenario.state_names.index(name) for name in wing.regions]
     force = scenario.asset.constant_load.get("tip_force", 0.0)
     table = np.empty((len(draws.values), len(states), len(controls), wing.gauge_count))
     try:
@@ -90,8 +90,7 @@ def model_observation_table(
                 for index, control in enumerate(controls):
                     inputs = (
                         control.values["load_factor"],
-                        float(levels[first]),
-                        float(levels[second]),
+                        *levels[order].tolist(),
                         force,
                     )
                     table[row, state, index] = behaviour.start(parameters, inputs, moment).strain

@@ -7,7 +7,8 @@ from typing import Self
 import numpy as np
 
 from calibration.virtual_wing import RECORDED_GAUGE, SENSITIVITY, RingDownSignal, sampling_times
-from fe.runtime.state import DigitalState
+from fe.runtime.state import DigitalState, losses_of
+from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.slaves.variables import QUASI_STATIC, TRANSIENT
@@ -56,7 +57,9 @@ class FmuTestBench:
         isolated: bool = True,
     ) -> None:
         self._fmu, self._isolated = Path(fmu), isolated
-        self._binding = load_binding(binding_files()[BINDING])
+        declared = [item.name for item in read_fmu(fmu).variables]
+        regions = [name.removeprefix("health.") for name in declared if name.startswith("health.")]
+        self._binding = load_binding(binding_files()[BINDING]).with_regions(regions)
         gauges = len(self._binding.observation["strain"].variables)
         if not 1 <= gauge <= gauges:
             raise MissionInputError(
@@ -70,7 +73,7 @@ class FmuTestBench:
             "damping_alpha": truth.damping_alpha,
             "damping_beta": truth.damping_beta,
         }
-        self._health = dict(zip(("z1", "z2"), truth.stiffness_loss, strict=True))
+        self._health = dict(zip(regions, losses_of(truth.stiffness_loss, tuple(regions)), strict=True))
         self._static = self._session(self._binding, {"response": float(QUASI_STATIC)})
 
     def __enter__(self) -> Self:

@@ -33,10 +33,10 @@ def wing_observation_table(
     OutsideModelError
         A state, control or draw lies outside the model's validity.
     """
-    check_wing_scenario(scenario, wing.gauge_count)
+    check_wing_scenario(scenario, wing.regions, wing.gauge_count)
     load = scenario.asset.constant_load.get("tip_force", 0.0)
     states = model.states.coordinates
-    order = [scenario.state_names.index(name) for name in ("z1", "z2")]
+    order = [scenario.state_names.index(name) for name in wing.regions]
     factors = np.array([control.values["load_factor"] for control in scenario.control])
     shape = (len(draws.values), len(states), len(factors))
     draw, state, control = (index.ravel() for index in np.indices(shape))
@@ -46,7 +46,7 @@ def wing_observation_table(
     return strains.reshape(*shape, wing.gauge_count)
 
 
-def check_wing_scenario(scenario: Scenario, gauge_count: int) -> None:
+def check_wing_scenario(scenario: Scenario, regions: tuple[str, ...], gauge_count: int) -> None:
     """Check that a scenario speaks of what a wing model has.
 
     Raises
@@ -55,7 +55,7 @@ def check_wing_scenario(scenario: Scenario, gauge_count: int) -> None:
         It does not.
     """
     expected: dict[str, tuple[set[str] | set[int], set[str] | set[int]]] = {
-        "states": (set(scenario.state_names), {"z1", "z2"}),
+        "states": (set(scenario.state_names), {*regions}),
         "control inputs": (set(scenario.control[0].values), {"load_factor"}),
         "calibrated parameter": ({scenario.calibration.parameter}, {"young_modulus_factor"}),
         "sensor count": ({scenario.observation.count}, {gauge_count}),
@@ -78,7 +78,7 @@ def wing_asset(wing: "ReducedModel", scenario: Scenario) -> StatelessAsset:
     force = scenario.asset.constant_load.get("tip_force", 0.0)
 
     def observe(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        response = wing.static_response(e, (health["z1"], health["z2"]), control["load_factor"], force)
+        response = wing.static_response(e, wing.losses(health), control["load_factor"], force)
         return AssetReading(response.strain, {"strain_error_bound": response.strain_error_bound})
 
     return StatelessAsset(observe)

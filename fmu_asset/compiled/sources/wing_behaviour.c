@@ -4,7 +4,10 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define STATE_HEAD (2 + WING_INPUTS)
+static size_t inputs_of(const wing_behaviour *wing) { return wing->model->regions + 2; }
+
+/* Numbers of a saved state before those of the motion. */
+static size_t head_of(const wing_behaviour *wing) { return 2 + inputs_of(wing); }
 
 static void lay_out(wing_behaviour *wing, wing_arena *arena) {
     for (size_t i = 0; i < 2; ++i) {
@@ -34,27 +37,28 @@ void wing_behaviour_free(wing_behaviour *wing) {
 
 void wing_behaviour_reset(wing_behaviour *wing) { wing->started = wing->moving = false; }
 
-static void loads_of(const double inputs[WING_INPUTS], double load[WING_LOADS]) {
+static void loads_of(const wing_behaviour *wing, const double *inputs, double load[WING_LOADS]) {
     load[0] = inputs[0];
-    load[1] = inputs[3];
+    load[1] = inputs[wing->model->regions + 1];
 }
 
-static void key_of(const wing_parameters *parameters, const double inputs[WING_INPUTS],
-                   double key[WING_MODE_KEYS]) {
+/* The key of the modes, which begins with the state of health of the static part. */
+static void key_of(const wing_model *model, const wing_parameters *parameters, const double *inputs,
+                   double key[WING_MOST_KEYS]) {
     key[0] = parameters->young_modulus_factor;
-    key[1] = inputs[1];
-    key[2] = inputs[2];
-    key[3] = parameters->servo_mass;
-    key[4] = parameters->pitot_mass;
+    memcpy(key + 1, inputs + 1, model->regions * sizeof *key);
+    key[model->regions + 1] = parameters->servo_mass;
+    key[model->regions + 2] = parameters->pitot_mass;
 }
 
 /* Static response, with the integrator in use, whose static part follows the inputs. */
 static bool find_equilibrium(wing_behaviour *wing, const wing_parameters *parameters,
-                             const double inputs[WING_INPUTS], double *output, wing_problem *problem) {
+                             const double *inputs, double *output, wing_problem *problem) {
     wing_static *steady = &wing->integrators[wing->integrator].steady;
-    const double health[3] = {parameters->young_modulus_factor, inputs[1], inputs[2]};
+    double health[WING_MOST_KEYS];
+    key_of(wing->model, parameters, inputs, health);
     double load[WING_LOADS];
-    loads_of(inputs, load);
+    loads_of(wing, inputs, load);
     if (!wing_static_prepare(steady, health, problem)) {
         return false;
     }
@@ -64,15 +68,15 @@ static bool find_equilibrium(wing_behaviour *wing, const wing_parameters *parame
 
 /* Bring an integrator to the state of health of these inputs. */
 static bool prepare(wing_integrator *integrator, const wing_parameters *parameters,
-                    const double inputs[WING_INPUTS], wing_problem *problem) {
-    double key[WING_MODE_KEYS];
-    key_of(parameters, inputs, key);
+                    const double *inputs, wing_problem *problem) {
+    double key[WING_MOST_KEYS];
+    key_of(integrator->model, parameters, inputs, key);
     return wing_integrator_prepare(integrator, key, parameters->damping_alpha, parameters->damping_beta,
                                    problem);
 }
 
 bool wing_behaviour_start(wing_behaviour *wing, const wing_parameters *parameters,
-                          const double inputs[WING_INPUTS], double *output, wing_problem *problem) {
+                          const double *inputs, double *output, wing_problem *problem) {
     if (!parameters->transient) {
         if (!find_equilibrium(wing, parameters, inputs, output, problem)) {
             return false;
@@ -83,7 +87,7 @@ bool wing_behaviour_start(wing_behaviour *wing, const wing_parameters *parameter
         wing_integrator *integrator = &wing->integrators[next];
         wing_motion *motion = &wing->motions[1 - wing->motion];
         double load[WING_LOADS];
-        loads_of(inputs, load);
+        loads_of(wing, inputs, load);
         if (!prepare(integrator, parameters, inputs, problem)) {
             return false;
         }
@@ -94,12 +98,12 @@ bool wing_behaviour_start(wing_behaviour *wing, const wing_parameters *parameter
         wing->moving = true;
     }
     wing->parameters = *parameters;
-    memcpy(wing->inputs, inputs, sizeof wing->inputs);
+    memcpy(wing->inputs, inputs, inputs_of(wing) * sizeof *inputs);
     wing->started = true;
     return true;
 }
 
-bool wing_behaviour_advance(wing_behaviour *wing, const double inputs[WING_INPUTS], double duration,
+bool wing_behaviour_advance(wing_behaviour *wing, const double *inputs, double duration,
                             double *output, wing_problem *problem) {
     if (!wing->started) {
         return wing_fail(problem, "the wing was not initialised");
@@ -112,8 +116,8 @@ bool wing_behaviour_advance(wing_behaviour *wing, const double inputs[WING_INPUT
         wing_integrator *integrator = &wing->integrators[wing->integrator];
         wing_motion *motion = &wing->motions[wing->motion], *other = &wing->motions[1 - wing->motion];
         double load[WING_LOADS];
-        loads_of(inputs, load);
-        if (memcmp(inputs + 1, wing->inputs + 1, 2 * sizeof *inputs) != 0) {
+        loads_of(wing, inputs, load);
+        if (memcmp(inputs + 1, wing->inputs + 1, wing->model->regions * sizeof *inputs) != 0) {
             wing_integrator *next = &wing->integrators[1 - wing->integrator];
             if (!prepare(next, &wing->parameters, inputs, problem)) {
                 return false;
@@ -130,7 +134,7 @@ bool wing_behaviour_advance(wing_behaviour *wing, const double inputs[WING_INPUT
         }
         wing_integrator_output(integrator, motion, output);
     }
-    memcpy(wing->inputs, inputs, sizeof wing->inputs);
+    memcpy(wing->inputs, inputs, inputs_of(wing) * sizeof *inputs);
     return true;
 }
 
@@ -139,9 +143,10 @@ bool wing_behaviour_error_bound(wing_behaviour *wing, double *bound, wing_proble
         return wing_fail(problem, "the wing was not initialised");
     }
     wing_static *steady = &wing->integrators[wing->integrator].steady;
-    const double health[3] = {wing->parameters.young_modulus_factor, wing->inputs[1], wing->inputs[2]};
+    double health[WING_MOST_KEYS];
+    key_of(wing->model, &wing->parameters, wing->inputs, health);
     double load[WING_LOADS];
-    loads_of(wing->inputs, load);
+    loads_of(wing, wing->inputs, load);
     if (!wing_static_prepare(steady, health, problem)) {
         return false;
     }
@@ -158,9 +163,10 @@ bool wing_behaviour_load_point(wing_behaviour *wing, double *displacement, wing_
         *displacement = wing_integrator_load_point(integrator, &wing->motions[wing->motion]);
         return true;
     }
-    const double health[3] = {wing->parameters.young_modulus_factor, wing->inputs[1], wing->inputs[2]};
+    double health[WING_MOST_KEYS];
+    key_of(wing->model, &wing->parameters, wing->inputs, health);
     double load[WING_LOADS];
-    loads_of(wing->inputs, load);
+    loads_of(wing, wing->inputs, load);
     if (!wing_static_prepare(&integrator->steady, health, problem)) {
         return false;
     }
@@ -179,8 +185,8 @@ bool wing_behaviour_modal_data(wing_behaviour *wing, size_t count, double *frequ
         return wing_fail(problem, "the wing was not initialised");
     }
     wing_integrator *integrator = &wing->integrators[wing->integrator];
-    double key[WING_MODE_KEYS];
-    key_of(&wing->parameters, wing->inputs, key);
+    double key[WING_MOST_KEYS];
+    key_of(wing->model, &wing->parameters, wing->inputs, key);
     if (!wing_modes_find(&integrator->modes, key, problem)) {
         return false;
     }
@@ -194,32 +200,32 @@ bool wing_behaviour_modal_data(wing_behaviour *wing, size_t count, double *frequ
 }
 
 size_t wing_behaviour_state_size(const wing_behaviour *wing) {
-    return STATE_HEAD + 2 * wing->model->mode_count + WING_LOADS;
+    return head_of(wing) + 2 * wing->model->mode_count + WING_LOADS;
 }
 
 size_t wing_behaviour_save(const wing_behaviour *wing, double *state) {
     const size_t count = wing->model->mode_count;
     state[0] = wing->started ? 1.0 : 0.0;
     state[1] = wing->moving ? 1.0 : 0.0;
-    for (size_t i = 0; i < WING_INPUTS; ++i) {
+    for (size_t i = 0; i < inputs_of(wing); ++i) {
         state[2 + i] = wing->started ? wing->inputs[i] : 0.0;
     }
     if (!wing->moving) {
-        return STATE_HEAD;
+        return head_of(wing);
     }
     const wing_motion *motion = &wing->motions[wing->motion];
-    double *rest = state + STATE_HEAD;
+    double *rest = state + head_of(wing);
     memcpy(rest, motion->displacement, count * sizeof *rest);
     memcpy(rest + count, motion->velocity, count * sizeof *rest);
     memcpy(rest + 2 * count, motion->load, sizeof motion->load);
-    return STATE_HEAD + 2 * count + WING_LOADS;
+    return head_of(wing) + 2 * count + WING_LOADS;
 }
 
 bool wing_behaviour_restore(wing_behaviour *wing, const wing_parameters *parameters, const double *state,
                             size_t count, wing_problem *problem) {
     const size_t modes = wing->model->mode_count;
     const bool moving = count > 1 && state[1] != 0.0;
-    if (count != STATE_HEAD + (moving ? 2 * modes + WING_LOADS : 0)) {
+    if (count != head_of(wing) + (moving ? 2 * modes + WING_LOADS : 0)) {
         return wing_fail(problem, "it holds %lu numbers of motion, which does not fit", (unsigned long)count);
     }
     for (size_t i = 0; i < count; ++i) {
@@ -229,7 +235,7 @@ bool wing_behaviour_restore(wing_behaviour *wing, const wing_parameters *paramet
     }
     if (moving) {
         const size_t next = 1 - wing->integrator;
-        const double *rest = state + STATE_HEAD;
+        const double *rest = state + head_of(wing);
         if (!prepare(&wing->integrators[next], parameters, state + 2, problem)) {
             return false;
         }
@@ -242,6 +248,6 @@ bool wing_behaviour_restore(wing_behaviour *wing, const wing_parameters *paramet
     wing->started = state[0] != 0.0;
     wing->moving = moving;
     wing->parameters = *parameters;
-    memcpy(wing->inputs, state + 2, sizeof wing->inputs);
+    memcpy(wing->inputs, state + 2, inputs_of(wing) * sizeof *state);
     return true;
 }

@@ -10,8 +10,8 @@
 #pragma GCC visibility push(hidden)
 #endif
 
-/* load factor [1], z1, z2 [1], tip force [N] */
-#define WING_INPUTS 4
+/* Room for inputs: load factor [1], the losses of the damage regions [1], tip force [N]. */
+#define WING_MOST_INPUTS (WING_MOST_REGIONS + 2)
 
 typedef struct {
     double young_modulus_factor;
@@ -28,7 +28,7 @@ typedef struct {
     bool started;
     bool moving; /* transient */
     wing_parameters parameters;
-    double inputs[WING_INPUTS]; /* of the last step */
+    double inputs[WING_MOST_INPUTS]; /* of the last step */
     /* The integrator in use, and the one that takes over when health changes; motions alike. */
     wing_integrator integrators[2];
     wing_motion motions[2];
@@ -47,10 +47,10 @@ void wing_behaviour_reset(wing_behaviour *wing);
 
 /* Find the initial state and its outputs (G + 1). */
 bool wing_behaviour_start(wing_behaviour *wing, const wing_parameters *parameters,
-                          const double inputs[WING_INPUTS], double *output, wing_problem *problem);
+                          const double *inputs, double *output, wing_problem *problem);
 
 /* Advance by a duration with the inputs held, and write the outputs (G + 1). */
-bool wing_behaviour_advance(wing_behaviour *wing, const double inputs[WING_INPUTS], double duration,
+bool wing_behaviour_advance(wing_behaviour *wing, const double *inputs, double duration,
                             double *output, wing_problem *problem);
 
 /* Certified bound of the static strains under the last inputs. */

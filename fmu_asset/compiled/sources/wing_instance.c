@@ -46,10 +46,11 @@ wing_instance *wing_instance_make(const char *name, const char *data_file, wing_
     }
     bool made = wing_model_read(&instance->model, data_file, problem);
     if (made && (instance->model.output_count != WING_GAUGE_COUNT + 1 ||
-                 instance->model.mode_count < WING_OUTPUT_MODES)) {
-        made = wing_fail(problem, "%s belongs to another FMU: %lu outputs and %lu modes", data_file,
-                         (unsigned long)instance->model.output_count,
-                         (unsigned long)instance->model.mode_count);
+                 instance->model.mode_count < WING_OUTPUT_MODES ||
+                 instance->model.regions + 2 != WING_INPUT_COUNT)) {
+        made = wing_fail(problem, "%s belongs to another FMU: %lu outputs, %lu modes and %lu damage regions",
+                         data_file, (unsigned long)instance->model.output_count,
+                         (unsigned long)instance->model.mode_count, (unsigned long)instance->model.regions);
     }
     if (!made || !wing_behaviour_make(&instance->behaviour, &instance->model, problem)) {
         wing_instance_free(instance);
@@ -127,13 +128,6 @@ static wing_parameters parameters_of(const double *values) {
     return parameters;
 }
 
-/* The inputs in the order of the behaviour. */
-static void inputs_of(const double *values, double inputs[WING_INPUTS]) {
-    inputs[0] = values[WING_LOAD_FACTOR];
-    inputs[1] = values[WING_HEALTH_Z1];
-    inputs[2] = values[WING_HEALTH_Z2];
-    inputs[3] = values[WING_TIP_FORCE];
-}
 
 static void accept_outputs(wing_instance *instance) {
     memcpy(instance->values + WING_STRAIN_1, instance->outputs, WING_GAUGE_COUNT * sizeof *instance->outputs);
@@ -169,9 +163,8 @@ static fmi2Status initialise(wing_instance *instance) {
         return range;
     }
     const wing_parameters parameters = parameters_of(instance->values);
-    double inputs[WING_INPUTS];
     wing_problem problem;
-    inputs_of(instance->values, inputs);
+    const double *inputs = instance->values; /* the first variables are the inputs in the behaviour's order */
     if (!wing_behaviour_start(&instance->behaviour, &parameters, inputs, instance->outputs, &problem)) {
         return wing_refuse(instance, WING_STATUS_INTERNAL, "the initialisation failed: %s", problem.text);
     }
@@ -226,9 +219,8 @@ fmi2Status wing_step(wing_instance *instance, double time, double step_size) {
     if (range != fmi2OK) {
         return range;
     }
-    double inputs[WING_INPUTS];
     wing_problem problem;
-    inputs_of(instance->values, inputs);
+    const double *inputs = instance->values; /* the first variables are the inputs in the behaviour's order */
     if (!wing_behaviour_advance(&instance->behaviour, inputs, step_size, instance->outputs, &problem)) {
         return wing_refuse(instance, WING_STATUS_INTERNAL, "the step from t = %g s failed: %s", time,
                            problem.text);

@@ -41,20 +41,25 @@ static size_t take_largest(double *values, size_t size) {
     return largest;
 }
 
-bool wing_modes_find(wing_modes *modes, const double key[WING_MODE_KEYS], wing_problem *problem) {
+bool wing_modes_find(wing_modes *modes, const double *key, wing_problem *problem) {
     const wing_model *model = modes->model;
     const size_t size = model->modal_size, outputs = model->output_count;
-    if (modes->known && memcmp(modes->key, key, sizeof modes->key) == 0) {
+    const size_t keys = model->regions + 3;
+    if (modes->known && memcmp(modes->key, key, keys * sizeof *key) == 0) {
         return true;
     }
     modes->known = false;
-    const double theta[WING_STIFFNESS_TERMS] = {key[0], 1.0 - key[1], 1.0 - key[2], 1.0};
-    const double mass_theta[WING_MASS_TERMS] = {1.0, key[3], key[4]};
-    wing_sum_terms(modes->factor, size, model->modal_stiffness, WING_STIFFNESS_TERMS, theta);
+    double theta[WING_MOST_TERMS] = {key[0]};
+    for (size_t k = 1; k <= model->regions; ++k) {
+        theta[k] = 1.0 - key[k];
+    }
+    theta[model->regions + 1] = 1.0;
+    const double mass_theta[WING_MASS_TERMS] = {1.0, key[keys - 2], key[keys - 1]};
+    wing_sum_terms(modes->factor, size, model->modal_stiffness, model->terms, theta);
     wing_sum_terms(modes->mass, size, model->modal_mass, WING_MASS_TERMS, mass_theta);
     if (!wing_cholesky(modes->factor, size)) {
-        return wing_fail(problem, "the modal stiffness at e = %g, z1 = %g, z2 = %g is not positive definite",
-                         key[0], key[1], key[2]);
+        return wing_fail(problem, "the modal stiffness at e = %g with the first loss %g is not positive definite",
+                         key[0], key[1]);
     }
     /* M x = K x / omega^2 with K = U' U: the eigenvalues of U'^-1 M U^-1 are 1 / omega^2. The stiffness is well
        conditioned in this basis, the mass is not, and the low modes are the largest eigenvalues, which keep all
@@ -64,12 +69,13 @@ bool wing_modes_find(wing_modes *modes, const double key[WING_MODE_KEYS], wing_p
     transpose_square(modes->matrix, size);
     wing_solve_lower_columns(modes->factor, size, modes->matrix);
     if (!wing_symmetric_eigen(modes->matrix, size, modes->values, modes->vectors, modes->work)) {
-        return wing_fail(problem, "the modes at e = %g, z1 = %g, z2 = %g were not found", key[0], key[1], key[2]);
+        return wing_fail(problem, "the modes at e = %g with the first loss %g were not found", key[0], key[1]);
     }
     for (size_t mode = 0; mode < model->mode_count; ++mode) {
         const size_t found = take_largest(modes->values, size);
         if (found == size) {
-            return wing_fail(problem, "the modal mass at %g kg and %g kg is not positive definite", key[3], key[4]);
+            return wing_fail(problem, "the modal mass at %g kg and %g kg is not positive definite",
+                             mass_theta[1], mass_theta[2]);
         }
         double *shape = modes->shape + mode * size, *output = modes->output + mode * outputs;
         const double root = sqrt(modes->values[found]);
@@ -85,7 +91,7 @@ bool wing_modes_find(wing_modes *modes, const double key[WING_MODE_KEYS], wing_p
         wing_multiply(modes->participation + mode * WING_LOADS, model->modal_load, WING_LOADS, size, shape);
         modes->angular_frequency[mode] = 1.0 / root;
     }
-    memcpy(modes->key, key, sizeof modes->key);
+    memcpy(modes->key, key, keys * sizeof *key);
     modes->known = true;
     return true;
 }
@@ -94,7 +100,7 @@ void wing_modes_project(const wing_modes *modes, const double *modal, const doub
                         double *work) {
     const wing_model *model = modes->model;
     const size_t size = model->modal_size, n = model->static_size;
-    const double mass_theta[WING_MASS_TERMS] = {1.0, modes->key[3], modes->key[4]};
+    const double mass_theta[WING_MASS_TERMS] = {1.0, modes->key[model->regions + 1], modes->key[model->regions + 2]};
     wing_multiply(work, modes->mass, size, size, modal);
     for (size_t k = 0; k < WING_MASS_TERMS; ++k) {
         for (size_t i = 0; i < size; ++i) {

@@ -8,13 +8,13 @@
 #pragma GCC visibility push(hidden)
 #endif
 
-/* e, z1, z2, servo mass [kg], pitot mass [kg] */
-#define WING_MODE_KEYS 5
+/* Room for a key: e, the losses, servo mass [kg], pitot mass [kg]. */
+#define WING_MOST_KEYS (WING_MOST_REGIONS + 3)
 
 typedef struct {
     const wing_model *model;
     bool known;
-    double key[WING_MODE_KEYS];
+    double key[WING_MOST_KEYS];
     double *angular_frequency; /* (M) rad/s, ascending */
     double *shape;             /* (M, Nm), mass-normalised, the tip moves upwards */
     double *output;            /* (M, G + 1) per unit of modal coordinate */
@@ -27,7 +27,7 @@ typedef struct {
 void wing_modes_lay_out(wing_modes *modes, const wing_model *model, wing_arena *arena);
 
 /* Find the modes; does nothing if the key is that of the last call. */
-bool wing_modes_find(wing_modes *modes, const double key[WING_MODE_KEYS], wing_problem *problem);
+bool wing_modes_find(wing_modes *modes, const double *key, wing_problem *problem);
 
 /* result (M) = shape' M u for displacements u = modal (Nm) in the modal plus static (N) in the static basis;
    `work` has room for Nm doubles. */

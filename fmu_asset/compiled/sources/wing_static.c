@@ -22,42 +22,45 @@ void wing_static_lay_out(wing_static *wing, const wing_model *model, wing_arena 
         wing->unit[load].residual = wing_take(arena, r);
         wing->unit[load].correction = wing_take(arena, outputs);
     }
-    wing->work = wing_take(arena, 2 * larger(n, larger(r, outputs)));
+    wing->work = wing_take(arena, (model->regions + 1) * larger(n, larger(r, outputs)));
 }
 
-/* sum = e * first + last, of the four terms of an array (4, size) */
-static void join_lasting(double *sum, const double *terms, size_t size, double skin) {
-    memcpy(sum, terms + 3 * size, size * sizeof *sum);
+/* sum = e * first + last, of the terms of an array (T, size) */
+static void join_lasting(double *sum, const double *terms, size_t count, size_t size, double skin) {
+    memcpy(sum, terms + (count - 1) * size, size * sizeof *sum);
     wing_add(sum, size, skin, terms);
 }
 
-bool wing_static_prepare(wing_static *wing, const double health[3], wing_problem *problem) {
+bool wing_static_prepare(wing_static *wing, const double *health, wing_problem *problem) {
     const wing_model *model = wing->model;
-    if (wing->factorised && memcmp(wing->health, health, sizeof wing->health) == 0) {
+    const size_t regions = model->regions;
+    if (wing->factorised && memcmp(wing->health, health, (regions + 1) * sizeof *health) == 0) {
         return true;
     }
-    memcpy(wing->health, health, sizeof wing->health);
+    memcpy(wing->health, health, (regions + 1) * sizeof *health);
     wing->theta[0] = health[0];
-    wing->theta[1] = 1.0 - health[1];
-    wing->theta[2] = 1.0 - health[2];
-    wing->theta[3] = 1.0;
+    for (size_t k = 1; k <= regions; ++k) {
+        wing->theta[k] = 1.0 - health[k];
+    }
+    wing->theta[regions + 1] = 1.0;
     wing->dual_known = false;
     for (size_t load = 0; load < WING_LOADS; ++load) {
         wing->unit[load].solved = wing->unit[load].bounded = false;
     }
     const size_t n = model->static_size;
     if (!wing->lasting_known || wing->lasting_skin != health[0]) {
-        join_lasting(wing->lasting_stiffness, model->static_stiffness, n * n, health[0]);
-        join_lasting(wing->lasting_residual, model->stiffness_residual, n * model->residual_size, health[0]);
+        join_lasting(wing->lasting_stiffness, model->static_stiffness, model->terms, n * n, health[0]);
+        join_lasting(wing->lasting_residual, model->stiffness_residual, model->terms,
+                     n * model->residual_size, health[0]);
         wing->lasting_skin = health[0];
         wing->lasting_known = true;
     }
     memcpy(wing->factor, wing->lasting_stiffness, n * n * sizeof *wing->factor);
-    wing_add_columns(wing->factor, n * n, model->static_stiffness + n * n, n * n, 2, wing->theta + 1);
+    wing_add_columns(wing->factor, n * n, model->static_stiffness + n * n, n * n, regions, wing->theta + 1);
     wing->factorised = wing_cholesky(wing->factor, n);
     return wing->factorised ||
-           wing_fail(problem, "the stiffness at e = %g, z1 = %g, z2 = %g is not positive definite", health[0],
-                     health[1], health[2]);
+           wing_fail(problem, "the stiffness at e = %g with the first loss %g is not positive definite",
+                     health[0], health[1]);
 }
 
 const wing_unit_response *wing_static_unit(wing_static *wing, size_t load) {
@@ -122,8 +125,11 @@ static size_t anchor_index(const wing_model *model, size_t region, double loss) 
 }
 
 static size_t anchor_of(const wing_static *wing) {
-    return anchor_index(wing->model, 0, wing->health[1]) * wing->model->anchors[1] +
-           anchor_index(wing->model, 1, wing->health[2]);
+    size_t index = 0;
+    for (size_t k = 0; k < wing->model->regions; ++k) {
+        index = index * wing->model->anchors[k] + anchor_index(wing->model, k, wing->health[k + 1]);
+    }
+    return index;
 }
 
 /* The residual of one unit response, and its product with the approximate dual solutions. */
@@ -133,29 +139,39 @@ static void bound_unit(wing_static *wing, size_t load) {
     const size_t n = model->static_size, r = model->residual_size, outputs = model->output_count;
     memcpy(unit->residual, model->load_residual + load * r, r * sizeof *unit->residual);
     wing_add_columns(unit->residual, r, wing->lasting_residual, r, n, unit->coordinates);
-    /* The two defect regions, whose columns lie one after another. */
-    for (size_t i = 0; i < n; ++i) {
-        wing->work[i] = wing->theta[1] * unit->coordinates[i];
-        wing->work[n + i] = wing->theta[2] * unit->coordinates[i];
+    /* The damage regions, whose columns lie one after another. */
+    for (size_t k = 0; k < model->regions; ++k) {
+        for (size_t i = 0; i < n; ++i) {
+            wing->work[k * n + i] = wing->theta[k + 1] * unit->coordinates[i];
+        }
     }
-    wing_add_columns(unit->residual, r, model->stiffness_residual + n * r, r, 2 * n, wing->work);
+    wing_add_columns(unit->residual, r, model->stiffness_residual + n * r, r, model->regions * n, wing->work);
     memset(unit->correction, 0, outputs * sizeof *unit->correction);
     wing_add_columns(unit->correction, outputs, model->correction_columns + anchor_of(wing) * r * outputs, outputs,
                      r, unit->residual);
     unit->bounded = true;
 }
 
-/* Norms of the dual residuals: of the factors times (1, -e, z1 - 1, z2 - 1). */
+/* Norms of the dual residuals: of the factors times (1, -e, z1 - 1, ...). */
 static void find_dual_norms(wing_static *wing) {
     const wing_model *model = wing->model;
-    const double *factor =
-        model->dual_residual + anchor_of(wing) * model->output_count * WING_DUAL_TERMS * WING_DUAL_TERMS;
-    const double coefficients[WING_DUAL_TERMS] = {1.0, -wing->theta[0], -wing->theta[1], -wing->theta[2]};
+    const size_t terms = model->terms;
+    const double *factor = model->dual_residual + anchor_of(wing) * model->output_count * terms * terms;
+    double coefficients[WING_MOST_TERMS] = {1.0};
+    for (size_t k = 1; k < terms; ++k) {
+        coefficients[k] = -wing->theta[k - 1];
+    }
     for (size_t i = 0; i < model->output_count; ++i) {
         double sum = 0.0;
-        for (size_t row = 0; row < WING_DUAL_TERMS; ++row, factor += WING_DUAL_TERMS) {
-            const double value = (coefficients[0] * factor[0] + coefficients[1] * factor[1]) +
-                                 (coefficients[2] * factor[2] + coefficients[3] * factor[3]);
+        for (size_t row = 0; row < terms; ++row, factor += terms) {
+            double value = 0.0;
+            size_t k = 0;
+            for (; k + 2 <= terms; k += 2) {
+                value += coefficients[k] * factor[k] + coefficients[k + 1] * factor[k + 1];
+            }
+            for (; k < terms; ++k) {
+                value += coefficients[k] * factor[k];
+            }
             sum += value * value;
         }
         wing->dual_norm[i] = sqrt(sum);
@@ -186,7 +202,7 @@ double wing_static_error_bound(wing_static *wing, const double load[WING_LOADS])
     superpose(wing->work, model->static_size, load, coordinates);
     remainder += model->residual_allowance * wing_norm(wing->work, model->static_size);
     double coercivity = 1.0;
-    for (size_t k = 0; k < 3; ++k) {
+    for (size_t k = 0; k <= model->regions; ++k) {
         coercivity = smaller(coercivity, wing->theta[k] / model->bound_reference[k]);
     }
     remainder /= coercivity;

@@ -26,8 +26,8 @@ typedef struct {
     const wing_model *model;
     bool factorised;
     bool dual_known;
-    double health[3];                 /* e, z1, z2 of the factor */
-    double theta[WING_STIFFNESS_TERMS]; /* e, 1 - z1, 1 - z2, 1 */
+    double health[WING_MOST_REGIONS + 1]; /* e and the losses of the factor */
+    double theta[WING_MOST_TERMS];    /* e, 1 - z1, ..., 1 */
     /* Skin and everything else together, since e hardly ever changes: e times the first term plus the last. */
     bool lasting_known;
     double lasting_skin;              /* e of these */
@@ -36,13 +36,13 @@ typedef struct {
     double *factor;                   /* (N, N) */
     double *dual_norm;                /* (G + 1) */
     wing_unit_response unit[WING_LOADS];
-    double *work;                     /* the longest of N, R, G + 1, twice */
+    double *work;                     /* the longest of N, R, G + 1, times K + 1 */
 } wing_static;
 
 void wing_static_lay_out(wing_static *wing, const wing_model *model, wing_arena *arena);
 
-/* Take e, z1 and z2; does nothing if they are those of the last call. */
-bool wing_static_prepare(wing_static *wing, const double health[3], wing_problem *problem);
+/* Take e and the losses; does nothing if they are those of the last call. */
+bool wing_static_prepare(wing_static *wing, const double *health, wing_problem *problem);
 
 /* Return the response to one unit of a load. */
 const wing_unit_response *wing_static_unit(wing_static *wing, size_t load);

@@ -29,7 +29,7 @@ void wing_integrator_damp(wing_integrator *integrator, double alpha, double beta
     }
 }
 
-bool wing_integrator_prepare(wing_integrator *integrator, const double key[WING_MODE_KEYS], double alpha,
+bool wing_integrator_prepare(wing_integrator *integrator, const double *key, double alpha,
                              double beta, wing_problem *problem) {
     const wing_model *model = integrator->model;
     const size_t count = model->mode_count, outputs = model->output_count;

@@ -36,8 +36,8 @@ void wing_motion_lay_out(wing_motion *motion, const wing_model *model, wing_aren
 /* Write the damping ratios of eq. (18) at the modes that were found. */
 void wing_integrator_damp(wing_integrator *integrator, double alpha, double beta);
 
-/* Take a state of health (e, z1, z2), mass and damping. */
-bool wing_integrator_prepare(wing_integrator *integrator, const double key[WING_MODE_KEYS], double alpha,
+/* Take a state of health (e and the losses), mass and damping. */
+bool wing_integrator_prepare(wing_integrator *integrator, const double *key, double alpha,
                              double beta, wing_problem *problem);
 
 /* The motion just after a tip that was held aside by a tip force is let go. */

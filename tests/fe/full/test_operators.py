@@ -6,7 +6,6 @@ from fe.full.assembly import Discretisation
 from fe.full.gauges import gauge_output
 from fe.full.operators import (
     ROOT_UNKNOWNS,
-    STIFFNESS_TERM_NAMES,
     AffineOperators,
     assemble,
     cell_density,
@@ -15,7 +14,7 @@ from fe.full.operators import (
 )
 from fe.full.statics import tip_stiffness
 from fe.full.turn_load import STANDARD_GRAVITY
-from fe.wing.mesh import DEFECT_1, DEFECT_2, SKIN, build_mesh
+from fe.wing.mesh import SKIN, build_mesh
 
 
 def _heave(operators):
@@ -32,8 +31,8 @@ def test_the_affine_sum_equals_direct_assembly(coarse_operators):
     mesh, body = coarse_operators.wing_mesh, coarse_operators.discretisation
     scale = np.ones(len(mesh.cells))
     scale[mesh.region == SKIN] = factor
-    scale[mesh.region == DEFECT_1] = 1.0 - loss[0]
-    scale[mesh.region == DEFECT_2] = 1.0 - loss[1]
+    scale[mesh.region == 1] = 1.0 - loss[0]
+    scale[mesh.region == 2] = 1.0 - loss[1]
     direct = body.stiffness(
         np.arange(len(scale)), cell_elasticity(mesh), modulus_variation(mesh) * scale[:, None]
     )
@@ -49,8 +48,7 @@ def test_the_affine_sum_equals_direct_assembly(coarse_operators):
 
 
 def test_the_terms_have_the_order_of_their_coefficients(coarse_operators):
-    assert STIFFNESS_TERM_NAMES == ("skin", "defect_1", "defect_2", "base")
-    assert AffineOperators.theta(1.1, (0.2, 0.4)) == pytest.approx([1.1, 0.8, 0.6, 1.0])
+    assert coarse_operators.theta(1.1, (0.2, 0.4)) == pytest.approx([1.1, 0.8, 0.6, 1.0])
     assert AffineOperators.mass_theta(0.1, 0.2) == pytest.approx([1.0, 0.1, 0.2])
     assert len(coarse_operators.stiffness_terms) == 4
     assert len(coarse_operators.mass_terms) == 3

@@ -38,7 +38,6 @@ from fe.runtime.patch import (
 from fe.runtime.patched_wing import PatchedWing
 from fe.wing import lift as lift_module
 from fe.wing.design import WingDesign
-from fe.wing.mesh import DEFECT_1, DEFECT_2, SKIN
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -122,9 +121,7 @@ def test_local_loss_between_mesh_lines_is_softer_cells(
     stiffness = operators.stiffness(*STATE)
     elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
     restriction = operators.expansion.T.tocsr()
-    for region, factor in zip(
-        (SKIN, DEFECT_1, DEFECT_2), operators.theta(STATE[0], STATE[1])[:3], strict=True
-    ):
+    for region, factor in zip(range(3), operators.theta(STATE[0], STATE[1])[:3], strict=True):
         middle = mesh.centres[:, 1]
         cells = np.flatnonzero((mesh.region == region) & (middle > start) & (middle < end))
         if cells.size:
@@ -153,7 +150,7 @@ def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(
     start, end = (float(mesh.span_lines[np.abs(mesh.span_lines - place).argmin()]) for place in (start, end))
     elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
     inside = (mesh.centres[:, 1] > start) & (mesh.centres[:, 1] < end)
-    cells = np.flatnonzero(inside & np.isin(mesh.region, (SKIN, DEFECT_1, DEFECT_2)))
+    cells = np.flatnonzero(inside & (mesh.stiffness_term < 3))
     part = operators.discretisation.stiffness(cells, elasticity[cells], variation[cells])
     whole = operators.stiffness()
     softer = whole - loss * (operators.expansion.T @ (part @ operators.expansion))

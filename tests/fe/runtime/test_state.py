@@ -6,15 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fe.runtime.errors import FiniteElementError, InvalidStateError
-from fe.runtime.state import STIFFNESS_LOSS_NAMES, DigitalState, Geometry
+from fe.runtime.state import DigitalState, Geometry, losses_of, region_names
 
 
 def test_the_default_state_is_the_healthy_wing_as_built():
     state = DigitalState()
     assert state.geometry == Geometry(1.828, 0.433, 0.260)
     assert state.young_modulus_factor == 1.0
-    assert state.stiffness_loss == (0.0, 0.0)
-    assert STIFFNESS_LOSS_NAMES == ("z1", "z2")
+    assert losses_of(state.stiffness_loss, region_names(2)) == (0.0, 0.0)
 
 
 def test_the_default_damping_gives_the_measured_ratios():
@@ -40,10 +39,10 @@ def test_states_are_frozen_and_comparable():
         ({"servo_mass": -0.1}, "servo_mass"),
         ({"pitot_mass": math.inf}, "pitot_mass"),
         ({"damping_beta": -1e-9}, "damping_beta"),
-        ({"stiffness_loss": (0.2, 1.0)}, "z2"),
+        ({"stiffness_loss": (0.2, 1.0)}, "stiffness_loss 2"),
         ({"stiffness_loss": (40.0, 0.0)}, "not percent"),
-        ({"stiffness_loss": (math.nan, 0.0)}, "z1"),
-        ({"stiffness_loss": (0.1,)}, "2 fractions"),
+        ({"stiffness_loss": (math.nan, 0.0)}, "stiffness_loss 1"),
+        ({"stiffness_loss": (0.1,) * 9}, "at most 8 fractions"),
     ],
 )
 def test_impossible_states_are_refused_with_the_place(changes, place):
@@ -65,3 +64,15 @@ def test_state_errors_are_value_errors_of_the_wing_model():
 @given(z1=st.floats(0.0, 1.0, exclude_max=True), z2=st.floats(0.0, 1.0, exclude_max=True))
 def test_every_fraction_below_one_is_a_stiffness_loss(z1, z2):
     assert DigitalState(stiffness_loss=(z1, z2)).stiffness_loss == (z1, z2)
+
+
+def test_losses_stand_in_the_order_of_the_regions():
+    regions = ("root", "z2", "tip")
+    assert region_names(3) == ("z1", "z2", "z3")
+    assert losses_of({"tip": 0.4, "root": 0.1}, regions) == (0.1, 0.0, 0.4)
+    assert losses_of([0.1, 0.2, 0.3], regions) == (0.1, 0.2, 0.3)
+    assert losses_of((), regions) == (0.0, 0.0, 0.0)
+    with pytest.raises(InvalidStateError, match="no damage region 'z1'; the regions are root, z2, tip"):
+        losses_of({"z1": 0.1}, regions)
+    with pytest.raises(InvalidStateError, match="3 fractions, one for each of root, z2, tip, but 2"):
+        losses_of((0.1, 0.2), regions)

@@ -7,7 +7,7 @@ from fe.full.assembly import gauss_points, jacobians, positions
 from fe.runtime.errors import InvalidDesignError, MeshError
 from fe.wing.airfoil import four_digit_half_thickness
 from fe.wing.grid import chord_lines
-from fe.wing.mesh import REGION_NAMES, build_mesh, straight_edged
+from fe.wing.mesh import build_mesh, straight_edged
 
 RIB = {"thickness": 0.003, "young_modulus": 6e9, "poisson_ratio": 0.3, "density": 500.0}
 
@@ -29,9 +29,9 @@ def test_every_cell_has_a_positive_jacobian_everywhere(coarse_mesh, shipped_desi
 
 
 def test_every_named_region_has_cells_and_they_partition_the_mesh(coarse_mesh):
-    numbers = np.concatenate([coarse_mesh.cells_of(name) for name in REGION_NAMES])
+    numbers = np.concatenate([coarse_mesh.cells_of(name) for name in coarse_mesh.region_names])
     assert sorted(numbers) == list(range(len(coarse_mesh.cells)))
-    assert all(len(coarse_mesh.cells_of(name)) for name in REGION_NAMES)
+    assert all(len(coarse_mesh.cells_of(name)) for name in coarse_mesh.region_names)
     with pytest.raises(MeshError, match="no region 'tail'"):
         coarse_mesh.cells_of("tail")
 
@@ -39,10 +39,10 @@ def test_every_named_region_has_cells_and_they_partition_the_mesh(coarse_mesh):
 def test_parts_have_the_volumes_of_the_design(coarse_design, coarse_mesh):
     plan = coarse_design.planform
     volume = _volumes(coarse_mesh)
-    for index, defect in enumerate(coarse_design.defects, start=1):
+    for name, defect in zip(coarse_design.regions, coarse_design.defects, strict=True):
         middle = plan.chord(0.5 * (defect.span_start + defect.span_end) / plan.semi_span)
         area = (defect.span_end - defect.span_start) * (defect.chord_end - defect.chord_start) * middle
-        found = volume[coarse_mesh.cells_of(f"defect_{index}")].sum()
+        found = volume[coarse_mesh.cells_of(name)].sum()
         # The skin is curved, so that the patch is a little larger than its shadow.
         assert area * 0.0006 <= found <= 1.1 * area * 0.0006
     for index, web in enumerate(coarse_design.webs):
@@ -53,8 +53,8 @@ def test_parts_have_the_volumes_of_the_design(coarse_design, coarse_mesh):
 
 
 def test_mesh_lines_lie_on_the_edges_of_the_defects(coarse_design, coarse_mesh):
-    for index, defect in enumerate(coarse_design.defects, start=1):
-        corners = coarse_mesh.corners[coarse_mesh.cells_of(f"defect_{index}")].reshape(-1, 3)
+    for name, defect in zip(coarse_design.regions, coarse_design.defects, strict=True):
+        corners = coarse_mesh.corners[coarse_mesh.cells_of(name)].reshape(-1, 3)
         assert corners[:, 1].min() == pytest.approx(defect.span_start)
         assert corners[:, 1].max() == pytest.approx(defect.span_end)
         plan = coarse_design.planform

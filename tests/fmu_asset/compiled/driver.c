@@ -213,7 +213,7 @@ static void ramp(const char *folder) {
     const double alphas[] = {0.0, 2.0, 2.0, 900.0};
     for (size_t k = 0; k < 4; ++k) {
         wing_integrator *integrator = &wing.integrators[0];
-        const double key[WING_MODE_KEYS] = {1.0, 0.2, 0.1, 0.17, 0.13};
+        const double key[WING_MOST_KEYS] = {1.0, 0.2, 0.1, 0.17, 0.13};
         double alpha = alphas[k];
         CHECK(wing_integrator_prepare(integrator, key, alpha, 1e-4, &problem));
         if (k == 2) { /* the first mode is critically damped, to rounding */

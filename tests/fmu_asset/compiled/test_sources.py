@@ -68,7 +68,14 @@ def test_the_data_file_holds_the_arrays_of_the_model(model: ReducedModel) -> Non
     content = data_file_bytes(model)
     assert data_file_bytes(ReducedModel.from_bytes(model.to_bytes())) == content
     arrays = arrays_of(content)
-    for name in ("static_stiffness", "dual_correction", "cross_mass", "dual_split_1", "validity_box"):
+    for name in (
+        "static_stiffness",
+        "dual_correction",
+        "cross_mass",
+        "dual_split",
+        "dual_counts",
+        "validity_box",
+    ):
         np.testing.assert_array_equal(arrays[name], getattr(model, name))
     assert arrays["mode_count"] == model.mode_count
     assert pack_arrays(arrays) == content
@@ -104,7 +111,11 @@ def damaged(content: bytes) -> dict[str, bytes]:
         "modes": with_array("mode_count", np.array(1e300)),
         "fewer_modes": with_array("mode_count", np.array(2.0)),
         "gauges": with_array("static_output", arrays["static_output"][:-1]),
-        "overflow": with_array("dual_residual", np.zeros((1, 1, 25, 4, 4))),
+        "regions": with_array("dual_counts", np.ones(9)),
+        "no_regions": with_array("dual_counts", np.ones((1, 1))),
+        "anchors": with_array("dual_counts", np.array([2.0, 1e300])),
+        "splits": with_array("dual_split", np.zeros(1)),
+        "overflow": with_array("dual_residual", np.zeros((1, 25, 4, 4))),
     }
     files |= {
         f"without_{name}": without(name)

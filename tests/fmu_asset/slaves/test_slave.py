@@ -41,7 +41,9 @@ class Bare:
 
 @pytest.fixture(scope="session")
 def make_slave(model: ReducedModel) -> Callable[..., Any]:
-    table = variable_table(gauge_count=24, mode_count=6, validity=model.validity, start=START)
+    table = variable_table(
+        gauge_count=24, mode_count=6, regions=model.regions, validity=model.validity, start=START
+    )
     reference = {row.name: row.reference for row in table}
 
     class Wing(WingSlave, Bare):
