@@ -293,7 +293,7 @@ class Problem:
         if len(unknowns.health_rows):
             at = unknowns.size - len(unknowns.health_rows)
             by_entry = np.zeros((len(unknowns.health_rows), *response.shape))
-            for region in range(2):
+            for region in range(data.trial.health.shape[1]):
                 entries = np.flatnonzero(unknowns.health_columns == region)
                 if not len(entries):
                     continue

@@ -274,7 +274,7 @@ class WingModel:
         )  # where a mass has weight; other zeros are read with it in place
         loads = patch.of(*LOADS, PointMass) if flight else patch.of(*LOADS)
         size = len(trial.time)
-        health = np.broadcast_to(conditions.health, (size, 2))
+        health = np.broadcast_to(self._losses(conditions.health), (size, len(self.wing.arrays.regions)))
         depends = any(isinstance(item, ModulusTemperature) for item in structure)
         temperature = trial.temperature if depends else np.zeros(size)
         acting = np.column_stack((health, temperature))
@@ -292,9 +292,9 @@ class WingModel:
         # rows of one structure that follow one another are solved together, in the order of the load path
         changes = np.flatnonzero(np.any(np.diff(acting, axis=0) != 0.0, axis=1)) + 1
         for end in (*changes.tolist(), size):
-            z1, z2, warmer = acting[start]
-            key = self._structure.stiffness_key(conditions.parameters, (z1, z2), structure, warmer)
-            stiffness = self._structure.stiffness(conditions.parameters, (z1, z2), structure, warmer)
+            *lost, warmer = acting[start]
+            key = self._structure.stiffness_key(conditions.parameters, tuple(lost), structure, warmer)
+            stiffness = self._structure.stiffness(conditions.parameters, tuple(lost), structure, warmer)
             shown, at_ports, flexible, port_flexibility = self._statics.get(
                 (key, place, loads.primitives, outputs, components, laws.ports),
                 lambda stiffness=stiffness: self._structure.static_units(  # type: ignore[misc]
@@ -321,6 +321,19 @@ class WingModel:
             return Response(values)
         return Response(values[:, :count], None, values[:, count : 2 * count], values[:, 2 * count :])
 
+    def _losses(self, health: FloatArray) -> FloatArray:
+        """Return the losses (N, K) of the wing's regions from those of a campaign, which may name fewer."""
+        regions = self.wing.arrays.regions
+        if np.any(health[:, len(regions) :]):
+            raise ModelError(
+                f"The campaign gives losses of {health.shape[1]} damage regions, but the wing has "
+                f"{len(regions)}: {', '.join(regions)}."
+            )
+        losses = np.zeros((len(health), len(regions)))
+        known = min(health.shape[1], len(regions))
+        losses[:, :known] = health[:, :known]
+        return losses
+
     def _moving(
         self,
         trial: Trial,
@@ -334,11 +347,11 @@ class WingModel:
         refinement: int,
     ) -> Response:
         structure = patch.of(*STRUCTURE)
-        z1, z2 = conditions.health[0]
+        losses = self._losses(conditions.health)[0]
         loads = patch.of(*LOADS)
         basis, system = self._structure.moving(
             conditions.parameters,
-            (z1, z2),
+            tuple(losses),
             structure,
             float(trial.temperature[0]),
             trial.load_place,

@@ -14,6 +14,7 @@ from discrepancy.models.second_order import SecondOrderSystem
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, ModulusTemperature, PointMass, RootCompliance
 from fe.runtime.patched_structure import motion_basis
 from fe.runtime.patched_wing import ON_MODES, PORTS, PatchedWing, Place, strain_gauge
+from fe.runtime.state import Losses
 
 FloatArray = NDArray[np.float64]
 Outputs = tuple[tuple[str, Quantity], ...]
@@ -111,22 +112,23 @@ class WingStructure:
 
     @staticmethod
     def stiffness_key(
-        parameters: FloatArray, health: tuple[float, float], structure: ModelPatch, temperature: float
+        parameters: FloatArray, health: Losses, structure: ModelPatch, temperature: float
     ) -> Key:
         """Return what the stiffness of a state depends on; primitives of other kinds are passed over."""
         kept = structure.of(RootCompliance, LocalStiffnessLoss, ModulusTemperature)
         if not any(isinstance(item, ModulusTemperature) for item in kept):
             temperature = 0.0
-        return float(parameters[0]), float(health[0]), float(health[1]), kept.primitives, float(temperature)
+        losses = tuple(float(loss) for loss in health)
+        return float(parameters[0]), losses, kept.primitives, float(temperature)
 
     def stiffness(
         self,
         parameters: FloatArray,
-        health: tuple[float, float],
+        health: Losses,
         structure: ModelPatch,
         temperature: float,
     ) -> Stiffness:
-        """Return the stiffness at parameters, (z1, z2), a patch and a temperature less the reference [K]."""
+        """Return the stiffness at parameters, losses, a patch and a temperature less the reference [K]."""
         key = self.stiffness_key(parameters, health, structure, temperature)
         return self._stiffnesses.get(
             key,
@@ -138,7 +140,7 @@ class WingStructure:
     def moving(
         self,
         parameters: FloatArray,
-        health: tuple[float, float],
+        health: Losses,
         structure: ModelPatch,
         temperature: float,
         place: Place,

@@ -17,7 +17,7 @@ from fe.runtime.state import DigitalState
 from fmu_asset.compiled.package import DATA_FILE, binary_of, compiled_members
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.slaves.effect_variables import effect_rows, switch_of, units_of
-from fmu_asset.slaves.variables import UNITS, variable_table
+from fmu_asset.slaves.variables import UNITS, FmuVariable, variable_table
 
 from .contents import (
     PLACEHOLDER,
@@ -120,14 +120,7 @@ def fmu_bytes(
     """Return the archive and its content hash; see `build_fmu`."""
     start = start_values(model, state or DigitalState())
     mode_count = min(MODE_COUNT, model.mode_count)
-    table = variable_table(
-        gauge_count=model.gauge_count,
-        mode_count=mode_count,
-        regions=model.regions,
-        validity=model.validity,
-        start=start,
-    )
-    check_start(table)
+    table = _table_of(model, mode_count, start)
     effects = []
     if patch is not None:
         check_kind(kind)
@@ -170,6 +163,19 @@ def fmu_bytes(
     if kind == "compiled":
         members |= binary_of(members, f"uav_wing_{tag_of(content_hash)}")
     return archive_bytes(members), content_hash
+
+
+def _table_of(model: ReducedModel, mode_count: int, start: Mapping[str, float]) -> tuple[FmuVariable, ...]:
+    """Return the checked table of a wing without missing effects."""
+    table = variable_table(
+        gauge_count=model.gauge_count,
+        mode_count=mode_count,
+        regions=model.regions,
+        validity=model.validity,
+        start=start,
+    )
+    check_start(table)
+    return table
 
 
 def check_kind(kind: FmuKind) -> None:
