@@ -97,10 +97,10 @@ class LumpedDescription(ModelDescription):
     def is_plain(self) -> bool:
         """Whether it is a structure at rest on springs under one force at a time."""
         motion = any(item.quantity.moving or item.through for item in self.input)
-        further = self.states or self.free or self.load or self.damping_part or motion
-        further = further or self.law or self.controller or any(item.acts for item in self.port)
+        parts = self.states or self.free or self.load or self.damping_part or self.law or self.controller
+        acts = any(item.acts for item in self.port)
         reads = any(item.reaction or item.constant for item in self.output)
-        return not (further or reads)
+        return not (parts or motion or acts or reads)
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
@@ -231,12 +231,12 @@ class LumpedDescription(ModelDescription):
             self._check_controller(item)
         names = [item.reference for item in self.controller if item.reference]
         check_unique("input or reference", [*(item.name for item in self.input), *names])
-        known = [item.name for item in self.controller]
+        controllers = [item.name for item in self.controller]
         for output in self.output:
-            if output.controller is not None and output.controller not in known:
+            if output.controller is not None and output.controller not in controllers:
                 raise ValueError(
                     f"the output {output.name!r} is what {output.controller!r} gives, but controllers are "
-                    f"{', '.join(known) or 'none'}"
+                    f"{', '.join(controllers) or 'none'}"
                 )
 
     def _check_controller(self, item: ControllerSection) -> None:
@@ -278,7 +278,8 @@ class LumpedDescription(ModelDescription):
         check_unique("part", [*parts, "mass", "stiffness", "damping", "capacity", "conductance"])
         check_unique("parameter", [item.name for item in self.parameter])
         known = list(self.terms)
-        more = [item.name for item in (*self.input, *self.load, *self.law, *self.controller)]
+        named = (self.input, self.load, self.law, self.controller)
+        more = [item.name for items in named for item in items]
         more += [f"{item.name}.{gain}" for item in self.controller for gain in GAINS]
         known += [name for name in more if name not in known]
         if self.is_plain:
