@@ -9,6 +9,7 @@ from reporting import terminal
 from twin_master.command import guarded
 from twin_master.command import run as run_command
 from twin_master.viewer.command import view as view_command
+from twin_master.watch_command import watch as watch_command
 from uav_twin.calibrate_commands import calibrate_app
 from uav_twin.discrepancy import discrepancy_app
 from uav_twin.fmu import fmu_app
@@ -43,6 +44,7 @@ def uav_twin(
 
 app.command("run")(run_command)
 app.command("view")(view_command)
+app.command("watch")(watch_command)
 app.command("scenarios")(list_scenarios)
 app.add_typer(scenario_app, name="scenario", help="Check a scenario before it is flown.")
 app.add_typer(

@@ -19,6 +19,7 @@ from twin_master.scenario.section import (
     NotNegative,
     Number,
     PerSensor,
+    Positive,
     Probability,
     Section,
     Seed,
@@ -208,6 +209,21 @@ class Calibration(FileSection):
         return self
 
 
+WATCHED_KIND = "watched"
+"""Kind of the asset of a scenario without `[asset]`."""
+
+
+class WatchSection(Section):
+    """How a real asset is watched."""
+
+    lag: Count = 50
+    """Turns back over which the twin smooths, and which a message may be late."""
+    longest_gap: Count = 1000
+    """Turns that a message may be ahead of the next one; those between are predicted through."""
+    seconds_per_turn: Positive | None = None
+    """Of messages that have a time in the place of a turn."""
+
+
 class Scenario(Section):
     """A whole scenario, in SI."""
 
@@ -224,7 +240,17 @@ class Scenario(Section):
     calibration: Calibration
     truth: TruthSection
     learning: Learning | None = None
+    watch: WatchSection = WatchSection()
     reference: tuple[Reference, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_a_real_asset(cls, table: object) -> object:
+        """Let a scenario without `[asset]` and `[truth]` be one of a real asset."""
+        if not isinstance(table, Mapping) or "asset" in table or "truth" in table:
+            return table
+        untold = {"kind": "scripted", "noise": {"standard_deviation": 0.0}}
+        return {**table, "asset": {"kind": WATCHED_KIND}, "truth": untold}
 
     @property
     def state_names(self) -> tuple[str, ...]:

@@ -1,0 +1,258 @@
+"""What a publisher sends: put in its place, or refused; never a change of the past, never an end."""
+
+from __future__ import annotations
+
+import io
+import json
+import random
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from twin_master.assets.strain_library import load_strain_library
+from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.mission.loop import operate
+from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.network.twin import Twin
+from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.schema import WatchSection
+from twin_master.watch import feeds
+from twin_master.watch.intake import Intake, RejectedFile
+from twin_master.watch.message import LARGEST_MESSAGE, MessageReader, Refused
+
+TURNS = 60
+
+
+@pytest.fixture(scope="module")
+def knowledge(library_file: Path) -> Knowledge:
+    scenario = load_scenario("level_turns").scenario
+    scenario = scenario.model_copy(update={"watch": WatchSection(lag=20, longest_gap=30)})
+    return prepare_knowledge(
+        scenario, StrainLibrarySource(scenario, load_strain_library(library_file), "h"), 0
+    )
+
+
+@pytest.fixture(scope="module")
+def strains(knowledge: Knowledge) -> np.ndarray:
+    """Sixty turns (60, 24) of a wing that is getting worse, as 3g shows it."""
+    noise = np.random.default_rng(2).standard_normal((TURNS, 24))
+    return knowledge.sensor_model.mean[np.arange(TURNS) // 13 * 6, 1] + 150e-6 * noise
+
+
+def message(turn: int, row: np.ndarray, **others: object) -> bytes:
+    shown = [None if np.isnan(value) else value for value in row.tolist()]
+    return json.dumps({"turn": turn, "control": "3g", "strain": shown, **others}).encode() + b"\n"
+
+
+def watched(knowledge: Knowledge, lines: list[bytes], rejected: Path | None = None) -> tuple[Twin, Intake]:
+    feed = feeds.JsonLinesFeed(knowledge.scenario, io.BytesIO(b"".join(lines)))
+    intake = Intake(knowledge.scenario, feed, RejectedFile(rejected))
+    twin = knowledge.twin(lag=20)
+    for _ in operate(twin, intake):
+        pass
+    return twin, intake
+
+
+def same(first: Twin, second: Twin) -> bool:
+    return first.save_state() == second.save_state()
+
+
+def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
+    knowledge: Knowledge, strains: np.ndarray, tmp_path: Path
+) -> None:
+    clean = [message(turn, row) for turn, row in enumerate(strains)]
+    expected, _ = watched(knowledge, clean)
+    chance = random.Random(5)
+    order = sorted(range(TURNS), key=lambda turn: turn + (chance.random() < 0.2) * chance.randint(1, 15))
+    lines: list[bytes] = []
+    for turn in order:
+        lines.append(clean[turn])
+        if chance.random() < 0.2:
+            lines.append(clean[turn])
+        if chance.random() < 0.2:
+            lines.append(chance.randbytes(40).replace(b"\n", b"") + b"\n")
+    lines += [clean[TURNS - 1]] * 3
+    twin, intake = watched(knowledge, lines, tmp_path / "rejected.jsonl")
+    assert same(twin, expected)
+    assert intake.counts.late >= 5
+    assert intake.counts.duplicates >= 5
+    refused = [json.loads(line) for line in (tmp_path / "rejected.jsonl").read_text().splitlines()]
+    assert len(refused) == intake.counts.rejected >= 5
+    assert all(record["reason"] and record["text"] for record in refused)
+    assert intake.counts.missing == 0
+    # A turn that never came is predicted through, and its sensors may come one by one.
+    parts = [line for turn, line in enumerate(clean) if turn != 50]
+    gap, counted = watched(knowledge, parts)
+    assert counted.counts.missing == 1
+    assert not same(gap, expected)
+    half = strains[50].copy()
+    half[::2] = np.nan
+    other = np.where(np.isnan(half), strains[50], np.nan)
+    assert same(watched(knowledge, [*parts, message(50, half), message(50, other)])[0], expected)
+
+
+@pytest.mark.parametrize(
+    ("sent", "reason"),
+    [
+        ({"turn": 5, "strain": [1e-4] * 24}, "contradicts what was received of turn 5"),
+        ({"turn": 58, "control": "2g"}, "contradicts the control of turn 58"),
+        ({"turn": 30}, "turn 30 is 29 turns late, and `watch.lag` is 20"),
+        ({"turn": 10**9}, "ahead of the next one, 60, and `watch.longest_gap` is 30"),
+        ({"turn": -1}, "`turn` is a whole number from 0"),
+        ({"turn": 60.0}, "`turn` is a whole number"),
+        ({"turn": True}, "`turn` is a whole number"),
+        ({"time": 3.0}, "no `watch.seconds_per_turn`"),
+        ({"control": "4g"}, "`control` is one of 2g, 3g"),
+        ({"strain_25": 1e-4}, "is no sensor"),
+        ({"strain_3_bar": 1.0}, "`bar` is no unit of sensor 3"),
+        ({"strain_3": "1e-4"}, "`strain_3` is a number, or null"),
+        ({"strain_3": True}, "`strain_3` is a number"),
+        ({"strain_3": 812.0}, "give its unit, such as `strain_3_microstrain`"),
+        ({"strain_3": 1e-4, "strain_3_percent": 0.01}, "sensor 3 is given twice"),
+        ({"strain": [1e-4] * 23}, "24 values are expected, and 23 came"),
+        ({"unit": 3}, "`unit` is the name of a unit"),
+    ],
+)
+def test_what_is_refused_changes_nothing(
+    knowledge: Knowledge, strains: np.ndarray, tmp_path: Path, sent: dict[str, object], reason: str
+) -> None:
+    clean = [message(turn, row) for turn, row in enumerate(strains)]
+    if sent.get("turn") == 5:
+        sent = sent | {"turn": 55}
+        reason = reason.replace("turn 5", "turn 55")
+    line = json.dumps(sent).encode() + b"\n"
+    twin, intake = watched(knowledge, [*clean, line], tmp_path / "rejected.jsonl")
+    assert same(twin, watched(knowledge, clean)[0])
+    assert intake.counts.rejected == 1
+    assert reason in json.loads((tmp_path / "rejected.jsonl").read_text())["reason"]
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.one_of(
+        st.binary(max_size=60),
+        st.recursive(
+            st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
+            lambda inner: (
+                st.lists(inner, max_size=3)
+                | st.dictionaries(
+                    st.sampled_from(["turn", "time", "strain", "strain_1", "unit", "control"]), inner
+                )
+            ),
+            max_leaves=6,
+        ).map(lambda value: json.dumps(value).encode()),
+    )
+)
+def test_anything_is_an_observation_or_refused(content: bytes) -> None:
+    reader = MessageReader(load_scenario("level_turns").scenario)
+    try:
+        found = reader.parse(content)
+    except Refused:
+        return
+    assert found.observed.shape == (24,)
+    assert not np.isinf(found.observed).any()
+
+
+def test_a_flood_and_messages_of_ten_megabytes_are_counted_and_forgotten(
+    knowledge: Knowledge, strains: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("twin_master.watch.intake.REJECTED_KEPT", 50)
+    big = b'{"strain_1": "' + b"x" * 10_000_000 + b'"}\n'
+    deep = b'{"strain": ' + b"[" * (LARGEST_MESSAGE // 4) + b"\n"
+    flood = [big, deep, b"\xff\xfe{\n", b"NaN\n", b'{"strain_1": NaN}\n', b'{"strain_1": 1e999}\n'] * 3
+    lines = [message(turn, row) for turn, row in enumerate(strains)]
+    expected, _ = watched(knowledge, lines)
+    twin, intake = watched(
+        knowledge, [*lines[:30], *flood * 1, *[b"{}x\n"] * 300, *lines[30:]], tmp_path / "r"
+    )
+    assert same(twin, expected)
+    assert intake.counts.rejected == 318
+    content = (tmp_path / "r").read_text().splitlines()
+    assert len(content) == 50
+    assert max(map(len, content)) < 1200
+
+
+def test_an_observation_that_no_state_allows_is_refused_and_its_turn_predicted_through(
+    knowledge: Knowledge, strains: np.ndarray, tmp_path: Path
+) -> None:
+    noise = replace(
+        knowledge
+    )  # the likelihood of 0.4 underflows nowhere: a certain prior makes it impossible
+    twin, intake = watched(
+        noise, [message(0, strains[0]), message(1, np.full(24, 0.4)), message(2, strains[2])], tmp_path / "r"
+    )
+    assert twin.turns == 3
+    assert np.isfinite(twin.smoothed()).all()
+    assert intake.counts.received == 3
+
+
+def test_times_stand_for_turns(knowledge: Knowledge, strains: np.ndarray) -> None:
+    section = WatchSection(lag=20, longest_gap=30, seconds_per_turn=0.5)
+    timed = replace(knowledge, scenario=knowledge.scenario.model_copy(update={"watch": section}))
+    lines = []
+    for turn, row in enumerate(strains[:10]):
+        record = json.loads(message(turn, row))
+        del record["turn"]
+        lines.append(
+            json.dumps(record | {"time": 1.7e9 + 0.5 * turn + 0.1 * (turn % 3 - 1)}).encode() + b"\n"
+        )
+    twin, intake = watched(timed, [*lines[:4], *lines[5:]])
+    assert (twin.turns, intake.counts.missing) == (10, 1)
+    np.testing.assert_array_equal(twin.observed(9), strains[9])
+    early = json.dumps({"time": 1.6e9, "strain_1": 1e-4}).encode() + b"\n"
+    assert watched(timed, [*lines, early])[1].counts.rejected == 1
+
+
+def test_units_and_names(knowledge: Knowledge) -> None:
+    reader = MessageReader(knowledge.scenario)
+    for name, value in (
+        ("strain_3", 8.12e-4),
+        ("strain_3_microstrain", 812.0),
+        ("strain_3 [microstrain]", 812.0),
+        ("strain_3 (percent)", 0.0812),
+        ("strain_3_1", 8.12e-4),
+    ):
+        found = reader.read({name: value}).observed
+        assert found[2] == pytest.approx(8.12e-4, rel=1e-15)
+        assert np.isnan(found).sum() == 23
+    pump = MessageReader(load_scenario("pump_wear").scenario)
+    unit = load_scenario("pump_wear").scenario.observation.sensor_units[0]
+    name = next(iter(pump._index))
+    assert pump.read({f"{name} [k{unit}]": 2.0}).observed[0] == 2000.0
+
+
+def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "gauges.csv"
+    names = ",".join(f"strain_{number}_microstrain" for number in range(1, 25))
+    rows = [
+        f"{turn},3g," + ",".join(repr(v) for v in (1e6 * row).tolist()) for turn, row in enumerate(strains)
+    ]
+    rows[7] = rows[7].replace(repr(float(1e6 * strains[7, 4])), "nan")
+    rows[9] = "9,3g" + "," * 24
+    rows[11] = "11,3g,zero" + "," * 23
+    rows[12] = "12,3g"
+    path.write_text("﻿step,control," + names + "\r\n" + "\r\n".join(rows), encoding="utf-8")
+
+    def messages() -> Iterator[feeds.Fed]:
+        return feeds.CsvFeed(path, knowledge.scenario).messages(0)
+
+    found = [fed[0] for fed in messages()]
+    assert len(found) == TURNS
+    refused = [turn for turn, fed in enumerate(found) if isinstance(fed, Refused)]
+    assert refused == [11, 12]
+    for turn, fed in enumerate(found):
+        if not isinstance(fed, Refused):
+            assert fed.turn == turn
+            assert fed.control == 1
+            lost = np.isnan(fed.observed)
+            assert lost.sum() == {7: 1, 9: 24}.get(turn, 0)
+            np.testing.assert_allclose(fed.observed[~lost], strains[turn][~lost], rtol=1e-15)
+    assert len(list(feeds.CsvFeed(path, knowledge.scenario).messages(50))) == 10
+    path.write_text("step,strian_1\n1,2\n", encoding="utf-8")
+    with pytest.raises(Exception, match=r"gauges.csv: the column `strian_1` is no sensor.*`turn`, `time`"):
+        feeds.CsvFeed(path, knowledge.scenario)

@@ -1,0 +1,394 @@
+"""A watch: the same as a mission, killed at any moment, patched on the way, over files and a real broker."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from paho.mqtt import client as paho
+from typer.testing import CliRunner
+
+import uav_twin
+from fe.runtime.patch import ModelPatch, SensorGain
+from fmu_asset.packing.patch_file import SCHEMA
+from reporting.progress import SilentProgress
+from twin_master.assets.resolution import Overrides
+from twin_master.errors import MissionInputError
+from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.loop import Flight, fly
+from twin_master.network.estimator import ExactFilter
+from twin_master.scenario.reading import LoadedScenario, load_scenario
+from twin_master.watch.feeds import CsvFeed, RunFeed
+from twin_master.watch.folder import Patched, Watch, begin_watch, resume_watch
+from twin_master.watch.mqtt import PASSWORD_VARIABLE, MqttFeed, broker_of
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> LoadedScenario:
+    """`level_turns` of a real wing: without what flies and what really happens."""
+    kept, skipping = [], False
+    for line in load_scenario("level_turns").path.read_text(encoding="utf-8").splitlines():
+        if line.startswith("["):
+            skipping = line.strip("[]").split(".")[0] in ("asset", "truth", "reference")
+        if not skipping:
+            kept.append(line)
+    path = tmp_path_factory.mktemp("scenario") / "my_wing.toml"
+    path.write_text("\n".join(kept) + "\n\n[watch]\nlag = 12\n", encoding="utf-8")
+    return load_scenario(path)
+
+
+@pytest.fixture(scope="module")
+def mission(base: Watch) -> Flight:
+    """The paper's mission, flown by the model that the watch believes."""
+    knowledge = replace(base.models[0].knowledge, scenario=load_scenario("level_turns").scenario)
+    plant = knowledge.plant(knowledge.truth(knowledge.scenario.mission.seed), base._source.open())
+    return fly(knowledge.scenario, knowledge.twin(), plant)
+
+
+def write_csv(path: Path, observed: np.ndarray, controls: np.ndarray, garbage: bool = False) -> Path:
+    lines = ["turn,control," + ",".join(f"strain_{number}" for number in range(1, 25))]
+    for turn, row in enumerate(observed):
+        cells = ",".join("" if np.isnan(value) else repr(value) for value in row.tolist())
+        lines.append(f"{turn},{('2g', '3g')[controls[turn]]},{cells}")
+        if garbage and turn % 7 == 3:
+            lines.append(f"{turn},4g,what")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded(mission: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The mission as a CSV file with some garbage between its turns."""
+    path = tmp_path_factory.mktemp("recorded") / "mission.csv"
+    return write_csv(path, mission.observed, mission.control_index, garbage=True)
+
+
+@pytest.fixture(scope="module")
+def base(scenario: LoadedScenario, tmp_path_factory: pytest.TempPathFactory) -> Watch:
+    """A watch that has seen nothing."""
+    folder = tmp_path_factory.mktemp("base") / "watch"
+    watch, lock = begin_watch(scenario, folder, Overrides(), SilentProgress(), replace_run=False)
+    os.close(lock)
+    return watch
+
+
+def begun(base: Watch, folder: Path) -> Watch:
+    """Return a watch of the same configuration in a folder of its own, without calibrating again."""
+    shutil.copytree(base.folder, folder)
+    watch = copy.copy(base)
+    watch.folder, watch._path, watch.models = folder, folder / JOURNAL_NAME, list(base.models)
+    return watch
+
+
+@pytest.fixture(scope="module")
+def whole(base: Watch, recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the watch of the whole mission."""
+    folder = tmp_path_factory.mktemp("whole") / "watch"
+    watch = begun(base, folder)
+    decisions: list[dict[str, object]] = []
+    counts = watch.run(CsvFeed(recorded, watch.scenario), lambda decision: decisions.append(dict(decision)))
+    watch.store(counts)
+    assert [decision["turn"] for decision in decisions] == list(range(50))
+    assert all(0.5 <= float(str(decision["probability"])) <= 1.0 for decision in decisions)
+    (folder / "decisions.json").write_text(json.dumps(decisions))
+    return folder
+
+
+def test_a_recorded_mission_is_watched_as_it_was_flown(mission: Flight, whole: Path) -> None:
+    run = uav_twin.open_run(whole)
+    for group, name, flown in (
+        ("observed", "strain", mission.observed),
+        ("observed", "control_index", mission.control_index),
+        ("filtered", "probability", mission.filtered),
+        ("filtered", "log_evidence", mission.log_evidence),
+        ("filtered", "decision_probability", mission.decision_probability),
+        ("smoothed", "probability", mission.smoothed),
+        ("predicted", "probability", mission.predicted),
+    ):
+        np.testing.assert_array_equal(run[group][name].values, flown, err_msg=f"{group}/{name}")
+    assert "truth" not in run.children
+    decisions = json.loads((whole / "decisions.json").read_text())
+    assert [d["next_control"] for d in decisions[:-1]] == [d["control"] for d in decisions[1:]]
+    figures = {f["key"]: f["value"] for f in json.loads((whole / "summary.json").read_text())["figures"]}
+    assert (figures["turns"], figures["rejected"], figures["missing"]) == (50, 7, 0)
+    assert len((whole / "rejected.jsonl").read_text().splitlines()) == 7
+    assert "messages refused" in (whole / "report.html").read_text()
+
+
+def test_a_run_file_is_watched_too(base: Watch, whole: Path, tmp_path: Path) -> None:
+    watch = begun(base, tmp_path / "watch")
+    watch.run(RunFeed(whole / "run.nc", watch.scenario), lambda _decision: None)
+    first, second = (
+        json.loads((f / JOURNAL_NAME).read_text().splitlines()[-1][65:]) for f in (whole, tmp_path / "watch")
+    )
+    assert first["filtered"] == second["filtered"]
+
+
+def killed(watch: Watch, feed: CsvFeed, size: int) -> bool:
+    """Watch in a process of its own, killed once the journal has a size; return whether it was killed."""
+    child = os.fork()
+    if not child:
+        try:
+            watch.run(feed, lambda _decision: None)
+            os._exit(0)
+        finally:
+            os._exit(1)
+    journal = watch.folder / JOURNAL_NAME
+    while not (ended := os.waitpid(child, os.WNOHANG))[0]:
+        if journal.exists() and journal.stat().st_size >= size:
+            os.kill(child, signal.SIGKILL)
+            ended = os.waitpid(child, 0)
+            break
+    assert ended[1] in (0, signal.SIGKILL)
+    return ended[1] == signal.SIGKILL
+
+
+def test_a_kill_at_any_moment_loses_no_turn(base: Watch, recorded: Path, whole: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "watch"
+    watch = begun(base, folder)
+    feed = CsvFeed(recorded, watch.scenario)
+    chance, kills, journal = random.Random(3), 0, folder / JOURNAL_NAME
+    expected, size = (whole / JOURNAL_NAME).read_bytes(), 0
+    while killed(watch, feed, size + chance.randint(0, len(expected) // 8)):
+        kills += 1
+        content = journal.read_bytes()
+        assert expected.startswith(content)
+        size = len(content)
+        with journal.open("ab") as file:  # as a kill within a write would leave it
+            file.write(expected[size : size + chance.choice([0, 1, 70, 300])])
+    assert kills >= 5
+    assert journal.read_bytes() == expected
+    assert (folder / "rejected.jsonl").read_bytes() == (whole / "rejected.jsonl").read_bytes()
+
+
+def test_a_long_watch_goes_on_from_its_snapshot(
+    base: Watch, mission: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("folder", "replay"):
+        monkeypatch.setattr(f"twin_master.watch.{module}.SNAPSHOT_TURNS", 16)
+    monkeypatch.setattr("twin_master.watch.folder.STORED_TURNS", 20)
+    path = write_csv(tmp_path / "m.csv", mission.observed, mission.control_index)
+    watch = begun(base, tmp_path / "watch")
+    seen: list[int] = []
+    monkeypatch.setattr(ExactFilter, "turn", counting(seen, ExactFilter.turn))
+    for turns in (18, 40, None):
+        counts = watch.run(CsvFeed(path, watch.scenario), lambda _decision: None, turns=turns)
+    assert len(seen) < 50 + 2 + 8 + 3  # each turn once, and those behind the last snapshot again
+    watch.store(counts, report=False)
+    run = uav_twin.open_run(tmp_path / "watch")
+    np.testing.assert_array_equal(run["filtered"]["step"].values, np.arange(30, 50))
+    np.testing.assert_array_equal(run["filtered"]["probability"].values, mission.filtered[30:])
+    np.testing.assert_array_equal(run["smoothed"]["probability"].values, mission.smoothed[30:])
+
+
+def counting(seen: list[int], inner: Callable[..., object]) -> Callable[..., object]:
+    def turn(*arguments: object) -> object:
+        seen.append(1)
+        return inner(*arguments)
+
+    return turn
+
+
+def test_a_changed_journal_and_other_folders_are_refused(
+    scenario: LoadedScenario, recorded: Path, whole: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(whole, tmp_path / "copy")
+    journal = tmp_path / "copy" / JOURNAL_NAME
+    journal.write_bytes(journal.read_bytes().replace(b'"turn": 9}', b'"turn": 8}', 1))
+    with pytest.raises(Exception, match=r"line 11 of the journal .*changed or is damaged"):
+        resume_watch(tmp_path / "copy", None, SilentProgress())
+    result = CliRunner().invoke(app(), ["watch", str(scenario.path), "--out", str(whole)])
+    assert "holds a run already" in str(result.exception)
+    with pytest.raises(Exception, match=r"this scenario has no `\[asset\]`"):
+        uav_twin.fly(scenario, tmp_path / "run")
+    for options in (["--resume", "--seed", "3"], ["--model-patch", "x.json"], []):
+        assert CliRunner().invoke(app(), ["watch", *options]).exit_code != 0
+
+
+def app() -> object:
+    from uav_twin.cli import app as application
+
+    return application
+
+
+def test_a_patch_is_believed_from_a_stated_turn_on(base: Watch, mission: Flight, tmp_path: Path) -> None:
+    observed = mission.observed.copy()
+    observed[20:, 4] *= 0.88
+    path = write_csv(tmp_path / "m.csv", observed, mission.control_index)
+    patch = tmp_path / "patch.json"
+    effects = [{"id": "loose", "primitives": ModelPatch((SensorGain("g5", -0.12),)).to_list()}]
+    patch.write_text(json.dumps({"schema": SCHEMA, "effects": effects, "channels": {"g5": "strain[5]"}}))
+    watch = begun(base, tmp_path / "watch")
+    watch.run(CsvFeed(path, watch.scenario), lambda _decision: None, turns=40)
+    with pytest.raises(MissionInputError, match="--from-turn names one of the 40 turns"):
+        watch.run(CsvFeed(path, watch.scenario), str, patched=Patched(patch, 41))
+    watch = begun(base, tmp_path / "other")
+    shutil.copy(tmp_path / "watch" / JOURNAL_NAME, tmp_path / "other")
+    watch.run(CsvFeed(path, watch.scenario), lambda _decision: None, turns=45, patched=Patched(patch, 20))
+    later = begun(base, tmp_path / "later")
+    shutil.copytree(tmp_path / "other", tmp_path / "later", dirs_exist_ok=True)
+    later.models.append(watch.models[1])  # as the journal says
+    later.store(later.run(CsvFeed(path, later.scenario), lambda _decision: None), report=False)
+
+    twin = base.models[0].knowledge.twin()
+    beliefs = []
+    for turn, row in enumerate(observed):
+        if turn == 20:
+            knew = watch.models[1].knowledge.twin()
+            knew.restore_state(twin.save_state())
+            twin = knew
+        beliefs.append(twin.turn(row, int(mission.control_index[turn])).filtered)
+    run = uav_twin.open_run(tmp_path / "later")
+    np.testing.assert_array_equal(run["filtered"]["probability"].values, beliefs)
+    figures = {
+        figure["key"]: figure["value"]
+        for figure in json.loads((tmp_path / "later" / "summary.json").read_text())["figures"]
+    }
+    assert figures["gap_after_patch_20"] < 0.97 * figures["gap_before_patch_20"]
+
+
+PASSWORD = "a password"
+
+
+class Mosquitto:
+    """A broker on the loopback that wants a user, or TLS, and keeps its sessions when it stops."""
+
+    def __init__(self, folder: Path, *, tls: bool = False) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = probe.getsockname()[1]
+        self.folder, self.tls = folder, tls
+        self.authority = folder / "certificate.pem"
+        subprocess.run(
+            ["mosquitto_passwd", "-b", "-c", str(folder / "users"), "wing", PASSWORD],
+            check=True,
+            capture_output=True,
+        )
+        lines = [
+            f"listener {self.port} 127.0.0.1", "allow_anonymous false", f"password_file {folder / 'users'}",
+            "persistence true", f"persistence_location {folder}/", "max_queued_messages 10000", "user root",
+        ]  # fmt: skip
+        if tls:
+            command = "req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2"
+            subprocess.run(
+                ["openssl", *command.split(), "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1",
+                 "-subj", "/CN=localhost",
+                 "-keyout", str(folder / "key.pem"), "-out", str(self.authority)],
+                check=True, capture_output=True,
+            )  # fmt: skip
+            lines += [f"certfile {self.authority}", f"keyfile {folder / 'key.pem'}"]
+        (folder / "mosquitto.conf").write_text("\n".join(lines) + "\n")
+        self.start()
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(
+            ["mosquitto", "-c", str(self.folder / "mosquitto.conf")], stderr=subprocess.DEVNULL
+        )
+        for _ in range(400):
+            try:
+                socket.create_connection(("127.0.0.1", self.port), 1.0).close()
+                return
+            except OSError:
+                time.sleep(0.02)
+
+    def stop(self) -> None:
+        self.process.terminate()
+        self.process.wait(20)
+
+    def client(self) -> Any:
+        client = paho.Client(paho.CallbackAPIVersion.VERSION2)
+        client.username_pw_set("wing", PASSWORD)
+        if self.tls:
+            client.tls_set(ca_certs=str(self.authority))
+        client.connect("localhost" if self.tls else "127.0.0.1", self.port)
+        client.loop_start()
+        return client
+
+
+@pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
+@pytest.mark.parametrize("tls", [False, True])
+def test_over_a_broker_that_stops_and_a_hostile_publisher(
+    base: Watch, mission: Flight, whole: Path, tmp_path: Path, tls: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broker = Mosquitto(tmp_path, tls=tls)
+    scheme, host = ("mqtts", "localhost") if tls else ("mqtt", "127.0.0.1")
+    where = broker_of(f"{scheme}://wing@{host}:{broker.port}/wing/7", broker.authority if tls else None)
+    watch = begun(base, tmp_path / "watch")
+    monkeypatch.setenv(PASSWORD_VARIABLE, "another")
+    with pytest.raises(MissionInputError, match=r"refuses the twin.*[Nn]ot authorized"):
+        watch.run(MqttFeed(where, watch.scenario, watch.folder, str), lambda _decision: None)
+    monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
+    notes: list[str] = []
+    feed = MqttFeed(where, watch.scenario, watch.folder, notes.append)
+    turns = len(mission.observed)
+    watching = threading.Thread(target=watch.run, args=(feed, feed.decide), kwargs={"turns": turns})
+    watching.start()
+    heard: list[dict[str, Any]] = []
+    listener = broker.client()
+    listener.on_message = lambda _client, _data, message: heard.append(json.loads(message.payload))
+    listener.subscribe("wing/7/decision", qos=1)
+    while not any("Connected" in note for note in notes):
+        time.sleep(0.02)
+    publisher = broker.client()
+
+    def publish(first: int, last: int) -> None:
+        for turn in range(first, last):
+            row, control = mission.observed[turn], ("2g", "3g")[mission.control_index[turn]]
+            record = {"turn": turn, "control": control, "strain": row.tolist()}
+            publisher.publish("wing/7", json.dumps(record), qos=1).wait_for_publish(20)
+
+    publish(0, 20)
+    for number in range(1000):
+        publisher.publish("wing/7", b"garbage %d" % number, qos=0)
+    publisher.publish("wing/7", b"x" * 3_000_000, qos=0)
+    publish(15, 19)
+    if not tls:
+        broker.stop()
+        broker.start()
+        while not publisher.is_connected():
+            time.sleep(0.02)
+    publish(20, turns)
+    watching.join(60)
+    assert not watching.is_alive()
+    feed.close()
+    publisher.disconnect()
+    listener.disconnect()
+    broker.stop()
+    last, expected = (
+        json.loads((folder / JOURNAL_NAME).read_text().splitlines()[-1][65:])
+        for folder in (watch.folder, whole)
+    )
+    assert last["filtered"] == expected["filtered"]
+    assert last["intake"]["counts"]["late"] == 0
+    assert last["intake"]["counts"]["duplicates"] >= 4
+    assert last["intake"]["counts"]["rejected"] <= 1000
+    assert {decision["turn"] for decision in heard} >= set(range(15))
+    assert all(decision["probability"] >= 0.5 for decision in heard)
+
+
+def test_addresses_of_brokers() -> None:
+    assert broker_of("mqtt://host/a/b").port == 1883
+    assert broker_of("mqtts://me@host:1/a").user == "me"
+    for wrong, match in (
+        ("mqtt://me:secret@host/a", "every user of this machine"),
+        ("mqtt://host/a/#", "one asset"),
+        ("mqtt://host/+/a", "one asset"),
+        ("mqtt://host", "is expected"),
+        ("mqtt://host:x/a", "is expected"),
+    ):
+        with pytest.raises(MissionInputError, match=match):
+            broker_of(wrong)

@@ -1,0 +1,204 @@
+"""Messages from files, recorded or growing, and from standard input."""
+
+import csv
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import xarray as xr
+
+from reporting.errors import DamagedFileError
+from reporting.netcdf import read_groups
+from twin_master.errors import MissionInputError
+from twin_master.scenario.schema import Scenario
+from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
+
+Fed = tuple[Message | Refused, str]
+
+POLL_SECONDS = 0.05
+"""Between two looks at a file that grows."""
+_LOST = ("", "nan", "null", "none")
+_TURN_COLUMNS = ("turn", "step")
+
+
+class CsvFeed:
+    """A CSV file with a header: `turn` (or `step`) or `time`, `control`, and sensors by their names.
+
+    Parameters
+    ----------
+    path : Path
+    scenario : Scenario
+        What its columns may be called.
+    follow : bool
+        Wait at its end for more, without end.
+
+    Raises
+    ------
+    MissionInputError
+        It cannot be read, or a column is neither of these.
+    """
+
+    replayable = True
+
+    def __init__(self, path: Path, scenario: Scenario, *, follow: bool = False) -> None:
+        self._path = path
+        self._follow = follow
+        self._reader = MessageReader(scenario)
+        try:
+            with path.open("rb") as file:
+                names = _cells(file.readline(LARGEST_MESSAGE))
+        except (OSError, ValueError) as error:
+            raise MissionInputError(f"{path} cannot be read as CSV: {error}.") from None
+        self._names = ["turn" if name in _TURN_COLUMNS else name for name in names]
+        for name in self._names:
+            if name not in ("turn", "time", "control"):
+                try:
+                    self._reader.column(name)
+                except Refused as refusal:
+                    raise MissionInputError(
+                        f"{path}: the column {refusal}; others are `turn`, `time` and `control`."
+                    ) from None
+
+    def messages(self, after: int) -> Iterator[Fed]:
+        """Return the rows behind the first `after` of them."""
+        with self._path.open("rb") as file:
+            for number, line in enumerate(_lines(file, follow=self._follow)):
+                if number > after:
+                    yield self._message(line), _shown(line)
+
+    def _message(self, line: bytes | Refused) -> Message | Refused:
+        if isinstance(line, Refused):
+            return line
+        try:
+            cells = _cells(line)
+            if len(cells) != len(self._names):
+                return Refused(f"{len(self._names)} cells are expected, and {len(cells)} came")
+            record: dict[str, object] = {}
+            for name, cell in zip(self._names, cells, strict=True):
+                if cell.lower() not in _LOST:
+                    record[name] = cell if name == "control" else int(cell) if name == "turn" else float(cell)
+            return self._reader.read(record)
+        except Refused as refusal:
+            return refusal
+        except (ValueError, OverflowError) as error:
+            return Refused(f"a cell is no number: {str(error)[:80]}")
+
+
+class RunFeed:
+    """A NetCDF file with the group `observed` of a run: observations and the controls that were in force.
+
+    Raises
+    ------
+    MissionInputError
+        It cannot be read, or holds other sensors or controls.
+    """
+
+    replayable = True
+
+    def __init__(self, path: Path, scenario: Scenario) -> None:
+        role = scenario.observation.role
+        try:
+            group: xr.Dataset = read_groups(path)["observed"].to_dataset()
+            self._values = np.asarray(group[role].values, dtype=np.float64)
+            self._control = (
+                np.asarray(group["control_index"].values, dtype=np.int64)
+                if "control_index" in group
+                else None
+            )
+            self._turn = np.asarray(group["step"].values, dtype=np.int64)
+        except (DamagedFileError, KeyError, ValueError, TypeError, OSError) as error:
+            raise MissionInputError(
+                f"{path} is no NetCDF file with `observed/{role}` (step, sensor): {str(error).rstrip('.')}."
+            ) from None
+        if self._values.shape != (len(self._turn), scenario.observation.count) or (
+            self._control is not None and not np.all(np.isin(self._control, range(len(scenario.control))))
+        ):
+            raise MissionInputError(
+                f"{path}: {scenario.observation.count} sensors and the controls of the scenario are "
+                f"expected, and `observed/{role}` has the shape {self._values.shape}."
+            )
+
+    def messages(self, after: int) -> Iterator[Fed]:
+        """Return the steps behind the first `after` of them."""
+        for row in range(after, len(self._values)):
+            control = None if self._control is None else int(self._control[row])
+            yield Message(self._values[row].copy(), int(self._turn[row]), None, control), f"row {row}"
+
+
+class JsonLinesFeed:
+    """JSON objects, one a line, from a stream such as standard input."""
+
+    replayable = False
+
+    def __init__(self, scenario: Scenario, stream: IO[bytes] | None = None) -> None:
+        self._reader = MessageReader(scenario)
+        self._stream = stream
+
+    def messages(self, after: int) -> Iterator[Fed]:
+        """Return what comes."""
+        for line in _lines(self._stream or sys.stdin.buffer):
+            yield parsed(self._reader, line), _shown(line)
+
+
+def parsed(reader: MessageReader, content: bytes | Refused) -> Message | Refused:
+    """Return the observation in a JSON object, or why there is none."""
+    if isinstance(content, Refused):
+        return content
+    try:
+        return reader.parse(content)
+    except Refused as refusal:
+        return refusal
+
+
+def file_feed(path: Path, scenario: Scenario, *, follow: bool = False) -> CsvFeed | RunFeed:
+    """Return the feed of a file: NetCDF by its ending `.nc`, else CSV.
+
+    Raises
+    ------
+    MissionInputError
+        It cannot be read, or a recorded one is to be followed.
+    """
+    if not path.is_file():
+        raise MissionInputError(f"there is no file {path} to read observations from.")
+    if path.suffix.lower() != ".nc":
+        return CsvFeed(path, scenario, follow=follow)
+    if follow:
+        raise MissionInputError(f"{path} is a recorded NetCDF file: only a CSV file can be followed.")
+    return RunFeed(path, scenario)
+
+
+def _lines(file: IO[bytes], *, follow: bool = False) -> Iterator[bytes | Refused]:
+    """Return whole lines; one that is too long is skipped in pieces, and the rest of a file is a line."""
+    part = b""
+    too_long = False
+    while True:
+        piece = file.readline(LARGEST_MESSAGE + 1)
+        if not piece:
+            if follow:
+                time.sleep(POLL_SECONDS)
+                continue
+            if part and not too_long:
+                yield part
+            return
+        ended = piece.endswith(b"\n")
+        part = b"" if too_long else part + piece
+        if len(part) > LARGEST_MESSAGE:
+            too_long, part = True, b""
+        if ended:
+            yield Refused(f"a message has at most {LARGEST_MESSAGE} bytes") if too_long else part
+            part, too_long = b"", False
+
+
+def _cells(line: bytes) -> list[str]:
+    text = line.decode("utf-8-sig").rstrip("\r\n")
+    if '"' in text:
+        return [cell.strip() for cell in next(csv.reader([text]), [])]
+    return [cell.strip() for cell in text.split(",")]
+
+
+def _shown(line: bytes | Refused) -> str:
+    return "" if isinstance(line, Refused) else line[:300].decode("utf-8", "replace").rstrip(os.linesep)

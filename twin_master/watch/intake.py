@@ -1,0 +1,232 @@
+"""From messages to readings: turns in order, gaps predicted through, late ones in their place."""
+
+import json
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reporting.files import write_error
+from twin_master.errors import ImpossibleObservation
+from twin_master.mission.loop import Reading
+from twin_master.network.twin import Twin
+from twin_master.scenario.schema import Scenario
+from twin_master.watch.message import Message, Refused
+
+Float = NDArray[np.float64]
+
+REJECTED_NAME = "rejected.jsonl"
+REJECTED_KEPT = 10_000
+"""Refused messages that are written down; further ones are counted only, so that a flood fills no disk."""
+_TEXT_KEPT = 200
+_MISSING, _ASSUMED, _GIVEN = 0, 1, 2
+"""Of a turn: not received; received; received with its control."""
+
+
+class Feed(Protocol):
+    """Where messages come from."""
+
+    replayable: bool
+    """Whether it begins anew with every process, so that what was read before is read again."""
+
+    def messages(self, after: int) -> Iterator[tuple[Message | Refused, str]]:
+        """Return the messages behind the first `after` of them, each with the begin of its text."""
+
+
+@dataclass
+class Counts:
+    """What came, and what became of it.
+
+    Attributes
+    ----------
+    received : int
+        Messages read.
+    missing : int
+        Turns that were predicted through because nothing came, less those that came late.
+    late, duplicates, rejected : int
+        Messages that were put in their place later, that said nothing new, and that were refused.
+    """
+
+    received: int = 0
+    missing: int = 0
+    late: int = 0
+    duplicates: int = 0
+    rejected: int = 0
+
+
+@dataclass
+class RejectedFile:
+    """`rejected.jsonl`: what was refused, and why; None keeps nothing."""
+
+    path: Path | None
+    kept: int = field(default=0, init=False)
+
+    def go_back(self, received: int) -> None:
+        """Forget what was refused behind a number of messages, which will be read again."""
+        if self.path is None or not self.path.exists():
+            return
+        lines = []
+        for line in self.path.read_text(encoding="utf-8").splitlines():
+            try:
+                record = json.loads(line)
+            except json.JSONDecodeError:
+                break  # cut off by a kill
+            if record["message"] <= received:
+                lines.append(line + "\n")
+        self.path.write_text("".join(lines), encoding="utf-8")
+        self.kept = len(lines)
+
+    def add(self, message: int, reason: str, text: str) -> None:
+        """Write down a refused message, its number from 1."""
+        if self.path is None or self.kept >= REJECTED_KEPT:
+            return
+        self.kept += 1
+        record = {"message": message, "reason": reason, "text": text[:_TEXT_KEPT]}
+        try:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(record, ensure_ascii=True) + "\n")
+        except OSError as error:
+            raise write_error(error, self.path) from error
+
+
+class Intake:
+    """The messages of a feed as the source of a twin.
+
+    A message belongs to the turn that it names, or to that of its time, or to the next one. One about a turn
+    that was received before must agree with it: what it has beyond is taken in, a contradiction is refused.
+    Nothing that was received can be changed afterwards.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Sensors, and how late and how far ahead a message may be.
+    feed : Feed
+        Of the messages.
+    rejected : RejectedFile
+        Where refused ones are written down.
+
+    Attributes
+    ----------
+    counts : Counts
+        What came so far, up to the last reading.
+    observation_turn : int
+        The turn of the last reading.
+    """
+
+    def __init__(self, scenario: Scenario, feed: Feed, rejected: RejectedFile) -> None:
+        self._section = scenario.watch
+        self._sensors = scenario.observation.count
+        self._feed = feed
+        self._rejected = rejected
+        self._messages: Iterator[tuple[Message | Refused, str]] | None = None
+        self._pending: deque[tuple[int, Reading, int]] = deque()
+        self._given: deque[int] = deque(maxlen=scenario.watch.lag + 1)
+        self._origin: float | None = None
+        self._text = ""
+        self._before: Float = np.empty(0)
+        self.counts = Counts()
+        self.observation_turn = -1
+
+    def state(self) -> dict[str, Any]:
+        """Return what is needed to go on, as JSON."""
+        return {"counts": vars(self.counts).copy(), "origin": self._origin, "given": list(self._given)}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state."""
+        self.counts = Counts(**state["counts"])
+        self._origin = state["origin"]
+        self._given.extend(state["given"])
+        if self._feed.replayable:
+            self._rejected.go_back(self.counts.received)
+
+    def read(self, twin: Twin) -> Reading | None:
+        """Return the next reading, see `Source.read`."""
+        if self._messages is None:
+            self._messages = self._feed.messages(self.counts.received if self._feed.replayable else 0)
+        while not self._pending:
+            message, self._text = next(self._messages, (None, ""))
+            if message is None:
+                return None
+            self.counts.received += 1
+            try:
+                if isinstance(message, Refused):
+                    raise message
+                self._sort(twin, message)
+            except Refused as refusal:
+                self._refuse(str(refusal))
+        turn, reading, given = self._pending.popleft()
+        self.observation_turn = turn
+        if reading.revises is None:
+            self._given.append(given)
+            self.counts.missing += given == _MISSING
+        else:
+            place = turn - twin.turns
+            self.counts.missing -= self._given[place] == _MISSING
+            self.counts.late += 1
+            self._given[place] = max(given, self._given[place])
+        return reading
+
+    def impossible(self, reading: Reading, error: ImpossibleObservation) -> Reading:
+        """Refuse an observation that no state allows; its turn is predicted through, or stays as it was."""
+        self._refuse(str(error))
+        if reading.revises is not None:
+            return Reading(self._before, None, reading.revises)
+        return Reading(np.full(self._sensors, np.nan), reading.control)
+
+    def _refuse(self, reason: str) -> None:
+        self.counts.rejected += 1
+        self._rejected.add(self.counts.received, reason, self._text)
+
+    def _turn_of(self, twin: Twin, message: Message) -> int:
+        if message.turn is not None:
+            return message.turn
+        if message.time is None:
+            return twin.turns
+        if self._section.seconds_per_turn is None:
+            raise Refused("it has a time and no turn, and the scenario has no `watch.seconds_per_turn`")
+        if self._origin is None:
+            self._origin = message.time - self._section.seconds_per_turn * twin.turns
+        turn = round((message.time - self._origin) / self._section.seconds_per_turn)
+        if turn < 0:
+            raise Refused(f"its time lies {-turn} turns before the first")
+        return turn
+
+    def _sort(self, twin: Twin, message: Message) -> None:
+        turn = self._turn_of(twin, message)
+        ahead = turn - twin.turns
+        given = _ASSUMED if message.control is None else _GIVEN
+        if ahead > self._section.longest_gap:
+            raise Refused(
+                f"turn {turn} is {ahead} turns ahead of the next one, {twin.turns}, and `watch.longest_gap` "
+                f"is {self._section.longest_gap}"
+            )
+        if ahead < 0:
+            self._sort_late(twin, turn, message, given)
+            return
+        lost = np.full(self._sensors, np.nan)
+        self._pending += [(twin.turns + gap, Reading(lost), _MISSING) for gap in range(ahead)]
+        self._pending.append((turn, Reading(message.observed, message.control), given))
+
+    def _sort_late(self, twin: Twin, turn: int, message: Message, given: int) -> None:
+        if turn < twin.first_kept:
+            raise Refused(
+                f"turn {turn} is {twin.turns - 1 - turn} turns late, and `watch.lag` is {self._section.lag}"
+            )
+        before, known = twin.observed(turn), self._given[turn - twin.turns]
+        both = ~np.isnan(before) & ~np.isnan(message.observed)
+        if not np.array_equal(before[both], message.observed[both]):
+            raise Refused(f"it contradicts what was received of turn {turn} before")
+        control = message.control
+        if control is not None and control != twin.control_of(turn) and known != _MISSING:
+            raise Refused(f"it contradicts the control of turn {turn}")
+        new = np.isnan(before) & ~np.isnan(message.observed)
+        if not new.any() and (control is None or control == twin.control_of(turn)):
+            self.counts.duplicates += 1
+            return
+        self._before = before
+        merged = np.where(np.isnan(before), message.observed, before)
+        self._pending.append((turn, Reading(merged, control, revises=turn), given))

@@ -1,0 +1,133 @@
+"""The command that watches a real asset: `uav-twin watch`."""
+
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from reporting import terminal
+from twin_master.command import Calibration, Library, Seed
+
+if TYPE_CHECKING:
+    from twin_master.watch.folder import Watch
+    from twin_master.watch.intake import Feed
+
+Observations = Annotated[
+    str,
+    typer.Option(
+        metavar="SOURCE",
+        help="A CSV or NetCDF file, `-` for JSON lines on standard input, or mqtt://[USER@]HOST[:PORT]/TOPIC "
+        "(mqtts:// with TLS).",
+    ),
+]
+
+
+def watch(
+    scenario: Annotated[
+        str | None,
+        typer.Argument(metavar="[SCENARIO]", help="A shipped scenario, or the path of a TOML file."),
+    ] = None,
+    observations: Observations = "-",
+    out: Annotated[
+        Path | None, typer.Option(help="The folder of the watch.", show_default="runs/SCENARIO")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Take up the watch in --out.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the folder if it exists.")] = False,
+    follow: Annotated[bool, typer.Option("--follow", help="Wait at the end of a CSV file for more.")] = False,
+    turns: Annotated[int | None, typer.Option(min=0, help="End after so many turns in all.")] = None,
+    model_patch: Annotated[
+        Path | None,
+        typer.Option(help="Believe this patch (`patch.json` of `discrepancy run`) from --from-turn on."),
+    ] = None,
+    from_turn: Annotated[
+        int | None, typer.Option(min=0, help="The first turn that --model-patch is believed in.")
+    ] = None,
+    ca_file: Annotated[
+        Path | None, typer.Option(help="Certificate of the authority of an mqtts:// broker.")
+    ] = None,
+    seed: Seed = None,
+    calibration: Calibration = None,
+    library: Library = None,
+    no_report: terminal.NoReport = False,
+) -> None:
+    """Watch a real asset: observations in, a decision for each turn out, as a line of JSON.
+
+    The same scenario as for a simulated mission; its tables `asset` and `truth` are not needed. Everything is
+    kept in the folder after every turn. Ctrl-C ends a watch in order; --resume takes it up again.
+    """
+    from twin_master.assets.resolution import Overrides
+    from twin_master.scenario.reading import load_scenario
+    from twin_master.watch.folder import Patched, begin_watch, resume_watch
+
+    if (model_patch is None) != (from_turn is None) or (model_patch is not None and not resume):
+        raise typer.BadParameter("--model-patch and --from-turn go together, with --resume.")
+    overrides = Overrides(seed=seed, calibration=calibration, library=library)
+    if resume and (replace or overrides != Overrides()):
+        raise typer.BadParameter(
+            "a watch is taken up with what its folder holds: give nothing that would change it.",
+            param_hint="--resume",
+        )
+    loaded = None if scenario is None else load_scenario(scenario)
+    if out is None and loaded is None:
+        raise typer.BadParameter("a scenario is needed, or --resume with --out.", param_hint="SCENARIO")
+    folder = out if out is not None or loaded is None else Path("runs") / loaded.scenario.mission.name
+    assert folder is not None
+    progress = terminal.progress()
+    if resume:
+        watched, lock = resume_watch(folder, loaded, progress)
+    else:
+        if loaded is None:
+            raise typer.BadParameter("a scenario is needed.", param_hint="SCENARIO")
+        watched, lock = begin_watch(loaded, folder, overrides, progress, replace_run=replace)
+    patched = None if model_patch is None or from_turn is None else Patched(model_patch, from_turn)
+    try:
+        feed, decide, close = _feed(observations, watched, follow, ca_file)
+        try:
+            counts = watched.run(feed, decide, turns=turns, patched=patched)
+        finally:
+            close()
+        watched.store(counts, report=not no_report)
+    except Exception as error:
+        error.add_note(f"What was observed is kept: go on with `uav-twin watch --resume --out {folder}`.")
+        raise
+    finally:
+        os.close(lock)
+    refused = f", {counts.rejected} messages refused (see rejected.jsonl)" if counts.rejected else ""
+    typer.echo(f"Watch: {folder}, {counts.received} messages{refused}.", err=True)
+
+
+def _feed(
+    observations: str, watched: "Watch", follow: bool, ca_file: Path | None
+) -> "tuple[Feed, Callable[[Mapping[str, Any]], None], Callable[[], None]]":
+    """Return where observations come from, who is told the decisions, and what ends both."""
+    from twin_master.errors import MissionInputError
+    from twin_master.watch.feeds import JsonLinesFeed, file_feed
+    from twin_master.watch.mqtt import MqttFeed, broker_of
+
+    scenario = watched.scenario
+    if observations.startswith(("mqtt://", "mqtts://")):
+        broker = broker_of(observations, ca_file)
+        mqtt = MqttFeed(broker, scenario, watched.folder, lambda text: typer.echo(text, err=True))
+
+        def publish(decision: Mapping[str, Any]) -> None:
+            _say(decision, flush=True)
+            mqtt.decide(decision)
+
+        return mqtt, publish, mqtt.close
+    if follow and observations == "-":
+        raise MissionInputError("--follow belongs to a CSV file; standard input is read to its end anyway.")
+    if observations == "-":
+        return JsonLinesFeed(scenario), lambda decision: _say(decision, flush=True), lambda: None
+    feed = file_feed(Path(observations), scenario, follow=follow)
+    return feed, lambda decision: _say(decision, flush=follow), sys.stdout.flush
+
+
+def _say(decision: Mapping[str, Any], *, flush: bool) -> None:
+    if not terminal.loudness.quiet:
+        sys.stdout.write(json.dumps(decision) + "\n")
+        if flush:
+            sys.stdout.flush()
