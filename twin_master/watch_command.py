@@ -13,6 +13,7 @@ from reporting import terminal
 from twin_master.command import Calibration, Library, Seed
 
 if TYPE_CHECKING:
+    from twin_master.assets.resolution import Overrides
     from twin_master.watch.folder import Watch
     from twin_master.watch.intake import Feed
 
@@ -60,29 +61,12 @@ def watch(
     kept in the folder after every turn. Ctrl-C ends a watch in order; --resume takes it up again.
     """
     from twin_master.assets.resolution import Overrides
-    from twin_master.scenario.reading import load_scenario
-    from twin_master.watch.folder import Patched, begin_watch, resume_watch
+    from twin_master.watch.folder import Patched
 
     if (model_patch is None) != (from_turn is None) or (model_patch is not None and not resume):
         raise typer.BadParameter("--model-patch and --from-turn go together, with --resume.")
     overrides = Overrides(seed=seed, calibration=calibration, library=library)
-    if resume and (replace or overrides != Overrides()):
-        raise typer.BadParameter(
-            "a watch is taken up with what its folder holds: give nothing that would change it.",
-            param_hint="--resume",
-        )
-    loaded = None if scenario is None else load_scenario(scenario)
-    if out is None and loaded is None:
-        raise typer.BadParameter("a scenario is needed, or --resume with --out.", param_hint="SCENARIO")
-    folder = out if out is not None or loaded is None else Path("runs") / loaded.scenario.mission.name
-    assert folder is not None
-    progress = terminal.progress()
-    if resume:
-        watched, lock = resume_watch(folder, loaded, progress)
-    else:
-        if loaded is None:
-            raise typer.BadParameter("a scenario is needed.", param_hint="SCENARIO")
-        watched, lock = begin_watch(loaded, folder, overrides, progress, replace_run=replace)
+    watched, lock = _opened(scenario, out, overrides, resume=resume, replace=replace)
     patched = None if model_patch is None or from_turn is None else Patched(model_patch, from_turn)
     try:
         feed, decide, close = _feed(observations, watched, follow, ca_file)
@@ -92,12 +76,39 @@ def watch(
             close()
         watched.store(counts, report=not no_report)
     except Exception as error:
-        error.add_note(f"What was observed is kept: go on with `uav-twin watch --resume --out {folder}`.")
+        error.add_note(
+            f"What was observed is kept: go on with `uav-twin watch --resume --out {watched.folder}`."
+        )
         raise
     finally:
         os.close(lock)
     refused = f", {counts.rejected} messages refused (see rejected.jsonl)" if counts.rejected else ""
-    typer.echo(f"Watch: {folder}, {counts.received} messages{refused}.", err=True)
+    typer.echo(f"Watch: {watched.folder}, {counts.received} messages{refused}.", err=True)
+
+
+def _opened(
+    scenario: str | None, out: Path | None, overrides: "Overrides", *, resume: bool, replace: bool
+) -> "tuple[Watch, int]":
+    """Return the watch, begun or taken up, and what holds its folder."""
+    from twin_master.assets.resolution import Overrides
+    from twin_master.scenario.reading import load_scenario
+    from twin_master.watch.folder import begin_watch, resume_watch
+
+    if resume and (replace or overrides != Overrides()):
+        raise typer.BadParameter(
+            "a watch is taken up with what its folder holds: give nothing that would change it.",
+            param_hint="--resume",
+        )
+    loaded = None if scenario is None else load_scenario(scenario)
+    progress = terminal.progress()
+    if loaded is None:
+        if out is None or not resume:
+            raise typer.BadParameter("a scenario is needed, or --resume with --out.", param_hint="SCENARIO")
+        return resume_watch(out, None, progress)
+    folder = out or Path("runs") / loaded.scenario.mission.name
+    if resume:
+        return resume_watch(folder, loaded, progress)
+    return begin_watch(loaded, folder, overrides, progress, replace_run=replace)
 
 
 def _feed(

@@ -68,7 +68,7 @@ class CsvFeed:
         with self._path.open("rb") as file:
             for number, line in enumerate(_lines(file, follow=self._follow)):
                 if number > after:
-                    yield self._message(line), _shown(line)
+                    yield self._message(line), shown(line)
 
     def _message(self, line: bytes | Refused) -> Message | Refused:
         if isinstance(line, Refused):
@@ -141,7 +141,7 @@ class JsonLinesFeed:
     def messages(self, after: int) -> Iterator[Fed]:
         """Return what comes."""
         for line in _lines(self._stream or sys.stdin.buffer):
-            yield parsed(self._reader, line), _shown(line)
+            yield parsed(self._reader, line), shown(line)
 
 
 def parsed(reader: MessageReader, content: bytes | Refused) -> Message | Refused:
@@ -200,5 +200,6 @@ def _cells(line: bytes) -> list[str]:
     return [cell.strip() for cell in text.split(",")]
 
 
-def _shown(line: bytes | Refused) -> str:
+def shown(line: bytes | Refused) -> str:
+    """Return the begin of a message, for people."""
     return "" if isinstance(line, Refused) else line[:300].decode("utf-8", "replace").rstrip(os.linesep)

@@ -136,12 +136,9 @@ class Watch:
                 self._adopt(journal, patched)
             found = self._replayed(None)
             twin = found.twin
+            intake.restore(None if found.last is None else found.last["intake"])
             if found.last is not None:
-                intake.restore(found.last["intake"])
-                if found.beliefs.filtered:
-                    self._progress.note(
-                        f"The watch goes on at {self.scenario.mission.step_name} {twin.turns}."
-                    )
+                self._progress.note(f"The watch goes on at {self.scenario.mission.step_name} {twin.turns}.")
             keep = _Keeper(journal, intake, twin)
             source = _Stopping(intake, turns)
             with source.listening():

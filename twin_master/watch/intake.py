@@ -10,11 +10,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from reporting.files import write_error
+from reporting.files import atomic_write_text, write_error
 from twin_master.errors import ImpossibleObservation
 from twin_master.mission.loop import Reading
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import LARGEST_SEED
 from twin_master.watch.message import Message, Refused
 
 Float = NDArray[np.float64]
@@ -66,7 +67,7 @@ class RejectedFile:
     kept: int = field(default=0, init=False)
 
     def go_back(self, received: int) -> None:
-        """Forget what was refused behind a number of messages, which will be read again."""
+        """Forget what was refused behind a number of messages that will be read again, and what was cut."""
         if self.path is None or not self.path.exists():
             return
         lines = []
@@ -77,7 +78,7 @@ class RejectedFile:
                 break  # cut off by a kill
             if record["message"] <= received:
                 lines.append(line + "\n")
-        self.path.write_text("".join(lines), encoding="utf-8")
+        atomic_write_text(self.path, "".join(lines))
         self.kept = len(lines)
 
     def add(self, message: int, reason: str, text: str) -> None:
@@ -133,15 +134,17 @@ class Intake:
 
     def state(self) -> dict[str, Any]:
         """Return what is needed to go on, as JSON."""
-        return {"counts": vars(self.counts).copy(), "origin": self._origin, "given": list(self._given)}
+        # The message behind a gap is read again, until its own turn is written down.
+        counts = vars(self.counts) | {"received": self.counts.received - bool(self._pending)}
+        return {"counts": counts, "origin": self._origin, "given": list(self._given)}
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state."""
-        self.counts = Counts(**state["counts"])
-        self._origin = state["origin"]
-        self._given.extend(state["given"])
-        if self._feed.replayable:
-            self._rejected.go_back(self.counts.received)
+    def restore(self, state: Mapping[str, Any] | None) -> None:
+        """Go on from a state; None is the begin."""
+        if state is not None:
+            self.counts = Counts(**state["counts"])
+            self._origin = state["origin"]
+            self._given.extend(state["given"])
+        self._rejected.go_back(self.counts.received if self._feed.replayable else LARGEST_SEED)
 
     def read(self, twin: Twin) -> Reading | None:
         """Return the next reading, see `Source.read`."""

@@ -17,8 +17,8 @@ from urllib.parse import unquote, urlsplit
 
 from twin_master.errors import MissionInputError
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.feeds import Fed, _shown, parsed
-from twin_master.watch.message import LARGEST_MESSAGE, MessageReader
+from twin_master.watch.feeds import Fed, parsed, shown
+from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 
 PASSWORD_VARIABLE = "UAV_TWIN_MQTT_PASSWORD"
 _WAITING = 200
@@ -28,6 +28,8 @@ _DECISIONS_WAITING = 1000
 _SESSION_SECONDS = 7 * 86_400
 """How long the broker keeps what comes while the watch is away."""
 _RETRY_SECONDS = (1.0, 30.0)
+_GOODBYE_SECONDS = 5.0
+"""How long the end waits for the broker to take the last decisions."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +117,7 @@ class MqttFeed:
         self._reader = MessageReader(scenario)
         self._note = note
         self._came: deque[Any] = deque()
+        self._untold: set[int] = set()
         self._refusal: str | None = None
         name = f"uav-twin-{scenario.mission.name}-{sha256(str(folder.resolve()).encode()).hexdigest()[:12]}"
         self._client = paho.Client(
@@ -131,9 +134,13 @@ class MqttFeed:
         self._client.max_queued_messages_set(_DECISIONS_WAITING)
         self._client.on_message = self._on_message
         self._client.on_connect = self._on_connect
+        self._client.on_publish = self._on_publish
 
     def _on_message(self, _client: Any, _data: Any, message: Any) -> None:
         self._came.append(message)
+
+    def _on_publish(self, _client: Any, _data: Any, number: int, _reason: Any, _properties: Any) -> None:
+        self._untold.discard(number)
 
     def _on_connect(self, client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:
@@ -170,7 +177,7 @@ class MqttFeed:
         while True:
             while self._came:
                 message = self._came.popleft()
-                yield parsed(self._reader, message.payload), _shown(message.payload)
+                yield self._placed(parsed(self._reader, message.payload)), shown(message.payload)
                 self._client.ack(message.mid, message.qos)
             failed = self._client.loop(0.1)
             if self._refusal is not None:
@@ -182,11 +189,22 @@ class MqttFeed:
                 self._came.clear()  # not acknowledged, so the broker sends them again
                 self._connect(first=False)
 
+    @staticmethod
+    def _placed(message: Message | Refused) -> Message | Refused:
+        if isinstance(message, Message) and message.turn is None and message.time is None:
+            return Refused("a broker may deliver it twice: `turn` or `time` is needed over MQTT")
+        return message
+
     def decide(self, decision: Mapping[str, Any]) -> None:
         """Publish a decision."""
-        self._client.publish(f"{self._broker.topic}/decision", json.dumps(decision), qos=1)
+        told = self._client.publish(f"{self._broker.topic}/decision", json.dumps(decision), qos=1)
+        if len(self._untold) < _DECISIONS_WAITING:
+            self._untold.add(told.mid)
         self._client.loop_write()
 
     def close(self) -> None:
-        """Say goodbye; the broker keeps the session."""
+        """Say goodbye once the broker has the last decisions; it keeps the session."""
+        end = time.monotonic() + _GOODBYE_SECONDS
+        while self._untold and time.monotonic() < end and not self._client.loop(0.1):
+            pass
         self._client.disconnect()
