@@ -42,8 +42,8 @@ ROOMS = {
     ),
     "twin_master": (
         "errors", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library", "mission",
-        "store", "report", "viewer", "workflow", "watch", "scenario_check", "study", "command", "watch_command",
-        "__main__",
+        "store", "report", "viewer", "workflow", "watch", "scenario_check", "study", "command",
+        "watch_command", "__main__",
     ),
     "discrepancy": (
         "errors", "campaign", "models", "lumped_models", "location", "catalogue", "document_types", "verdict",

@@ -12,6 +12,7 @@ from twin_master.scenario.reading import load_scenario
 
 def test_what_is_shipped() -> None:
     wings = {"level_turns", "growing_damage", "failing_gauges", "model_mismatch", "three_fmus"}
+    wings |= {"level_turns_learning"}
     assert set(scenario_files()) == {*wings, "pump_wear"}
     assert set(binding_files()) == {"gear_pump", "three_fmus", "uav_wing", "uav_wing_laboratory"}
     assert set(asset_scripts()) == {"gear_pump"}
