@@ -423,7 +423,7 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(
     assert last["filtered"] == expected["filtered"]
     assert last["intake"]["counts"]["late"] == 0
     assert last["intake"]["counts"]["duplicates"] >= 4
-    assert 1 <= last["intake"]["counts"]["rejected"] <= 1001
+    assert 1 <= last["intake"]["counts"]["rejected"] < 1010  # a broker may lose or repeat some
     assert {decision["turn"] for decision in heard} == set(range(turns))
     assert all(decision["probability"] >= 0.5 for decision in heard)
 
