@@ -126,9 +126,9 @@ bool wing_behaviour_advance(wing_behaviour *wing, const double *inputs, double d
             wing_integrator_take_over(next, integrator, motion, other);
             wing->integrator = 1 - wing->integrator;
             integrator = next;
-            wing_integrator_advance(integrator, other, duration, load, load, motion);
+            wing_integrator_advance(integrator, other, duration, load, motion);
         } else {
-            wing_integrator_advance(integrator, motion, duration, load, load, other);
+            wing_integrator_advance(integrator, motion, duration, load, other);
             wing->motion = 1 - wing->motion;
             motion = other;
         }

@@ -14,7 +14,7 @@ void wing_integrator_lay_out(wing_integrator *integrator, const wing_model *mode
     integrator->modal_static = wing_take(arena, WING_LOADS * count);
     integrator->correction = wing_take(arena, WING_LOADS * model->output_count);
     integrator->propagator = wing_take(arena, 4 * count);
-    integrator->work = wing_take(arena, 3 * count + 2 * model->modal_size + model->static_size);
+    integrator->work = wing_take(arena, count + 2 * model->modal_size + model->static_size);
 }
 
 void wing_motion_lay_out(wing_motion *motion, const wing_model *model, wing_arena *arena) {
@@ -95,8 +95,7 @@ static void propagate_mode(double omega, double zeta, double duration, double fa
 }
 
 void wing_integrator_advance(wing_integrator *integrator, const wing_motion *before, double duration,
-                             const double load_start[WING_LOADS], const double load_end[WING_LOADS],
-                             wing_motion *after) {
+                             const double load[WING_LOADS], wing_motion *after) {
     const size_t count = integrator->model->mode_count;
     const double *omega = integrator->modes.angular_frequency;
     if (integrator->duration != duration) {
@@ -105,29 +104,22 @@ void wing_integrator_advance(wing_integrator *integrator, const wing_motion *bef
         }
         integrator->duration = duration;
     }
-    /* A particular solution for p(t) = p0 + p' t is (p(t) - 2 zeta p' / omega) / omega^2, its rate p' / omega^2. */
-    double *start = integrator->work, *end = start + count, *rate = end + count;
-    const double slope[WING_LOADS] = {(load_end[0] - load_start[0]) / duration,
-                                      (load_end[1] - load_start[1]) / duration};
-    find_rest(integrator, load_start, start);
-    find_rest(integrator, load_end, end);
-    find_rest(integrator, slope, rate);
+    double *rest = integrator->work;
+    find_rest(integrator, load, rest);
     for (size_t i = 0; i < count; ++i) {
         const double *factor = integrator->propagator + 4 * i;
-        const double lag = 2.0 * integrator->damping_ratio[i] / omega[i] * rate[i];
-        const double displacement = before->displacement[i] - (start[i] - lag);
-        const double velocity = before->velocity[i] - rate[i];
-        after->displacement[i] = factor[0] * displacement + factor[1] * velocity + (end[i] - lag);
-        after->velocity[i] = factor[2] * displacement + factor[3] * velocity + rate[i];
+        const double aside = before->displacement[i] - rest[i], velocity = before->velocity[i];
+        after->displacement[i] = factor[0] * aside + factor[1] * velocity + rest[i];
+        after->velocity[i] = factor[2] * aside + factor[3] * velocity + 0.0; /* 0, not -0, at rest */
     }
-    memcpy(after->load, load_end, sizeof after->load);
+    memcpy(after->load, load, sizeof after->load);
 }
 
 void wing_integrator_take_over(wing_integrator *integrator, wing_integrator *former, const wing_motion *before,
                                wing_motion *after) {
     const wing_model *model = integrator->model;
     const size_t count = model->mode_count, size = model->modal_size, n = model->static_size;
-    double *deviation = integrator->work, *modal = deviation + 3 * count, *scratch = modal + size,
+    double *deviation = integrator->work, *modal = deviation + count, *scratch = modal + size,
            *steady = scratch + size;
     find_rest(former, before->load, deviation);
     for (size_t i = 0; i < count; ++i) {

@@ -20,7 +20,7 @@ typedef struct {
     double *correction;    /* (2, G + 1) what the modes that are not kept contribute, per unit of load */
     double duration;       /* of the propagator; 0 if there is none */
     double *propagator;    /* (4, M): q from q and q', q' from q and q' */
-    double *work;          /* (3 M + 2 Nm + N) */
+    double *work;          /* (M + 2 Nm + N) */
 } wing_integrator;
 
 /* All that the wing remembers between two steps. */
@@ -44,10 +44,9 @@ bool wing_integrator_prepare(wing_integrator *integrator, const double *key, dou
 void wing_integrator_release(wing_integrator *integrator, double tip_displacement,
                              const double load[WING_LOADS], wing_motion *motion);
 
-/* Carry a motion over a duration in which the load runs straight from one value to another. */
+/* Carry a motion over a duration in which the load is held. */
 void wing_integrator_advance(wing_integrator *integrator, const wing_motion *before, double duration,
-                             const double load_start[WING_LOADS], const double load_end[WING_LOADS],
-                             wing_motion *after);
+                             const double load[WING_LOADS], wing_motion *after);
 
 /* Express a motion in the modes of this integrator after a change of health: displacement and velocity of the
    structure stay, projected with the mass matrix. */
