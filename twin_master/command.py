@@ -167,6 +167,9 @@ def show_outcome(outcome: "RunOutcome") -> None:
             f"{outcome.origin.model}.",
             soft_wrap=True,
         )
+    for sentence in outcome.notices:
+        said = sentence.replace(" DIR", f" {outcome.folder}")
+        console.print(said, soft_wrap=True, markup=False, highlight=False, style="yellow")
     for source, number in sources.items():
         console.print(f"  ({number}) {source}", soft_wrap=True)
     if outcome.report is None:

@@ -250,9 +250,10 @@ def _fly_and_store(
             text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
             atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
         keep_knowledge(folder, knowledge)
-        # A turn without observations on a twin of its own compiles the inner loops before the flight.
+        # Turns without observations on a twin of its own compile the inner loops before the flight.
         compiling = knowledge.twin()
-        compiling.turn(np.full(scenario.observation.count, np.nan), 0)
+        for _ in range(2):
+            compiling.turn(np.full(scenario.observation.count, np.nan), 0)
         compiling.smoothed()
     with clock.stage("mission"), _kept(folder):
         result = _fly(folder, config, knowledge, source, progress)
@@ -374,7 +375,10 @@ def _store(
     controls = knowledge.scenario.control_names
     said = {"control": control_changes(controls, result.flight.control_index, mission.step_name)}
     origin = {"asset": source.origin.asset, "twin_model": source.origin.model}
-    write_summary(folder, figures, heading | said | origin | {"asset_and_model_differ": source.origin.differ})
+    heading |= said | origin | {"asset_and_model_differ": source.origin.differ}
+    if knowledge.scenario.notice is not None:
+        heading["notices"] = [{"turn": turn} | vars(notice) for turn, notice in result.flight.notices]
+    write_summary(folder, figures, heading)
 
 
 def _misfit(knowledge: Knowledge, source: AssetSource) -> Misfit | None:

@@ -1,34 +1,49 @@
-"""Notices of operation: a gauge that is off, states that do not explain the gauges, readings that are absurd.
+"""Notices of operation: a gauge that is off, states that explain no gauges, readings that are absurd.
 
-Beside the model as it is (every gauge shows what the state, a draw of the parameter and noise of unknown scale
-say) run rival hypotheses with filters of their own, so that state and parameter are marginalised under each: for
-each gauge that its gain is free, and that the gain of every gauge is free, which no state of the model explains.
-The ratio of the evidence of a rival to that of the model is an e-process: its mean under the model is at most
-one at every turn, so that it exceeds a threshold c with a probability of at most 1 / c however often one looks
-(Ville 1939; Ramdas, Grünwald, Vovk and Shafer 2023). What begins later is met by a mixture over its first turn.
+Beside the model as it is (every gauge shows what the state, a draw of the parameter and noise of unknown
+scale say) run rivals with filters of their own, so that state and parameter are marginalised under each: that
+a gauge shows a stated share too much or too little, and that the gain of every gauge is free, which no state
+of the model explains. Each may begin in any turn; the mixture over the first turn is exact, because until
+then the rival's belief is the model's. The ratio of the evidence of a rival to that of the model is an
+e-process: its mean under the predictions of the model is one at every turn, so that it ever exceeds a
+threshold c with a probability of at most 1 / c, however often one looks (Ville 1939; Ramdas, Grünwald, Vovk
+and Shafer 2023).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.learning.monitor_kernels import watch_turn
-from twin_master.network.estimator import Carried, Estimate, Estimator, Learnt, Notice
+from twin_master.errors import InvalidModelError
+from twin_master.learning.monitor_kernels import (
+    forecast_rows,
+    mix_onset,
+    weigh_gauges,
+    weigh_model,
+    weigh_none,
+)
+from twin_master.network.estimator import Carried, Estimate, Estimator, Notice, Suspicion
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel
 
-__all__ = ["MonitorSettings", "WatchfulEstimator"]
+__all__ = ["MonitorSettings", "WatchfulEstimator", "Words"]
 
 Float = NDArray[np.float64]
+Arrays = dict[str, NDArray[Any]]
 
 COMMAND = "uav-twin discrepancy run --from-run DIR"
 _PREFIX = "notice/"
-_FROM_THE_START = 0.75
+_FROM_THE_START = 0.5
 """Prior share of faults that are there from the first turn; the others begin at a later one."""
+_GAINS = (-2.5, -1.0, 1.0, 2.5)
+"""Gain errors of a gauge that is off, in those that are to be found; larger ones are found by the largest."""
 _DRAWS = 15
-"""Draws of the parameter that the rivals keep apart: they compare evidence, and need no fine posterior."""
+"""Draws of the parameter that are kept apart here: evidence is compared, and no fine posterior is needed."""
+_LARGEST = 20_000_000
+"""Numbers that the beliefs of the rivals may take: each turn that is kept holds them."""
 _NAMED_SHARE = 0.1
 _NAMED_DEVIATIONS = 2.0
 _MOST_NAMED = 6
@@ -41,34 +56,72 @@ class MonitorSettings:
     Attributes
     ----------
     threshold : float
-        Of the e-processes: false alarms of each are at most 1 / threshold, whatever the number of turns.
-    gain, all_gain : float
-        Prior standard deviation of the gain error of a gauge that is off, and of every gauge where no state of
-        the model explains them.
-    absurd : float
-        A reading this many assumed standard deviations beyond what any state can show is left out.
+        Of each of the two e-processes: the probability of a false alarm is at most 1 / threshold, whatever
+        the number of turns.
+    gauge_gain : float
+        Gain error of a single gauge that is to be found; less than half of it raises no alarm.
+    all_gain : float
+        Prior standard deviation of the gain error of every gauge where no state of the model explains them.
     memory_turns : float
-        Turns after which what was learnt of a free gain has faded to 1 / e.
-    onset : float
-        Probability that what was right until then goes wrong in a turn.
+        Turns after which what was learnt of these gains has faded to 1 / e.
+    onset_turns : float
+        Turns within which half of the faults begin that were not there from the start; n turns later a
+        share of onset_turns / (onset_turns + n) is still to begin.
+    absurd_deviations : float
+        A reading so many assumed standard deviations beyond what any state can show is left out.
     prior : float
-        Prior probability of each of the two rivals, for their posterior.
+        Prior probability of each of the two kinds of fault, for their posterior.
     noise_degrees : float
-        Degrees of freedom of the noise scale about the assumed one.
+        How sure the assumed noise is: as if it came from so many observations of each gauge.
     """
 
     threshold: float = 100.0
-    gain: float = 0.2
+    gauge_gain: float = 0.2
     all_gain: float = 0.1
-    absurd: float = 8.0
     memory_turns: float = 20.0
-    onset: float = 0.02
+    onset_turns: float = 50.0
+    absurd_deviations: float = 8.0
     prior: float = 0.01
     noise_degrees: float = 10.0
 
 
+@dataclass(frozen=True)
+class Words:
+    """How sentences speak of turns and sensors.
+
+    Attributes
+    ----------
+    step, sensor : str
+        What one is called.
+    factor : float
+        From the values of the sensors, SI, to what is printed.
+    units : tuple of str
+        Printed unit of each sensor; none where they are empty or "1".
+    """
+
+    step: str = "turn"
+    sensor: str = "gauge"
+    factor: float = 1.0
+    units: tuple[str, ...] = ()
+
+    def value(self, sensor: int, *values: float) -> list[str]:
+        """Return values of a sensor as they are printed."""
+        unit = self.units[sensor] if self.units else "1"
+        return [f"{self.factor * value:.4g}{'' if unit == '1' else f' {unit}'}" for value in values]
+
+    def sensors(self, numbers: Sequence[int]) -> str:
+        """Return sensors, counted from 0, in words."""
+        names = [str(g + 1) for g in numbers]
+        if len(names) == 1:
+            return f"{self.sensor} {names[0]}"
+        return f"{self.sensor}s {', '.join(names[:-1])} and {names[-1]}"
+
+
 class WatchfulEstimator:
-    """An estimator with notices beside it; its beliefs are those of the estimator, absurd readings left out.
+    """An estimator with notices beside it; its beliefs are its own, with absurd readings left out.
+
+    It carries beside the arrays of the estimator, under the prefix `notice/`, the beliefs of the model and
+    the rivals over draws and states, their log e-values and sums of squares.
 
     Parameters
     ----------
@@ -78,26 +131,52 @@ class WatchfulEstimator:
         Predictions (E, S, U, G) and assumed noise.
     draws : (E,)
         Values of the parameter.
-    settings : MonitorSettings
+    settings : MonitorSettings, optional
+    words : Words, optional
+
+    Raises
+    ------
+    InvalidModelError
+        The average over the draws stands inside the product over the sensors, or there are too many states.
     """
 
     def __init__(
-        self, inner: Estimator, sensor_model: GaussianSensorModel, draws: Float, settings: MonitorSettings
+        self,
+        inner: Estimator,
+        sensor_model: GaussianSensorModel,
+        draws: Float,
+        settings: MonitorSettings | None = None,
+        words: Words | None = None,
     ) -> None:
-        self._inner, self._sensor_model, self._settings = inner, sensor_model, settings
-        order = np.argsort(draws, kind="stable")
-        places = np.linspace(0, len(order) - 1, min(_DRAWS, len(order))).round().astype(int)
-        table = sensor_model.value_per_draw[order[places]]
-        self._value = [np.ascontiguousarray(table[:, :, u]) for u in range(sensor_model.control_count)]
-        deviation = sensor_model.total_standard_deviation
-        self._inverse = [np.ascontiguousarray(1.0 / deviation[:, u]) for u in range(deviation.shape[1])]
-        reach = settings.absurd * deviation
+        if sensor_model.averages_inside:
+            raise InvalidModelError(
+                "noticing needs the average over the draws outside the product over the sensors: inside, "
+                "each sensor has a parameter of its own"
+            )
+        self._inner, self._sensor_model = inner, sensor_model
+        self._settings = settings = settings or MonitorSettings()
+        self._words = words or Words()
+        places, self._draw_weight = _spread(np.asarray(draws, np.float64), sensor_model.draw_weight)
+        table, deviation = sensor_model.value_per_draw[places], sensor_model.total_standard_deviation
+        sensors, states = sensor_model.sensor_count, inner.model.states.size
+        self._shape = (sensors, len(_GAINS), len(places), states)
+        if np.prod(self._shape, dtype=float) > _LARGEST:
+            raise InvalidModelError(
+                f"noticing keeps a belief over {states} states and {len(places)} draws for each of "
+                f"{sensors * len(_GAINS)} faults of gauges, which are more than {_LARGEST} numbers: take "
+                "fewer levels or state factors, or leave out `notice`"
+            )
+        controls = range(sensor_model.control_count)
+        self._value = [np.ascontiguousarray(table[:, :, u]) for u in controls]
+        self._inverse = [np.ascontiguousarray(1.0 / deviation[:, u]) for u in controls]
+        reach = settings.absurd_deviations * deviation
         self._low = (sensor_model.value_per_draw.min(axis=0) - reach).min(axis=0)  # (U, G)
         self._high = (sensor_model.value_per_draw.max(axis=0) + reach).max(axis=0)
-        # A gauge that shows little needs the longest to be found: it is given more of the prior.
-        response = np.mean((settings.gain * sensor_model.mean / deviation) ** 2, axis=(0, 1))
-        weight = 1.0 / np.sqrt(1.0 + response / settings.gain**2)
-        self._log_weight: Float = np.log(weight / weight.sum())
+        self._gains = settings.gauge_gain * np.array(_GAINS)
+        # The prior of a gauge grows with the turns that it takes to be found, or weak ones would be lost.
+        per_turn = np.mean((settings.gauge_gain * sensor_model.mean / deviation) ** 2, axis=(0, 1))
+        turns = 1.0 + 1.0 / np.maximum(per_turn, 1e-3)
+        self._log_prior: Float = np.log(turns / turns.sum())
 
     @property
     def model(self) -> GraphicalModel:
@@ -114,139 +193,197 @@ class WatchfulEstimator:
         absurd = (seen < self._low[control_index]) | (seen > self._high[control_index])
         used = np.where(absurd, np.nan, seen)
         estimate = self._inner.turn(before, used, control_index, turn)
-        arrays = self._start() if before is None else self._advanced(before)
-        self._assimilate(arrays, used, control_index)
-        notices = self._left_out(arrays["absurd"], absurd, seen, control_index, turn)
-        arrays["absurd"] = absurd
-        log_gauge, log_none = self._log_evidence(arrays)
-        notices += self._alarms(arrays, log_gauge, log_none, turn)
-        carried = Carried(
-            control_index,
-            {**estimate.carried.arrays, **{_PREFIX + name: value for name, value in arrays.items()}},
-        )
-        return Estimate(
-            forecast=estimate.forecast,
-            filtered=estimate.filtered,
-            log_evidence=estimate.log_evidence,
-            carried=carried,
-            learnt={**estimate.learnt, **self._probabilities(log_gauge, log_none)},
+        own = self._start() if before is None else self._advanced(before)
+        self._assimilate(own, used, control_index)
+        notices = self._left_out(own["left_out"] > 0.0, absurd, seen, control_index, turn)
+        # A gauge that is left out stays so while it is silent.
+        own["left_out"] = (absurd | ((own["left_out"] > 0.0) & np.isnan(seen))).astype(np.float64)
+        suspicion = self._suspicion(own)
+        notices += self._alarms(own, suspicion, turn)
+        arrays = {**estimate.carried.arrays, **{_PREFIX + name: value for name, value in own.items()}}
+        return replace(
+            estimate,
+            carried=Carried(control_index, arrays),
             notices=(*estimate.notices, *notices),
+            suspicion=suspicion,
         )
 
-    def _start(self) -> dict[str, NDArray[np.float64]]:
-        sensors = self._sensor_model.sensor_count
-        rivals = sensors + 1
-        draws = len(self._value[0])
-        belief = np.broadcast_to(self.model.prior / draws, (rivals + 1, draws, len(self.model.prior)))
+    def _start(self) -> Arrays:
+        """Return what is carried, before the first observation."""
+        sensors, gains = self._shape[:2]
+        model = self._draw_weight[:, None] * self.model.prior
+        weight = np.log(_FROM_THE_START)
         return {
-            "belief": belief.copy(),
-            "statistics": np.zeros((rivals + 1, sensors, 6)),
-            "count": np.zeros((rivals + 1, sensors)),
-            "always": np.zeros(rivals),
-            "begun": np.full(rivals, -np.inf),
+            "model": model,
+            "gauge": np.broadcast_to(model, self._shape).astype(np.float32),
+            "none": model[None].astype(np.float32),
+            "log_gauge": np.full((sensors, gains), weight - np.log(gains)),
+            "log_none": np.full(1, weight),
+            "gauge_onset": np.zeros((sensors, gains)),
+            "none_onset": np.zeros(1),
+            "model_squares": np.zeros(sensors),
+            "gauge_squares": np.zeros((sensors, gains)),
+            "none_statistics": np.zeros((1, sensors, 6)),
+            "count": np.zeros(sensors),
             "turns": np.zeros(1),
             "alarmed": np.zeros(2),
-            "absurd": np.zeros(sensors, dtype=bool),
+            "left_out": np.zeros(sensors),
         }
 
-    def _advanced(self, before: Carried) -> dict[str, NDArray[np.float64]]:
-        arrays = {
+    def _advanced(self, before: Carried) -> Arrays:
+        """Return what was carried, one transition later, with the rivals that begin in this turn."""
+        own = {
             name.removeprefix(_PREFIX): value.copy()
             for name, value in before.arrays.items()
             if name.startswith(_PREFIX)
         }
-        arrays["belief"] = arrays["belief"] @ self.model.transition.matrix[before.control_index]
-        return arrays
-
-    def _assimilate(self, arrays: dict[str, Float], seen: Float, control_index: int) -> None:
-        settings, sensors = self._settings, self._sensor_model.sensor_count
-        log_evidence = np.zeros(sensors + 2)
-        watch_turn(
-            seen, self._value[control_index], self._inverse[control_index], np.full(sensors, settings.gain),
-            settings.all_gain, settings.noise_degrees, float(np.exp(-1.0 / settings.memory_turns)),
-            arrays["belief"], arrays["statistics"], arrays["count"], log_evidence,
+        sparse, states = self.model.transition.sparse, self._shape[-1]
+        for name in ("model", "gauge", "none"):
+            rows = before.arrays[_PREFIX + name].reshape(-1, states)
+            forecast_rows(
+                sparse.start, sparse.source, sparse.probability, before.control_index * states,
+                rows, own[name].reshape(-1, states),
+            )  # fmt: skip
+        turn = float(own["turns"][0])
+        inflow = np.log(self._to_begin(turn - 1.0) - self._to_begin(turn))
+        gains = self._shape[1]
+        keep = np.empty(self._shape[:2])
+        mix_onset(
+            own["model"], own["gauge"].reshape(-1, *self._shape[2:]), own["log_gauge"].reshape(-1),
+            np.full(keep.size, inflow - np.log(gains)), turn, own["gauge_onset"].reshape(-1),
+            keep.reshape(-1),
         )  # fmt: skip
-        ratio = np.nan_to_num(log_evidence[1:] - log_evidence[0], nan=0.0)
-        # The mixture over the first turn of a fault: those that have begun, and one that begins now.
-        quiet = arrays["turns"][0] * np.log1p(-settings.onset)
-        arrays["begun"] = np.logaddexp(arrays["begun"], np.log(settings.onset) + quiet) + ratio
-        arrays["always"] = arrays["always"] + ratio
-        arrays["turns"] = arrays["turns"] + 1.0
+        own["gauge_squares"] = keep * own["gauge_squares"] + (1.0 - keep) * own["model_squares"][:, None]
+        kept = np.empty(1)
+        mix_onset(
+            own["model"], own["none"], own["log_none"], np.full(1, inflow), turn, own["none_onset"], kept
+        )
+        own["none_statistics"][..., :5] *= kept[0] * np.exp(-1.0 / self._settings.memory_turns)
+        own["none_statistics"][..., 5] = (
+            kept[0] * own["none_statistics"][..., 5] + (1.0 - kept[0]) * own["model_squares"]
+        )
+        return own
 
-    def _log_evidence(self, arrays: dict[str, Float]) -> tuple[Float, float]:
-        """Return the log e-values of each gauge, with its weight (G,), and of "none of these"."""
-        quiet = arrays["turns"][0] * np.log1p(-self._settings.onset)
-        late = np.log(1.0 - _FROM_THE_START) + np.logaddexp(arrays["begun"], quiet)
-        both = np.logaddexp(np.log(_FROM_THE_START) + arrays["always"], late)
-        return both[:-1] + self._log_weight, float(both[-1])
+    def _to_begin(self, turn: float) -> float:
+        """Return the prior share of faults that begin after a turn."""
+        return (1.0 - _FROM_THE_START) / (1.0 + turn / self._settings.onset_turns)
 
-    def _probabilities(self, log_gauge: Float, log_none: float) -> dict[str, Learnt]:
-        """Return the posterior probabilities of the two rivals."""
+    def _assimilate(self, own: Arrays, seen: Float, control_index: int) -> None:
+        value, inverse = self._value[control_index], self._inverse[control_index]
+        degrees, count = self._settings.noise_degrees, own["count"]
+        known, log_likelihood = np.ones(value.shape), np.empty(value.shape[:2])
+        before = own["model_squares"].copy()
+        log_model = weigh_model(
+            seen, value, inverse, degrees, count, own["model_squares"], own["model"], known, log_likelihood
+        )
+        weigh_gauges(
+            seen, value, inverse, self._gains, degrees, count, before, known, log_likelihood, log_model,
+            own["gauge"], own["log_gauge"], own["gauge_squares"],
+        )  # fmt: skip
+        log_none = weigh_none(
+            seen, value, inverse, self._settings.all_gain, degrees, count, before, known, log_likelihood,
+            own["none"][0], own["none_statistics"],
+        )  # fmt: skip
+        own["log_none"] += log_none - log_model
+        count += ~np.isnan(seen)
+        own["turns"] += 1.0
+
+    def _suspicion(self, own: Arrays) -> Suspicion:
+        to_begin = np.log(self._to_begin(float(own["turns"][0]) - 1.0))
+        begun = np.logaddexp.reduce(own["log_gauge"], axis=1)
+        log_gauge = np.logaddexp(begun, to_begin)
+        off, none = float(np.logaddexp.reduce(begun + self._log_prior)), float(own["log_none"][0])
         prior = self._settings.prior
-        log_share = np.array([0.0, np.logaddexp.reduce(log_gauge), log_none])
-        log_share += np.log([1.0 - 2.0 * prior, prior, prior])
+        right = np.log(1.0 - 2.0 * prior + 2.0 * prior * np.exp(to_begin))
+        log_share = np.array([right, np.log(prior) + off, np.log(prior) + none])
         share = np.exp(log_share - np.logaddexp.reduce(log_share))
-        return {
-            name: Learnt(p, float(np.sqrt(p * (1.0 - p))), p, p)
-            for name, p in zip(("gauge_off", "none_of_these"), share[1:].tolist(), strict=True)
-        }
+        return Suspicion(
+            none_of_these=float(share[2]),
+            gauge_off=float(share[1]),
+            log_evidence_none=float(np.logaddexp(none, to_begin)),
+            log_evidence_any_gauge=float(np.logaddexp.reduce(log_gauge + self._log_prior)),
+            log_evidence_gauge=log_gauge,
+            left_out=own["left_out"] > 0.0,
+        )
 
     def _left_out(
-        self, before: Float, absurd: Float, seen: Float, control_index: int, turn: int
+        self, before: NDArray[np.bool_], absurd: NDArray[np.bool_], seen: Float, control_index: int, turn: int
     ) -> list[Notice]:
         """Return a notice for each gauge whose readings begin or cease to be absurd."""
-        notices = []
-        for g in np.flatnonzero(absurd & ~before.astype(bool)).tolist():
-            low, high = self._low[control_index, g], self._high[control_index, g]
+        notices, words = [], self._words
+        when = f"{words.step.capitalize()} {turn}"
+        for g in np.flatnonzero(absurd & ~before).tolist():
+            shown, low, high = words.value(
+                g, seen[g], self._low[control_index, g], self._high[control_index, g]
+            )
             notices.append(
                 Notice(
                     "gauge_left_out",
-                    f"Turn {turn}: gauge {g + 1} shows {seen[g]:.4g}, and no state can show less than "
-                    f"{low:.4g} or more than {high:.4g}; it is left out until it comes back.",
+                    f"{when}: {words.sensors([g])} shows {shown}, and no state can show less than {low} or "
+                    f"more than {high}; its readings are left out until they come back.",
                     (g + 1,),
                     float(seen[g]),
                 )
             )
-        for g in np.flatnonzero(before.astype(bool) & ~absurd & ~np.isnan(seen)).tolist():
-            notices.append(
-                Notice("gauge_back", f"Turn {turn}: gauge {g + 1} is back, and used again.", (g + 1,))
-            )
+        for g in np.flatnonzero(before & ~absurd & ~np.isnan(seen)).tolist():
+            sentence = f"{when}: the readings of {words.sensors([g])} are back, and used again."
+            notices.append(Notice("gauge_back", sentence, (g + 1,), float(seen[g])))
         return notices
 
-    def _alarms(self, arrays: dict[str, Float], log_gauge: Float, log_none: float, turn: int) -> list[Notice]:
-        """Return the alarms that are raised in this turn, each once."""
-        notices, threshold = [], np.log(self._settings.threshold)
-        log_any = float(np.logaddexp.reduce(log_gauge))
-        if log_any >= threshold and not arrays["alarmed"][0]:
-            arrays["alarmed"][0] = 1.0
-            share = np.exp(log_gauge - log_any)
-            named = [g for g in np.argsort(-share).tolist() if share[g] >= _NAMED_SHARE][:_MOST_NAMED]
-            notices.append(self._alarm(turn, "does not show what the model says", named or [0], log_any))
-        if log_none >= threshold and not arrays["alarmed"][1]:
-            arrays["alarmed"][1] = 1.0
-            sums = arrays["statistics"][-1]
+    def _alarms(self, own: Arrays, suspicion: Suspicion, turn: int) -> list[Notice]:
+        """Return the alarms that are raised in this turn, each once.
+
+        What explains less than the other kind of fault waits: a gauge that is off is also seen by the gains
+        of all gauges, and a region that softens by its gauges. Waiting makes false alarms rarer still.
+        """
+        gauge, none = suspicion.log_evidence_any_gauge, suspicion.log_evidence_none
+        threshold, notices = np.log(self._settings.threshold), []
+        if gauge >= max(threshold, none) and not own["alarmed"][0]:
+            own["alarmed"][0] = 1.0
+            notices.append(self._gauge_alarm(own, gauge, turn))
+        if none >= max(threshold, gauge) and not own["alarmed"][1]:
+            own["alarmed"][1] = 1.0
+            sums = own["none_statistics"][0]
             deviations = np.abs(sums[:, 4]) / np.sqrt(1.0 + sums[:, 2])
-            named = [g for g in np.argsort(-deviations).tolist() if deviations[g] >= _NAMED_DEVIATIONS]
-            notices.append(
-                self._alarm(
-                    turn,
-                    "stands out where no state of the model explains all gauges together",
-                    named[:_MOST_NAMED] or [int(np.argmax(deviations))],
-                    log_none,
-                )
-            )
+            order = np.argsort(-deviations, kind="stable").tolist()
+            named = [g for g in order if deviations[g] >= _NAMED_DEVIATIONS][:_MOST_NAMED] or order[:1]
+            what = f"no state of the model explains all gauges together, least {self._words.sensors(named)}"
+            notices.append(self._alarm(turn, what, named, none, float(own["none_onset"][0])))
         return notices
 
-    def _alarm(self, turn: int, what: str, gauges: list[int], log_value: float) -> Notice:
-        numbers = tuple(g + 1 for g in gauges)
-        one = len(numbers) == 1
-        names = f"gauge {numbers[0]}" if one else f"gauges {', '.join(map(str, numbers))}"
-        verb = what if one else what.replace("does not", "do not").replace("stands", "stand")
-        odds = float(np.exp(min(log_value, 700.0)))
+    def _gauge_alarm(self, own: Arrays, log_value: float, turn: int) -> Notice:
+        log_weight = own["log_gauge"] + self._log_prior[:, None]
+        share = np.exp(log_weight - np.logaddexp.reduce(log_weight, axis=None))
+        order = np.argsort(-share.sum(axis=1), kind="stable").tolist()
+        named = [g for g in order if share[g].sum() >= _NAMED_SHARE][:_MOST_NAMED] or order[:1]
+        onset = float(np.sum(share * own["gauge_onset"]))
+        sign = share @ np.sign(self._gains)
+        if len(named) > 1:
+            what = f"one of {self._words.sensors(named)} does not show what the model says"
+        else:
+            what = f"{self._words.sensors(named)} shows too {'much' if sign[named[0]] > 0.0 else 'little'}"
+        return self._alarm(turn, what, named, log_value, onset)
+
+    def _alarm(self, turn: int, what: str, gauges: list[int], log_value: float, onset: float) -> Notice:
+        odds, step = float(np.exp(min(log_value, 700.0))), self._words.step
+        since = "from the start" if onset < 0.5 else f"since about {step} {onset:.0f}"
         return Notice(
             "alarm",
-            f"Turn {turn}: {names} {verb} (evidence {odds:.3g}, alarm from "
+            f"{step.capitalize()} {turn}: {what}, {since} (evidence {odds:.3g} against the model, alarm from "
             f"{self._settings.threshold:g}); to find the cause: {COMMAND}",
-            numbers,
+            tuple(g + 1 for g in gauges),
             odds,
         )
+
+
+def _spread(draws: Float, weight: Float) -> tuple[NDArray[np.int64], Float]:
+    """Return some draws that lie evenly over the range of all, and the probability nearest to each.
+
+    Evenly, because a true value between two of them must not look like a fault, in the tails least of all.
+    """
+    order = np.argsort(draws, kind="stable")
+    grid = np.linspace(draws[order[0]], draws[order[-1]], _DRAWS)
+    chosen = np.unique([order[np.argmin(np.abs(draws[order] - value))] for value in grid])
+    nearest = np.argmin(np.abs(draws[:, None] - draws[chosen]), axis=1)
+    total = np.bincount(nearest, weight, minlength=len(chosen))
+    return chosen, np.asarray(total / total.sum(), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Compiled loop of the monitor: rival hypotheses about the gauges beside the model as it is."""
+"""Compiled loops of the monitor: rival hypotheses about the gauges beside the model as it is."""
 
 import math
 
@@ -9,111 +9,234 @@ from fe.compilation import compiled
 from twin_master.learning.kernels import regression
 from twin_master.network.kernels import _exp
 
-__all__ = ["watch_turn"]
+__all__ = ["forecast_rows", "mix_onset", "weigh_gauges", "weigh_model", "weigh_none"]
 
 Float = NDArray[np.float64]
+Single = NDArray[np.float32]
 Unsigned = NDArray[np.uint64]
 
 NEGLIGIBLE = 1e-30
-"""States of a hypothesis below this probability are left out of its likelihood until they come back."""
+"""States of the model below this probability are left out of its evidence."""
+NEGLIGIBLE_RIVAL = 1e-9
+"""The same of a rival: what is left out makes its evidence smaller, and an alarm later."""
+NEGLIGIBLE_SHARE = 1e-12
+"""States below this probability add nothing to a sum of squares."""
 
 
 @compiled
-def watch_turn(
+def forecast_rows(
+    start: Unsigned, source: Unsigned, probability: Float, first_row: int, before: Float, after: Float
+) -> None:
+    """Fill after (n, S) with n beliefs one transition later; any kind of float."""
+    rows, size = before.shape
+    for row in range(rows):
+        if not np.any(before[row]):  # a draw that is left out
+            after[row] = 0.0
+            continue
+        for state in range(size):
+            total = 0.0
+            for i in range(start[first_row + state], start[first_row + state + 1]):
+                total += before[row, source[i]] * probability[i]
+            after[row, state] = total
+
+
+@compiled
+def mix_onset(
+    model: Float, belief: Single, log_weight: Float, log_inflow: Float, turn: float, onset: Float, keep: Float
+) -> None:
+    """Let rivals begin in this turn: those of before and the model's belief are mixed by their weights.
+
+    belief (n, E, S), log_weight and onset, the expected first turn, (n,) in place; log_inflow (n,); keep (n,)
+    becomes the share of those that began before.
+    """
+    for m in range(len(log_weight)):
+        largest = max(log_weight[m], log_inflow[m])
+        old, new = _exp(log_weight[m] - largest), _exp(log_inflow[m] - largest)
+        keep[m] = old / (old + new)
+        log_weight[m] = largest + math.log(old + new)
+        onset[m] = keep[m] * onset[m] + (1.0 - keep[m]) * turn
+        for e in range(model.shape[0]):
+            for s in range(model.shape[1]):
+                belief[m, e, s] = keep[m] * belief[m, e, s] + (1.0 - keep[m]) * model[e, s]
+
+
+@compiled
+def weigh_model(
     observation: Float,
     value: Float,
     inverse_deviation: Float,
-    gain: Float,
-    all_gain: float,
     degrees: float,
-    memory: float,
-    forecast: Float,
-    statistics: Float,
     count: Float,
-    log_evidence: Float,
-) -> None:
-    """Assimilate one observation under G + 2 hypotheses, in place.
+    squares: Float,
+    belief: Float,
+    known: Float,
+    log_likelihood: Float,
+) -> float:
+    """Assimilate one observation under the model; return its log evidence, up to a constant of the turn.
 
-    Hypothesis 0 has every gauge as the model says, hypothesis g the gain of gauge g free, the last one the
-    gain of every gauge. value is (E, S, G), inverse_deviation (S, G), gain (G,) the prior deviation of the
-    gain of hypothesis g, all_gain that of the last; forecast (H, E, S) becomes the belief; log_evidence (H,)
-    is that of the observation. statistics (H, G, 6) and count (H, G) are the sums of the regressions, those of
-    the gain fading by `memory` a turn; the sum of squares is that of the innovations over their spread
-    (West and Harrison 1997, section 4.6), so that what a gain explained once stays explained.
+    value is (E, S, G), inverse_deviation (S, G); squares (G,), the expected sums of squares of the residuals
+    in units of the assumed noise, and belief (E, S), the forecast, are brought up to date. known (E, S, G)
+    becomes 1 + x² / (degrees + squares), log_likelihood (E, S) the sum over the gauges.
     """
-    hypotheses, draws, states = forecast.shape
-    sensors = len(observation)
-    fitted = np.zeros_like(statistics)
-    regression(statistics, fitted)
-    standard = np.empty((draws, states, sensors))
-    known = np.zeros((draws, states, sensors))
-    total = np.zeros((draws, states))
-    constant = np.zeros((hypotheses, sensors))
-    for m in range(hypotheses):
-        for g in range(sensors):
-            half = 0.5 * (degrees + count[m, g])
-            constant[m, g] = math.lgamma(half + 0.5) - math.lgamma(half)
-            constant[m, g] -= 0.5 * math.log(degrees + statistics[m, g, 5])
+    draws, states, sensors = value.shape
+    best = -np.inf
     for e in range(draws):
         for s in range(states):
+            total = 0.0
             for g in range(sensors):
                 if np.isnan(observation[g]):
                     continue
                 scale = inverse_deviation[s, g]
                 x = (observation[g] - value[e, s, g]) * scale
-                power = 0.5 * (degrees + count[0, g] + 1.0)
-                known[e, s, g] = constant[0, g] - power * math.log1p(x * x / (degrees + statistics[0, g, 5]))
-                standard[e, s, g] = x
-                total[e, s] += known[e, s, g] + math.log(scale)
-    for m in range(hypotheses):
-        best = -np.inf
-        belief = forecast[m]
-        for e in range(draws):
-            for s in range(states):
-                if belief[e, s] < NEGLIGIBLE:
-                    belief[e, s] = -np.inf
-                    continue
-                log_value = total[e, s]
-                first = 0 if m == hypotheses - 1 else m - 1
-                last = sensors if m == hypotheses - 1 else m
-                for g in range(max(first, 0), last):
-                    if np.isnan(observation[g]):
-                        continue
-                    prior = all_gain if m == hypotheses - 1 else gain[g]
-                    c = prior * value[e, s, g] * inverse_deviation[s, g]
-                    x = standard[e, s, g] - c * fitted[m, g, 1]
-                    spread = 1.0 + c * c * fitted[m, g, 4]
-                    power = 0.5 * (degrees + count[m, g] + 1.0)
-                    log_value += constant[m, g] - 0.5 * math.log(spread) - known[e, s, g]
-                    log_value -= power * math.log1p(x * x / ((degrees + statistics[m, g, 5]) * spread))
-                belief[e, s] = log_value + math.log(belief[e, s])
-                best = max(best, belief[e, s])
-        mass = 0.0
-        for e in range(draws):
-            for s in range(states):
-                belief[e, s] = _exp(belief[e, s] - best) if best > -np.inf else 0.0
+                known[e, s, g] = 1.0 + x * x / (degrees + squares[g])
+                total += math.log(scale) - 0.5 * (degrees + count[g] + 1.0) * math.log(known[e, s, g])
+            log_likelihood[e, s] = total
+            if belief[e, s] >= NEGLIGIBLE:
+                best = max(best, total)
+    mass = 0.0
+    for e in range(draws):
+        for s in range(states):
+            if belief[e, s] >= NEGLIGIBLE:
+                belief[e, s] *= _exp(log_likelihood[e, s] - best)
                 mass += belief[e, s]
-        log_evidence[m] = best + math.log(mass) if mass > 0.0 else -np.inf
-        for e in range(draws):
-            for s in range(states):
-                belief[e, s] /= max(mass, NEGLIGIBLE)
-        first = 0 if m == hypotheses - 1 or m == 0 else m - 1
-        last = sensors if m == hypotheses - 1 or m == 0 else m
-        for g in range(first, last):
-            for i in range(5):
-                statistics[m, g, i] *= memory
-            if np.isnan(observation[g]):
-                continue
-            count[m, g] += 1.0
-            prior = 0.0 if m == 0 else all_gain if m == hypotheses - 1 else gain[g]
+            else:
+                belief[e, s] = 0.0
+    added = np.zeros(sensors)
+    for e in range(draws):
+        for s in range(states):
+            belief[e, s] /= mass
+            if belief[e, s] >= NEGLIGIBLE_SHARE:
+                for g in range(sensors):
+                    if not np.isnan(observation[g]):
+                        added[g] += belief[e, s] * (known[e, s, g] - 1.0) * (degrees + squares[g])
+    squares += added
+    return float(best + math.log(mass))
+
+
+@compiled
+def weigh_gauges(
+    observation: Float,
+    value: Float,
+    inverse_deviation: Float,
+    gains: Float,
+    degrees: float,
+    count: Float,
+    squares_of_model: Float,
+    known: Float,
+    log_likelihood: Float,
+    log_evidence: float,
+    belief: Single,
+    log_weight: Float,
+    squares: Float,
+) -> None:
+    """Assimilate one observation under the rivals "gauge g shows 1 + gains[k] times what is there".
+
+    squares_of_model (G,) are those before the observation; known, log_likelihood and log_evidence are of the
+    model. belief (G, K, E, S), log_weight and squares (G, K) are brought up to date.
+    """
+    draws, states, sensors = value.shape
+    log_value = np.empty((draws, states))
+    for g in range(sensors):
+        for k in range(len(gains)):
+            seen = not np.isnan(observation[g])
+            left = degrees + squares[g, k]
+            power = 0.5 * (degrees + count[g] + 1.0)
+            constant = 0.5 * math.log((degrees + squares_of_model[g]) / left)
+            best = -np.inf
             for e in range(draws):
                 for s in range(states):
-                    share = belief[e, s]
-                    if share < 1e-12:
+                    if belief[g, k, e, s] < NEGLIGIBLE_RIVAL:
+                        belief[g, k, e, s] = 0.0
                         continue
-                    x = standard[e, s, g]
-                    c = prior * value[e, s, g] * inverse_deviation[s, g]
-                    statistics[m, g, 2] += share * c * c
-                    statistics[m, g, 4] += share * c * x
-                    x -= c * fitted[m, g, 1]
-                    statistics[m, g, 5] += share * x * x / (1.0 + c * c * fitted[m, g, 4])
+                    total = log_likelihood[e, s]
+                    if seen:
+                        x = (observation[g] - (1.0 + gains[k]) * value[e, s, g]) * inverse_deviation[s, g]
+                        total += constant + power * math.log(known[e, s, g] / (1.0 + x * x / left))
+                    log_value[e, s] = total
+                    best = max(best, total)
+            mass = 0.0
+            for e in range(draws):
+                for s in range(states):
+                    if belief[g, k, e, s] > 0.0:
+                        log_value[e, s] = belief[g, k, e, s] * _exp(log_value[e, s] - best)
+                        mass += log_value[e, s]
+            log_weight[g, k] += best + math.log(mass) - log_evidence if mass > 0.0 else -np.inf
+            added = 0.0
+            for e in range(draws):
+                for s in range(states):
+                    if belief[g, k, e, s] > 0.0:
+                        share = log_value[e, s] / mass
+                        belief[g, k, e, s] = share
+                        if seen and share >= NEGLIGIBLE_SHARE:
+                            x = (observation[g] - (1.0 + gains[k]) * value[e, s, g]) * inverse_deviation[s, g]
+                            added += share * x * x
+            squares[g, k] += added
+
+
+@compiled
+def weigh_none(
+    observation: Float,
+    value: Float,
+    inverse_deviation: Float,
+    gain: float,
+    degrees: float,
+    count: Float,
+    squares_of_model: Float,
+    known: Float,
+    log_likelihood: Float,
+    belief: Single,
+    statistics: Float,
+) -> float:
+    """Assimilate one observation under the rival that the gain of every gauge is free; return log evidence.
+
+    belief (E, S) and statistics (1, G, 6), the sums of the regressions, are brought up to date. The sum of
+    squares is that of the innovations over their spread (West and Harrison 1997, section 4.6), so that what a
+    gain explained once stays explained.
+    """
+    draws, states, sensors = value.shape
+    fitted = np.zeros_like(statistics)
+    regression(statistics, fitted)
+    log_value = np.empty((draws, states))
+    best = -np.inf
+    for e in range(draws):
+        for s in range(states):
+            if belief[e, s] < NEGLIGIBLE_RIVAL:
+                belief[e, s] = 0.0
+                continue
+            total = log_likelihood[e, s]
+            for g in range(sensors):
+                if np.isnan(observation[g]):
+                    continue
+                left = degrees + statistics[0, g, 5]
+                c = gain * value[e, s, g] * inverse_deviation[s, g]
+                x = (observation[g] - value[e, s, g]) * inverse_deviation[s, g] - c * fitted[0, g, 1]
+                spread = 1.0 + c * c * fitted[0, g, 4]
+                total += 0.5 * math.log((degrees + squares_of_model[g]) / (left * spread))
+                power = 0.5 * (degrees + count[g] + 1.0)
+                total += power * math.log(known[e, s, g] / (1.0 + x * x / (left * spread)))
+            log_value[e, s] = total
+            best = max(best, total)
+    mass = 0.0
+    for e in range(draws):
+        for s in range(states):
+            if belief[e, s] > 0.0:
+                log_value[e, s] = belief[e, s] * _exp(log_value[e, s] - best)
+                mass += log_value[e, s]
+    for e in range(draws):
+        for s in range(states):
+            if belief[e, s] == 0.0:
+                continue
+            share = log_value[e, s] / mass
+            belief[e, s] = share
+            if share < NEGLIGIBLE_SHARE:
+                continue
+            for g in range(sensors):
+                if np.isnan(observation[g]):
+                    continue
+                x = (observation[g] - value[e, s, g]) * inverse_deviation[s, g]
+                c = gain * value[e, s, g] * inverse_deviation[s, g]
+                statistics[0, g, 2] += share * c * c
+                statistics[0, g, 4] += share * c * x
+                x -= c * fitted[0, g, 1]
+                statistics[0, g, 5] += share * x * x / (1.0 + c * c * fitted[0, g, 4])
+    return float(best + math.log(mass)) if mass > 0.0 else -np.inf

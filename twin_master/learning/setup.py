@@ -1,25 +1,26 @@
-"""The estimator that a scenario asks for."""
+"""The estimator that a scenario asks for: one that learns, one that gives notice, or both."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
-from twin_master.network.estimator import Estimator
+from twin_master.learning.monitor import MonitorSettings, WatchfulEstimator, Words
+from twin_master.network.estimator import Estimator, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
 
-__all__ = ["learning_estimator"]
+__all__ = ["scenario_estimator"]
 
 
-def learning_estimator(
+def scenario_estimator(
     scenario: Scenario,
     model: GraphicalModel,
     sensor_model: GaussianSensorModel,
     draws: NDArray[np.float64],
 ) -> Estimator | None:
-    """Return the filter that learns what the scenario says, or None where it says nothing.
+    """Return what learns and gives notice as the scenario says, or None where it says nothing.
 
     Parameters
     ----------
@@ -34,8 +35,34 @@ def learning_estimator(
     Raises
     ------
     InvalidModelError
-        A transition factor makes a probability larger than one.
+        A transition factor makes a probability larger than one, or there are too many states to watch.
     """
+    learning = _learning_filter(scenario, model, sensor_model, draws)
+    if scenario.notice is None:
+        return learning
+    return WatchfulEstimator(
+        learning or ExactFilter(model, sensor_model, scenario.mission.name),
+        sensor_model,
+        draws,
+        MonitorSettings(**dict(scenario.notice)),
+        _words(scenario),
+    )
+
+
+def _words(scenario: Scenario) -> Words:
+    observation = scenario.observation
+    if observation.role == "strain" and set(observation.sensor_units) == {"1"}:
+        return Words(scenario.mission.step_name, "gauge", 1e6, ("microstrain",) * observation.count)
+    sensor = "gauge" if observation.role == "strain" else "sensor"
+    return Words(scenario.mission.step_name, sensor, 1.0, observation.sensor_units)
+
+
+def _learning_filter(
+    scenario: Scenario,
+    model: GraphicalModel,
+    sensor_model: GaussianSensorModel,
+    draws: NDArray[np.float64],
+) -> LearningFilter | None:
     learning = scenario.learning
     if learning is None:
         return None

@@ -50,6 +50,11 @@ def belief_record(turn: TwinTurn) -> dict[str, Any]:
         record["learnt"] = {name: vars(learnt) for name, learnt in turn.learnt.items()}
     if turn.notices:
         record["notices"] = [vars(notice) for notice in turn.notices]
+    if turn.suspicion is not None:
+        record["suspicion"] = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in vars(turn.suspicion).items()
+        }
     return record
 
 

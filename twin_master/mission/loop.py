@@ -16,6 +16,7 @@ from reporting.progress import Progress, SilentProgress
 from twin_master.errors import ImpossibleObservation, MissionError, NotResumableError
 from twin_master.mission.checkpoint import Checkpoint, FlownTurn
 from twin_master.mission.plant import Plant, PlantRecord
+from twin_master.network.estimator import Notice, Suspicion
 from twin_master.network.twin import Twin, TwinTurn
 from twin_master.scenario.schema import Scenario
 
@@ -126,6 +127,10 @@ class Flight:
         Turn at which this process took over; 0 for an uninterrupted mission.
     first_turn : int
         Number of the first of the T turns.
+    suspicion : tuple of Suspicion
+        How well the model explains the sensors in each turn; empty where that is not watched.
+    notices : tuple of (int, Notice)
+        Turns, and what the operator should know of them.
     """
 
     observed: Float
@@ -139,6 +144,8 @@ class Flight:
     timing: tuple[TurnTiming, ...]
     resumed_at: int = 0
     first_turn: int = 0
+    suspicion: tuple[Suspicion, ...] = ()
+    notices: tuple[tuple[int, Notice], ...] = ()
 
     @property
     def happened(self) -> PlantRecord:
@@ -249,6 +256,8 @@ class Beliefs:
     log_evidence: list[float] = field(default_factory=list)
     predicted: list[Float] = field(default_factory=list)
     decision_probability: list[Float] = field(default_factory=list)
+    suspicion: list[Suspicion] = field(default_factory=list)
+    notices: list[tuple[int, Notice]] = field(default_factory=list)
 
     def add(self, observed: Float, turn: TwinTurn) -> None:
         """Keep a turn."""
@@ -258,6 +267,9 @@ class Beliefs:
         self.log_evidence.append(turn.log_evidence)
         self.predicted.append(turn.prediction.predicted)
         self.decision_probability.append(turn.decision_probability)
+        if turn.suspicion is not None:
+            self.suspicion.append(turn.suspicion)
+        self.notices += [(turn.turn, notice) for notice in turn.notices]
 
     def flight(
         self,
@@ -281,6 +293,8 @@ class Beliefs:
             timing=timing,
             resumed_at=resumed_at,
             first_turn=first_turn,
+            suspicion=tuple(self.suspicion),
+            notices=tuple(self.notices),
         )
 
 

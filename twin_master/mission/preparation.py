@@ -14,7 +14,7 @@ from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.interface import Asset
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
-from twin_master.learning.setup import learning_estimator
+from twin_master.learning.setup import scenario_estimator
 from twin_master.mission.plant import Plant
 from twin_master.mission.truth import Truth
 from twin_master.network.estimator import Estimator
@@ -79,11 +79,11 @@ class Knowledge:
             How many turns back it smooths and may be revised; None keeps all, as a mission of a known length
             wants.
         estimator : Estimator, optional
-            What holds the belief in the place of the exact filter, or of the one that learns where the
-            scenario says so.
+            What holds the belief in the place of the exact filter, or of what learns and gives notice where
+            the scenario says so.
         """
         if estimator is None:
-            estimator = learning_estimator(self.scenario, self.model, self.sensor_model, self.draws.values)
+            estimator = scenario_estimator(self.scenario, self.model, self.sensor_model, self.draws.values)
         return Twin(
             self.scenario.mission.name,
             self.model,

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import ObservationContext, filter_step, smooth
 
-__all__ = ["Carried", "Estimate", "Estimator", "ExactFilter", "Learnt", "Notice", "SensorModel"]
+__all__ = ["Carried", "Estimate", "Estimator", "ExactFilter", "Learnt", "Notice", "SensorModel", "Suspicion"]
 
 Float = NDArray[np.float64]
 
@@ -88,6 +88,35 @@ class Notice:
 
 
 @dataclass(frozen=True)
+class Suspicion:
+    """How well the model explains the sensors up to a turn.
+
+    A log e-value is the logarithm of the evidence for a fault over that for the model; its exponential has a
+    mean of one where the model holds, at every turn.
+
+    Attributes
+    ----------
+    none_of_these : float
+        Posterior probability that no state of the model explains the sensors.
+    gauge_off : float
+        Posterior probability that a single sensor does not show what is there.
+    log_evidence_none, log_evidence_any_gauge : float
+        Log e-values of the two.
+    log_evidence_gauge : (G,)
+        Log e-value of each sensor.
+    left_out : (G,)
+        Whether the readings of a sensor are absurd and left out.
+    """
+
+    none_of_these: float
+    gauge_off: float
+    log_evidence_none: float
+    log_evidence_any_gauge: float
+    log_evidence_gauge: Float
+    left_out: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
 class Estimate:
     """What an estimator concludes in one turn t.
 
@@ -105,6 +134,8 @@ class Estimate:
         Posterior of what is learnt, by name.
     notices : tuple of Notice
         What the operator should know of this turn.
+    suspicion : Suspicion or None
+        How well the model explains the sensors, where that is watched.
     """
 
     forecast: Float
@@ -113,6 +144,7 @@ class Estimate:
     carried: Carried
     learnt: Mapping[str, Learnt] = field(default_factory=dict)
     notices: tuple[Notice, ...] = ()
+    suspicion: Suspicion | None = None
 
 
 class Estimator(Protocol):

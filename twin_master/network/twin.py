@@ -20,6 +20,7 @@ from twin_master.network.estimator import (
     Learnt,
     Notice,
     SensorModel,
+    Suspicion,
 )
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.inference import Predicted, predict
@@ -112,6 +113,8 @@ class TwinTurn:
         Posterior of what the estimator learns.
     notices : tuple of Notice
         What the operator should know.
+    suspicion : Suspicion or None
+        How well the model explains the sensors, where that is watched.
     """
 
     turn: int
@@ -123,6 +126,7 @@ class TwinTurn:
     next_control: int
     learnt: Mapping[str, Learnt] = field(default_factory=dict)
     notices: tuple[Notice, ...] = ()
+    suspicion: Suspicion | None = None
 
 
 @dataclass(frozen=True)
@@ -375,4 +379,5 @@ class Twin:
             next_control=self._proposed,
             learnt=estimate.learnt,
             notices=estimate.notices,
+            suspicion=estimate.suspicion,
         )

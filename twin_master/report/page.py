@@ -291,8 +291,14 @@ def _add_calibrated_wing(page: Page, view: CalibrationView | None) -> None:
 
 
 def _notices(record: RunRecord) -> list[str]:
-    """Return what a reader must not miss: another model, lost observations."""
-    notices = _loss_notices(record)
+    """Return what a reader must not miss: another model, alarms, lost observations."""
+    said = record.summary.get("notices")
+    notices = [
+        str(notice.get("sentence", ""))
+        for notice in (said if isinstance(said, list) else [])
+        if isinstance(notice, Mapping)
+    ]
+    notices += _loss_notices(record)
     if record.summary.get("asset_and_model_differ") is True:
         asset, model = record.summary.get("asset"), record.summary.get("twin_model")
         notices.insert(

@@ -13,6 +13,7 @@ from pydantic import Field, SerializeAsAny, model_validator
 
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
 from twin_master.scenario.learning import Learning
+from twin_master.scenario.notice import Noticing
 from twin_master.scenario.section import (
     Count,
     Name,
@@ -44,6 +45,10 @@ FALLBACK_FIGURES = (
 """Figures of the summary that say when the control left that of the first turn."""
 MISFIT_FIGURES = ("model_misfit_rms", "model_misfit_largest")
 """Figures of the summary that say by how much asset and twin's model differ."""
+
+
+NOTICE_FIGURES = ("alarm_step", "none_of_these", "gauge_off")
+"""Figures of the summary that say what was noticed."""
 
 
 class Mission(Section):
@@ -171,7 +176,7 @@ class Reference(Section):
     source: str
 
 
-OPTIONAL_TABLES = ("learning",)
+OPTIONAL_TABLES = ("learning", "notice")
 """Tables without which a scenario says what it said before there were any."""
 CALIBRATION_COPY = "asset/calibration.nc"
 """The calibration file inside a run folder."""
@@ -240,6 +245,7 @@ class Scenario(Section):
     calibration: Calibration
     truth: TruthSection
     learning: Learning | None = None
+    notice: Noticing | None = None
     watch: WatchSection = WatchSection()
     reference: tuple[Reference, ...] = ()
 
@@ -276,6 +282,8 @@ class Scenario(Section):
             names += [*MISFIT_FIGURES]
         if set(self.observation.sensor_units) == {"1"}:
             names += ["strain_error_bound"]
+        if self.notice is not None:
+            names += [*NOTICE_FIGURES]
         return tuple(names)
 
     @property
@@ -368,9 +376,10 @@ class Scenario(Section):
         check_one_or_each("rewards.error_scale", self.rewards.error_scale, count)
         if self.learning is not None:
             self.learning.check_sensors(count)
-            if self.observation.average_over_draws == "inside":
+        for table in ("learning", "notice"):
+            if getattr(self, table) is not None and self.observation.average_over_draws == "inside":
                 raise ValueError(
-                    "`learning` needs `observation.average_over_draws` `outside`: inside, each sensor has a "
+                    f"`{table}` needs `observation.average_over_draws` `outside`: inside, each sensor has a "
                     "parameter of its own"
                 )
         check_one_or_each("truth.noise.standard_deviation", self.truth.noise.standard_deviation, count)

@@ -37,6 +37,8 @@ class RunOutcome:
         What a step is called.
     control : str
         When which control was left for which, in words.
+    notices : tuple of str
+        What the operator should know, a sentence each.
     """
 
     folder: Path
@@ -46,6 +48,7 @@ class RunOutcome:
     origin: FlownAndBelieved
     step_name: str
     control: str
+    notices: tuple[str, ...] = ()
 
 
 def read_outcome(folder: Path) -> RunOutcome:
@@ -68,6 +71,7 @@ def read_outcome(folder: Path) -> RunOutcome:
         ),
         str(read_config(folder)["scenario"]["mission"]["step_name"]),
         str(summary["control"]),
+        tuple(str(notice["sentence"]) for notice in summary.get("notices", ())),
     )
 
 

@@ -104,6 +104,8 @@ def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.Data
             }
         ).assign_attrs(parameter=result.scenario.calibration.parameter),
     }
+    if result.flight.suspicion:
+        groups["notice"] = _notice(result, labels)
     if result.truth is not None:
         groups["truth"] = _truth(result, labels, result.truth)
     return xr.DataTree.from_dict({"/": xr.Dataset(attrs=dict(attributes)), **groups})
@@ -304,6 +306,51 @@ def _policy(result: MissionResult, labels: _Labels) -> xr.Dataset:
             "control_index": (("state",), plan.control_index, "1", "control of the policy in each state"),
             "action_value": (("state", "control"), plan.action_value, "1", "Q of value iteration, eq. (36)"),
             "value": (("state",), plan.value, "1", "value of each state"),
+        }
+    )
+
+
+def _notice(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    turns = result.flight.suspicion
+    sensor = ("step", "sensor")
+    return labels.dataset(
+        {
+            "none_of_these": (
+                ("step",),
+                np.array([turn.none_of_these for turn in turns]),
+                "1",
+                "p(no state of the model explains the sensors | observations up to the step)",
+            ),
+            "gauge_off": (
+                ("step",),
+                np.array([turn.gauge_off for turn in turns]),
+                "1",
+                "p(a single sensor does not show what is there | observations up to the step)",
+            ),
+            "log_evidence_none": (
+                ("step",),
+                np.array([turn.log_evidence_none for turn in turns]),
+                "1",
+                "log e-value of the first: evidence for it over that for the model",
+            ),
+            "log_evidence_any_gauge": (
+                ("step",),
+                np.array([turn.log_evidence_any_gauge for turn in turns]),
+                "1",
+                "log e-value of the second",
+            ),
+            "log_evidence_gauge": (
+                sensor,
+                np.array([turn.log_evidence_gauge for turn in turns]),
+                "1",
+                "log e-value of each sensor",
+            ),
+            "left_out": (
+                sensor,
+                np.array([turn.left_out for turn in turns], dtype=np.int8),
+                "1",
+                "1 where the readings of a sensor are absurd and left out",
+            ),
         }
     )
 

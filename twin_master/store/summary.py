@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from twin_master.assets.mismatch import Misfit
 from twin_master.assets.parameter import ParameterDraws
+from twin_master.mission.loop import Flight
 from twin_master.mission.plant import PlantRecord
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.rewards import REWARD_NAMES
-from twin_master.scenario.schema import FALLBACK_FIGURES, MISFIT_FIGURES, Reference
+from twin_master.scenario.schema import FALLBACK_FIGURES, MISFIT_FIGURES, NOTICE_FIGURES, Reference
 from twin_master.store.results import MissionResult
 
 Float = NDArray[np.float64]
@@ -173,8 +174,22 @@ def summarise(
                 "strain_error_bound", "worst certified strain error", 1e6 * float(bound.max()), "microstrain"
             )
         )
+    if flight.suspicion:
+        figures += _notice_figures(flight, scenario.mission.step_name)
     references = {entry.figure: entry for entry in scenario.reference}
     return tuple(_beside(figure, references.get(figure.key)) for figure in figures)
+
+
+def _notice_figures(flight: Flight, step_name: str) -> list[Figure]:
+    """Return when the first alarm came, and what is left of the model at the end."""
+    alarm, none, gauge = NOTICE_FIGURES
+    last = flight.suspicion[-1]
+    first = next((turn for turn, notice in flight.notices if notice.kind == "alarm"), None)
+    return [
+        Figure(alarm, f"{step_name} of the first alarm", first),
+        Figure(none, "probability that no state explains the sensors", last.none_of_these),
+        Figure(gauge, "probability that a single sensor is off", last.gauge_off),
+    ]
 
 
 def _scored(result: MissionResult, truth: PlantRecord) -> list[Figure]:

@@ -1,0 +1,127 @@
+"""`[notice]` in a scenario: what is refused, and what a run leaves of what was noticed."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from scenarios import scenario_files
+from twin_master.errors import TwinMasterError
+from twin_master.learning.monitor import MonitorSettings
+from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.report.page import render_page
+from twin_master.report.reading import open_run, read_run
+from twin_master.scenario.notice import Noticing
+from twin_master.scenario.reading import load_scenario
+from twin_master.workflow import resume_run
+from uav_twin.cli import app
+
+TEXT = scenario_files()["level_turns_learning"].read_text()
+FAULTS = """
+[[truth.sensor_faults]]
+kind = "drift"
+sensors = [5]
+first_step = 0
+rate_microstrain_per_step = 100
+
+[[truth.sensor_faults]]
+kind = "drift"
+sensors = [12]
+first_step = 3
+rate_microstrain_per_step = 1e14
+
+# What the figures"""
+
+
+def test_defaults_are_those_of_the_estimator_and_absence_is_off() -> None:
+    assert dict(Noticing()) == vars(MonitorSettings())
+    loaded = load_scenario("level_turns").scenario
+    assert loaded.notice is None
+    assert "notice" not in loaded.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("threshold = 1.0", "greater than 1"),
+        ("gauge_gain_percent = 60", "less than or equal to 0.4"),
+        ("absurd_deviations = 1", "greater than or equal to 3"),
+        ("prior = 0.5", "less than 0.5"),
+        ("colour = true", "colour"),
+    ],
+)
+def test_what_cannot_be_noticed_is_refused_in_a_sentence(tmp_path: Path, line: str, sentence: str) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(TEXT.replace("threshold = 100 ", line + " "))
+    with pytest.raises(TwinMasterError, match=sentence):
+        load_scenario(file)
+
+
+def test_sensors_with_parameters_of_their_own_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    before, after = TEXT.split("[learning]")
+    text = before + "[notice]" + after.split("[notice]")[1]
+    file.write_text(text.replace("[transition]", 'average_over_draws = "inside"\n[transition]', 1))
+    with pytest.raises(TwinMasterError, match=r"`notice` needs `observation.average_over_draws` `outside`"):
+        load_scenario(file)
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("notice") / "mine.toml"
+    text = TEXT.replace("# What the figures", FAULTS).replace("steps = 50", "steps = 9")
+    file.write_text(text.replace("draws = 60", "draws = 8"))
+    return file
+
+
+@pytest.fixture(scope="module")
+def folder(scenario: Path) -> Path:
+    run = scenario.parent / "run"
+    result = CliRunner().invoke(app, ["run", str(scenario), "--out", str(run), "--no-report"])
+    assert result.exit_code == 0, result.output
+    (scenario.parent / "said.txt").write_text(result.stdout)
+    return run
+
+
+def test_the_console_names_turn_gauge_and_the_command(folder: Path) -> None:
+    said = (folder.parent / "said.txt").read_text()
+    alarm = next(line for line in said.splitlines() if "gauge 5" in line)
+    assert alarm.startswith("Turn ")
+    assert alarm.endswith(f"to find the cause: uav-twin discrepancy run --from-run {folder}")
+    assert "Turn 3: gauge 12 shows 1e+14 microstrain, and no state can show less than" in said
+
+
+def test_journal_store_and_summary_agree(folder: Path) -> None:
+    notices = json.loads((folder / "summary.json").read_text())["notices"]
+    assert {(n["kind"], *n["sensors"]) for n in notices} == {("gauge_left_out", 12), ("alarm", 5)}
+    lines = [json.loads(line[65:]) for line in (folder / JOURNAL_NAME).read_text().splitlines()[1:]]
+    assert [{"turn": line["turn"]} | n for line in lines for n in line.get("notices", ())] == notices
+    kept = open_run(folder)["notice"].to_dataset()
+    for name, values in kept.data_vars.items():
+        assert [line["suspicion"][name] for line in lines] == values.values.tolist()
+    np.testing.assert_array_equal(kept["left_out"].sel(sensor=12), [0, 0, 0, 1, 1, 1, 1, 1, 1])
+    alarm = next(n["turn"] for n in notices if n["kind"] == "alarm")
+    figures = {f["key"]: f["value"] for f in json.loads((folder / "summary.json").read_text())["figures"]}
+    assert figures["alarm_step"] == alarm
+    assert figures["gauge_off"] == kept["gauge_off"].values[-1] > 0.5
+
+
+def test_the_report_has_the_alarm(folder: Path) -> None:
+    text = render_page(read_run(folder), [])
+    assert "gauge 5 shows too much" in text
+    assert "gauge 12 shows 1e+14 microstrain" in text
+
+
+def test_a_run_that_was_cut_off_ends_the_same(folder: Path) -> None:
+    cut = folder.parent / "cut"
+    shutil.copytree(folder, cut)
+    journal = cut / JOURNAL_NAME
+    journal.write_text("".join(journal.read_text().splitlines(keepends=True)[:6]))
+    kept = {name: (cut / name).read_bytes() for name in ("run.nc", "summary.json")}
+    for name in kept:
+        (cut / name).unlink()
+    resume_run(cut, report=False)
+    assert {name: (cut / name).read_bytes() for name in kept} == kept
