@@ -48,7 +48,7 @@ from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_sc
 from twin_master.scenario.schema import Scenario
 from twin_master.store.outcome import RunOutcome, finished_run, read_outcome
 from twin_master.store.results import MissionResult
-from twin_master.store.summary import control_changes, summarise
+from twin_master.store.summary import control_changes, noticed, summarise
 from twin_master.store.writing import (
     store_mission,
     values_of,
@@ -375,9 +375,7 @@ def _store(
     controls = knowledge.scenario.control_names
     said = {"control": control_changes(controls, result.flight.control_index, mission.step_name)}
     origin = {"asset": source.origin.asset, "twin_model": source.origin.model}
-    heading |= said | origin | {"asset_and_model_differ": source.origin.differ}
-    if knowledge.scenario.notice is not None:
-        heading["notices"] = [{"turn": turn} | vars(notice) for turn, notice in result.flight.notices]
+    heading |= said | origin | {"asset_and_model_differ": source.origin.differ} | noticed(result)
     write_summary(folder, figures, heading)
 
 

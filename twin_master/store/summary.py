@@ -180,6 +180,13 @@ def summarise(
     return tuple(_beside(figure, references.get(figure.key)) for figure in figures)
 
 
+def noticed(result: MissionResult) -> dict[str, Any]:
+    """Return what the operator was told, `notices`, for the summary; nothing where nothing is watched."""
+    if result.scenario.notice is None:
+        return {}
+    return {"notices": [{"turn": turn} | vars(notice) for turn, notice in result.flight.notices]}
+
+
 def _notice_figures(flight: Flight, step_name: str) -> list[Figure]:
     """Return when the first alarm came, and what is left of the model at the end."""
     alarm, none, gauge = NOTICE_FIGURES

@@ -49,7 +49,7 @@ from twin_master.run_folder import (
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.results import MissionResult
-from twin_master.store.summary import Figure, control_changes, summarise
+from twin_master.store.summary import Figure, control_changes, noticed, summarise
 from twin_master.store.writing import store_mission, values_of, write_summary
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile
 from twin_master.watch.replay import SNAPSHOT_TURNS, BelievedModel, Replayed, replay
@@ -199,7 +199,7 @@ class Watch:
         flight = found.beliefs.flight(
             found.twin.smoothed()[-(turns - found.first_turn) :], None, first_turn=found.first_turn
         )
-        parts = ("observed", "control_index", "filtered", "log_evidence", "smoothed", "predicted")
+        parts = ("observed", "control_index", "filtered", "log_evidence", "smoothed", "predicted", "suspicion")
         cut = {name: getattr(flight, name)[skipped:] for name in (*parts, "decision_probability")}
         knowledge, mission = self.models[-1].knowledge, self.scenario.mission
         result = MissionResult(
@@ -235,6 +235,7 @@ class Watch:
                     self.scenario.control_names, result.flight.control_index, mission.step_name
                 ),
                 "asset": WATCHED, "twin_model": origin.model, "asset_and_model_differ": False,
+                **noticed(result),
             }  # fmt: skip
             write_summary(self.folder, figures, heading)
         if report:
