@@ -199,8 +199,8 @@ class Watch:
         flight = found.beliefs.flight(
             found.twin.smoothed()[-(turns - found.first_turn) :], None, first_turn=found.first_turn
         )
-        parts = ("observed", "control_index", "filtered", "log_evidence", "smoothed", "predicted", "suspicion")
-        cut = {name: getattr(flight, name)[skipped:] for name in (*parts, "decision_probability")}
+        beliefs = ("filtered", "log_evidence", "smoothed", "predicted", "decision_probability", "suspicion")
+        cut = {name: getattr(flight, name)[skipped:] for name in ("observed", "control_index", *beliefs)}
         knowledge, mission = self.models[-1].knowledge, self.scenario.mission
         result = MissionResult(
             scenario=self.scenario, model=knowledge.model, sensor_model=knowledge.sensor_model,
