@@ -191,12 +191,19 @@ def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> d
 
 def convert(
     out: Annotated[Path, typer.Argument(help="Folder to write the campaign to.", show_default=False)],
-    data: Annotated[
-        Path, typer.Option(help="The authors' calibration folder, as published.", show_default=False)
-    ],
+    data: Annotated[Path, typer.Option(help="The folder of the published data.", show_default=False)],
+    rig: Annotated[str, typer.Option(help="real_wing, falling_phone, two_tanks or pendulum.")] = "real_wing",
 ) -> None:
-    """Write the real wing's published ring-downs and load test as a campaign."""
+    """Write published measurements as a campaign; of other rigs than the wing with `model.toml` beside it."""
+    from discrepancy.campaign.reading import read_campaign
+    from discrepancy.sources.measured_rigs import write_rig_campaign
     from discrepancy.sources.real_wing import write_wing_campaign
 
+    if rig != "real_wing":
+        made = read_campaign(write_rig_campaign(rig, data, out))
+        terminal.say(
+            f"{made.name}: {counted(len(made.trials), 'trial')} in {out}, its model in {out / 'model.toml'}"
+        )
+        return
     campaign = write_wing_campaign(data, out)
     terminal.say(f"{campaign.name}: {counted(len(campaign.trials), 'trial')} in {out}")

@@ -241,6 +241,8 @@ def _unexplained(
             f" The best hypothesis, {words}, closes {_share_words(weighed.shares(leading))} of the gap on "
             f"{explained.trials} trials."
         )
+    else:
+        sentence += weighed.little()
     sentence += f" {why}" if why else ""
     return told.verdict(
         VerdictKind.UNEXPLAINED, sentence, first.probability, gates=first.gates,

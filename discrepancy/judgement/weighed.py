@@ -74,6 +74,22 @@ class Weighed:
         closing = (item for item in ranked if item.candidate.terms and self.shares(item).value > LEAST_SHOWN)
         return next(closing, self.found.none)
 
+    def little(self) -> str:
+        """Return the sentence on how little of the gap is closed where no set closes a part that counts."""
+        closing = [
+            (self.shares(item).summary(), item)
+            for item in (*self.found.judged.values(), *self.left_out)
+            if item.candidate.terms
+        ]
+        if not closing:
+            return ""
+        share, most = max(closing, key=lambda pair: pair[0].value)
+        words = " and ".join(effect.name for effect in named_effects(self.problem, most))
+        closed = (
+            f"{words} closes most, {100.0 * share.value:.0f} %" if share.value > 0.005 else "none closes any"
+        )
+        return f" Of the hypotheses that were weighed, {closed} of the gap on {share.trials} trials."
+
     def leave_out_stand_ins(self) -> None:
         """Take sets with a stand-in out of the comparison where a law explains as much, or it may not be.
 

@@ -126,14 +126,14 @@ class LumpedDescription(ModelDescription):
         n, m = self.size, self.states
         if n == 0 and m == 0:
             raise ValueError("mass is missing (or capacity, of states of first order)")
-        second = [("stiffness", self.stiffness)] if self.stiffness or not self.free else []
-        second += [(f"{kind} {part.name!r}", part.matrix) for kind, part in self._parts_of(n)]
+        second = [("stiffness", self.stiffness)] if self.stiffness or (n and not self.free) else []
+        second += [(f"{kind} {part.name!r}", part.matrix) for kind, part in self._parts_of("mass")]
         if n and self.damping is None and not self.free:
             raise ValueError("'damping' is missing")
         if self.damping is not None and self.damping.matrix is not None:
             second.append(("damping.matrix", self.damping.matrix))
-        first = [("conductance", self.conductance)]
-        first += [(f"{kind} {part.name!r}", part.matrix) for kind, part in self._parts_of(0)]
+        first = [("conductance", self.conductance)] if self.conductance or not self.conductance_part else []
+        first += [(f"{kind} {part.name!r}", part.matrix) for kind, part in self._parts_of("capacity")]
         for reference, count, matrices in (("mass", n, second), ("capacity", m, first)):
             if count:
                 matrices = [(reference, getattr(self, reference)), *matrices]
@@ -154,8 +154,8 @@ class LumpedDescription(ModelDescription):
             if content is not None and _shape(content) != (rows, columns):
                 raise ValueError(f"coupling.{name} must be a {rows} x {columns} matrix by rows")
 
-    def _parts_of(self, of_displacements: int) -> list[tuple[str, PartSection]]:
-        names = ("mass_part", "stiffness_part", "damping_part") if of_displacements else _STATE_PARTS
+    def _parts_of(self, reference: str) -> list[tuple[str, PartSection]]:
+        names = ("mass_part", "stiffness_part", "damping_part") if reference == "mass" else _STATE_PARTS
         return [(name, part) for name in names for part in getattr(self, name)]
 
     def whole(self, name: str, factors: Mapping[str, float] = MappingProxyType({})) -> FloatArray:

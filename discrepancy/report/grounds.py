@@ -132,6 +132,8 @@ def add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
         f"± {number(proof.log_score_gain_error, 2)} nat per sample. "
     )  # fmt: skip
     closed = f"Gap closed: {percent(proof.gap_closed)} %." if isfinite(proof.gap_closed) else proof.gap_reason
+    if investigation.verdict.explained is not None:
+        closed = proof.gap_reason  # the share of the verdict is that of all channels in units of their noise
     trials = f" Held out: {', '.join(held)}; only their own releases and zeros were adapted." if held else ""
     page.add_table(
         Table(columns, rows), f"{gain}{closed}{trials}", title="Before and after, at the same scale"

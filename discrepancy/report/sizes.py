@@ -80,6 +80,8 @@ def size_sentence(
 
 def _words(parameter: str, primitive: Primitive, unit: str) -> str:
     words = parameter.replace("_", " ")
+    if parameter == "coefficient" and unit.endswith("capacity"):
+        return "flow"  # into or out of a state
     if parameter == "coefficient" and primitive.kind in ("power_damping", "power_stiffness"):
         words = "force"
     return words.replace("force", "moment") if unit == "N m" else words  # at a port that turns
@@ -112,9 +114,22 @@ def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campa
         units = {"1" if item is Quantity.SIGNAL else UNITS[item].si for item in measured}
         return unit_text(units.pop()) if len(units) == 1 and unit == CHANNEL_UNIT else ""
     if " or " in unit:
+        if state := _unit_of_state(str(getattr(primitive, "port", "")), model):
+            return state if unit.startswith("m/s") else f"{state}/s times capacity"
         moving, turning = unit.split(" or ")
         return {True: turning, False: moving, None: unit}[_turns(str(getattr(primitive, "port", "")), model)]
     return unit_text(unit)
+
+
+def _unit_of_state(port: str, model: Model) -> str:
+    """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""
+    if not isinstance(model, LumpedModel):
+        return ""
+    first = model.description.size
+    if not any(any(item.vector[first:]) for item in model.description.port if item.name == port):
+        return ""
+    shown = {item.quantity for item in model.description.output if item.vector and any(item.vector[first:])}
+    return unit_text(UNITS[shown.pop()].si) if len(shown) == 1 else "of the state's unit"
 
 
 def _turns(port: str, model: Model) -> bool | None:

@@ -115,7 +115,8 @@ def headline(verdict: Verdict) -> str:
     text = verdict.sentence.rstrip(".")
     known = [*verdict.effects, *(effect for item in verdict.hypotheses for effect in item.effects)]
     for identifier, name in {effect.identifier: effect.name for effect in known}.items():
-        text = re.sub(rf"\b{identifier}\b", name, text)
+        whole = rf"{re.escape(name)}|\b{identifier}\b"  # a name may hold the identifier
+        text = re.sub(whole, lambda _, name=name: name, text)  # type: ignore[misc]
     if isnan(verdict.probability) or "probability" in text:
         return text + "."
     about = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.model_choice import ModelKind, choose_model
 from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.lumped_file import parse_lumped
 from discrepancy.models.wing import WingModel
 from discrepancy.report.check_tables import (
     confused_lines,
@@ -74,6 +76,7 @@ from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdi
 from discrepancy.workflow import Investigation, investigate, patch_draws
 from fe.runtime.patch import (
     ModelPatch,
+    Overflow,
     PointMass,
     PowerDamping,
     PowerStiffness,
@@ -325,6 +328,32 @@ def test_sizes_have_the_unit_of_their_port_or_channel(
     patch = ModelPatch((primitive,))
     found = si_sizes(patch, primitive_intervals(patch), drag.model, drag.campaign)
     assert re.sub(r"(\d\.\d*?)0+(?= )", r"\1", found) == re.sub(r"(\d\.\d*?)0+(?= )", r"\1", text)
+
+
+def test_a_flow_has_the_unit_of_its_state(drag: Investigation) -> None:
+    tank = """
+format = 1
+name = "Tank"
+capacity = 2.0
+conductance_part = [{ name = "outlet", matrix = 0.1 }]
+output = [{ name = "level", vector = 1.0, quantity = "level" }]
+port = [{ name = "outlet", vector = 1.0 }]
+"""
+    model = LumpedModel(parse_lumped(tomllib.loads(tank)))
+    for law, text in (
+        (PowerDamping("outlet", 0.5, 0.5, 0.0, 2.0, 1.0), "flow 0.500 m/s times capacity at 2 m"),
+        (Overflow("outlet", 0.5, 1.5, 3.0, 2.0), "flow 0.500 m/s times capacity, level 3.000 m"),
+    ):
+        patch = ModelPatch((law,))
+        assert si_sizes(patch, primitive_intervals(patch), model, drag.campaign) == text
+
+
+def test_a_name_that_holds_its_identifier_is_said_once(drag: Investigation) -> None:
+    (effect,) = drag.verdict.effects
+    named = replace(effect, identifier="outflow", name="outflow by a power of the level")
+    sentence = f"The nearest is outflow; {named.name} closes 74 %."
+    said = headline(replace(drag.verdict, sentence=sentence, effects=(named,), hypotheses=()))
+    assert said.startswith(f"The nearest is {named.name}; {named.name} closes 74 %")
 
 
 def test_a_port_that_turns_has_a_moment(drag: Investigation) -> None:

@@ -403,6 +403,23 @@ def test_scales_come_from_what_acts_and_moves() -> None:
     assert port.angular_frequency * port.displacement == pytest.approx(9.81 * time[-1])
 
 
+def test_states_may_be_given_by_parts_alone() -> None:
+    parts = """[[conductance_part]]
+name = "first"
+matrix = [[0.1, 0.0], [-0.1, 0.0]]
+[[conductance_part]]
+name = "second"
+matrix = [[0.0, 0.0], [0.0, 0.08]]
+[[input]]"""
+    whole = "conductance = [[0.1, 0.0], [-0.1, 0.08]]\n"
+    text = TANKS.replace(whole, "").replace("[[input]]", parts)
+    made = [LumpedModel(parse_lumped(tomllib.loads(item))) for item in (TANKS, text)]
+    one, other = (model.description.whole("conductance") for model in made)
+    np.testing.assert_array_equal(one, other)
+    with pytest.raises(ModelError, match="conductance must be a 2 x 2 matrix"):
+        parse_lumped(tomllib.loads(TANKS.replace(whole, "")))
+
+
 @pytest.mark.parametrize(
     ("text", "old", "new", "sentence"),
     [

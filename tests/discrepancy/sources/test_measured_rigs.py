@@ -1,0 +1,173 @@
+"""Rigs that others measured: their files as published become campaigns, and what the search says of them."""
+
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.records import Campaign
+from discrepancy.catalogue.library import effect_by_identifier, library
+from discrepancy.checks.model_check import check_against_model
+from discrepancy.errors import CampaignFileError
+from discrepancy.model_choice import load_model
+from discrepancy.models.interface import Model
+from discrepancy.sources.measured_rigs import write_rig_campaign
+from discrepancy.verdict import Verdict, VerdictKind
+from discrepancy.workflow import investigate
+from uav_twin.cli import app
+
+PUBLISHED = Path(__file__).parents[3].parent / "shared" / "reference" / "measured"
+Rig = tuple[Campaign, Model]
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Rig]:
+    def made(name: str) -> Rig:
+        if not (PUBLISHED / name).is_dir():
+            pytest.skip(f"the published records of {name} are not beside the project")
+        folder = write_rig_campaign(name, PUBLISHED / name, tmp_path_factory.mktemp(name) / "campaign")
+        return read_campaign(folder), load_model(folder / "model.toml")
+
+    return made
+
+
+@pytest.fixture(scope="module")
+def phone(rig: Callable[[str], Rig]) -> Rig:
+    return rig("falling_phone")
+
+
+@pytest.fixture(scope="module")
+def tanks(rig: Callable[[str], Rig]) -> Rig:
+    return rig("two_tanks")
+
+
+@pytest.fixture(scope="module")
+def pendulum(rig: Callable[[str], Rig]) -> Rig:
+    return rig("pendulum")
+
+
+def judged(rig: Rig, *effects: str) -> Verdict:
+    chosen = [effect_by_identifier(name, library()) for name in effects]
+    return investigate(*rig, chosen, thorough=False).verdict
+
+
+def write_falls(folder: Path, size: int = 400) -> Path:
+    """Write a rest of a second and a half, a fall of 0.4 s in the middle of a record, and a second record."""
+    folder.mkdir()
+    time = 0.005 * np.arange(size)
+    z = np.where((time > 0.6) & (time < 1.0), 0.2, 9.7)
+    np.savetxt(folder / "at_rest.txt", np.column_stack((time, 0 * time, 0 * time, 9.7 + 0.01 * np.cos(time))))
+    for number in (2, 10):
+        table = np.column_stack((time, 0 * time, 0 * time, z))
+        np.savetxt(folder / f"fall_{number}.csv", table, delimiter=",", header="t,x,y,z")
+    return folder
+
+
+def test_only_the_fall_is_taken_without_its_ends(tmp_path: Path) -> None:
+    read = read_campaign(
+        write_rig_campaign("falling_phone", write_falls(tmp_path / "data"), tmp_path / "out")
+    )
+    assert [trial.name for trial in read.trials] == ["fall_2", "fall_10"]
+    for trial in read.trials:
+        np.testing.assert_allclose(trial.values, 0.2)
+        assert trial.time[0] == pytest.approx(0.04)
+        assert trial.time[-1] == pytest.approx(0.345)
+
+
+def test_the_command_writes_what_run_reads(tmp_path: Path) -> None:
+    out, data = tmp_path / "out", write_falls(tmp_path / "data")
+    words = ["discrepancy", "convert", str(out), "--rig", "falling_phone", "--data", str(data)]
+    said = CliRunner().invoke(app, words)
+    assert said.exit_code == 0, said.output
+    assert "2 trials" in said.output
+    assert not [
+        fault
+        for fault in check_against_model(read_campaign(out), load_model(out / "model.toml"))
+        if fault.fatal
+    ]
+
+
+def test_what_is_not_as_published_is_refused_in_a_sentence_and_nothing_is_written(tmp_path: Path) -> None:
+    out, data = tmp_path / "out", write_falls(tmp_path / "data")
+    with pytest.raises(
+        CampaignFileError, match="There is no rig 'wing': give one of falling_phone, two_tanks"
+    ):
+        write_rig_campaign("wing", data, out)
+    for name, missing in (("two_tanks", r"dataBenchmark\.csv"), ("pendulum", r"pd_trajectory\.csv")):
+        with pytest.raises(CampaignFileError, match=rf"There is no .*{missing}: give the folder"):
+            write_rig_campaign(name, data, out)
+    (data / "fall_2.csv").write_text("t,x,y,z\n" + "0,0,0\n" * 20)
+    with pytest.raises(
+        CampaignFileError, match=r"fall_2\.csv is not as it was published: it needs the column"
+    ):
+        write_rig_campaign("falling_phone", data, out)
+    (data / "fall_2.csv").write_text("t,x,y,z\n" + "".join(f"{0.01 * k},0,0,9.7\n" for k in range(20)))
+    with pytest.raises(CampaignFileError, match="holds no fall"):
+        write_rig_campaign("falling_phone", data, out)
+    (data / "fall_2.csv").write_text("t,x,y,z\n" + "0.1,0,0,0.1\n" * 20)
+    with pytest.raises(CampaignFileError, match="its times must increase"):
+        write_rig_campaign("falling_phone", data, out)
+    assert not out.exists()
+
+
+def test_a_fall_is_no_short_record(phone: Rig) -> None:
+    assert not [fault for fault in check_against_model(*phone) if fault.fatal]
+
+
+def test_drag_is_named_with_its_exponent_and_nothing_that_only_describes(phone: Rig) -> None:
+    verdict = judged(
+        phone, "quadratic_damping", "coulomb_friction", "cubic_stiffness", "joint_micro_slip",
+        "gauge_zero_drift", "clock_error",
+    )  # fmt: skip
+    assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
+    assert [effect.identifier for effect in verdict.effects] == ["quadratic_damping"]
+    assert verdict.explained is not None
+    assert verdict.explained.trials == "held-out"
+    assert verdict.explained.low > 0.9
+    told = re.search(r"exponent of the speed \S+ \((\S+) to (\S+)\)", verdict.sentence)
+    assert told is not None, verdict.sentence
+    low, high = map(float, told.groups())
+    assert 1.0 < low < 2.0 < high
+    assert {"joint_micro_slip", "cubic_stiffness"} <= {item.identifier for item in verdict.not_fitted}
+
+
+def test_readings_at_the_end_of_the_level_sensor_are_left_out(tanks: Rig) -> None:
+    campaign, _ = tanks
+    assert [trial.name for trial in campaign.held_out] == ["validation"]
+    for trial, left_out in zip(campaign.trials, (47, 37), strict=True):
+        assert trial.values.shape == (1024, 1)
+        assert int((~trial.used).sum()) == left_out
+        assert float(trial.values[trial.used].max()) < 10.0
+
+
+@pytest.mark.skipif(
+    not os.environ.get("UAV_TWIN_LONG_TESTS"),
+    reason="takes a minute of processor time; set UAV_TWIN_LONG_TESTS to run it",
+)
+def test_the_tanks_have_a_root_of_the_level_and_an_overflow_in_part(tanks: Rig) -> None:
+    verdict = judged(tanks, "outflow", "overflow", "logger_clock")
+    assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
+    found = {(effect.identifier, effect.place) for effect in verdict.effects}
+    assert found == {("outflow", "lower outlet"), ("overflow", "upper outlet")}
+    assert verdict.explained is not None
+    assert verdict.explained.trials == "held-out"
+    assert verdict.explained.low > 0.5
+
+
+def test_a_sample_of_the_pendulum_is_a_fiftieth_of_a_second(pendulum: Rig) -> None:
+    campaign, _ = pendulum
+    assert [trial.name for trial in campaign.held_out] == ["ilqr"]
+    for trial, count in zip(campaign.trials, (195, 1000), strict=True):
+        assert len(trial.time) == count
+        assert float(np.median(np.diff(trial.time))) == pytest.approx(0.02, rel=0.01)
+
+
+def test_the_pendulum_has_no_name_and_its_share_is_said(pendulum: Rig) -> None:
+    verdict = judged(pendulum, "coulomb_friction", "quadratic_damping", "clock_error")
+    assert verdict.kind is VerdictKind.UNEXPLAINED
+    assert "none closes any of the gap on held-out trials" in verdict.sentence
