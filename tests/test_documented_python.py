@@ -74,6 +74,10 @@ def empty_rig(folder: Path) -> None:
     (folder / "my_rig").mkdir()
 
 
+def empty_cart(folder: Path) -> None:
+    (folder / "my_cart").mkdir()
+
+
 def campaign_folder(folder: Path) -> None:
     from discrepancy.models.wing import WingModel
 
@@ -160,6 +164,7 @@ READER_HAS: dict[str, tuple[Prepare, ...]] = {
     "docs/another_asset.md": (pump_library,),
     "docs/calibration.md": (calibration_data,),
     "docs/campaign.md": (campaign_folder,),
+    "docs/cart_in_ten_minutes.md": (empty_cart,),
     "docs/fmu_models.md": (fmu_rig,),
     "docs/fmu.md": (checkout, patch_file, wing_with_effects),
     "docs/inference.md": (strain_library,),

@@ -1,4 +1,4 @@
-"""The rig of docs/rig_in_ten_minutes.md is made, read and understood as the page says."""
+"""The rigs of the two pages of ten minutes are made, read and understood as the pages say."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from discrepancy.campaign.reading import read_campaign
@@ -18,37 +19,58 @@ from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import checked, investigate, without_port
 from fe.runtime.patch import ModelPatch
 
-PAGE = Path(__file__).parents[2] / "docs" / "rig_in_ten_minutes.md"
+DOCS = Path(__file__).parents[2] / "docs"
+DRIVEN_RIVALS = ("coulomb_friction", "quadratic_damping", "load_cell")
 RIVALS = ("coulomb_friction", "structural_damping", "quadratic_damping", "clock_error")
+
+
+def write_rig(text: str, folder: Path, campaign_folder: str) -> Path:
+    """Write what a page gives into a folder and run its script; return the folder."""
+    (folder / campaign_folder).mkdir()
+    (script,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    campaign, model, *more = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    (folder / "make_tables.py").write_text(script, encoding="utf-8")
+    (folder / campaign_folder / "campaign.toml").write_text(campaign, encoding="utf-8")
+    (folder / "model.toml").write_text(model, encoding="utf-8")
+    (folder / "with_port.toml").write_text("\n".join([model, *more]), encoding="utf-8")
+    subprocess.run([sys.executable, "make_tables.py"], cwd=folder, check=True)
+    return folder
+
+
+def check_tables(text: str, folder: Path, names: tuple[str, ...]) -> None:
+    """Compare the beginnings of tables with those that a page shows side by side."""
+    shown = re.search(
+        rf"{' +'.join(f'{folder.name}/{name}.csv' for name in names)}\n(.*?)```", text, re.DOTALL
+    )
+    assert shown
+    columns = zip(*(line.split() for line in shown.group(1).splitlines()), strict=True)
+    for name, lines in zip(names, columns, strict=True):
+        made = (folder / f"{name}.csv").read_text(encoding="utf-8").splitlines()
+        assert tuple(made[: len(lines)]) == lines
+
+
+def check_force(text: str, verdict: Verdict) -> None:
+    """Compare the force of the only effect with the one that a page shows."""
+    shown = re.search(r"force ([\d.]+) N \(([\d.]+) to ([\d.]+)\)", text)
+    assert shown
+    value, low, high = (float(number) for number in shown.groups())
+    (law,) = verdict.effects[0].patch
+    assert law.coefficient == pytest.approx(value, abs=0.2 * (high - low))  # type: ignore[attr-defined]
 
 
 @pytest.fixture(scope="module")
 def text() -> str:
-    return PAGE.read_text(encoding="utf-8")
+    return (DOCS / "rig_in_ten_minutes.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
 def rig(text: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the page gives, its script run."""
-    folder = tmp_path_factory.mktemp("rig")
-    (folder / "my_rig").mkdir()
-    (script,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    campaign, model, port = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
-    (folder / "make_tables.py").write_text(script, encoding="utf-8")
-    (folder / "my_rig" / "campaign.toml").write_text(campaign, encoding="utf-8")
-    (folder / "model.toml").write_text(model, encoding="utf-8")
-    (folder / "with_port.toml").write_text(f"{model}\n{port}", encoding="utf-8")
-    subprocess.run([sys.executable, "make_tables.py"], cwd=folder, check=True)
-    return folder
+    return write_rig(text, tmp_path_factory.mktemp("rig"), "my_rig")
 
 
 def test_the_tables_begin_as_they_are_shown(text: str, rig: Path) -> None:
-    shown = re.search(r"my_rig/rest.csv +my_rig/weights.csv +my_rig/release_1.csv\n(.*?)```", text, re.DOTALL)
-    assert shown
-    columns = zip(*(line.split() for line in shown.group(1).splitlines()), strict=True)
-    for name, lines in zip(("rest", "weights", "release_1"), columns, strict=True):
-        made = (rig / "my_rig" / f"{name}.csv").read_text(encoding="utf-8").splitlines()
-        assert tuple(made[: len(lines)]) == lines
+    check_tables(text, rig / "my_rig", ("rest", "weights", "release_1"))
 
 
 def test_without_a_port_the_remark_is_the_one_shown(text: str, rig: Path) -> None:
@@ -78,8 +100,35 @@ def test_with_the_port_friction_is_named_in_the_size_shown(text: str, rig: Path)
     assert [(effect.identifier, effect.place) for effect in found.verdict.effects] == [
         ("coulomb_friction", "slide")
     ]
-    shown = re.search(r"force ([\d.]+) N \(([\d.]+) to ([\d.]+)\)", text)
-    assert shown
-    value, low, high = (float(number) for number in shown.groups())
-    (law,) = found.verdict.effects[0].patch
-    assert law.coefficient == pytest.approx(value, abs=0.2 * (high - low))  # type: ignore[attr-defined]
+    check_force(text, found.verdict)
+
+
+@pytest.fixture(scope="module")
+def cart_text() -> str:
+    return (DOCS / "cart_in_ten_minutes.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def cart(cart_text: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_rig(cart_text, tmp_path_factory.mktemp("cart"), "my_cart")
+
+
+def test_the_tables_of_the_cart_begin_as_they_are_shown_and_jitter(cart_text: str, cart: Path) -> None:
+    check_tables(cart_text, cart / "my_cart", ("rest", "ride_1"))
+    for trial in read_campaign(cart / "my_cart").trials:
+        steps = np.diff(trial.time)
+        assert 0.015 < np.std(steps) / np.mean(steps) / np.sqrt(2.0) < 0.025
+
+
+def test_friction_of_the_cart_is_named_in_the_size_shown_and_not_the_offset(
+    cart_text: str, cart: Path
+) -> None:
+    effects = tuple(effect for effect in library() if effect.identifier in DRIVEN_RIVALS)
+    found = investigate(
+        read_campaign(cart / "my_cart"), LumpedModel.load(cart / "model.toml"), effects, thorough=False
+    )
+    assert found.verdict.kind is VerdictKind.NAMED
+    assert [(effect.identifier, effect.place) for effect in found.verdict.effects] == [
+        ("coulomb_friction", "rail")
+    ]
+    check_force(cart_text, found.verdict)
