@@ -13,7 +13,7 @@ from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
-from discrepancy.sources.from_run import CALIBRATION_FILE, DESIGN_FILE, MODEL_PATCH_FILE, run_model
+from discrepancy.sources.from_run import CALIBRATION_FILE, DESIGN_FILE, patch_of_run, run_model
 from fe.reduction.reduced_basis import Progress
 from fe.runtime.errors import FiniteElementError
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
@@ -139,8 +139,8 @@ def choice_of_run(folder: Path) -> ModelChoice:
     model = run_model(folder)
     calibration = folder / CALIBRATION_FILE
     choice = _calibrated(calibration, None) if calibration.is_file() else _wing(folder / DESIGN_FILE, None)
-    patch = folder / MODEL_PATCH_FILE
-    if not patch.is_file():
+    patch = patch_of_run(folder)
+    if patch is None:
         return replace(choice, model=model)
     source = hash_record({"model": choice.source_hash, "patch": hash_file(patch)})
     return replace(choice, model=model, source_hash=source)

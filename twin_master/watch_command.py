@@ -11,6 +11,7 @@ import typer
 
 from reporting import terminal
 from twin_master.command import Calibration, Library, Seed
+from twin_master.viewer.command import View, shown
 
 if TYPE_CHECKING:
     from twin_master.assets.resolution import Overrides
@@ -21,8 +22,8 @@ Observations = Annotated[
     str,
     typer.Option(
         metavar="SOURCE",
-        help="A CSV or NetCDF file, `-` for JSON lines on standard input, or mqtt://[USER@]HOST[:PORT]/TOPIC "
-        "(mqtts:// with TLS).",
+        help="A CSV or NetCDF file, the folder of a run or watch, `-` for JSON lines on standard input, or "
+        "mqtt://[USER@]HOST[:PORT]/TOPIC (mqtts:// with TLS).",
     ),
 ]
 
@@ -53,6 +54,8 @@ def watch(
     seed: Seed = None,
     calibration: Calibration = None,
     library: Library = None,
+    last: Annotated[int, typer.Option(min=1, help="Turns, the last ones, in run.nc and report.")] = 1000,
+    view: View = False,
     no_report: terminal.NoReport = False,
 ) -> None:
     """Watch a real asset: observations in, a decision for each turn out, as a line of JSON.
@@ -66,24 +69,27 @@ def watch(
     if (model_patch is None) != (from_turn is None) or (model_patch is not None and not resume):
         raise typer.BadParameter("--model-patch and --from-turn go together, with --resume.")
     overrides = Overrides(seed=seed, calibration=calibration, library=library)
-    watched, lock = _opened(scenario, out, overrides, resume=resume, replace=replace)
-    patched = None if model_patch is None or from_turn is None else Patched(model_patch, from_turn)
-    try:
-        feed, decide, close = _feed(observations, watched, follow, ca_file)
+    with shown(view) as begun:
+        watched, lock = _opened(scenario, out, overrides, resume=resume, replace=replace)
+        if begun is not None:
+            begun(watched.folder)
+        patched = None if model_patch is None or from_turn is None else Patched(model_patch, from_turn)
         try:
-            counts = watched.run(feed, decide, turns=turns, patched=patched)
+            feed, decide, close = _feed(observations, watched, follow, ca_file)
+            try:
+                counts = watched.run(feed, decide, turns=turns, patched=patched)
+            finally:
+                close()
+            watched.store(counts, last=last, report=not no_report)
+        except Exception as error:
+            error.add_note(
+                f"What was observed is kept: go on with `uav-twin watch --resume --out {watched.folder}`."
+            )
+            raise
         finally:
-            close()
-        watched.store(counts, report=not no_report)
-    except Exception as error:
-        error.add_note(
-            f"What was observed is kept: go on with `uav-twin watch --resume --out {watched.folder}`."
-        )
-        raise
-    finally:
-        os.close(lock)
-    refused = f", {counts.rejected} messages refused (see rejected.jsonl)" if counts.rejected else ""
-    typer.echo(f"Watch: {watched.folder}, {counts.received} messages{refused}.", err=True)
+            os.close(lock)
+        refused = f", {counts.rejected} messages refused (see rejected.jsonl)" if counts.rejected else ""
+        typer.echo(f"Watch: {watched.folder}, {counts.received} messages{refused}.", err=True)
 
 
 def _opened(

@@ -40,6 +40,8 @@ DESIGN_FILE, CALIBRATION_FILE, BINDING_FILE = (
     "asset/binding.toml",
 )
 MODEL_PATCH_FILE = "asset/model_patch.json"
+PATCH_NAME, PATCH_STEP = "model_patch", "model_patch_from_step"
+"""Attributes of `run.nc` where a watch adopted a patch on the way: its file, and the first step with it."""
 STRAIN = "strain"
 TEMPERATURE = ("temperature_difference", "temperature")
 """Names under which a run may record the temperature: less the reference [K], or itself [degC]."""
@@ -115,7 +117,9 @@ def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
 def _campaign(folder: Path, plan: RunPlan, scenario: dict[str, Any]) -> Campaign:
     _refuse_others(folder, scenario)
     run = _run(folder)
-    observed, smoothed = run["observed"], run["smoothed"]
+    # Turns before a patch that was adopted on the way were believed with another model.
+    since = slice(run.attrs.get(PATCH_STEP), None)
+    observed, smoothed = (run[name].to_dataset().sel(step=since) for name in ("observed", "smoothed"))
     strain = np.asarray(observed[STRAIN].values, dtype=np.float64)
     used = np.isfinite(strain)
     if not used.any():
@@ -128,7 +132,7 @@ def _campaign(folder: Path, plan: RunPlan, scenario: dict[str, Any]) -> Campaign
         mean = np.full_like(mean, HEALTH_MEAN)
     deviation = np.maximum(deviation, plan.health_deviation)
     time = _step_size(folder) * (np.asarray(observed["step"].values, dtype=np.float64) + 1.0)
-    temperature, known = _temperature(run, size)
+    temperature, known = _temperature(run, since, size)
     noise, source = _noise(scenario, plan)
     channels = {
         name: Channel(name, Quantity.STRAIN, f"strain[{name[1:]}]", NoiseRecord(noise, inf)) for name in names
@@ -190,14 +194,27 @@ def run_model(folder: Path | str) -> Model:
             f"{folder} holds no design (`{DESIGN_FILE}`): its twin believed no model of a wing that could be "
             "patched."
         )
-    if (folder / MODEL_PATCH_FILE).is_file():
+    patch = patch_of_run(folder)
+    if patch is not None:
         try:
-            effects = load_patch(folder / MODEL_PATCH_FILE).for_outputs(_outputs(folder))
+            effects = load_patch(patch).for_outputs(_outputs(folder))
         except FmuError as cause:
             raise CampaignFileError(f"The patch of the twin's model cannot be read: {cause}") from cause
         for effect in effects:
             model = PatchedModel(model, effect.patch)
     return model
+
+
+def patch_of_run(folder: Path) -> Path | None:
+    """Return the file of the patch that the twin of a run believed last; None where it had none.
+
+    Raises
+    ------
+    CampaignFileError
+        If the run is not whole.
+    """
+    file = folder / str(_run(folder).attrs.get(PATCH_NAME, MODEL_PATCH_FILE))
+    return file if file.is_file() else None
 
 
 def held_out_turns(count: int, block: int, share: float) -> NDArray[np.bool_]:
@@ -275,14 +292,14 @@ def _step_size(folder: Path) -> float:
     return float(step)
 
 
-def _temperature(run: xr.DataTree, size: int) -> tuple[FloatArray, bool]:
+def _temperature(run: xr.DataTree, since: slice, size: int) -> tuple[FloatArray, bool]:
     """Return temperatures less the reference [K], and whether they were recorded."""
     for group in ("observed", "truth"):
         if group not in run.children:
             continue
         for name in TEMPERATURE:
             if name in run[group]:
-                values = np.asarray(run[group][name].values, dtype=np.float64)
+                values = np.asarray(run[group][name].sel(step=since).values, dtype=np.float64)
                 return values - (REFERENCE_TEMPERATURE if name == "temperature" else 0.0), True
     return np.zeros(size), False
 

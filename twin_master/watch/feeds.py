@@ -1,12 +1,13 @@
 """Messages from files, recorded or growing, and from standard input."""
 
 import csv
+import math
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 import xarray as xr
@@ -14,6 +15,7 @@ import xarray as xr
 from reporting.errors import DamagedFileError
 from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError
+from twin_master.mission.journal import JOURNAL_NAME, array_of, read_records
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 
@@ -23,6 +25,7 @@ POLL_SECONDS = 0.05
 """Between two looks at a file that grows."""
 _LOST = ("", "nan", "null", "none")
 _TURN_COLUMNS = ("turn", "step")
+_OTHERS = ("turn", "time", "control")
 
 
 class CsvFeed:
@@ -54,14 +57,21 @@ class CsvFeed:
         except (OSError, ValueError) as error:
             raise MissionInputError(f"{path} cannot be read as CSV: {error}.") from None
         self._names = ["turn" if name in _TURN_COLUMNS else name for name in names]
-        for name in self._names:
-            if name not in ("turn", "time", "control"):
-                try:
-                    self._reader.column(name)
-                except Refused as refusal:
-                    raise MissionInputError(
-                        f"{path}: the column {refusal}; others are `turn`, `time` and `control`."
-                    ) from None
+        sensors = [place for place, name in enumerate(self._names) if name not in _OTHERS]
+        try:
+            columns = [self._reader.column(self._names[place]) for place in sensors]
+        except Refused as refusal:
+            raise MissionInputError(
+                f"{path}: the column {refusal}; others are `turn`, `time` and `control`."
+            ) from None
+        self._sensors = sensors
+        self._index = np.array([sensor for sensor, _ in columns], dtype=np.int64)
+        self._factor = np.array([factor for _, factor in columns], dtype=np.float64)
+        twice = len({*self._index.tolist()}) < len(columns) or any(
+            self._names.count(name) > 1 for name in _OTHERS
+        )
+        if twice:
+            raise MissionInputError(f"{path}: two columns say the same; {', '.join(names)[:300]} came.")
 
     def messages(self, after: int) -> Iterator[Fed]:
         """Return the rows behind the first `after` of them."""
@@ -77,15 +87,33 @@ class CsvFeed:
             cells = _cells(line)
             if len(cells) != len(self._names):
                 return Refused(f"{len(self._names)} cells are expected, and {len(cells)} came")
-            record: dict[str, object] = {}
-            for name, cell in zip(self._names, cells, strict=True):
-                if cell.lower() not in _LOST:
-                    record[name] = cell if name == "control" else int(cell) if name == "turn" else float(cell)
-            return self._reader.read(record)
+            return self._row(cells)
         except Refused as refusal:
             return refusal
         except (ValueError, OverflowError) as error:
             return Refused(f"a cell is no number: {str(error)[:80]}")
+
+    def _row(self, cells: list[str]) -> Message:
+        values = [
+            math.nan if (cell := cells[place]).lower() in _LOST else float(cell) for place in self._sensors
+        ]
+        record: dict[str, object] = {
+            name: cells[place]
+            if name == "control"
+            else int(cells[place])
+            if name == "turn"
+            else float(cells[place])
+            for place, name in enumerate(self._names)
+            if name in _OTHERS and cells[place].lower() not in _LOST
+        }
+        message = self._reader.read(record)
+        observed = np.array(values) * self._factor
+        wrong = np.abs(observed) > self._reader.largest[self._index]
+        if wrong.any():  # say which, and why
+            first = int(np.argmax(wrong))
+            return self._reader.read({self._names[self._sensors[first]]: values[first]})
+        message.observed[self._index] = observed
+        return message
 
 
 class RunFeed:
@@ -129,6 +157,41 @@ class RunFeed:
             yield Message(self._values[row].copy(), int(self._turn[row]), None, control), f"row {row}"
 
 
+class FolderFeed:
+    """The journal of another run or watch, of whatever version: its observations as they came.
+
+    Raises
+    ------
+    MissionInputError
+        The folder holds no journal.
+    """
+
+    replayable = True
+
+    def __init__(self, folder: Path, scenario: Scenario) -> None:
+        self._path = folder / JOURNAL_NAME
+        self._scenario = scenario
+        if not self._path.is_file():
+            raise MissionInputError(f"{folder} holds no journal of a run or a watch ({JOURNAL_NAME}).")
+
+    def messages(self, after: int) -> Iterator[Fed]:
+        """Return the observations behind the first `after` of them."""
+        records = (record for record, _ in read_records(self._path) if "observed" in record)
+        for number, record in enumerate(records, start=1):
+            if number > after:
+                yield self._message(record), f"line {number}"
+
+    def _message(self, record: Mapping[str, Any]) -> Message | Refused:
+        try:
+            observed, control = array_of(record["observed"]), int(record["control_index"])
+            turn = int(record.get("observation_turn", record["turn"]))
+        except (KeyError, TypeError, ValueError):
+            return Refused("the line has another layout")
+        if len(observed) != self._scenario.observation.count or control >= len(self._scenario.control):
+            return Refused("it is of an asset with other sensors or controls")
+        return Message(observed, turn, None, control)
+
+
 class JsonLinesFeed:
     """JSON objects, one a line, from a stream such as standard input."""
 
@@ -154,20 +217,22 @@ def parsed(reader: MessageReader, content: bytes | Refused) -> Message | Refused
         return refusal
 
 
-def file_feed(path: Path, scenario: Scenario, *, follow: bool = False) -> CsvFeed | RunFeed:
-    """Return the feed of a file: NetCDF by its ending `.nc`, else CSV.
+def file_feed(path: Path, scenario: Scenario, *, follow: bool = False) -> CsvFeed | RunFeed | FolderFeed:
+    """Return the feed of a run folder, or of a file: NetCDF by its ending `.nc`, else CSV.
 
     Raises
     ------
     MissionInputError
         It cannot be read, or a recorded one is to be followed.
     """
-    if not path.is_file():
+    if not path.exists():
         raise MissionInputError(f"there is no file {path} to read observations from.")
-    if path.suffix.lower() != ".nc":
+    if path.is_file() and path.suffix.lower() != ".nc":
         return CsvFeed(path, scenario, follow=follow)
     if follow:
-        raise MissionInputError(f"{path} is a recorded NetCDF file: only a CSV file can be followed.")
+        raise MissionInputError(f"{path} is recorded: only a CSV file can be followed.")
+    if path.is_dir():
+        return FolderFeed(path, scenario)
     return RunFeed(path, scenario)
 
 

@@ -13,8 +13,6 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import Any
 
-import numpy as np
-
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.progress import Progress
 from reporting.provenance import collect_provenance, hash_file, hash_record
@@ -30,10 +28,9 @@ from twin_master.mission.journal import (
     plain,
     read_records,
 )
+from twin_master.mission.kept_knowledge import keep_knowledge
 from twin_master.mission.loop import Reading, operate
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.inference import known_control
 from twin_master.network.memory import check_scenario_fits
 from twin_master.network.twin import Twin, TwinTurn
 from twin_master.run_folder import (
@@ -51,11 +48,12 @@ from twin_master.scenario.schema import Scenario
 from twin_master.store.results import MissionResult
 from twin_master.store.summary import Figure, control_changes, noticed, summarise
 from twin_master.store.writing import store_mission, values_of, write_summary
+from twin_master.watch.decision import decision_of, gap_of
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile
 from twin_master.watch.replay import SNAPSHOT_TURNS, BelievedModel, Replayed, replay
 
-STORED_TURNS = 5_000
-"""The last turns that `run.nc` and the report show; the journal has all of them."""
+STORED_TURNS = 1_000
+"""The last turns that `run.nc` and the report show if not told otherwise; the journal has all of them."""
 FLUSH_SECONDS = 1.0
 """Of a recorded file, which is read again after a power failure; live turns are flushed one by one."""
 
@@ -95,11 +93,14 @@ class Watch:
         self.models = [BelievedModel(0, knowledge)]
         self._path = folder / JOURNAL_NAME
         self._hash = hash_record(self._config)
+        self._adopted: dict[str, Any] | None = None
         for record, _ in read_records(self._path, self._hash):
             if "model" in record:
+                self._adopted = record["model"]
                 self.models.append(
-                    self._with_patch(folder / record["model"]["patch"], record["model"]["from_turn"])
+                    self._with_patch(folder / self._adopted["patch"], self._adopted["from_turn"])
                 )
+        keep_knowledge(folder, self.models[-1].knowledge)
 
     def _with_patch(self, file: Path, from_turn: int) -> BelievedModel:
         belief = self.scenario.belief
@@ -160,13 +161,13 @@ class Watch:
         name = f"asset/model_patch_{len(self.models)}.json"
         candidate = self._with_patch(patched.file, patched.from_turn)
         atomic_write_bytes(self.folder / name, patched.file.read_bytes())
-        believed = self.models[-1]
+        first, believed = patched.from_turn, self.models[-1].knowledge.sensor_model
         self.models.append(candidate)
         after = self._replayed(patched.from_turn)
         model: dict[str, Any] = {
-            "patch": name, "sha256": hash_file(self.folder / name), "from_turn": patched.from_turn,
-            "before": _gap(before, believed, patched.from_turn),
-            "after": _gap(after, candidate, patched.from_turn),
+            "patch": name, "sha256": hash_file(self.folder / name), "from_turn": first,
+            "before": gap_of(before.beliefs, first - before.first_turn, believed),
+            "after": gap_of(after.beliefs, first - after.first_turn, candidate.knowledge.sensor_model),
         }  # fmt: skip
         journal.append(
             {
@@ -177,6 +178,8 @@ class Watch:
                 "twin_state": base64.b64encode(after.twin.save_state()).decode("ascii"),
             }
         )
+        self._adopted = model
+        keep_knowledge(self.folder, candidate.knowledge)
         self._progress.note(
             f"The patched model is believed from {self.scenario.mission.step_name} {patched.from_turn} on: "
             + ", ".join(
@@ -187,13 +190,13 @@ class Watch:
             + "."
         )
 
-    def store(self, counts: Counts, *, report: bool = True) -> None:
+    def store(self, counts: Counts, *, last: int = STORED_TURNS, report: bool = True) -> None:
         """Write `run.nc`, tables, summary and report of the last turns."""
         turns = self._replayed(None).twin.turns
         if not turns:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
-        first = max(0, turns - STORED_TURNS)
+        first = max(0, turns - last)
         found = self._replayed(first, lag=False)
         skipped = first - found.first_turn
         flight = found.beliefs.flight(
@@ -222,6 +225,11 @@ class Watch:
             "asset": WATCHED,
             "twin_model": origin.model,
         }
+        if self._adopted is not None:
+            attributes |= {
+                "model_patch": self._adopted["patch"],
+                "model_patch_from_step": self._adopted["from_turn"],
+            }
         if knowledge.draws.record is not None:
             text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
             atomic_write_text(self.folder / "calibration.json", text + "\n")
@@ -323,6 +331,10 @@ def resume_watch(folder: Path, loaded: LoadedScenario | None, progress: Progress
     try:
         check_versions(folder, config, scenario.mission.seed)
         return Watch(folder, config, located_scenario(scenario, folder), progress), lock
+    except NotResumableError as error:
+        os.close(lock)
+        error.add_note(f"Another watch may take in what this one observed: `--observations {folder}`.")
+        raise
     except BaseException:
         os.close(lock)
         raise
@@ -333,32 +345,6 @@ def believed_source(scenario: Scenario) -> AssetSource:
     check_scenario_fits(scenario)
     source: AssetSource = scenario.belief.source(scenario, scenario.asset.source(scenario))
     return source
-
-
-def decision_of(
-    scenario: Scenario, model: GraphicalModel, twin: Twin, reading: Reading, turn: TwinTurn
-) -> dict[str, Any]:
-    """Return what the operator is told of a turn: never a control without its certainty."""
-    controls = scenario.control_names
-    mean, deviation = model.states.mean(turn.filtered), model.states.standard_deviation(turn.filtered)
-    record: dict[str, Any] = {
-        "turn": turn.turn,
-        "control": controls[turn.control_index],
-        "health": {
-            factor.name: {"mean": mean[index], "standard_deviation": deviation[index], "unit": factor.unit}
-            for index, factor in enumerate(scenario.state)
-        },
-        "next_control": controls[turn.next_control],
-        "probability": min(float(turn.decision_probability[turn.next_control]), 1.0),
-        "lost_sensors": int(np.isnan(reading.observed).sum()),
-        "log_evidence": turn.log_evidence,
-        "alarms": [vars(notice) for notice in turn.notices],
-    }
-    if reading.revises is not None:
-        record["revised_by_turn"] = reading.revises
-    if turn.learnt:
-        record["learnt"] = {name: vars(learnt) for name, learnt in turn.learnt.items()}
-    return record
 
 
 class _Keeper:
@@ -426,20 +412,3 @@ class _Stopping:
 
 class _Asked(BaseException):
     """Somebody asked the watch to end while it waited."""
-
-
-def _gap(found: Replayed, believed: BelievedModel, from_turn: int) -> dict[str, Any]:
-    """Return root mean square residual and log evidence of the turns from one on; None without any."""
-    skipped = from_turn - found.first_turn
-    beliefs, sensors = found.beliefs, believed.knowledge.sensor_model
-    observed = np.array(beliefs.observed[skipped:])
-    if not len(observed) or np.isnan(observed).all():
-        return {"rms_residual": None, "log_evidence": None}
-    joint = known_control(
-        np.array(beliefs.filtered[skipped:]), np.array(beliefs.control_index[skipped:]), sensors.control_count
-    )
-    residual = (observed - sensors.moments(joint)[0]) / sensors.noise(joint)
-    return {
-        "rms_residual": float(np.sqrt(np.nanmean(residual**2))),
-        "log_evidence": float(np.sum(beliefs.log_evidence[skipped:])),
-    }

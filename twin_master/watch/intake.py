@@ -136,14 +136,14 @@ class Intake:
         """Return what is needed to go on, as JSON."""
         # The message behind a gap is read again, until its own turn is written down.
         counts = vars(self.counts) | {"received": self.counts.received - bool(self._pending)}
-        return {"counts": counts, "origin": self._origin, "given": list(self._given)}
+        return {"counts": counts, "origin": self._origin, "given": "".join(map(str, self._given))}
 
     def restore(self, state: Mapping[str, Any] | None) -> None:
         """Go on from a state; None is the begin."""
         if state is not None:
             self.counts = Counts(**state["counts"])
             self._origin = state["origin"]
-            self._given.extend(state["given"])
+            self._given.extend(map(int, state["given"]))
         self._rejected.go_back(self.counts.received if self._feed.replayable else LARGEST_SEED)
 
     def read(self, twin: Twin) -> Reading | None:

@@ -20,7 +20,8 @@ Float = NDArray[np.float64]
 LARGEST_MESSAGE = 1_000_000
 """Bytes of a message; a larger one is refused unread."""
 LARGEST_STRAIN = 0.5
-"""A strain without unit beyond this is one whose unit was forgotten."""
+"""A strain beyond this is one whose unit was forgotten."""
+LARGEST = float(np.finfo(np.float64).max)
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9}
 _WITHOUT_UNIT = {"1": 1.0, "percent": 1e-2, "microstrain": 1e-6}
 _NAMED = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]$")
@@ -58,6 +59,11 @@ class MessageReader:
     A sensor goes by `ROLE_NUMBER` (`strain_7`) or its title, its unit behind it: `strain_7_microstrain`,
     `strain_7 [microstrain]`; without a unit it is in that of the scenario. All sensors together go by their
     role, as a list, with `unit` beside it.
+
+    Attributes
+    ----------
+    largest : (G,)
+        Largest value of each sensor that is believed, SI.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -67,6 +73,11 @@ class MessageReader:
         self._index = {f"{role}_{number + 1}": number for number in range(count)}
         self._index |= {title: number for number, title in enumerate(scenario.observation.titles)}
         self._columns: dict[str, tuple[int, float]] = {}
+        units = scenario.observation.sensor_units
+        self.largest: Float = np.array(
+            [LARGEST_STRAIN if role == "strain" and unit == "1" else LARGEST for unit in units]
+        )
+        self._largest = self.largest.tolist()
 
     def column(self, name: str) -> tuple[int, float]:
         """Return the index of the sensor that a name stands for, and what its values are multiplied by.
@@ -176,16 +187,15 @@ class MessageReader:
             return math.nan
         if type(value) not in (int, float):
             raise Refused(f"`{name[:60]}` is a number, or null where the sensor is lost")
-        number = _number(value)
-        if not math.isfinite(number * factor):
+        number = _number(value) * factor
+        if not math.isfinite(number):
             raise Refused(f"`{name[:60]}` is not finite; a sensor that is lost is null or absent")
-        own = self._observation.sensor_units[sensor]
-        if self._observation.role == "strain" and own == "1" and abs(number * factor) > LARGEST_STRAIN:
+        if abs(number) > self._largest[sensor]:
             raise Refused(
-                f"`{name[:60]}` would be a strain of {number * factor:g}: give its unit, such as "
+                f"`{name[:60]}` would be a strain of {number:g}: give its unit, such as "
                 f"`strain_{sensor + 1}_microstrain`"
             )
-        return number * factor if factor != 1.0 else number
+        return number
 
     def _control(self, control: object) -> int | None:
         if control is None:

@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -108,8 +109,15 @@ def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path: Path) 
     np.testing.assert_allclose(again[:, 8], 1.05 * plain[:, 8], rtol=1e-12)
     np.testing.assert_array_equal(np.delete(again, 8, axis=1), np.delete(shown, 8, axis=1))
     patched = choice_of_run(folder).source_hash
-    (folder / "asset" / "model_patch.json").unlink()
+    (folder / "asset" / "model_patch.json").rename(folder / "asset" / "model_patch_1.json")
     assert choice_of_run(folder).source_hash != patched
+    # A watch whose twin adopted the patch on the way: the turns before were believed with another model.
+    with h5py.File(folder / "run.nc", "a") as file:
+        file.attrs["model_patch"], file.attrs["model_patch_from_step"] = "asset/model_patch_1.json", 3
+    assert choice_of_run(folder).source_hash == patched
+    (trial,) = run_campaign(folder, RunPlan(held_out_share=0.0)).trials
+    np.testing.assert_array_equal(trial.values, campaign.trials[0].values[3:])
+    np.testing.assert_array_equal(trial.time, [4.0])
 
 
 @pytest.mark.xdist_group("wing")

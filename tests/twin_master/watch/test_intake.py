@@ -23,7 +23,7 @@ from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import WatchSection
 from twin_master.watch import feeds
 from twin_master.watch.intake import Intake, RejectedFile
-from twin_master.watch.message import LARGEST_MESSAGE, MessageReader, Refused
+from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 
 TURNS = 60
 
@@ -253,6 +253,16 @@ def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_p
             assert lost.sum() == {7: 1, 9: 24}.get(turn, 0)
             np.testing.assert_allclose(fed.observed[~lost], strains[turn][~lost], rtol=1e-15)
     assert len(list(feeds.CsvFeed(path, knowledge.scenario).messages(50))) == 10
+    path.write_text("time,strain_2,strain_1_microstrain\n0.5,0.6,5\n,1e-4,inf\n,nan,5\n", encoding="utf-8")
+    units, infinite, fine = (fed[0] for fed in feeds.CsvFeed(path, knowledge.scenario).messages(0))
+    assert "`strain_2` would be a strain of 0.6" in str(units)
+    assert "`strain_1_microstrain` is not finite" in str(infinite)
+    assert isinstance(fine, Message)
+    np.testing.assert_allclose(fine.observed[:2], [5e-6, np.nan], rtol=1e-15)
+    for twice in ("strain_1,strain_1_1", "turn,step,strain_1"):
+        path.write_text(f"{twice}\n", encoding="utf-8")
+        with pytest.raises(Exception, match="two columns say the same"):
+            feeds.CsvFeed(path, knowledge.scenario)
     path.write_text("step,strian_1\n1,2\n", encoding="utf-8")
     with pytest.raises(Exception, match=r"gauges.csv: the column `strian_1` is no sensor.*`turn`, `time`"):
         feeds.CsvFeed(path, knowledge.scenario)

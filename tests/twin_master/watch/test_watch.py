@@ -32,7 +32,7 @@ from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import Flight, fly
 from twin_master.network.estimator import ExactFilter
 from twin_master.scenario.reading import LoadedScenario, load_scenario
-from twin_master.watch.feeds import CsvFeed, RunFeed
+from twin_master.watch.feeds import CsvFeed, file_feed
 from twin_master.watch.folder import Patched, Watch, begin_watch, resume_watch
 from twin_master.watch.mqtt import PASSWORD_VARIABLE, MqttFeed, broker_of
 from twin_master.watch.replay import BelievedModel
@@ -131,12 +131,14 @@ def test_a_recorded_mission_is_watched_as_it_was_flown(mission: Flight, whole: P
 
 
 def test_a_run_file_is_watched_too(base: Watch, whole: Path, tmp_path: Path) -> None:
-    watch = begun(base, tmp_path / "watch")
-    watch.run(RunFeed(whole / "run.nc", watch.scenario), lambda _decision: None)
-    first, second = (
-        json.loads((f / JOURNAL_NAME).read_text().splitlines()[-1][65:]) for f in (whole, tmp_path / "watch")
-    )
-    assert first["filtered"] == second["filtered"]
+    last = [json.loads((whole / JOURNAL_NAME).read_text().splitlines()[-1][65:])]
+    for number, source in enumerate((whole / "run.nc", whole)):
+        watch = begun(base, tmp_path / str(number))
+        watch.run(file_feed(source, watch.scenario), lambda _decision: None)
+        last.append(json.loads((watch.folder / JOURNAL_NAME).read_text().splitlines()[-1][65:]))
+    assert last[0]["filtered"] == last[1]["filtered"] == last[2]["filtered"]
+    with pytest.raises(MissionInputError, match="holds no journal"):
+        file_feed(tmp_path, base.scenario)
 
 
 def killed(watch: Watch, feed: CsvFeed, size: int) -> bool:
@@ -224,7 +226,6 @@ def test_a_long_watch_goes_on_from_its_snapshot(
 ) -> None:
     for module in ("folder", "replay"):
         monkeypatch.setattr(f"twin_master.watch.{module}.SNAPSHOT_TURNS", 16)
-    monkeypatch.setattr("twin_master.watch.folder.STORED_TURNS", 20)
     path = write_csv(tmp_path / "m.csv", mission.observed, mission.control_index)
     watch = begun(base, tmp_path / "watch")
     seen: list[int] = []
@@ -232,7 +233,7 @@ def test_a_long_watch_goes_on_from_its_snapshot(
     for turns in (18, 40, None):
         counts = watch.run(CsvFeed(path, watch.scenario), lambda _decision: None, turns=turns)
     assert len(seen) < 50 + 2 + 8 + 3  # each turn once, and those behind the last snapshot again
-    watch.store(counts, report=False)
+    watch.store(counts, last=20, report=False)
     run = uav_twin.open_run(tmp_path / "watch")
     np.testing.assert_array_equal(run["filtered"]["step"].values, np.arange(30, 50))
     np.testing.assert_array_equal(run["filtered"]["probability"].values, mission.filtered[30:])
@@ -286,6 +287,7 @@ def test_a_patch_is_believed_from_a_stated_turn_on(base: Watch, mission: Flight,
     later = begun(base, tmp_path / "later")
     shutil.copytree(tmp_path / "other", tmp_path / "later", dirs_exist_ok=True)
     later.models.append(watch.models[1])  # as the journal says
+    later._adopted = watch._adopted
     later.store(later.run(CsvFeed(path, later.scenario), lambda _decision: None), report=False)
 
     twin = base.models[0].knowledge.twin()
@@ -297,6 +299,7 @@ def test_a_patch_is_believed_from_a_stated_turn_on(base: Watch, mission: Flight,
             twin = knew
         beliefs.append(twin.turn(row, int(mission.control_index[turn])).filtered)
     run = uav_twin.open_run(tmp_path / "later")
+    assert (run.attrs["model_patch"], run.attrs["model_patch_from_step"]) == ("asset/model_patch_1.json", 20)
     np.testing.assert_array_equal(run["filtered"]["probability"].values, beliefs)
     figures = {
         figure["key"]: figure["value"]
