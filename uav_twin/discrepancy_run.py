@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from discrepancy.files.document import Origin
     from discrepancy.model_choice import ModelChoice
     from discrepancy.self_calibration import SelfCalibration
-    from discrepancy.verdict import Proof
+    from discrepancy.verdict import ExplainedShare, Proof
     from discrepancy.verdict_folder import Pack
     from discrepancy.workflow import Investigation
     from reporting.progress import Progress
@@ -277,7 +277,7 @@ def _show(found: "Investigation", folder: Path, console: "Console") -> None:
         ]  # fmt: skip
         console.print(console_table(headings, rows, console.width))
     if proof is not None:
-        _show_proof(proof, found.campaign, console, share_said=verdict.explained is not None)
+        _show_proof(proof, verdict.explained, found.campaign, console)
     for experiment in verdict.next_experiments[:SHOWN_EXPERIMENTS]:
         console.print(f"Next: {experiment.description} ({experiment.information:.2f} nat)", soft_wrap=True)
     for fault in found.faults:
@@ -288,15 +288,21 @@ def _show(found: "Investigation", folder: Path, console: "Console") -> None:
             console.print(f"Note: {remark}", soft_wrap=True)
 
 
-def _show_proof(proof: "Proof", campaign: "Campaign", console: "Console", *, share_said: bool) -> None:
-    from discrepancy.report.text import number, percent
+def _show_proof(
+    proof: "Proof", explained: "ExplainedShare | None", campaign: "Campaign", console: "Console"
+) -> None:
+    from discrepancy.report.text import number, percent, residual_sizes
 
     first, second, where = proof.fitted_before, proof.fitted_after, "fitted trials (none is held out)"
     if proof.held_out_before is not None and proof.held_out_after is not None:
         first, second = proof.held_out_before, proof.held_out_after
         where = f"held-out trials ({', '.join(trial.name for trial in campaign.held_out)})"
-    told = isfinite(proof.gap_closed) and not share_said
-    closed = f", {percent(proof.gap_closed)} % of the gap closed" if told else ""
+    if explained is not None:
+        before, after = residual_sizes(explained)
+        text = f"Residuals on {where}: rms of {before} noise deviations before, {after} with the effect."
+        console.print(text, soft_wrap=True)
+        return
+    closed = f", {percent(proof.gap_closed)} % of the gap closed" if isfinite(proof.gap_closed) else ""
     why = f" {proof.gap_reason}" if proof.held_out_before is not None and proof.gap_reason else ""
     scores = (
         f"χ²/dof on {where}: {number(first.chi_square_per_dof)} before, "

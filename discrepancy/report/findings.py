@@ -21,6 +21,7 @@ from discrepancy.report.text import (
     percent,
     probability_text,
     remainders_sentence,
+    residual_sizes,
     rounded,
     shares_sentence,
     unit_text,
@@ -160,12 +161,18 @@ def _add_highlights(page: Page, investigation: Investigation) -> None:
         first, second, where = proof.fitted_before, proof.fitted_after, "fitted"
         if proof.held_out_before is not None and proof.held_out_after is not None:
             first, second, where = proof.held_out_before, proof.held_out_after, "held-out"
-        items.append(
-            (
-                f"{number(first.chi_square_per_dof)} → {number(second.chi_square_per_dof)}",
-                f"χ²/dof on {where} trials, before and after",
+        if verdict.explained is not None:  # at the scale of its share: χ²/dof counts uncertainty as expected
+            before, after = residual_sizes(verdict.explained)
+            items.append(
+                (f"{before} → {after}", f"noise deviations, rms on {where} trials, before and after")
             )
-        )
+        else:
+            items.append(
+                (
+                    f"{number(first.chi_square_per_dof)} → {number(second.chi_square_per_dof)}",
+                    f"χ²/dof on {where} trials, before and after",
+                )
+            )
         if isfinite(proof.gap_closed) and verdict.explained is None:  # whose share says nearly the same
             items.append((f"{percent(proof.gap_closed)} %", "of the gap closed on held-out trials"))
     elif judged := [

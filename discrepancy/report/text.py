@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from math import floor, isfinite, isnan, log10
 
 from discrepancy.catalogue.entry import Effect
-from discrepancy.verdict import Estimate, Hypothesis, Verdict, VerdictKind
+from discrepancy.verdict import Estimate, ExplainedShare, Hypothesis, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 
 MEANING = {
@@ -140,6 +140,12 @@ def shares_sentence(verdict: Verdict) -> str:
         f"{whose} {percent(found.effect)} % of the mean square on {found.trials} trials, in units of the "
         f"noise; {percent(found.remainder)} % is left without a name and {percent(found.noise)} % is noise."
     )
+
+
+def residual_sizes(found: ExplainedShare) -> tuple[str, str]:
+    """Return the rms of the residuals before and after, in deviations of the noise, for people."""
+    noise = max(found.noise, 1e-300)
+    return number((1.0 / noise) ** 0.5, 2), number(((found.remainder + found.noise) / noise) ** 0.5, 2)
 
 
 def remainders_sentence(verdict: Verdict) -> str:

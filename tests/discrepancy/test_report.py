@@ -59,6 +59,7 @@ from discrepancy.report.text import (
     number,
     probability_text,
     remainders_sentence,
+    residual_sizes,
     rounded,
     shares_sentence,
 )
@@ -620,4 +621,7 @@ def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(dr
     ):
         assert words in text
     assert shares_sentence(replace(verdict, explained=None)) == ""
+    assert verdict.explained is not None
+    # a mean square of 25 in units of the noise, of which 2.5 are left
+    assert residual_sizes(verdict.explained) == ("5", "1.6")
     assert remainders_sentence(replace(verdict, remainders=())) == ""
