@@ -103,13 +103,14 @@ def global_gradients(corners: FloatArray, local: FloatArray) -> tuple[FloatArray
 
 
 def strain_matrix(gradients: FloatArray) -> FloatArray:
-    """Strain matrix B (..., 6, 60) of gradients (..., 20, 3); the unknowns of a node are consecutive."""
-    B = np.zeros((*gradients.shape[:-2], 6, NODES, 3))
+    """Strain matrix B (..., 6, 3k) of gradients (..., k, 3); the unknowns of a node are consecutive."""
+    nodes = gradients.shape[-2]
+    B = np.zeros((*gradients.shape[:-2], 6, nodes, 3))
     for row, (i, j) in enumerate(_VOIGT):
         B[..., row, :, i] += gradients[..., j]
         if i != j:
             B[..., row, :, j] += gradients[..., i]
-    return B.reshape(*B.shape[:-2], 3 * NODES)
+    return B.reshape(*B.shape[:-2], 3 * nodes)
 
 
 def orthotropic_elasticity(

@@ -1,0 +1,160 @@
+"""A structure as affine operators with names: sums of a few matrices and vectors.
+
+K = sum of p (1 - z) K_pz over the pairs of a parameter p (or none) and a damage region z (or none), M = M_0 +
+sum of m M_m over the free point masses, and loads f = sum of u (f_l0 + sum of m f_lm) with the controls u,
+where acceleration fields act on the free masses too.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from fe.full.affine import affine_sum
+from fe.runtime.errors import InvalidStateError
+from fe.runtime.state import losses_of
+
+FloatArray = NDArray[np.float64]
+Values = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class StiffnessTerm:
+    """Stiffness (n, n) [N/m] that is proportional to a parameter and to what a region has kept."""
+
+    matrix: sparse.csr_array
+    parameter: str | None = None
+    region: str | None = None
+
+
+@dataclass(frozen=True)
+class LoadTerm:
+    """Part (n,) of a load [N], or of a load on 1 kg of a free mass [N/kg]."""
+
+    load: str
+    vector: FloatArray
+    mass: str | None = None
+
+
+@dataclass(frozen=True)
+class AffineStructure:
+    """Affine model of a structure on its n free unknowns.
+
+    Attributes
+    ----------
+    parameters, masses, controls : dict of str to float
+        Nominal values of the parameters [1], free masses [kg] and controls [each in its unit].
+    regions : tuple of str
+        Names of the damage regions.
+    stiffness_terms : tuple of StiffnessTerm
+        One for each pair of parameter and region that occurs; springs are with the pair of none.
+    mass_terms : tuple of csr (n, n)
+        Structure with its fixed point masses [kg]; then 1 kg at each free point mass [1].
+    loads : dict of str to str or None
+        The control that each load is times, None for a constant one.
+    load_terms : tuple of LoadTerm
+        What they are made of.
+    gauges, displacements, accelerations : tuple of str
+        Names of the outputs.
+    gauge_output : csr (gauges, n) 1/m
+        Strain of each gauge, positive in tension.
+    displacement_output, acceleration_output : csr (m, n) 1
+        Rows that give a displacement, or with second derivatives an acceleration.
+    expansion : csr (full, n)
+        Free unknowns to the displacements of all nodes (3 node + component).
+    damping_alpha, damping_beta : float
+        Rayleigh damping [1/s] and [s].
+    design_hash : str
+        Hash of the design with its mesh.
+    """
+
+    parameters: dict[str, float]
+    masses: dict[str, float]
+    controls: dict[str, float]
+    regions: tuple[str, ...]
+    stiffness_terms: tuple[StiffnessTerm, ...]
+    mass_terms: tuple[sparse.csr_array, ...]
+    loads: dict[str, str | None]
+    load_terms: tuple[LoadTerm, ...]
+    gauges: tuple[str, ...]
+    displacements: tuple[str, ...]
+    accelerations: tuple[str, ...]
+    gauge_output: sparse.csr_array
+    displacement_output: sparse.csr_array
+    acceleration_output: sparse.csr_array
+    expansion: sparse.csr_array
+    damping_alpha: float
+    damping_beta: float
+    design_hash: str
+
+    @property
+    def unknowns(self) -> int:
+        """Number n of free unknowns."""
+        return int(self.expansion.shape[1])
+
+    def theta(self, parameters: Values | None = None, stiffness_loss: Values | Iterable[float] = ()) -> FloatArray:
+        """Coefficients of the stiffness terms.
+
+        Parameters
+        ----------
+        parameters : mapping of str to float, optional
+            Parameters that differ from their nominal values.
+        stiffness_loss : mapping of str to float, or iterable of float
+            Stiffness losses of the regions, see `fe.runtime.state.losses_of`.
+        """
+        factor = _updated(self.parameters, parameters, "parameter")
+        kept = dict(zip(self.regions, (1.0 - z for z in losses_of(stiffness_loss, self.regions)), strict=True))
+        return np.array(
+            [
+                (1.0 if term.parameter is None else factor[term.parameter])
+                * (1.0 if term.region is None else kept[term.region])
+                for term in self.stiffness_terms
+            ]
+        )
+
+    def stiffness(
+        self, parameters: Values | None = None, stiffness_loss: Values | Iterable[float] = ()
+    ) -> sparse.csr_array:
+        """Stiffness (n, n) [N/m], see `theta`."""
+        terms = tuple(term.matrix for term in self.stiffness_terms)
+        return affine_sum(self.theta(parameters, stiffness_loss), terms)
+
+    def mass(self, masses: Values | None = None) -> sparse.csr_array:
+        """Mass (n, n) [kg]; `masses` [kg] are those free ones that differ from their nominal values."""
+        return affine_sum([1.0, *_updated(self.masses, masses, "free mass").values()], self.mass_terms)
+
+    def load(self, name: str, value: float | None = None, masses: Values | None = None) -> FloatArray:
+        """Load (n,) [N].
+
+        Parameters
+        ----------
+        name : str
+            Name of the load.
+        value : float, optional
+            Value of its control; nominal by default, and one for a constant load.
+        masses : mapping of str to float, optional
+            As of `mass`.
+        """
+        control = self.loads[name]
+        factor = (1.0 if control is None else self.controls[control]) if value is None else value
+        kilograms = _updated(self.masses, masses, "free mass")
+        total = np.zeros(self.unknowns)
+        for term in self.load_terms:
+            if term.load == name:
+                total = total + factor * (1.0 if term.mass is None else kilograms[term.mass]) * term.vector
+        return total
+
+    def full_displacement(self, free: FloatArray) -> FloatArray:
+        """Displacements (nodes, 3) [m] of all nodes from free unknowns (n,)."""
+        return np.asarray(self.expansion @ free).reshape(-1, 3)
+
+
+def _updated(nominal: dict[str, float], changed: Values | None, what: str) -> dict[str, float]:
+    unknown = set(changed or {}) - set(nominal)
+    if unknown:
+        raise InvalidStateError(
+            f"The structure has no {what} named {min(unknown)!r}; there are {', '.join(nominal) or 'none'}."
+        )
+    return nominal | dict(changed or {})

@@ -1,0 +1,104 @@
+"""Strain gauges on the surface of a mesh, as rows on the nodal displacements."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from fe.runtime.errors import InvalidDesignError
+
+from .design import Gauge
+from .location import Locator, SurfacePoint
+from .mesh import StructureMesh
+
+FloatArray = NDArray[np.float64]
+
+STEEPEST = 30.0
+"""Largest angle [degrees] between a gauge's direction and the surface; less is turned into the surface."""
+_SAMPLES = 20  # of a gauge that has a length
+
+
+class GaugePlace(NamedTuple):
+    """Where a gauge came to lie.
+
+    Attributes
+    ----------
+    point, direction, normal : (3,)
+        Its place on the surface [m], its direction in the surface, and the outward normal there.
+    moved : float
+        Distance [m] from the place that was asked for.
+    """
+
+    point: FloatArray
+    direction: FloatArray
+    normal: FloatArray
+    moved: float
+
+
+def gauge_rows(
+    mesh: StructureMesh, locator: Locator, gauges: tuple[Gauge, ...]
+) -> tuple[sparse.csr_array, tuple[GaugePlace, ...]]:
+    """Strain rows (gauges, full) [1/m], positive in tension, and where the gauges lie.
+
+    A gauge without a length reads the strain at its point, the mean of the cells that meet there; one with
+    a length reads the mean of 20 points along it, each put onto the surface.
+
+    Raises
+    ------
+    InvalidDesignError
+        If a gauge lies off the surface, reaches over its edge, or points out of it.
+    """
+    rows, places = [sparse.csr_array((0, mesh.unknowns))], []
+    for number, gauge in enumerate(gauges, start=1):
+        where = f"gauge[{number}]"
+        point = mesh.unit * np.asarray(gauge.point)
+        found = locator.on_surface(point, f"{where}: the point {mesh.place(point)}")
+        direction = _in_surface(np.asarray(gauge.direction), found.normal, where)
+        length = mesh.unit * gauge.length
+        spots = [found]
+        if length:
+            share = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+            steps = [*share, -0.5, 0.5]  # the ends must lie on the surface, too
+            spots = [
+                locator.on_surface(
+                    point + step * length * direction,
+                    f"{where}: {gauge.length:g} {mesh.unit_name} long, the gauge reaches over the edge; its "
+                    f"point {mesh.place(point + step * length * direction)}",
+                )
+                for step in steps
+            ][:_SAMPLES]
+        row = np.zeros(mesh.unknowns)
+        for spot in spots:
+            _add_strain(mesh, spot, _in_surface(direction, spot.normal, where), 1.0 / len(spots), row)
+        rows.append(sparse.csr_array(row[None]))
+        values, _ = mesh.kind.shape_functions(found.local[:1])
+        places.append(
+            GaugePlace(values[0] @ mesh.nodes[found.cell[0]], direction, found.normal, found.distance)
+        )
+    return sparse.vstack(rows).tocsr(), tuple(places)
+
+
+def _in_surface(direction: FloatArray, normal: FloatArray, where: str) -> FloatArray:
+    """Unit direction (3,) turned into the surface."""
+    direction = direction / np.linalg.norm(direction)
+    angle = float(np.degrees(np.arcsin(min(1.0, abs(direction @ normal)))))
+    if angle > STEEPEST:
+        raise InvalidDesignError(
+            f"{where}: its direction points {angle:.0f} degrees out of the surface, whose normal there is "
+            f"({', '.join(f'{value + 0.0:.3g}' for value in normal)}); at most {STEEPEST:g} degrees are allowed."
+        )
+    inside = direction - (direction @ normal) * normal
+    return np.asarray(inside / np.linalg.norm(inside))
+
+
+def _add_strain(
+    mesh: StructureMesh, spot: SurfacePoint, direction: FloatArray, share: float, row: FloatArray
+) -> None:
+    """Add the strain along a direction, the mean of the cells at a spot, to a row (full,)."""
+    _, slopes = mesh.kind.shape_functions(spot.local)
+    nodes = mesh.nodes[spot.cell]
+    jacobian = np.einsum("nai,naj->nij", nodes, slopes)
+    slope = np.einsum("nak,nki,i->na", slopes, np.linalg.inv(jacobian), direction)
+    weights = share / len(spot.cell) * slope[..., None] * direction
+    np.add.at(row.reshape(-1, 3), mesh.cells[spot.cell], weights)

@@ -1,0 +1,239 @@
+"""Reading and checking a mesh file: Gmsh, Abaqus and CalculiX, VTU, Nastran and what else meshio reads."""
+
+import contextlib
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from fe.runtime.errors import MeshError
+
+from .abaqus_file import read_abaqus
+from .elements import BATCH, KINDS, ElementKind, jacobians
+from .mesh import FileMesh, StructureMesh
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_FLAT = {
+    "vertex": 1, "line": 2, "line3": 2, "triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4,
+}  # fmt: skip
+"""Cells that only name nodes and faces, with the number of their corners."""
+_MOST_VALUES = 1000
+LARGEST_EDGE_SHIFT = 0.3
+"""A mid-edge node may lie so far from the middle of its edge, in lengths of the edge."""
+
+
+def read_mesh(path: Path, unit: float, unit_name: str) -> StructureMesh:
+    """Read a mesh file and check it.
+
+    Parameters
+    ----------
+    path : Path
+        The file; its ending says its format.
+    unit : float
+        Metres in its unit of length.
+    unit_name : str
+        Name of the unit.
+
+    Raises
+    ------
+    MeshError
+        One sentence that names the file and the place: cells of an unknown kind or of several, a negative
+        Jacobian, a mid-edge node far from its edge, parts that do not hang together.
+    """
+    found = read_abaqus(path) if path.suffix.lower() == ".inp" else _from_meshio(path)
+    if not np.isfinite(found.points).all():
+        number = int(found.node_numbers[~np.isfinite(found.points).all(axis=1)][0])
+        raise MeshError(f"{path}: the coordinates of node {number} are not finite numbers.")
+    mesh = _without_loose_nodes(found, path, unit, unit_name)
+    _check_edges(mesh)
+    _check_jacobians(mesh)
+    _check_parts(mesh)
+    return mesh
+
+
+def _without_loose_nodes(found: FileMesh, path: Path, unit: float, unit_name: str) -> StructureMesh:
+    used = np.zeros(len(found.points), dtype=bool)
+    used[found.cells] = True
+    place = np.cumsum(used) - 1
+    return StructureMesh(
+        source=str(path),
+        kind=found.kind,
+        points=unit * found.points[used],
+        node_numbers=found.node_numbers[used],
+        cells=place[found.cells],
+        cell_numbers=found.cell_numbers,
+        unit=unit,
+        unit_name=unit_name,
+        node_sets={name: place[nodes[used[nodes]]] for name, nodes in found.node_sets.items()},
+        cell_sets=found.cell_sets,
+        face_sets={
+            name: frozenset(tuple(place[list(face)].tolist()) for face in faces if used[list(face)].all())
+            for name, faces in found.face_sets.items()
+        },
+        loose=found.node_numbers[~used],
+        loose_in={name: int((~used[nodes]).sum()) for name, nodes in found.node_sets.items()},
+    )
+
+
+def _check_edges(mesh: StructureMesh) -> None:
+    first = len(mesh.kind.corners)
+    for number, (a, b) in enumerate(mesh.kind.edges):
+        start, end = mesh.nodes[:, a], mesh.nodes[:, b]
+        shift = np.linalg.norm(mesh.nodes[:, first + number] - 0.5 * (start + end), axis=1)
+        far = shift > LARGEST_EDGE_SHIFT * np.linalg.norm(end - start, axis=1)
+        if far.any():
+            cell = int(np.flatnonzero(far)[0])
+            raise MeshError(
+                f"{mesh.source}: node {mesh.node_numbers[mesh.cells[cell, first + number]]} of element "
+                f"{mesh.cell_numbers[cell]} at {mesh.place(mesh.centres[cell])} lies far from the middle of its "
+                "edge; the nodes of the element stand in another order, or the edge is bent too much."
+            )
+
+
+def _check_jacobians(mesh: StructureMesh) -> None:
+    worst, where, count = np.inf, 0, 0
+    local = np.vstack((mesh.kind.places, mesh.kind.stiffness_rule[0]))
+    for start in range(0, len(mesh.cells), BATCH):
+        least = np.linalg.det(jacobians(mesh.kind, mesh.nodes[start : start + BATCH], local)).min(axis=1)
+        count += int((least <= 0.0).sum())
+        if least.min() < worst:
+            worst, where = float(least.min()), start + int(least.argmin())
+    if count:
+        raise MeshError(
+            f"{mesh.source}: {count} of {len(mesh.cells)} elements are inside out or flat (their Jacobian is "
+            f"not positive everywhere), the worst is element {mesh.cell_numbers[where]} at "
+            f"{mesh.place(mesh.centres[where])}."
+        )
+
+
+def _check_parts(mesh: StructureMesh) -> None:
+    rows = np.repeat(mesh.cells[:, 0], mesh.cells.shape[1] - 1)
+    columns = mesh.cells[:, 1:].ravel()
+    graph = sparse.coo_array(
+        (np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(len(mesh.points), len(mesh.points))
+    )
+    count, part = csgraph.connected_components(graph, directed=False)
+    if count > 1:
+        cells = np.bincount(part[mesh.cells[:, 0]], minlength=count)
+        smallest = int(cells.argmin())
+        first = int(np.flatnonzero(part[mesh.cells[:, 0]] == smallest)[0])
+        raise MeshError(
+            f"{mesh.source}: the mesh falls into {count} parts that share no node; the smallest, of "
+            f"{cells[smallest]} elements, is around {mesh.place(mesh.centres[first])}. Merge the nodes where "
+            "the parts touch, or leave parts out."
+        )
+
+
+def _from_meshio(path: Path) -> FileMesh:
+    import meshio
+
+    try:
+        # meshio writes what it thinks of a file to the terminal, and ends the program where it fails.
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = meshio.read(path)
+    except FileNotFoundError:
+        raise MeshError(f"The mesh file {path} is not there.") from None
+    except meshio.ReadError as error:
+        raise MeshError(
+            f"The mesh file {path} cannot be read: {error or 'its format is not known'}."
+        ) from None
+    except OSError as error:
+        raise MeshError(f"The mesh file {path} cannot be read: {error.strerror}.") from None
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - the readers of formats fail in any way
+        raise MeshError(f"The mesh file {path} cannot be read as {path.suffix}: {error!r}.") from None
+    kind = _one_kind(path, found)
+    numbers = np.cumsum([0, *(len(block.data) for block in found.cells)])
+    solid = [number for number, block in enumerate(found.cells) if block.type == kind.file_type]
+    cells = np.concatenate([found.cells[number].data for number in solid]).astype(np.int64)
+    ids = np.concatenate([np.arange(numbers[number], numbers[number + 1]) + 1 for number in solid])
+    points = np.zeros((len(found.points), 3))
+    points[:, : found.points.shape[1]] = found.points
+    node_sets, cell_sets, face_sets = _sets(found, solid)
+    return FileMesh(
+        kind=kind,
+        points=points,
+        node_numbers=np.arange(1, len(points) + 1),
+        cells=cells,
+        cell_numbers=ids,
+        node_sets=node_sets,
+        cell_sets=cell_sets,
+        face_sets=face_sets,
+    )
+
+
+def _one_kind(path: Path, found: Any) -> ElementKind:
+    kinds = {block.type: len(block.data) for block in found.cells if block.type not in _FLAT}
+    unknown = [name for name in kinds if name not in KINDS]
+    if unknown or not kinds:
+        readable = ", ".join(KINDS)
+        came = ", ".join(unknown) or "none that is solid"
+        raise MeshError(f"{path}: cells of the kinds {readable} are expected, but {came} came.")
+    if len(kinds) > 1:
+        came = ", ".join(f"{count} {KINDS[name].name}" for name, count in kinds.items())
+        raise MeshError(f"{path}: a mesh of one kind of elements is expected, but {came} came.")
+    return KINDS[next(iter(kinds))]
+
+
+def _sets(
+    found: Any, solid: list[int]
+) -> tuple[dict[str, IntArray], dict[str, IntArray], dict[str, frozenset[tuple[int, ...]]]]:
+    """Collect the sets of nodes, cells and faces: named ones, and the values of integer arrays."""
+    offset = dict(zip(solid, np.cumsum([0, *(len(found.cells[n].data) for n in solid)]), strict=False))
+    members: dict[str, list[tuple[int, IntArray]]] = {}
+    for name, blocks in found.cell_sets.items():
+        if not name.startswith("gmsh:"):
+            for number, chosen in enumerate(blocks):
+                if chosen is not None and len(chosen):
+                    members.setdefault(name, []).append((number, np.asarray(chosen, dtype=np.int64)))
+    titles = (
+        {(int(dimension), int(tag)): name for name, (tag, dimension) in found.field_data.items()}
+        if all(len(value) == 2 for value in found.field_data.values())
+        else {}
+    )
+    for label, arrays in found.cell_data.items():
+        for number, values in enumerate(np.asarray(array) for array in arrays):
+            for value, chosen in _values(values):
+                name = f"{label}={value}"
+                if label == "gmsh:physical":
+                    name = titles.get((_dimension(found.cells[number].type), value), name)
+                if not (name in found.cell_sets):
+                    members.setdefault(name, []).append((number, chosen))
+    nodes = {name: np.unique(np.asarray(chosen, dtype=np.int64)) for name, chosen in found.point_sets.items()}
+    for label, array in found.point_data.items():
+        for value, chosen in _values(np.asarray(array)):
+            nodes.setdefault(f"{label}={value}", chosen)
+    cells: dict[str, IntArray] = {}
+    faces: dict[str, frozenset[tuple[int, ...]]] = {}
+    for name, parts in members.items():
+        inside = [offset[number] + chosen for number, chosen in parts if number in offset]
+        if inside:
+            cells[name] = np.unique(np.concatenate(inside))
+            continue
+        flat = [(found.cells[number].type, found.cells[number].data[chosen]) for number, chosen in parts]
+        nodes.setdefault(name, np.unique(np.concatenate([table.ravel() for _, table in flat])))
+        corners = [tuple(sorted(row[: _FLAT[kind]].tolist())) for kind, table in flat for row in table]
+        if any(len(row) > 2 for row in corners):
+            faces[name] = frozenset(row for row in corners if len(row) > 2)
+    return nodes, cells, faces
+
+
+def _dimension(kind: str) -> int:
+    return {1: 0, 2: 1}.get(_FLAT.get(kind, 5), 2 if kind in _FLAT else 3)
+
+
+def _values(array: NDArray[Any]) -> list[tuple[int, IntArray]]:
+    """Return the values of an array of integers and where each stands; none where it does not name sets."""
+    if array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):
+        return []
+    values = np.unique(array)
+    if len(values) > _MOST_VALUES:
+        return []
+    return [(int(value), np.flatnonzero(array == value)) for value in values]

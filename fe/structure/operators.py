@@ -1,0 +1,313 @@
+"""From a structure file and its mesh to affine operators."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from fe.runtime.errors import MeshError
+
+from .affine import AffineStructure, LoadTerm, StiffnessTerm
+from .design import StructureDesign, load_structure, structure_hash
+from .elements import BATCH, mass_blocks, stiffness_blocks
+from .gauges import GaugePlace, gauge_rows
+from .loads import point_shares, surface_load
+from .location import Locator
+from .memory import check_memory
+from .mesh import StructureMesh
+from .mesh_file import read_mesh
+from .supports import SupportedUnknowns, supported
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_TRIPLETS = 4_000_000  # entries of element arrays that are summed at once, of 16 bytes each
+
+
+@dataclass(frozen=True)
+class Structure(AffineStructure):
+    """Finite element model of a structure.
+
+    Attributes
+    ----------
+    design : StructureDesign
+        What was asked for.
+    mesh : StructureMesh
+        Its mesh.
+    material_of : (nc,)
+        Number of the material of each cell.
+    region_of : (nc,)
+        Number of the damage region of each cell, -1 for none.
+    unknowns_held : SupportedUnknowns
+        What the supports hold and spring.
+    gauge_places : tuple of GaugePlace
+        Where the gauges came to lie.
+    point_weights : dict of str to (nodes,)
+        Share of each node in the displacement of each point mass.
+    """
+
+    design: StructureDesign
+    mesh: StructureMesh
+    material_of: IntArray
+    region_of: IntArray
+    unknowns_held: SupportedUnknowns
+    gauge_places: tuple[GaugePlace, ...]
+    point_weights: dict[str, FloatArray]
+
+
+def structure_mesh(design: StructureDesign, file: Path) -> StructureMesh:
+    """Read the mesh of the design in `file`, which may name it relative to itself, with the design's sets.
+
+    Raises
+    ------
+    MeshError
+        If the mesh cannot be read or is faulty.
+    """
+    mesh = read_mesh(file.parent / design.mesh, design.unit, design.length_unit)
+    sets: dict[str, dict[str, IntArray]] = {"nodes": {}, "cells": {}}
+    for part in design.set:
+        places = mesh.points if part.of == "nodes" else mesh.centres
+        low, high = design.unit * np.array(part.box)
+        slack = 1e-9 * mesh.size
+        inside = ((places >= low - slack) & (places <= high + slack)).all(axis=1)
+        sets[part.of][part.name] = np.flatnonzero(inside)
+    return mesh.with_sets(sets["nodes"], sets["cells"])
+
+
+def cells_by_set(mesh: StructureMesh, parts: tuple[tuple[str, str, str], ...], what: str) -> IntArray:
+    """Number (nc,) of the part whose set holds each cell, -1 for none.
+
+    Parameters
+    ----------
+    mesh : StructureMesh
+        The mesh.
+    parts : tuple of (place in the design, name, set)
+        Materials or regions.
+    what : str
+        What they are, for the sentence.
+
+    Raises
+    ------
+    MeshError
+        If a set is missing or empty, or two overlap.
+    """
+    owner = np.full(len(mesh.cells), -1, dtype=np.int64)
+    for number, (where, name, chosen) in enumerate(parts):
+        cells = mesh.cells_of(chosen, where)
+        taken = cells[owner[cells] >= 0]
+        if len(taken):
+            raise MeshError(
+                f"{where}: the {what} {name!r} and {parts[owner[taken[0]]][1]!r} share {len(taken)} elements, "
+                f"among them {mesh.cell_numbers[taken[0]]} at {mesh.place(mesh.centres[taken[0]])}; sets of "
+                f"{what}s must not overlap."
+            )
+        owner[cells] = number
+    return owner
+
+
+def _materials(design: StructureDesign, mesh: StructureMesh) -> IntArray:
+    parts = tuple((f"material[{n}]", part.name, part.set) for n, part in enumerate(design.material, 1))
+    owner = cells_by_set(mesh, parts, "material")
+    bare = np.flatnonzero(owner < 0)
+    if len(bare):
+        raise MeshError(
+            f"{mesh.source}: {len(bare)} of {len(owner)} elements have no material, among them "
+            f"{mesh.cell_numbers[bare[0]]} at {mesh.place(mesh.centres[bare[0]])}."
+        )
+    return owner
+
+
+def assembled(
+    mesh: StructureMesh, cells: IntArray, blocks: Callable[[FloatArray], FloatArray], components: int
+) -> sparse.csr_array:
+    """Sum of element arrays (n, components k, components k) over cells, csr (components nodes, ...).
+
+    Parameters
+    ----------
+    mesh : StructureMesh
+        The mesh.
+    cells : (m,)
+        Cells.
+    blocks : callable
+        Element arrays of cells with nodes (n, k, 3).
+    components : int
+        Unknowns of a node.
+    """
+    size = components * len(mesh.points)
+    total = sparse.csr_array((size, size))
+    together = max(BATCH, _TRIPLETS // (components * mesh.kind.node_count) ** 2)
+    for start in range(0, len(cells), together):
+        rows, columns, values = [], [], []
+        for part in _batches(cells[start : start + together]):
+            dofs = (components * mesh.cells[part, :, None] + np.arange(components)).reshape(len(part), -1)
+            dofs = dofs.astype(np.int32)
+            rows.append(np.repeat(dofs, dofs.shape[1], axis=1).ravel())
+            columns.append(np.tile(dofs, (1, dofs.shape[1])).ravel())
+            values.append(blocks(mesh.nodes[part]).ravel())
+        places = (np.concatenate(rows), np.concatenate(columns))
+        total = total + sparse.coo_array((np.concatenate(values), places), shape=total.shape).tocsr()
+    return total
+
+
+def _batches(cells: IntArray) -> Iterator[IntArray]:
+    for start in range(0, len(cells), BATCH):
+        yield cells[start : start + BATCH]
+
+
+def load_and_assemble(file: Path | str, memory_limit: float | None = None) -> Structure:
+    """Read a structure file with its mesh, check both and assemble the affine operators.
+
+    Parameters
+    ----------
+    file : Path or str
+        The structure file.
+    memory_limit : float, optional
+        Bytes that assembly and factorisation may take; what the machine has left by default.
+
+    Raises
+    ------
+    DesignFileError, InvalidDesignError
+        If the structure file cannot be read, or is no structure.
+    MeshError
+        If the mesh cannot be read, is faulty or does not hold what the design names, or would take too much
+        memory.
+    """
+    file = Path(file)
+    design = load_structure(file)
+    mesh = structure_mesh(design, file)
+    return assemble(design, mesh, structure_hash(design, file.parent / design.mesh), memory_limit)
+
+
+def assemble(
+    design: StructureDesign, mesh: StructureMesh, design_hash: str, memory_limit: float | None = None
+) -> Structure:
+    """Assemble the affine operators of a design on its mesh, see `load_and_assemble`."""
+    check_memory(mesh, memory_limit)
+    material_of = _materials(design, mesh)
+    regions = tuple((f"damage[{n}]", part.name, part.set) for n, part in enumerate(design.damage, 1))
+    region_of = cells_by_set(mesh, regions, "damage region")
+    held = supported(design, mesh)
+    expansion = held.expansion
+    restriction = expansion.T.tocsr()
+
+    locator = Locator(mesh)
+    weights = {
+        part.name: point_shares(mesh, locator, part.point, f"mass[{number}]")
+        for number, part in enumerate(design.mass, start=1)
+    }
+    structure_mass = _structure_mass(design, mesh, material_of)
+    for part in design.mass:
+        if not part.free:
+            structure_mass = structure_mass + part.mass * _outer(weights[part.name])
+    free = tuple(part for part in design.mass if part.free)
+    mass_terms = (structure_mass, *(_outer(weights[part.name]) for part in free))
+
+    loads = []
+    for number, load in enumerate(design.load, start=1):
+        where = f"load[{number}]"
+        if load.acceleration is None:
+            loads.append(LoadTerm(load.name, restriction @ surface_load(mesh, locator, load, where).ravel()))
+            continue
+        field = np.asarray(load.acceleration)
+        inertia = structure_mass @ np.ones((len(mesh.points), 1)) * field
+        loads.append(LoadTerm(load.name, restriction @ inertia.ravel()))
+        loads.extend(
+            LoadTerm(load.name, restriction @ np.outer(weights[part.name], field).ravel(), part.name)
+            for part in free
+        )
+
+    gauges, places = gauge_rows(mesh, locator, design.gauge)
+    return Structure(
+        parameters={part.name: part.nominal for part in design.parameter},
+        masses={part.name: part.mass for part in free},
+        controls={part.name: part.nominal for part in design.control},
+        regions=tuple(part.name for part in design.damage),
+        stiffness_terms=_stiffness_terms(design, mesh, material_of, region_of, held),
+        mass_terms=tuple(
+            (restriction @ sparse.kron(term, sparse.eye_array(3)) @ expansion).tocsr() for term in mass_terms
+        ),
+        loads={part.name: part.control for part in design.load},
+        load_terms=tuple(loads),
+        gauges=tuple(part.name for part in design.gauge),
+        displacements=tuple(part.name for part in design.displacement),
+        accelerations=tuple(part.name for part in design.acceleration),
+        gauge_output=(gauges @ expansion).tocsr(),
+        displacement_output=_point_rows(design, mesh, locator, "displacement") @ expansion,
+        acceleration_output=_point_rows(design, mesh, locator, "acceleration") @ expansion,
+        expansion=expansion,
+        damping_alpha=design.damping.alpha,
+        damping_beta=design.damping.beta,
+        design_hash=design_hash,
+        design=design,
+        mesh=mesh,
+        material_of=material_of,
+        region_of=region_of,
+        unknowns_held=held,
+        gauge_places=places,
+        point_weights=weights,
+    )
+
+
+def _outer(weights: FloatArray) -> sparse.csr_array:
+    column = sparse.csr_array(weights[:, None])
+    return (column @ column.T).tocsr()
+
+
+def _structure_mass(design: StructureDesign, mesh: StructureMesh, material_of: IntArray) -> sparse.csr_array:
+    """Mass (nodes, nodes) [kg] of one component, without point masses."""
+    total = sparse.csr_array((len(mesh.points), len(mesh.points)))
+    for number, part in enumerate(design.material):
+        density = part.density
+
+        def blocks(nodes: FloatArray, density: float = density) -> FloatArray:
+            return mass_blocks(mesh.kind, nodes, density)
+
+        total = total + assembled(mesh, np.flatnonzero(material_of == number), blocks, 1)
+    return total
+
+
+def _stiffness_terms(
+    design: StructureDesign,
+    mesh: StructureMesh,
+    material_of: IntArray,
+    region_of: IntArray,
+    held: SupportedUnknowns,
+) -> tuple[StiffnessTerm, ...]:
+    """Terms by pairs of a parameter and a region, parameters first; the pair of none holds the springs too."""
+    restriction = held.expansion.T.tocsr()
+    found: dict[tuple[str | None, str | None], sparse.csr_array] = {}
+    for number, part in enumerate(design.material):
+        elasticity = part.elasticity
+
+        def blocks(nodes: FloatArray, elasticity: FloatArray = elasticity) -> FloatArray:
+            return stiffness_blocks(mesh.kind, nodes, elasticity)
+
+        for region in np.unique(region_of[material_of == number]):
+            cells = np.flatnonzero((material_of == number) & (region_of == region))
+            matrix = restriction @ assembled(mesh, cells, blocks, 3) @ held.expansion
+            pair = (part.scaled_by, None if region < 0 else design.damage[region].name)
+            found[pair] = found[pair] + matrix if pair in found else matrix
+    if held.springs.any():
+        springs = restriction @ sparse.diags_array(held.springs) @ held.expansion
+        found[None, None] = found[None, None] + springs if (None, None) in found else springs
+    order = {name: number for number, name in enumerate(part.name for part in design.parameter)}
+    order |= {part.name: number for number, part in enumerate(design.damage)}
+    pairs = sorted(
+        found, key=lambda pair: [(name is None, 0 if name is None else order[name]) for name in pair]
+    )
+    return tuple(StiffnessTerm(found[pair].tocsr(), *pair) for pair in pairs)
+
+
+def _point_rows(
+    design: StructureDesign, mesh: StructureMesh, locator: Locator, key: str
+) -> sparse.csr_array:
+    """Rows (m, full) of the displacements of points along directions."""
+    rows = [sparse.csr_array((0, mesh.unknowns))]
+    for number, part in enumerate(getattr(design, key), start=1):
+        shares = point_shares(mesh, locator, part.point, f"{key}[{number}]")
+        direction = np.asarray(part.direction) / np.linalg.norm(part.direction)
+        rows.append(sparse.csr_array(np.outer(shares, direction).reshape(1, -1)))
+    return sparse.vstack(rows).tocsr()
