@@ -31,7 +31,7 @@ MAY_IMPORT = {
 
 # The rooms of each package from the ground up; a file at the root of its package is a room of its own.
 ROOMS = {
-    "fe": ("designs", "runtime", "wing", "full", "reduction", "compilation", "verification"),
+    "fe": ("designs", "runtime", "wing", "full", "structure", "reduction", "compilation", "verification"),
     "fmu_asset": (
         "errors", "folders", "slaves", "description", "instances", "worker", "archive", "compiled", "door",
         "packing", "companions", "coupling", "check", "ssp",

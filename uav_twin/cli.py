@@ -16,6 +16,7 @@ from uav_twin.fmu import fmu_app
 from uav_twin.library import library_app
 from uav_twin.scenarios import list_scenarios, scenario_app
 from uav_twin.ssp import ssp_app
+from uav_twin.structure import structure_app
 from uav_twin.wing import wing_app
 
 app = typer.Typer(
@@ -57,6 +58,7 @@ app.add_typer(discrepancy_app, name="discrepancy")
 app.add_typer(fmu_app, name="fmu")
 app.add_typer(library_app, name="library")
 app.add_typer(ssp_app, name="ssp")
+app.add_typer(structure_app, name="structure")
 
 
 def main() -> None:

@@ -148,7 +148,8 @@ class _Reader:
         if kind and self.kind and kind is not self.kind:
             _fail(
                 block.where,
-                f"{kind.name} ({name}) stand beside {self.kind.name}; a mesh of one kind of elements is expected.",
+                f"{kind.name} ({name}) stand beside {self.kind.name}; a mesh of one kind of elements is "
+                "expected.",
             )
         self.kind = kind or self.kind
         values = [(where, self._whole(where, text)) for where, row in block.data for text in row if text]

@@ -94,7 +94,9 @@ class AffineStructure:
         """Number n of free unknowns."""
         return int(self.expansion.shape[1])
 
-    def theta(self, parameters: Values | None = None, stiffness_loss: Values | Iterable[float] = ()) -> FloatArray:
+    def theta(
+        self, parameters: Values | None = None, stiffness_loss: Values | Iterable[float] = ()
+    ) -> FloatArray:
         """Coefficients of the stiffness terms.
 
         Parameters
@@ -105,7 +107,9 @@ class AffineStructure:
             Stiffness losses of the regions, see `fe.runtime.state.losses_of`.
         """
         factor = _updated(self.parameters, parameters, "parameter")
-        kept = dict(zip(self.regions, (1.0 - z for z in losses_of(stiffness_loss, self.regions)), strict=True))
+        kept = dict(
+            zip(self.regions, (1.0 - z for z in losses_of(stiffness_loss, self.regions)), strict=True)
+        )
         return np.array(
             [
                 (1.0 if term.parameter is None else factor[term.parameter])

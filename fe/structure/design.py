@@ -286,7 +286,9 @@ class StructureDesign(Part):
             ]
             for (first, one), (second, two) in itertools.combinations(named, 2):
                 if one == two:
-                    raise ValueError(f"{first} and {second} are both named {one!r}; give each a name of its own")
+                    raise ValueError(
+                        f"{first} and {second} are both named {one!r}; give each a name of its own"
+                    )
         parameters = [part.name for part in self.parameter]
         for number, part in enumerate(self.material, start=1):
             if part.scaled_by is not None and part.scaled_by not in parameters:

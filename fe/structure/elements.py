@@ -2,7 +2,8 @@
 
 Shape functions are the polynomials of scikit-fem's elements of the same name, made for many places at once;
 nodes stand in the order of the mesh file, which is that of VTK and, for these kinds, of Abaqus and CalculiX. All kinds are isoparametric: the mid-edge nodes of a file bend the
-edges and faces. Stiffness is integrated as CalculiX integrates C3D4, C3D10 and C3D20. Element arrays are
+edges and faces. Stiffness is integrated as CalculiX integrates C3D4, C3D8, C3D10 and C3D20; mass is integrated
+exactly on straight cells, while CalculiX takes the points of the stiffness for it. Element arrays are
 contracted for many cells at once, as in `fe.full.assembly`. Strains are in Voigt order 11, 22, 33, 23, 13, 12.
 """
 
@@ -215,9 +216,9 @@ def stiffness_blocks(kind: ElementKind, nodes: FloatArray, elasticity: FloatArra
     return np.asarray(0.5 * (blocks + blocks.swapaxes(1, 2)))
 
 
-def mass_blocks(kind: ElementKind, nodes: FloatArray, density: float) -> FloatArray:
+def mass_blocks(kind: ElementKind, nodes: FloatArray, density: float, rule: Rule) -> FloatArray:
     """Consistent element mass (n, k, k) [kg] of one component, cells with nodes (n, k, 3) [m]."""
-    local, weight = kind.mass_rule
+    local, weight = rule
     values, _ = kind.shape_functions(local)
     factor = np.linalg.det(jacobians(kind, nodes, local)) * weight * density
     return np.asarray(np.einsum("nq,qa,qb->nab", factor, values, values, optimize=True))

@@ -29,7 +29,9 @@ def area_shares(mesh: StructureMesh, surface: Surface) -> FloatArray:
     return total
 
 
-def _face_points(mesh: StructureMesh, surface: Surface) -> list[tuple[NDArray[np.int64], FloatArray, FloatArray]]:
+def _face_points(
+    mesh: StructureMesh, surface: Surface
+) -> list[tuple[NDArray[np.int64], FloatArray, FloatArray]]:
     """Cells (n,), weighted outward normals (n, q, 3) [m^2] and shape functions (q, k), face by face."""
     kind, found = mesh.kind, []
     for number in np.unique(surface.face):

@@ -247,9 +247,7 @@ class StructureMesh:
 
     def with_sets(self, node_sets: dict[str, IntArray], cell_sets: dict[str, IntArray]) -> "StructureMesh":
         """Return the mesh with further sets."""
-        return replace(
-            self, node_sets=self.node_sets | node_sets, cell_sets=self.cell_sets | cell_sets
-        )
+        return replace(self, node_sets=self.node_sets | node_sets, cell_sets=self.cell_sets | cell_sets)
 
 
 def _found(sets: dict[str, _Content], name: str) -> _Content | None:

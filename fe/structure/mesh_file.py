@@ -204,7 +204,7 @@ def _sets(
                 name = f"{label}={value}"
                 if label == "gmsh:physical":
                     name = titles.get((_dimension(found.cells[number].type), value), name)
-                if not (name in found.cell_sets):
+                if name not in found.cell_sets:
                     members.setdefault(name, []).append((number, chosen))
     nodes = {name: np.unique(np.asarray(chosen, dtype=np.int64)) for name, chosen in found.point_sets.items()}
     for label, array in found.point_data.items():

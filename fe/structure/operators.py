@@ -12,7 +12,7 @@ from fe.runtime.errors import MeshError
 
 from .affine import AffineStructure, LoadTerm, StiffnessTerm
 from .design import StructureDesign, load_structure, structure_hash
-from .elements import BATCH, mass_blocks, stiffness_blocks
+from .elements import BATCH, Rule, mass_blocks, stiffness_blocks
 from .gauges import GaugePlace, gauge_rows
 from .loads import point_shares, surface_load
 from .location import Locator
@@ -47,6 +47,8 @@ class Structure(AffineStructure):
         Where the gauges came to lie.
     point_weights : dict of str to (nodes,)
         Share of each node in the displacement of each point mass.
+    nodal_mass : (nodes,) kg
+        Share of each node in the mass of the structure with its fixed point masses.
     """
 
     design: StructureDesign
@@ -56,6 +58,7 @@ class Structure(AffineStructure):
     unknowns_held: SupportedUnknowns
     gauge_places: tuple[GaugePlace, ...]
     point_weights: dict[str, FloatArray]
+    nodal_mass: FloatArray
 
 
 def structure_mesh(design: StructureDesign, file: Path) -> StructureMesh:
@@ -157,7 +160,9 @@ def _batches(cells: IntArray) -> Iterator[IntArray]:
         yield cells[start : start + BATCH]
 
 
-def load_and_assemble(file: Path | str, memory_limit: float | None = None) -> Structure:
+def load_and_assemble(
+    file: Path | str, memory_limit: float | None = None, *, mass_as_stiffness: bool = False
+) -> Structure:
     """Read a structure file with its mesh, check both and assemble the affine operators.
 
     Parameters
@@ -166,6 +171,8 @@ def load_and_assemble(file: Path | str, memory_limit: float | None = None) -> St
         The structure file.
     memory_limit : float, optional
         Bytes that assembly and factorisation may take; what the machine has left by default.
+    mass_as_stiffness : bool
+        Integrate the mass at the points of the stiffness, as CalculiX does: not exact for tetrahedra.
 
     Raises
     ------
@@ -178,14 +185,15 @@ def load_and_assemble(file: Path | str, memory_limit: float | None = None) -> St
     file = Path(file)
     design = load_structure(file)
     mesh = structure_mesh(design, file)
-    return assemble(design, mesh, structure_hash(design, file.parent / design.mesh), memory_limit)
+    check_memory(mesh, memory_limit)
+    digest = structure_hash(design, file.parent / design.mesh)
+    return assemble(design, mesh, digest, mass_as_stiffness=mass_as_stiffness)
 
 
 def assemble(
-    design: StructureDesign, mesh: StructureMesh, design_hash: str, memory_limit: float | None = None
+    design: StructureDesign, mesh: StructureMesh, design_hash: str, *, mass_as_stiffness: bool = False
 ) -> Structure:
     """Assemble the affine operators of a design on its mesh, see `load_and_assemble`."""
-    check_memory(mesh, memory_limit)
     material_of = _materials(design, mesh)
     regions = tuple((f"damage[{n}]", part.name, part.set) for n, part in enumerate(design.damage, 1))
     region_of = cells_by_set(mesh, regions, "damage region")
@@ -198,10 +206,13 @@ def assemble(
         part.name: point_shares(mesh, locator, part.point, f"mass[{number}]")
         for number, part in enumerate(design.mass, start=1)
     }
-    structure_mass = _structure_mass(design, mesh, material_of)
+    structure_mass = _structure_mass(
+        design, mesh, material_of, mesh.kind.stiffness_rule if mass_as_stiffness else mesh.kind.mass_rule
+    )
     for part in design.mass:
         if not part.free:
             structure_mass = structure_mass + part.mass * _outer(weights[part.name])
+    nodal_mass = np.asarray(structure_mass.sum(axis=1))
     free = tuple(part for part in design.mass if part.free)
     mass_terms = (structure_mass, *(_outer(weights[part.name]) for part in free))
 
@@ -212,8 +223,7 @@ def assemble(
             loads.append(LoadTerm(load.name, restriction @ surface_load(mesh, locator, load, where).ravel()))
             continue
         field = np.asarray(load.acceleration)
-        inertia = structure_mass @ np.ones((len(mesh.points), 1)) * field
-        loads.append(LoadTerm(load.name, restriction @ inertia.ravel()))
+        loads.append(LoadTerm(load.name, restriction @ np.outer(nodal_mass, field).ravel()))
         loads.extend(
             LoadTerm(load.name, restriction @ np.outer(weights[part.name], field).ravel(), part.name)
             for part in free
@@ -248,6 +258,7 @@ def assemble(
         unknowns_held=held,
         gauge_places=places,
         point_weights=weights,
+        nodal_mass=nodal_mass,
     )
 
 
@@ -256,14 +267,16 @@ def _outer(weights: FloatArray) -> sparse.csr_array:
     return (column @ column.T).tocsr()
 
 
-def _structure_mass(design: StructureDesign, mesh: StructureMesh, material_of: IntArray) -> sparse.csr_array:
+def _structure_mass(
+    design: StructureDesign, mesh: StructureMesh, material_of: IntArray, rule: Rule
+) -> sparse.csr_array:
     """Mass (nodes, nodes) [kg] of one component, without point masses."""
     total = sparse.csr_array((len(mesh.points), len(mesh.points)))
     for number, part in enumerate(design.material):
         density = part.density
 
         def blocks(nodes: FloatArray, density: float = density) -> FloatArray:
-            return mass_blocks(mesh.kind, nodes, density)
+            return mass_blocks(mesh.kind, nodes, density, rule)
 
         total = total + assembled(mesh, np.flatnonzero(material_of == number), blocks, 1)
     return total
@@ -301,9 +314,7 @@ def _stiffness_terms(
     return tuple(StiffnessTerm(found[pair].tocsr(), *pair) for pair in pairs)
 
 
-def _point_rows(
-    design: StructureDesign, mesh: StructureMesh, locator: Locator, key: str
-) -> sparse.csr_array:
+def _point_rows(design: StructureDesign, mesh: StructureMesh, locator: Locator, key: str) -> sparse.csr_array:
     """Rows (m, full) of the displacements of points along directions."""
     rows = [sparse.csr_array((0, mesh.unknowns))]
     for number, part in enumerate(getattr(design, key), start=1):

@@ -9,6 +9,7 @@ from fe.full.modes import lowest_eigenpairs
 from fe.full.statics import Factorisation
 
 from .affine import AffineStructure
+from .operators import Structure
 
 FloatArray = NDArray[np.float64]
 
@@ -71,3 +72,12 @@ def natural_frequencies(structure: AffineStructure, count: int) -> tuple[FloatAr
     values, shapes = lowest_eigenpairs(structure.stiffness(), structure.mass(), count)
     shapes = shapes / np.sqrt(np.einsum("im,im->m", shapes, structure.mass() @ shapes))
     return np.sqrt(values) / (2.0 * np.pi), shapes
+
+
+def weighed(structure: Structure) -> tuple[float, FloatArray]:
+    """Mass [kg] with the nominal point masses, and the centre of gravity (3,) [m]."""
+    mesh, shares = structure.mesh, structure.nodal_mass
+    for name, value in structure.masses.items():
+        shares = shares + value * structure.point_weights[name]
+    mass = float(shares.sum())
+    return mass, shares @ mesh.points / mass if mass > 0.0 else mesh.points.mean(axis=0)

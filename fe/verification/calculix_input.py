@@ -7,7 +7,7 @@ nodal loads; it integrates, assembles and solves on its own. The gauges are node
 strain, by an equation, because the printed displacements hold seven digits only.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -133,7 +133,7 @@ class CalculixModel:
         body = self.operators.discretisation
         yield "*NODE, NSET=NALL"
         for number, point in enumerate(body.node_points, start=1):
-            yield f"{number},{_numbers(point)}"
+            yield f"{number},{number_line(point)}"
         yield "*ELEMENT, TYPE=C3D20, ELSET=EALL"
         given = ElementHexS2().doflocs
         order = [int(np.flatnonzero(np.all(np.equal(given, place), axis=1))[0]) for place in C3D20_NODES]
@@ -150,7 +150,7 @@ class CalculixModel:
         # Constants in the cell's own axes; CalculiX turns them by the orientation.
         local = rotate_elasticity(cell_elasticity(mesh), np.swapaxes(axes, 1, 2))
         factor = self.operators.theta(self.young_modulus_factor, self.stiffness_loss)[mesh.stiffness_term]
-        constants = np.column_stack([local[:, row, column] for row, column in _ORTHOTROPIC])
+        constants = np.column_stack([local[:, row, column] for row, column in ORTHOTROPIC])
         constants *= factor[:, None]
         density = cell_density(mesh)
         graded = self._graded
@@ -170,10 +170,10 @@ class CalculixModel:
             yield "*ELASTIC, TYPE=ORTHO"
             for temperature, modulus in courses:
                 row = modulus * constants[first]
-                yield _numbers(row[:8])
-                yield _numbers((*row[8:], temperature))
+                yield number_line(row[:8])
+                yield number_line((*row[8:], temperature))
             yield "*DENSITY"
-            yield _numbers(density[first : first + 1])
+            yield number_line(density[first : first + 1])
             if self.damping_alpha or self.damping_beta:
                 yield f"*DAMPING, ALPHA={self.damping_alpha:.12E}, BETA={self.damping_beta:.12E}"
         if graded.any():
@@ -184,7 +184,7 @@ class CalculixModel:
                 yield f"{node},{place:.13E}"
         for cell, key in enumerate(rounded):
             yield f"*ORIENTATION, NAME=O{cell}, SYSTEM=RECTANGULAR"
-            yield _numbers(axes[cell, :2].ravel())
+            yield number_line(axes[cell, :2].ravel())
             yield f"*ELSET, ELSET=E{cell}"
             yield str(cell + 1)
             yield f"*SOLID SECTION, ELSET=E{cell}, MATERIAL=M{materials[key]}, ORIENTATION=O{cell}"
@@ -211,23 +211,19 @@ class CalculixModel:
         span = self.operators.wing_mesh.design.planform.semi_span
         on_root: list[int] = np.flatnonzero(np.abs(points[:, 1]) < 1e-9 * span).tolist()
         for node in on_root:
-            yield from _equation([(node + 1, 3, -1.0), (reference, 1, 1.0)])
+            yield from equation_lines([(node + 1, 3, -1.0), (reference, 1, 1.0)])
             terms = [
                 (node + 1, 2, -1.0),
                 (reference, 2, -float(points[node, 2])),
                 (reference, 3, float(points[node, 0])),
             ]
-            yield from _equation(term for term in terms if term[2] != 0.0)
+            yield from equation_lines(term for term in terms if term[2] != 0.0)
         yield "*BOUNDARY"
         for node in on_root:
             yield f"{node + 1},1"
 
     def _masses(self) -> Iterator[str]:
-        """Yield a block for each point mass, all its nodes tied to the mean of the two skins.
-
-        The block only translates, so that its elasticity does not count. CalculiX 2.20 ends with an error in
-        `add_sm_st` when an element of type MASS sits on a node that depends on others.
-        """
+        """Yield a block for each point mass, all its nodes tied to the mean of the two skins."""
         mesh, body = self.operators.wing_mesh, self.operators.discretisation
         design = mesh.design
         first_element = len(mesh.cells) + ROOT_UNKNOWNS + 1
@@ -244,22 +240,8 @@ class CalculixModel:
             mass = self.servo_mass if place.kind == "servo" else self.pitot_mass
             if mass <= 0.0:
                 continue
-            yield "*NODE"
-            for corner, (x, y, z) in enumerate(C3D20_NODES[:8] * _BLOCK):
-                yield f"{first + corner},{_numbers((x, distance + y, z))}"
-            yield f"*ELEMENT, TYPE=C3D8, ELSET=MASS{number}"
-            yield ",".join(str(n) for n in (first_element + number, *range(first, first + 8)))
-            yield f"*MATERIAL, NAME=MASS{number}"
-            yield "*ELASTIC"
-            yield "1.E6,0."
-            yield "*DENSITY"
-            yield f"{mass / _BLOCK**3:.13E}"
-            yield f"*SOLID SECTION, ELSET=MASS{number}, MATERIAL=MASS{number}"
-            for node in range(first, first + 8):
-                for component in (1, 2, 3):
-                    yield from _equation(
-                        [(node, component, -1.0), *((n + 1, component, w) for n, w in weights.items())]
-                    )
+            place_of_block = np.array([0.0, distance, 0.0])
+            yield from mass_block_lines(number, mass, place_of_block, weights, first, first_element + number)
 
     def _probe_nodes(self) -> Iterator[str]:
         first = self.node_count + 2 + 8 * len(self.operators.wing_mesh.design.point_masses)
@@ -269,7 +251,7 @@ class CalculixModel:
         for node in nodes:
             yield f"{node},0.,0.,0."
         for number, weights in enumerate(probes):
-            yield from _equation([(first + number // 3, number % 3 + 1, -1.0), *self._terms(weights)])
+            yield from equation_lines([(first + number // 3, number % 3 + 1, -1.0), *self._terms(weights)])
 
     def _terms(self, free: FloatArray) -> Iterator[tuple[int, int, float]]:
         """Yield (node, direction, value) of the values (n,) of free unknowns that are not zero."""
@@ -289,16 +271,58 @@ class CalculixModel:
             yield f"{node},{direction},{value:.13E}"
 
 
-_ORTHOTROPIC = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (5, 5), (4, 4), (3, 3))
+ORTHOTROPIC = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (5, 5), (4, 4), (3, 3))
+"""Rows and columns of an elasticity in the order of CalculiX's nine orthotropic constants."""
 
 
-def _numbers(values: Iterable[float]) -> str:
-    return ",".join(f"{value:.13E}" for value in values)  # at most 20 characters, as CalculiX reads
+def number_line(values: Iterable[float]) -> str:
+    """Return numbers with the digits of a double, at most 20 characters each, as CalculiX reads them."""
+    return ",".join(f"{value:.13E}" for value in values)
 
 
-def _equation(terms: Iterable[tuple[int, int, float]]) -> Iterator[str]:
+def equation_lines(terms: Iterable[tuple[int, int, float]]) -> Iterator[str]:
+    """Yield an equation: the terms (node, direction, factor) are zero together, the first one depends."""
     text = [f"{node},{direction},{value:.13E}" for node, direction, value in terms]
     yield "*EQUATION"
     yield str(len(text))
     for start in range(0, len(text), _PER_LINE):
         yield ",".join(text[start : start + _PER_LINE])
+
+
+def mass_block_lines(
+    number: int, mass: float, place: FloatArray, weights: Mapping[int, float], node: int, element: int
+) -> Iterator[str]:
+    """Yield a point mass [kg] as a block that moves with the weighted mean of nodes, as element set MASSn.
+
+    The block only translates, so that its elasticity does not count. CalculiX 2.20 ends with an error in
+    `add_sm_st` when an element of type MASS sits on a node that depends on others.
+
+    Parameters
+    ----------
+    number : int
+        Number n of the mass.
+    mass : float
+        The mass [kg].
+    place : (3,)
+        Where the block is drawn [m].
+    weights : mapping of int to float
+        Nodes, counted from 0, and their shares in the displacement.
+    node, element : int
+        The first of its eight nodes, and its element, as numbers that are free.
+    """
+    yield "*NODE"
+    for corner, local in enumerate(C3D20_NODES[:8] * _BLOCK):
+        yield f"{node + corner},{number_line(place + local)}"
+    yield f"*ELEMENT, TYPE=C3D8, ELSET=MASS{number}"
+    yield ",".join(str(n) for n in (element, *range(node, node + 8)))
+    yield f"*MATERIAL, NAME=MASS{number}"
+    yield "*ELASTIC"
+    yield "1.E6,0."
+    yield "*DENSITY"
+    yield f"{mass / _BLOCK**3:.13E}"
+    yield f"*SOLID SECTION, ELSET=MASS{number}, MATERIAL=MASS{number}"
+    for own in range(node, node + 8):
+        for component in (1, 2, 3):
+            yield from equation_lines(
+                [(own, component, -1.0), *((n + 1, component, w) for n, w in weights.items())]
+            )

@@ -1,0 +1,191 @@
+"""A structure as input for CalculiX, on the same mesh; `fe.verification.calculix_job` runs it.
+
+CalculiX gets nodes, cells, materials with their orientations, supports and springs, and applies pressures and
+acceleration fields itself; forces on sets and points come as nodal forces. Point masses are blocks tied to
+the structure, outputs are nodes whose displacement is the strain or displacement, by an equation.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fe.runtime.errors import CalculixError
+from fe.structure.design import Load, Material
+from fe.structure.elements import WEDGES_6
+from fe.structure.operators import Structure
+
+from .calculix_input import ORTHOTROPIC, equation_lines, mass_block_lines, number_line
+
+FloatArray = NDArray[np.float64]
+
+NOT_COMPARABLE = (WEDGES_6,)
+"""Kinds that CalculiX integrates otherwise (C3D6 at two points)."""
+_PER_LINE = 12
+
+
+@dataclass(frozen=True)
+class StructureDeck:
+    """A structure, undamaged and with nominal parameters and masses, as input for CalculiX.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX has no element that is integrated in the same way.
+    """
+
+    structure: Structure
+
+    def __post_init__(self) -> None:
+        kind = self.structure.mesh.kind
+        if kind in NOT_COMPARABLE:
+            raise CalculixError(
+                f"CalculiX integrates {kind.name} ({kind.calculix}) in another way, so that nothing can be "
+                "compared; tetrahedra and hexahedra can."
+            )
+
+    @property
+    def probes(self) -> FloatArray:
+        """Rows (gauges + displacements, full) of what is read."""
+        structure = self.structure
+        rows = (structure.gauge_output, structure.displacement_output)
+        return np.vstack([(row @ structure.expansion.T).toarray() for row in rows])
+
+    @property
+    def _node_count(self) -> int:
+        return len(self.structure.mesh.points)
+
+    def static_steps(self) -> str:
+        """Input of one linear static step for each load, its control at the nominal value."""
+        lines = [*self._definition()]
+        for load in self.structure.design.load:
+            lines += ["*STEP", "*STATIC", *self._load_lines(load), "*NODE PRINT, NSET=NALL", "U"]
+            if len(self.probes):
+                lines += ["*NODE PRINT, NSET=NPROBES", "U"]
+            lines += ["*END STEP"]
+        return "\n".join(lines) + "\n"
+
+    def frequency_step(self, count: int) -> str:
+        """Input of the lowest undamped modes."""
+        return "\n".join([*self._definition(), "*STEP", "*FREQUENCY", str(count), "*END STEP"]) + "\n"
+
+    def _definition(self) -> Iterator[str]:
+        yield "*HEADING"
+        yield f"structure {self.structure.design_hash[:12]}"
+        yield from self._nodes_and_cells()
+        yield from self._materials()
+        yield from self._supports()
+        yield from self._masses()
+        yield from self._probe_nodes()
+
+    def _nodes_and_cells(self) -> Iterator[str]:
+        mesh = self.structure.mesh
+        yield "*NODE, NSET=NALL"
+        for number, point in enumerate(mesh.points, start=1):
+            yield f"{number},{number_line(point)}"
+        yield f"*ELEMENT, TYPE={mesh.kind.calculix}, ELSET=EALL"
+        for number, nodes in enumerate(mesh.cells + 1, start=1):
+            text = [str(value) for value in (number, *nodes)]
+            for start in range(0, len(text), _PER_LINE):
+                rest = "," if start + _PER_LINE < len(text) else ""
+                yield ",".join(text[start : start + _PER_LINE]) + rest
+
+    def _materials(self) -> Iterator[str]:
+        structure = self.structure
+        for number, part in enumerate(structure.design.material):
+            cells = np.flatnonzero(structure.material_of == number)
+            yield f"*MATERIAL, NAME=M{number}"
+            yield from _elastic_lines(part, structure.parameters.get(part.scaled_by or "", 1.0))
+            yield "*DENSITY"
+            yield number_line([part.density])
+            orientation = ""
+            if part.axes is not None:
+                yield f"*ORIENTATION, NAME=O{number}, SYSTEM=RECTANGULAR"
+                yield number_line([*part.axes[0], *part.axes[1]])
+                orientation = f", ORIENTATION=O{number}"
+            yield f"*ELSET, ELSET=E{number}"
+            yield from (str(cell + 1) for cell in cells)
+            yield f"*SOLID SECTION, ELSET=E{number}, MATERIAL=M{number}{orientation}"
+
+    def _supports(self) -> Iterator[str]:
+        held = self.structure.unknowns_held
+        yield "*BOUNDARY"
+        for unknown in np.flatnonzero(held.held).tolist():
+            yield f"{unknown // 3 + 1},{unknown % 3 + 1}"
+        element = len(self.structure.mesh.cells)
+        axes = np.arange(len(held.springs)) % 3
+        for axis in range(3):
+            values = np.where(axes == axis, held.springs, 0.0)
+            for group, spring in enumerate(np.unique(values[values > 0.0])):
+                name = f"SPRING{axis}X{group}"
+                yield f"*ELEMENT, TYPE=SPRING1, ELSET={name}"
+                for unknown in np.flatnonzero(values == spring).tolist():
+                    element += 1
+                    yield f"{element},{unknown // 3 + 1}"
+                yield f"*SPRING, ELSET={name}"
+                yield str(axis + 1)
+                yield number_line([spring])
+
+    def _masses(self) -> Iterator[str]:
+        structure = self.structure
+        element = len(structure.mesh.cells) + int((structure.unknowns_held.springs > 0.0).sum()) + 1
+        node = self._node_count + 1
+        yield "*ELSET, ELSET=EHEAVY"
+        yield "EALL"
+        for number, part in enumerate(structure.design.mass):
+            if part.mass <= 0.0:
+                continue
+            shares = structure.point_weights[part.name]
+            weights = {int(n): float(shares[n]) for n in np.flatnonzero(shares)}
+            place = structure.mesh.unit * np.asarray(part.point)
+            yield from mass_block_lines(number, part.mass, place, weights, node, element)
+            yield "*ELSET, ELSET=EHEAVY"
+            yield f"MASS{number}"
+            node, element = node + 8, element + 1
+
+    def _probe_nodes(self) -> Iterator[str]:
+        probes = self.probes
+        if not len(probes):
+            return
+        first = self._node_count + 8 * len(self.structure.design.mass) + 1
+        yield "*NODE, NSET=NPROBES"
+        for node in range(first, first + (len(probes) + 2) // 3):
+            yield f"{node},0.,0.,0."
+        for number, weights in enumerate(probes):
+            yield from equation_lines([(first + number // 3, number % 3 + 1, -1.0), *_terms(weights)])
+
+    def _load_lines(self, load: Load) -> Iterator[str]:
+        structure, mesh = self.structure, self.structure.mesh
+        factor = 1.0 if load.control is None else structure.controls[load.control]
+        yield "*CLOAD, OP=NEW"
+        yield "1,1,0."
+        if load.force is not None:
+            full = structure.expansion @ structure.load(load.name)
+            for node, direction, value in _terms(full):
+                yield f"{node},{direction},{value:.13E}"
+        yield "*DLOAD, OP=NEW"
+        if load.acceleration is not None:
+            size = float(np.linalg.norm(load.acceleration))
+            direction = np.sign(factor) * np.asarray(load.acceleration) / size
+            yield f"EHEAVY,GRAV,{number_line([abs(factor) * size, *direction])}"
+        elif load.pressure is not None and load.set is not None:
+            surface = mesh.faces_of(load.set, load.name)
+            for cell, face in zip(surface.cell, surface.face, strict=True):
+                yield f"{cell + 1},P{face + 1},{factor * load.pressure:.13E}"
+        else:
+            yield "EALL,GRAV,0.,0.,0.,1."
+
+
+def _elastic_lines(part: Material, factor: float) -> Iterator[str]:
+    local = factor * np.linalg.inv(part.compliance)
+    constants = [float(local[row, column]) for row, column in ORTHOTROPIC]
+    yield "*ELASTIC, TYPE=ORTHO"
+    yield number_line(constants[:8])
+    yield number_line([constants[8], 0.0])
+
+
+def _terms(full: FloatArray) -> Iterator[tuple[int, int, float]]:
+    """Yield (node, direction, value) of the values (full,) that are not zero."""
+    for unknown in np.flatnonzero(full).tolist():
+        yield unknown // 3 + 1, unknown % 3 + 1, float(full[unknown])

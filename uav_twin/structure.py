@@ -1,0 +1,220 @@
+"""`uav-twin structure ...`."""
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from reporting import terminal
+from uav_twin.console_table import console_table
+
+if TYPE_CHECKING:
+    from fe.structure.operators import Structure
+    from fe.verification.structure_comparison import StructureAgreement
+
+DISPLACEMENT_LIMIT, STRAIN_LIMIT, FREQUENCY_LIMIT = 1e-5, 1e-5, 1e-6
+"""Largest differences to CalculiX, each relative to the largest of its kind."""
+
+structure_app = typer.Typer(
+    no_args_is_help=True, help="Look at a structure from a mesh, or verify its model against CalculiX."
+)
+
+File = Annotated[Path, typer.Argument(help="A structure file (TOML) beside its mesh.", show_default=False)]
+Modes = Annotated[int, typer.Option(min=1, max=50, help="Number of modes.")]
+MemoryLimit = Annotated[
+    float | None, typer.Option(min=0.1, help="GiB that it may take; what the machine has left by default.")
+]
+
+
+def _model(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool = False) -> "Structure":
+    from fe.structure.memory import GIB
+    from fe.structure.operators import load_and_assemble
+
+    limit = None if memory_limit is None else memory_limit * GIB
+    with terminal.progress().stage("Reading the mesh and assembling"):
+        return load_and_assemble(file, limit, mass_as_stiffness=mass_as_stiffness)
+
+
+@structure_app.command("info")
+def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: terminal.Json = False) -> None:
+    """Say what a structure is made of, what it weighs, how it vibrates and what its loads do to it."""
+    structure = _model(file, memory_limit)
+    with terminal.progress().stage("Solving the loads and the modes"):
+        record = structure_record(structure, modes)
+    if json:
+        terminal.print_json(record)
+        return
+    console = terminal.console()
+    console.print(console_table(("fact", "value", "unit"), _facts(record), console.width))
+    rows = [
+        (part["what"], part["name"], part["set"], f"{part['count']:,} {part['of']}", part["note"])
+        for part in record["parts"]
+    ]
+    console.print(console_table(("part", "name", "set", "holds", "note"), rows, console.width))
+    rows = [(f"{number}", f"{value:.6g}") for number, value in enumerate(record["frequencies"], start=1)]
+    console.print(console_table(("mode", "frequency [Hz]"), rows, console.width))
+    for load in record["loads"]:
+        of = f" at {load['control']} = {load['value']:g}" if load["control"] else ""
+        console.print(
+            f"Load {load['name']}{of}: largest displacement {1e3 * load['largest_displacement']:.6g} mm",
+            soft_wrap=True,
+        )
+        rows = [
+            ("gauge", name, f"{1e6 * value:.6g}", "microstrain") for name, value in load["strain"].items()
+        ]
+        rows += [("displacement", name, f"{1e3 * value:.6g}", "mm") for name, value in load["output"].items()]
+        if rows:
+            console.print(console_table(("output", "name", "value", "unit"), rows, console.width))
+
+
+def _facts(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    yield "name", record["name"], ""
+    yield "mesh", f"{record['mesh']}: {record['elements']:,} {record['kind']}, {record['nodes']:,} nodes", ""
+    if record["loose_nodes"]:
+        first = ", ".join(str(number) for number in record["loose_nodes"][:3])
+        yield "nodes left out", f"{len(record['loose_nodes'])} touch no element, among them {first}", ""
+    yield "unknowns", f"{record['unknowns']:,} free, {record['held']:,} held", ""
+    yield "memory", f"about {record['memory'] / 2**30:.2g}, at most", "GiB"
+    yield "mass", f"{record['mass']:.6g}", "kg"
+    for key, title in (("centre_of_gravity", "centre of gravity"), ("lower", "from"), ("upper", "to")):
+        unit = record["length_unit"]
+        yield title, ", ".join(f"{value:.6g}" for value in record[key]), unit
+
+
+def structure_record(structure: "Structure", modes: int) -> dict[str, Any]:
+    """Return what is known of a structure without damage, at nominal values, by name.
+
+    Lengths carry the unit of the mesh where `length_unit` stands beside them; everything else is in SI units.
+    """
+    from fe.structure.memory import upper_estimate
+    from fe.structure.solution import natural_frequencies, static_responses, weighed
+
+    mesh, design = structure.mesh, structure.design
+    mass, centre = weighed(structure)
+    frequencies = natural_frequencies(structure, modes)[0] if mass > 0.0 else []
+    loads = [
+        {
+            "name": name,
+            "control": structure.loads[name],
+            "value": 1.0 if structure.loads[name] is None else structure.controls[str(structure.loads[name])],
+            "largest_displacement": found.largest,
+            "strain": dict(zip(structure.gauges, map(float, found.strain), strict=True)),
+            "output": dict(zip(structure.displacements, map(float, found.output), strict=True)),
+        }
+        for name, found in static_responses(structure).items()
+    ]
+    return {
+        "name": design.name,
+        "mesh": design.mesh,
+        "design_hash": structure.design_hash,
+        "kind": mesh.kind.name,
+        "elements": len(mesh.cells),
+        "nodes": len(mesh.points),
+        "loose_nodes": [int(number) for number in mesh.loose],
+        "unknowns": structure.unknowns,
+        "held": mesh.unknowns - structure.unknowns,
+        "memory": upper_estimate(mesh),
+        "mass": mass,
+        "length_unit": mesh.unit_name,
+        "centre_of_gravity": [float(value) / mesh.unit for value in centre],
+        "lower": [float(value) / mesh.unit for value in mesh.points.min(axis=0)],
+        "upper": [float(value) / mesh.unit for value in mesh.points.max(axis=0)],
+        "parts": list(_parts(structure)),
+        "frequencies": [float(value) for value in frequencies],
+        "loads": loads,
+    }
+
+
+def _parts(structure: "Structure") -> Iterator[dict[str, Any]]:
+    design, mesh = structure.design, structure.mesh
+
+    def part(what: str, name: str, chosen: str, count: int, of: str, note: str = "") -> dict[str, Any]:
+        return {"what": what, "name": name, "set": chosen, "count": count, "of": of, "note": note}
+
+    for number, material in enumerate(design.material):
+        count = int((structure.material_of == number).sum())
+        note = f"scaled by {material.scaled_by}" if material.scaled_by else ""
+        yield part("material", material.name, material.set, count, "elements", note)
+    for number, damage in enumerate(design.damage):
+        count = int((structure.region_of == number).sum())
+        yield part("damage region", damage.name, damage.set, count, "elements")
+    for number, support in enumerate(design.support, start=1):
+        count = len(mesh.nodes_of(support.set, f"support[{number}]"))
+        note = f"holds {', '.join(support.hold)}" if support.hold else "springs"
+        yield part("support", str(number), support.set, count, "nodes", note)
+    for load in design.load:
+        if load.set is not None:
+            nodes = mesh.nodes_of(load.set, load.name)
+            faces = len(mesh.faces_between(load.set, nodes))
+            yield part("load", load.name, load.set, faces or len(nodes), "faces" if faces else "nodes")
+    for gauge, place in zip(design.gauge, structure.gauge_places, strict=True):
+        moved = f"put onto the surface, {place.moved / mesh.unit:.3g} {mesh.unit_name} away"
+        yield part("gauge", gauge.name, "", 1, "place", moved if place.moved > 1e-6 * mesh.size else "")
+
+
+@structure_app.command("verify")
+def verify(
+    file: File,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the decks and results of CalculiX; it must be empty.")
+    ] = None,
+    modes: Modes = 6,
+    memory_limit: MemoryLimit = None,
+    json: terminal.Json = False,
+) -> None:
+    """Solve the loads and the modes by CalculiX on the same mesh, and compare."""
+    from fe.runtime.errors import CalculixError
+    from fe.verification.calculix_job import calculix_program
+    from fe.verification.structure_comparison import structure_agreement
+    from reporting.errors import FileNotWrittenError
+
+    if calculix_program() is None:
+        raise CalculixError(
+            "CalculiX ('ccx') is not installed; on Debian and Ubuntu: apt-get install calculix-ccx."
+        )
+    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FileNotWrittenError(f"{out} exists and is not an empty folder: choose another --out.")
+    structure = _model(file, memory_limit, mass_as_stiffness=True)
+    with (
+        tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch,
+        terminal.progress().stage("CalculiX on the same mesh"),
+    ):
+        agreement = structure_agreement(structure, out or Path(scratch), modes)
+    rows = list(_differences(agreement))
+    broken = [row for row in rows if not row[2] <= row[3]]
+    if json:
+        terminal.print_json(
+            {
+                "checks": [
+                    dict(zip(("of", "what", "difference", "limit"), row, strict=True)) for row in rows
+                ],
+                "frequencies": {"ours": list(agreement.ours), "calculix": list(agreement.calculix)},
+                "passed": not broken,
+            }
+        )
+    else:
+        console = terminal.console()
+        table = [
+            (of, what, f"{value:.2g}", f"{limit:g}", "kept" if value <= limit else "BROKEN")
+            for of, what, value, limit in rows
+        ]
+        headings = ("of", "what", "difference", "limit", "verdict")
+        console.print(console_table(headings, table, console.width))
+        if out is not None:
+            console.print(f"Wrote the decks and results of CalculiX to {out}", soft_wrap=True)
+    if broken:
+        names = "; ".join(f"{of}, {what}" for of, what, _, _ in broken)
+        typer.echo(f"{len(broken)} of {len(rows)} checks broke their limit: {names}.", err=True)
+        raise typer.Exit(1)
+
+
+def _differences(agreement: "StructureAgreement") -> Iterator[tuple[str, str, float, float]]:
+    for load in agreement.loads:
+        yield f"load {load.load}", "nodal displacements", load.field, DISPLACEMENT_LIMIT
+        if load.output is not None:
+            yield f"load {load.load}", "displacement outputs", load.output, DISPLACEMENT_LIMIT
+        if load.strain is not None:
+            yield f"load {load.load}", "gauge strains", load.strain, STRAIN_LIMIT
+    yield f"{len(agreement.ours)} modes", "frequencies", agreement.frequency, FREQUENCY_LIMIT
