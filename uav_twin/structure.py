@@ -48,25 +48,27 @@ def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: t
         return
     console = terminal.console()
     console.print(console_table(("fact", "value", "unit"), _facts(record), console.width))
-    rows = [
+    parts = [
         (part["what"], part["name"], part["set"], f"{part['count']:,} {part['of']}", part["note"])
         for part in record["parts"]
     ]
-    console.print(console_table(("part", "name", "set", "holds", "note"), rows, console.width))
-    rows = [(f"{number}", f"{value:.6g}") for number, value in enumerate(record["frequencies"], start=1)]
-    console.print(console_table(("mode", "frequency [Hz]"), rows, console.width))
+    console.print(console_table(("part", "name", "set", "holds", "note"), parts, console.width))
+    modes_found = [(f"{number}", f"{value:.6g}") for number, value in enumerate(record["frequencies"], 1)]
+    console.print(console_table(("mode", "frequency [Hz]"), modes_found, console.width))
     for load in record["loads"]:
         of = f" at {load['control']} = {load['value']:g}" if load["control"] else ""
-        console.print(
-            f"Load {load['name']}{of}: largest displacement {1e3 * load['largest_displacement']:.6g} mm",
-            soft_wrap=True,
-        )
-        rows = [
-            ("gauge", name, f"{1e6 * value:.6g}", "microstrain") for name, value in load["strain"].items()
+        largest = f"largest displacement {1e3 * load['largest_displacement']:.6g} mm"
+        console.print(f"Load {load['name']}{of}: {largest}", soft_wrap=True)
+        outputs = [
+            (what, name, f"{scale * value:.6g}", unit)
+            for what, key, scale, unit in (
+                ("gauge", "strain", 1e6, "microstrain"),
+                ("displacement", "output", 1e3, "mm"),
+            )
+            for name, value in load[key].items()
         ]
-        rows += [("displacement", name, f"{1e3 * value:.6g}", "mm") for name, value in load["output"].items()]
-        if rows:
-            console.print(console_table(("output", "name", "value", "unit"), rows, console.width))
+        if outputs:
+            console.print(console_table(("output", "name", "value", "unit"), outputs, console.width))
 
 
 def _facts(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
@@ -76,7 +78,7 @@ def _facts(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
         first = ", ".join(str(number) for number in record["loose_nodes"][:3])
         yield "nodes left out", f"{len(record['loose_nodes'])} touch no element, among them {first}", ""
     yield "unknowns", f"{record['unknowns']:,} free, {record['held']:,} held", ""
-    yield "memory", f"about {record['memory'] / 2**30:.2g}, at most", "GiB"
+    yield "memory", f"at most about {record['memory'] / 2**30:.2g}", "GiB"
     yield "mass", f"{record['mass']:.6g}", "kg"
     for key, title in (("centre_of_gravity", "centre of gravity"), ("lower", "from"), ("upper", "to")):
         unit = record["length_unit"]
@@ -93,7 +95,7 @@ def structure_record(structure: "Structure", modes: int) -> dict[str, Any]:
 
     mesh, design = structure.mesh, structure.design
     mass, centre = weighed(structure)
-    frequencies = natural_frequencies(structure, modes)[0] if mass > 0.0 else []
+    frequencies = natural_frequencies(structure, modes)[0].tolist() if mass > 0.0 else []
     loads = [
         {
             "name": name,
@@ -122,7 +124,7 @@ def structure_record(structure: "Structure", modes: int) -> dict[str, Any]:
         "lower": [float(value) / mesh.unit for value in mesh.points.min(axis=0)],
         "upper": [float(value) / mesh.unit for value in mesh.points.max(axis=0)],
         "parts": list(_parts(structure)),
-        "frequencies": [float(value) for value in frequencies],
+        "frequencies": frequencies,
         "loads": loads,
     }
 

@@ -4,6 +4,7 @@ meshio reads such files as well, but neither NSET of *NODE, nor GENERATE over se
 and it loses element sets of a deck of several blocks; nor does it name the line of a fault.
 """
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,9 +22,10 @@ from .mesh import FileMesh
 IntArray = NDArray[np.int64]
 
 _KINDS = {
-    "C3D4": "tetra", "C3D10": "tetra10", "C3D8": "hexahedron", "C3D8I": "hexahedron", "C3D8R": "hexahedron",
-    "C3D20": "hexahedron20", "C3D20R": "hexahedron20", "C3D6": "wedge",
+    "C3D4": "tetra", "C3D10": "tetra10", "C3D8": "hexahedron", "C3D20": "hexahedron20", "C3D6": "wedge",
 }  # fmt: skip
+_VARIANT = re.compile(r"(C3D\d+)(?:[IMR]?H?|T)")
+"""Reduced, hybrid and other variants are the same cells; they are integrated here as the plain ones."""
 _FLAT = {"T3D2": 2, "T3D3": 3, "CPS3": 3, "CPS4": 4, "CPS6": 6, "CPS8": 8}
 """Elements by which Gmsh and others hand on lines and surfaces: they only name nodes and faces here."""
 _DEEPEST_INCLUDE = 5
@@ -107,7 +109,7 @@ class _Reader:
             self._set(block)
         elif block.keyword == "SURFACE" and block.parameters.get("TYPE", "ELEMENT").upper() == "ELEMENT":
             name = self._name(block, "NAME")
-            self.surfaces[name] = [(where, *(*values, "")[:2]) for where, values in block.data]
+            self.surfaces[name] = [(where, values[0], (*values, "")[1]) for where, values in block.data]
         elif block.keyword in ("PART", "INSTANCE"):
             _fail(
                 block.where,
@@ -140,11 +142,12 @@ class _Reader:
 
     def _elements(self, block: _Lines) -> None:
         name = self._name(block, "TYPE").upper()
-        kind = KINDS.get(_KINDS.get(name, ""))
+        variant = _VARIANT.fullmatch(name)
+        kind = KINDS.get(_KINDS.get(variant[1] if variant else "", ""))
         width = kind.node_count if kind else _FLAT.get(name)
         if width is None:
             readable = ", ".join(_KINDS)
-            _fail(block.where, f"elements of type {name} cannot be read; {readable} can.")
+            _fail(block.where, f"elements of type {name} cannot be read; {readable} and their variants can.")
         if kind and self.kind and kind is not self.kind:
             _fail(
                 block.where,

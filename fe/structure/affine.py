@@ -107,9 +107,8 @@ class AffineStructure:
             Stiffness losses of the regions, see `fe.runtime.state.losses_of`.
         """
         factor = _updated(self.parameters, parameters, "parameter")
-        kept = dict(
-            zip(self.regions, (1.0 - z for z in losses_of(stiffness_loss, self.regions)), strict=True)
-        )
+        loss = losses_of(stiffness_loss, self.regions)
+        kept = {name: 1.0 - z for name, z in zip(self.regions, loss, strict=True)}
         return np.array(
             [
                 (1.0 if term.parameter is None else factor[term.parameter])

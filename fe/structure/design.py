@@ -1,6 +1,6 @@
 """A structure as its engineer describes it: a TOML file beside a mesh file, checked.
 
-Places and lengths are in the unit of length of the mesh, which the file names; everything else is in SI units.
+Places and lengths are in the unit of length of the mesh, which the file names; all else is in SI units.
 """
 
 import hashlib
@@ -36,7 +36,7 @@ Spring = Annotated[float, Field(ge=0.0, le=1e15, description="N/m")]
 
 def unit_vector(vector: Vector) -> FloatArray:
     """Vector (3,) of length one."""
-    return np.asarray(vector) / np.linalg.norm(vector)
+    return np.asarray(np.asarray(vector) / np.linalg.norm(vector), dtype=np.float64)
 
 
 def _refuse_zero(vector: Vector | None, key: str) -> None:
@@ -45,7 +45,7 @@ def _refuse_zero(vector: Vector | None, key: str) -> None:
 
 
 class NamedSet(Part):
-    """Set of the nodes, or of the cells whose centres, lie in a box: two opposite corners [unit of length]."""
+    """Set of the nodes, or of the cells whose centres, lie in a box: two corners [unit of length]."""
 
     name: SetName
     of: Literal["nodes", "cells"]
@@ -76,9 +76,9 @@ class Control(Part):
 class Material(Part):
     """Material of the cells of a set: isotropic, or orthotropic in axes given by two vectors.
 
-    An orthotropic material gives three moduli along its axes 1, 2 and 3, Poisson's ratios 12, 13 and 23 (ratio
-    ij is the contraction along j under tension along i) and shear moduli 12, 13 and 23. Axis 1 is along
-    `axes[1]`; axis 2 lies in the plane of both vectors, at right angles to it.
+    An orthotropic material gives three moduli along its axes 1, 2 and 3, Poisson's ratios 12, 13 and 23
+    (ratio ij is the contraction along j under tension along i) and shear moduli 12, 13 and 23. Axis 1 is
+    along the first vector; axis 2 lies in the plane of both vectors, at right angles to it.
     """
 
     name: Name
@@ -107,7 +107,7 @@ class Material(Part):
             assert self.axes is not None
             for axis in self.axes:
                 _refuse_zero(axis, "an axis")
-            if np.linalg.norm(np.cross(*map(unit_vector, self.axes))) < LEAST_SINE:
+            if np.linalg.norm(np.cross(unit_vector(self.axes[0]), unit_vector(self.axes[1]))) < LEAST_SINE:
                 raise ValueError("the two axes must not be parallel")
             if np.linalg.eigvalsh(self.compliance)[0] <= 0.0:
                 raise ValueError(
@@ -136,13 +136,14 @@ class Material(Part):
     @property
     def elasticity(self) -> FloatArray:
         """Elasticity (6, 6) [Pa] in space."""
-        local = np.linalg.inv(self.compliance)
+        local = np.asarray(np.linalg.inv(self.compliance), dtype=np.float64)
         if self.axes is None:
-            return np.asarray(local)
+            return local
         first = unit_vector(self.axes[0])
         third = np.cross(first, self.axes[1])
         third /= np.linalg.norm(third)
-        return rotate_elasticity(local[None], np.array([[first, np.cross(third, first), third]]))[0]
+        axes = np.array([[first, np.cross(third, first), third]])
+        return np.asarray(rotate_elasticity(local[None], axes)[0])
 
 
 class Support(Part):
@@ -211,7 +212,7 @@ class PointMass(Part):
 
 
 class Gauge(Part):
-    """Strain gauge on the surface: the strain along `direction`, positive in tension, averaged over `length`."""
+    """Strain gauge on the surface: mean strain over `length` along `direction`, positive in tension."""
 
     name: Name
     point: Vector
@@ -302,7 +303,8 @@ class StructureDesign(Part):
         for number, load in enumerate(self.load, start=1):
             if load.control is not None and load.control not in controls:
                 raise ValueError(
-                    f"load[{number}] is tied to the control {load.control!r}, but no [[control]] has that name"
+                    f"load[{number}] is tied to the control {load.control!r}, but no [[control]] has that "
+                    "name"
                 )
         for name in controls:
             if not any(load.control == name for load in self.load):

@@ -1,10 +1,11 @@
 """The kinds of elements that a structure may be made of: nodes, faces, integration, element arrays.
 
 Shape functions are the polynomials of scikit-fem's elements of the same name, made for many places at once;
-nodes stand in the order of the mesh file, which is that of VTK and, for these kinds, of Abaqus and CalculiX. All kinds are isoparametric: the mid-edge nodes of a file bend the
-edges and faces. Stiffness is integrated as CalculiX integrates C3D4, C3D8, C3D10 and C3D20; mass is integrated
-exactly on straight cells, while CalculiX takes the points of the stiffness for it. Element arrays are
-contracted for many cells at once, as in `fe.full.assembly`. Strains are in Voigt order 11, 22, 33, 23, 13, 12.
+nodes stand in the order of the mesh file, which is that of VTK and, for these kinds, of Abaqus and CalculiX.
+All kinds are isoparametric: the mid-edge nodes of a file bend the edges and faces. Stiffness is integrated as
+CalculiX integrates C3D4, C3D8, C3D10 and C3D20; mass is integrated exactly on straight cells, while CalculiX
+takes the points of the stiffness for it. Element arrays are contracted for many cells at once, as in
+`fe.full.assembly`. Strains are in Voigt order 11, 22, 33, 23, 13, 12.
 """
 
 import itertools

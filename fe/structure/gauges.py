@@ -80,13 +80,14 @@ def gauge_rows(
 
 
 def _in_surface(direction: FloatArray, normal: FloatArray, where: str) -> FloatArray:
-    """Unit direction (3,) turned into the surface."""
+    """Return a direction (3,) turned into the surface, of length one."""
     direction = direction / np.linalg.norm(direction)
-    angle = float(np.degrees(np.arcsin(min(1.0, abs(direction @ normal)))))
+    angle = float(np.degrees(np.arcsin(min(1.0, abs(float(direction @ normal))))))
     if angle > STEEPEST:
         raise InvalidDesignError(
             f"{where}: its direction points {angle:.0f} degrees out of the surface, whose normal there is "
-            f"({', '.join(f'{value + 0.0:.3g}' for value in normal)}); at most {STEEPEST:g} degrees are allowed."
+            f"({', '.join(f'{value + 0.0:.3g}' for value in normal)}); at most {STEEPEST:g} degrees are "
+            "allowed."
         )
     inside = direction - (direction @ normal) * normal
     return np.asarray(inside / np.linalg.norm(inside))

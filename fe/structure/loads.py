@@ -11,10 +11,7 @@ FloatArray = NDArray[np.float64]
 
 
 def area_vectors(mesh: StructureMesh, surface: Surface) -> FloatArray:
-    """Integral (nodes, 3) [m^2] over faces of each node's shape function times the outward normal.
-
-    Its norm, node by node, is no area where faces meet at an angle: see `area_shares`.
-    """
+    """Integral (nodes, 3) [m^2] over faces of each node's shape function times the outward normal."""
     total = np.zeros((len(mesh.points), 3))
     for cells, vectors, values in _face_points(mesh, surface):
         np.add.at(total, mesh.cells[cells], np.einsum("nqi,qa->nai", vectors, values))
@@ -59,11 +56,11 @@ def surface_load(mesh: StructureMesh, locator: Locator, load: Load, where: str) 
     """
     if load.pressure is not None:
         assert load.set is not None
-        return -load.pressure * area_vectors(mesh, mesh.faces_of(load.set, where))
+        return np.asarray(-load.pressure * area_vectors(mesh, mesh.faces_of(load.set, where)))
     assert load.force is not None
     force = np.asarray(load.force)
     if load.point is not None:
-        return point_shares(mesh, locator, load.point, where)[:, None] * force
+        return np.outer(point_shares(mesh, locator, load.point, where), force)
     assert load.set is not None
     nodes = mesh.nodes_of(load.set, where)
     surface = mesh.faces_between(load.set, nodes)
@@ -73,7 +70,7 @@ def surface_load(mesh: StructureMesh, locator: Locator, load: Load, where: str) 
         shares /= shares.sum()
     else:
         shares[nodes] = 1.0 / len(nodes)
-    return shares[:, None] * force
+    return np.outer(shares, force)
 
 
 def point_shares(

@@ -15,8 +15,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 FARTHEST = 0.1
-"""A point may lie so far off the surface, in sizes of the nearest face: coordinates are rounded, and the faces of
-a mesh lie beside the curved surface that they stand for."""
+"""A point may lie so far off the surface, in sizes of the nearest face: coordinates are rounded, and the
+faces of a mesh lie beside the curved surface that they stand for."""
 _INSIDE = 1e-9
 _STEPS = 25
 _SAME_PLACE = 1e-6

@@ -90,6 +90,6 @@ def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
     if needed > allowed:
         raise MeshError(
             f"{mesh.source}: {mesh.unknowns:,} unknowns would take about {needed / GIB:.1f} GiB, but "
-            f"{allowed / GIB:.1f} GiB are {'left on this machine' if limit is None else 'allowed'}; a coarser "
-            "mesh is needed."
+            f"{allowed / GIB:.1f} GiB are {'left on this machine' if limit is None else 'allowed'}; coarsen "
+            "the mesh."
         )

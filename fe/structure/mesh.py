@@ -189,7 +189,8 @@ class StructureMesh:
             if surface is None:
                 known = _listed((*self.node_sets, *self.face_sets))
                 raise MeshError(
-                    f"{where}: {self.source} holds no set of nodes or faces named {name!r}; these are {known}."
+                    f"{where}: {self.source} holds no set of nodes or faces named {name!r}; there are "
+                    f"{known}."
                 )
             found = self._nodes_of_faces(surface)
         left_out = _found(self.loose_in, name) or 0
@@ -213,8 +214,8 @@ class StructureMesh:
         surface = self.faces_between(name, self.nodes_of(name, where))
         if not len(surface):
             raise MeshError(
-                f"{where}: no face of the surface lies in the set {name!r} of {self.source}; a set of faces, or "
-                "all nodes of the faces, is expected."
+                f"{where}: no face of the surface lies in the set {name!r} of {self.source}; a set of faces, "
+                "or all nodes of the faces, is expected."
             )
         return surface
 

@@ -92,8 +92,8 @@ def _check_edges(mesh: StructureMesh) -> None:
             cell = int(np.flatnonzero(far)[0])
             raise MeshError(
                 f"{mesh.source}: node {mesh.node_numbers[mesh.cells[cell, first + number]]} of element "
-                f"{mesh.cell_numbers[cell]} at {mesh.place(mesh.centres[cell])} lies far from the middle of its "
-                "edge; the nodes of the element stand in another order, or the edge is bent too much."
+                f"{mesh.cell_numbers[cell]} at {mesh.place(mesh.centres[cell])} lies far from the middle of "
+                "its edge; the nodes of the element stand in another order, or the edge is bent too much."
             )
 
 
@@ -134,16 +134,16 @@ def _check_parts(mesh: StructureMesh) -> None:
 def _from_meshio(path: Path) -> FileMesh:
     import meshio
 
+    if not path.is_file():
+        raise MeshError(f"The mesh file {path} is not there.")
     try:
         # meshio writes what it thinks of a file to the terminal, and ends the program where it fails.
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             found = meshio.read(path)
-    except FileNotFoundError:
-        raise MeshError(f"The mesh file {path} is not there.") from None
     except meshio.ReadError as error:
         raise MeshError(
-            f"The mesh file {path} cannot be read: {error or 'its format is not known'}."
+            f"The mesh file {path} cannot be read: {str(error).strip('. ') or 'its format is not known'}."
         ) from None
     except OSError as error:
         raise MeshError(f"The mesh file {path} cannot be read: {error.strerror}.") from None

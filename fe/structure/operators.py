@@ -81,7 +81,7 @@ def structure_mesh(design: StructureDesign, file: Path) -> StructureMesh:
 
 
 def cells_by_set(mesh: StructureMesh, parts: tuple[tuple[str, str, str], ...], what: str) -> IntArray:
-    """Number (nc,) of the part whose set holds each cell, -1 for none.
+    """Find the number (nc,) of the part whose set holds each cell, -1 for none.
 
     Parameters
     ----------
@@ -103,9 +103,9 @@ def cells_by_set(mesh: StructureMesh, parts: tuple[tuple[str, str, str], ...], w
         taken = cells[owner[cells] >= 0]
         if len(taken):
             raise MeshError(
-                f"{where}: the {what} {name!r} and {parts[owner[taken[0]]][1]!r} share {len(taken)} elements, "
-                f"among them {mesh.cell_numbers[taken[0]]} at {mesh.place(mesh.centres[taken[0]])}; sets of "
-                f"{what}s must not overlap."
+                f"{where}: the {what}s {name!r} and {parts[owner[taken[0]]][1]!r} share {len(taken)} "
+                f"elements, such as {mesh.cell_numbers[taken[0]]} at {mesh.place(mesh.centres[taken[0]])}; "
+                "their sets must not overlap."
             )
         owner[cells] = number
     return owner
@@ -289,7 +289,7 @@ def _stiffness_terms(
     region_of: IntArray,
     held: SupportedUnknowns,
 ) -> tuple[StiffnessTerm, ...]:
-    """Terms by pairs of a parameter and a region, parameters first; the pair of none holds the springs too."""
+    """Sum the cells by pairs of a parameter and a region; the pair of none holds the springs too."""
     restriction = held.expansion.T.tocsr()
     found: dict[tuple[str | None, str | None], sparse.csr_array] = {}
     for number, part in enumerate(design.material):

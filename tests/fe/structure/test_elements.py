@@ -1,0 +1,140 @@
+"""Shape functions, faces and element arrays against scikit-fem, closed forms and the patch test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from skfem import Basis, BilinearForm, ElementVector, MeshHex, MeshTet
+from skfem.element import ElementHex1, ElementHexS2, ElementTetP1, ElementTetP2, ElementWedge1
+from skfem.helpers import ddot, sym_grad
+from skfem.models.elasticity import lame_parameters, linear_stress
+
+from fe.full.assembly import isotropic_elasticity
+from fe.structure.design import Gauge
+from fe.structure.elements import KINDS, jacobians, mass_blocks, stiffness_blocks
+from fe.structure.gauges import gauge_rows
+from fe.structure.loads import area_shares, area_vectors
+from fe.structure.location import Locator
+from fe.structure.mesh import StructureMesh
+from fe.structure.mesh_file import read_mesh
+from fe.structure.operators import assembled
+
+SKFEM: dict[str, Any] = {
+    "tetra": ElementTetP1(),
+    "tetra10": ElementTetP2(),
+    "hexahedron": ElementHex1(),
+    "hexahedron20": ElementHexS2(),
+    "wedge": ElementWedge1(),
+}
+
+
+@pytest.fixture(params=sorted(KINDS))
+def distorted(
+    request: pytest.FixtureRequest, box: Callable[..., Any], write: Callable[..., Path]
+) -> StructureMesh:
+    """A box whose inner nodes are moved; edges stay straight."""
+    points, cells = box(request.param, (2, 2, 2))
+    kind = KINDS[request.param]
+    corners = np.unique(cells[:, : len(kind.corners)])
+    moved = points.copy()
+    inner = corners[((points[corners] > 0.0) & (points[corners] < 1.0)).all(axis=1)]
+    moved[inner] += (0.07, -0.05, 0.06)
+    for number, (a, b) in enumerate(kind.edges):
+        moved[cells[:, len(kind.corners) + number]] = 0.5 * (moved[cells[:, a]] + moved[cells[:, b]])
+    moved = moved * (1.0, 2.0, 0.5)
+    return read_mesh(write(moved, request.param, cells, "").parent / "mesh.vtu", 1.0, "m")
+
+
+@pytest.mark.parametrize("name", sorted(KINDS))
+def test_shape_functions_are_those_of_scikit_fem(name: str) -> None:
+    kind, other = KINDS[name], SKFEM[name]
+    local = np.random.default_rng(0).random((7, 3)) / 3.0
+    values, gradients = kind.shape_functions(local)
+    for node, place in enumerate(kind.places):
+        number = int(np.flatnonzero((np.asarray(other.doflocs) == place).all(axis=1))[0])
+        value, gradient = other.lbasis(local.T, number)
+        np.testing.assert_allclose(values[:, node], value, atol=1e-14)
+        np.testing.assert_allclose(gradients[:, node], np.array(gradient).T, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["tetra", "tetra10", "hexahedron", "hexahedron20"])
+def test_element_arrays_are_those_of_scikit_fems_forms(name: str, box: Callable[..., Any]) -> None:
+    points, cells = box(name, (1, 1, 1))
+    kind = KINDS[name]
+    points = points + 0.1 * points[:, [1, 2, 0]]  # sheared: straight, and no two edges alike
+    corners = len(kind.corners)
+    mesh = MeshTet if corners == 4 else MeshHex
+    order = [int(np.flatnonzero((np.array(kind.corners) == p).all(axis=1))[0]) for p in mesh.elem.refdom.p.T]
+    used, vertices = np.unique(cells[:, order], return_inverse=True)
+    vertices = vertices.reshape(len(cells), corners)
+    body = mesh(np.ascontiguousarray(points[used].T), np.ascontiguousarray(vertices.T), sort_t=False)
+    basis = Basis(body, ElementVector(SKFEM[name]), intorder=6)
+    stress = linear_stress(*lame_parameters(2.0, 0.3))
+    stiffness = BilinearForm(lambda u, v, w: ddot(stress(sym_grad(u)), sym_grad(v))).assemble(basis)
+    mass = BilinearForm(lambda u, v, w: sum(u[i] * v[i] for i in range(3))).assemble(basis)
+    nodes = points[cells]
+    K = stiffness_blocks(kind, nodes, isotropic_elasticity(2.0, 0.3))
+    M = mass_blocks(kind, nodes, 1.0, kind.mass_rule)
+    # Unknowns of both are told by the places of their nodes: compare the energies of one smooth field.
+    field = np.sin(points @ np.array([[1.0, 2.0, 0.5], [0.3, -1.0, 2.0], [0.7, 0.2, 1.0]]))
+    ours = field[cells].reshape(len(cells), -1)
+    theirs = np.zeros(basis.N)
+    for row, unknowns in enumerate(basis.element_dofs):
+        for unknown in unknowns:
+            node = int(np.linalg.norm(points - basis.doflocs[:, unknown], axis=1).argmin())
+            theirs[unknown] = field[node, row % 3]
+    assert np.einsum("ni,nij,nj->", ours, K, ours) == pytest.approx(theirs @ stiffness @ theirs, rel=1e-12)
+    scalar = np.einsum("nai,nab,nbi->", field[cells], M, field[cells])
+    assert scalar == pytest.approx(theirs @ mass @ theirs, rel=1e-12)
+
+
+def test_patch_test_and_gauges(distorted: StructureMesh) -> None:
+    gradient = 1e-3 * np.array([[1.0, 2.0, -0.5], [0.3, -1.5, 0.8], [0.6, -0.2, 0.9]])
+    exact = distorted.points @ gradient.T
+    elasticity = isotropic_elasticity(7e10, 0.3)
+    K = assembled(
+        distorted,
+        np.arange(len(distorted.cells)),
+        lambda nodes: stiffness_blocks(distorted.kind, nodes, elasticity),
+        3,
+    )
+    inner = ((distorted.points > 1e-9) & (distorted.points < np.array([1, 2, 0.5]) - 1e-9)).all(axis=1)
+    assert inner.any()
+    free = np.repeat(inner, 3)
+    found = np.where(free, 0.0, exact.ravel())
+    found[free] = np.linalg.solve(K[free][:, free].toarray(), -(K @ found)[free])
+    np.testing.assert_allclose(found, exact.ravel(), atol=1e-12 * np.abs(exact).max())
+    # The strain of that field along any direction of the surface, with and without a length.
+    gauges = (
+        Gauge(name="a", point=(0.31, 0.77, 0.5), direction=(1.0, 2.0, 0.0)),
+        Gauge(name="b", point=(1.0, 1.2, 0.2), direction=(0.0, 1.0, 1.0), length=0.3),
+        Gauge(name="c", point=(0.5, 1.0, 0.0), direction=(1.0, 0.0, 0.0)),  # on a node
+    )
+    rows, places = gauge_rows(distorted, Locator(distorted), gauges)
+    for gauge, strain, place in zip(gauges, rows @ exact.ravel(), places, strict=True):
+        along = np.array(gauge.direction) / np.linalg.norm(gauge.direction)
+        assert strain == pytest.approx(along @ gradient @ along, rel=1e-10)
+        np.testing.assert_allclose(place.point, gauge.point, atol=1e-12)
+
+
+def test_faces_enclose_the_volume(distorted: StructureMesh) -> None:
+    normal = area_vectors(distorted, distorted.boundary)
+    np.testing.assert_allclose(normal.sum(axis=0), 0.0, atol=1e-13)
+    # Gauss: the integral of x . n over the surface is three volumes.
+    assert np.sum(normal * distorted.points) == pytest.approx(3.0)
+    assert area_shares(distorted, distorted.boundary).sum() == pytest.approx(2 * (2.0 + 0.5 + 1.0))
+    local, weight = distorted.kind.mass_rule
+    volume = (np.linalg.det(jacobians(distorted.kind, distorted.nodes, local)) * weight).sum()
+    assert volume == pytest.approx(1.0)
+
+
+def test_a_point_inside_is_found(distorted: StructureMesh) -> None:
+    locator = Locator(distorted)
+    for point in np.random.default_rng(1).random((5, 3)) * (1.0, 2.0, 0.5):
+        cell, local = locator.attach(point, "here")
+        values, _ = distorted.kind.shape_functions(local[None])
+        np.testing.assert_allclose(values[0] @ distorted.nodes[cell], point, atol=1e-12)

@@ -1,0 +1,132 @@
+"""`uav-twin structure` as a user calls it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from fe.verification.calculix_job import calculix_program
+from uav_twin import cli
+
+DECK = """*NODE
+1, 0, 0, 0
+2, 100, 0, 0
+3, 100, 10, 0
+4, 0, 10, 0
+5, 0, 0, 10
+6, 100, 0, 10
+7, 100, 10, 10
+8, 0, 10, 10
+9, 7, 7, 7
+*ELEMENT, TYPE=C3D8, ELSET=BAR
+1, 1, 2, 3, 4, 5, 6, 7, 8
+*NSET, NSET=ROOT
+1, 4, 5, 8
+*SURFACE, NAME=END
+BAR, S4
+"""
+STRUCTURE = """
+name = "bar"
+mesh = "bar.inp"
+length_unit = "mm"
+[[parameter]]
+name = "e"
+[[material]]
+name = "steel"
+set = "BAR"
+density = 7800
+young_modulus = 2e11
+poisson_ratio = 0.0
+scaled_by = "e"
+[[support]]
+set = "ROOT"
+hold = ["x", "y", "z"]
+[[load]]
+name = "pull"
+set = "END"
+force = [2000, 0, 0]
+[[gauge]]
+name = "top"
+point = [50, 5, 10]
+direction = [1, 0, 0]
+[[displacement]]
+name = "end"
+point = [100, 5, 5]
+direction = [1, 0, 0]
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    (tmp_path / "bar.inp").write_text(DECK)
+    (tmp_path / "bar.toml").write_text(STRUCTURE)
+    return tmp_path / "bar.toml"
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["uav-twin", "structure", *arguments])
+    monkeypatch.setenv("COLUMNS", "120")
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    return int(caught.value.code or 0)
+
+
+def test_info_says_what_a_structure_is(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call(monkeypatch, "info", str(file), "--modes", "2", "--quiet", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["mass"] == pytest.approx(7800 * 0.1 * 0.01**2)
+    assert record["centre_of_gravity"] == pytest.approx([50, 5, 5])
+    assert (record["unknowns"], record["held"], record["loose_nodes"]) == (12, 12, [9])
+    # A bar under 20 MPa: 100 microstrain, 0.01 mm.
+    (load,) = record["loads"]
+    assert load["strain"]["top"] == pytest.approx(1e-4, rel=1e-9)
+    assert load["output"]["end"] == pytest.approx(1e-5, rel=1e-9)
+    assert len(record["frequencies"]) == 2
+    assert call(monkeypatch, "info", str(file), "--modes", "2") == 0
+    text = capsys.readouterr().out
+    for part in (
+        "1 8-node hexahedra, 8 nodes",
+        "1 touch no element, among them 9",
+        "scaled by e",
+        "holds x, y, z",
+    ):
+        assert part in text
+    assert "Load pull: largest displacement 0.01 mm" in text
+
+
+@pytest.mark.skipif(calculix_program() is None, reason="CalculiX (ccx) is not installed")
+def test_verify_compares_with_calculix(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "jobs"
+    assert call(monkeypatch, "verify", str(file), "--modes", "2", "--out", str(out)) == 0
+    text = capsys.readouterr().out
+    assert text.count("kept") == 4
+    assert "BROKEN" not in text
+    assert (out / "static.inp").is_file()
+    assert call(monkeypatch, "verify", str(file), "--out", str(out)) == 1
+    assert "is not an empty folder" in capsys.readouterr().err
+    assert call(monkeypatch, "verify", str(file), "--modes", "2", "--json", "--quiet") == 0
+    assert json.loads(capsys.readouterr().out)["passed"] is True
+    monkeypatch.setattr("uav_twin.structure.FREQUENCY_LIMIT", 0.0)
+    assert call(monkeypatch, "verify", str(file), "--modes", "2") == 1
+    found = capsys.readouterr()
+    assert "BROKEN" in found.out
+    assert "1 of 4 checks broke their limit: 2 modes, frequencies." in found.err
+
+
+def test_a_fault_ends_in_one_sentence(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call(monkeypatch, "info", str(file), "--memory-limit", "0.1") == 1
+    assert "24 unknowns would take about" in capsys.readouterr().err
+    file.write_text(STRUCTURE.replace('"ROOT"', '"WALL"'))
+    assert call(monkeypatch, "info", str(file)) == 1
+    assert "no set of nodes or faces named 'WALL'; there are ROOT, END." in capsys.readouterr().err
+    assert call(monkeypatch, "info", str(file.parent / "none.toml")) == 1
+    assert "none.toml" in capsys.readouterr().err
