@@ -5,6 +5,7 @@ Each page has a namespace and a folder of its own, which holds what the page say
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import shutil
@@ -158,6 +159,29 @@ length = 1.8
 """
 
 
+def bracket(folder: Path) -> None:
+    """Write the structure of the page, and a mesh with its sets."""
+    (text,) = blocks(ROOT / "docs" / "structures.md", "toml")
+    (folder / "bracket.toml").write_text(text, encoding="utf-8")
+    nodes = {
+        (x, y, z): number
+        for number, (x, y, z) in enumerate(itertools.product(range(13), range(3), range(3)), start=1)
+    }
+    deck = ["*NODE", *(f"{n}, {10 * x}, {10 * y - 10}, {10 * z}" for (x, y, z), n in nodes.items())]
+    deck.append("*ELEMENT, TYPE=C3D8, ELSET=BODY")
+    corners = ((0, 0), (1, 0), (1, 1), (0, 1))
+    for element, (x, y, z) in enumerate(itertools.product(range(12), range(2), range(2)), start=1):
+        own = [nodes[x + a, y + b, z + c] for c in (0, 1) for a, b in corners]
+        deck.append(f"{element}, {', '.join(map(str, own))}")
+    for kind, name, members in (
+        ("NSET", "ROOT", [n for (x, _, _), n in nodes.items() if x == 0]),
+        ("NSET", "TOP", [n for (_, _, z), n in nodes.items() if z == 2]),
+        ("ELSET", "LUG", range(1, 9)),
+    ):
+        deck += [f"*{kind}, {kind}={name}", *map(str, members)]
+    (folder / "bracket.inp").write_text("\n".join(deck) + "\n", encoding="ascii")
+
+
 Prepare = Callable[[Path], None]
 
 READER_HAS: dict[str, tuple[Prepare, ...]] = {
@@ -171,6 +195,7 @@ READER_HAS: dict[str, tuple[Prepare, ...]] = {
     "docs/python.md": (wing_fmu, drafted_binding, without_the_fmu, verdict_folder),
     "docs/real_wing.md": (converted_wing,),
     "docs/rig_in_ten_minutes.md": (empty_rig,),
+    "docs/structures.md": (bracket,),
     "docs/use_the_wing_in.md": (wing_fmu,),
     "docs/verdict.md": (verdict_folder,),
 }

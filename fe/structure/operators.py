@@ -216,19 +216,6 @@ def assemble(
     free = tuple(part for part in design.mass if part.free)
     mass_terms = (structure_mass, *(_outer(weights[part.name]) for part in free))
 
-    loads = []
-    for number, load in enumerate(design.load, start=1):
-        where = f"load[{number}]"
-        if load.acceleration is None:
-            loads.append(LoadTerm(load.name, restriction @ surface_load(mesh, locator, load, where).ravel()))
-            continue
-        field = np.asarray(load.acceleration)
-        loads.append(LoadTerm(load.name, restriction @ np.outer(nodal_mass, field).ravel()))
-        loads.extend(
-            LoadTerm(load.name, restriction @ np.outer(weights[part.name], field).ravel(), part.name)
-            for part in free
-        )
-
     gauges, places = gauge_rows(mesh, locator, design.gauge)
     return Structure(
         parameters={part.name: part.nominal for part in design.parameter},
@@ -240,7 +227,7 @@ def assemble(
             (restriction @ sparse.kron(term, sparse.eye_array(3)) @ expansion).tocsr() for term in mass_terms
         ),
         loads={part.name: part.control for part in design.load},
-        load_terms=tuple(loads),
+        load_terms=tuple(_load_terms(design, mesh, locator, restriction, nodal_mass, weights)),
         gauges=tuple(part.name for part in design.gauge),
         displacements=tuple(part.name for part in design.displacement),
         accelerations=tuple(part.name for part in design.acceleration),
@@ -260,6 +247,28 @@ def assemble(
         point_weights=weights,
         nodal_mass=nodal_mass,
     )
+
+
+def _load_terms(
+    design: StructureDesign,
+    mesh: StructureMesh,
+    locator: Locator,
+    restriction: sparse.csr_array,
+    nodal_mass: FloatArray,
+    weights: dict[str, FloatArray],
+) -> Iterator[LoadTerm]:
+    """Yield the parts of every load; an acceleration acts on 1 kg of each free mass as well."""
+    for number, load in enumerate(design.load, start=1):
+        if load.acceleration is None:
+            nodal = surface_load(mesh, locator, load, f"load[{number}]")
+            yield LoadTerm(load.name, restriction @ nodal.ravel())
+            continue
+        field = np.asarray(load.acceleration)
+        yield LoadTerm(load.name, restriction @ np.outer(nodal_mass, field).ravel())
+        for part in design.mass:
+            if part.free:
+                vector = restriction @ np.outer(weights[part.name], field).ravel()
+                yield LoadTerm(load.name, vector, part.name)
 
 
 def _outer(weights: FloatArray) -> sparse.csr_array:

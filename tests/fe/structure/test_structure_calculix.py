@@ -100,7 +100,7 @@ direction = [0, 0, 1]
 
 
 def body(box: Callable[..., Any], write: Callable[..., Path], kind: str, **options: bool) -> Structure:
-    points, cells = box(kind, (3, 2, 1) if kind in ("hexahedron20", "tetra10") else (4, 2, 2))
+    points, cells = box(kind, (4, 2, 1) if kind in ("hexahedron20", "tetra10") else (4, 2, 2))
     bent = points * (100, 25, 10)
     if kind in ("hexahedron20", "tetra10"):  # curved edges, in the plane of the top
         bent[:, 1] += 12.0 * (bent[:, 0] / 100.0) ** 2 * (bent[:, 1] / 25.0)
