@@ -10,8 +10,9 @@ threshold c with a probability of at most 1 / c, however often one looks (Ville 
 and Shafer 2023).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -166,6 +167,8 @@ class WatchfulEstimator:
                 f"{sensors * len(_GAINS)} faults of gauges, which are more than {_LARGEST} numbers: take "
                 "fewer levels or state factors, or leave out `notice`"
             )
+        # A model that takes the place of another, as one that was taught, begins without suspicion.
+        self._key = np.frombuffer(sha256(np.ascontiguousarray(table).tobytes()).digest()[:8], dtype=np.uint64)
         controls = range(sensor_model.control_count)
         self._value = [np.ascontiguousarray(table[:, :, u]) for u in controls]
         self._inverse = [np.ascontiguousarray(1.0 / deviation[:, u]) for u in controls]
@@ -193,14 +196,15 @@ class WatchfulEstimator:
         absurd = (seen < self._low[control_index]) | (seen > self._high[control_index])
         used = np.where(absurd, np.nan, seen)
         estimate = self._inner.turn(before, used, control_index, turn)
-        own = self._start() if before is None else self._advanced(before)
+        followed = before is not None and before.arrays.get(_PREFIX + "model_key") == self._key
+        own = self._advanced(before) if before is not None and followed else self._start(estimate.forecast)
         self._assimilate(own, used, control_index)
         notices = self._left_out(own["left_out"] > 0.0, absurd, seen, control_index, turn)
         # A gauge that is left out stays so while it is silent.
         own["left_out"] = (absurd | ((own["left_out"] > 0.0) & np.isnan(seen))).astype(np.float64)
         suspicion = self._suspicion(own)
         notices += self._alarms(own, suspicion, turn)
-        arrays = {**estimate.carried.arrays, **{_PREFIX + name: value for name, value in own.items()}}
+        arrays = {**estimate.carried.arrays, **self._packed(own)}
         return replace(
             estimate,
             carried=Carried(control_index, arrays),
@@ -208,10 +212,10 @@ class WatchfulEstimator:
             suspicion=suspicion,
         )
 
-    def _start(self) -> Arrays:
-        """Return what is carried, before the first observation."""
+    def _start(self, forecast: Float) -> Arrays:
+        """Return what is carried, before the first observation of this model."""
         sensors, gains = self._shape[:2]
-        model = self._draw_weight[:, None] * self.model.prior
+        model = self._draw_weight[:, None] * forecast
         weight = np.log(_FROM_THE_START)
         return {
             "model": model,
@@ -232,14 +236,10 @@ class WatchfulEstimator:
 
     def _advanced(self, before: Carried) -> Arrays:
         """Return what was carried, one transition later, with the rivals that begin in this turn."""
-        own = {
-            name.removeprefix(_PREFIX): value.copy()
-            for name, value in before.arrays.items()
-            if name.startswith(_PREFIX)
-        }
+        own = self._unpacked(before.arrays)
         sparse, states = self.model.transition.sparse, self._shape[-1]
         for name in ("model", "gauge", "none"):
-            rows = before.arrays[_PREFIX + name].reshape(-1, states)
+            rows, own[name] = own[name].reshape(-1, states), np.empty_like(own[name])
             forecast_rows(
                 sparse.start, sparse.source, sparse.probability, before.control_index * states,
                 rows, own[name].reshape(-1, states),
@@ -263,6 +263,23 @@ class WatchfulEstimator:
             kept[0] * own["none_statistics"][..., 5] + (1.0 - kept[0]) * own["model_squares"]
         )
         return own
+
+    def _packed(self, own: Arrays) -> Arrays:
+        """Return what is carried: of the beliefs about gauges, most of which are zero, those that are not."""
+        place = np.flatnonzero(own["gauge"])
+        packed = own | {"gauge": own["gauge"].ravel()[place], "gauge_place": place.astype(np.int32)}
+        return {_PREFIX + name: value for name, value in packed.items()} | {_PREFIX + "model_key": self._key}
+
+    def _unpacked(self, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+        own = {
+            name.removeprefix(_PREFIX): value.copy()
+            for name, value in arrays.items()
+            if name.startswith(_PREFIX)
+        }
+        del own["model_key"]
+        gauge = np.zeros(self._shape, dtype=np.float32)
+        gauge.ravel()[own.pop("gauge_place")] = own["gauge"]
+        return own | {"gauge": gauge}
 
     def _to_begin(self, turn: float) -> float:
         """Return the prior share of faults that begin after a turn."""

@@ -31,6 +31,8 @@ def decision_of(
         "log_evidence": turn.log_evidence,
         "alarms": [vars(notice) for notice in turn.notices],
     }
+    if turn.suspicion is not None:
+        record["none_of_these"] = turn.suspicion.none_of_these
     if reading.revises is not None:
         record["revised_by_turn"] = reading.revises
     if turn.learnt:

@@ -201,6 +201,20 @@ def test_a_twin_that_was_saved_goes_on_to_the_last_bit() -> None:
         np.testing.assert_array_equal(one.log_evidence_gauge, other.log_evidence_gauge)
 
 
+def test_a_model_that_takes_the_place_of_another_begins_without_suspicion() -> None:
+    model, sensors = small()
+    taught = GaussianSensorModel(1.2 * sensors.value_per_draw, 1.0)
+    other = WatchfulEstimator(ExactFilter(model, taught), taught, DRAWS)
+    seen = 1.2 * drawn(np.random.default_rng(7), 12)
+    before = run(watchful(), seen)
+    assert before[-1].suspicion is not None
+    assert before[-1].suspicion.log_evidence_none > np.log(SETTINGS.threshold)
+    after = other.turn(before[-1].carried, seen[-1], 0, 12)
+    assert after.suspicion is not None
+    assert max(after.suspicion.none_of_these, after.suspicion.gauge_off) < 0.05
+    assert not after.notices
+
+
 def test_too_many_states_are_refused_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("twin_master.learning.monitor._LARGEST", 71)
     with pytest.raises(InvalidModelError, match=r"3 states and 2 draws for each of 12 faults .* leave out"):
