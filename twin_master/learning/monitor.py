@@ -2,8 +2,8 @@
 
 Beside the model as it is (every gauge shows what the state, a draw of the parameter and noise of unknown
 scale say) run rivals with filters of their own, so that state and parameter are marginalised under each: that
-a gauge shows a stated share too much or too little, and that the gain of every gauge is free, which no state
-of the model explains. Each may begin in any turn; the mixture over the first turn is exact, because until
+a gauge shows a stated share too much or too little, and that several gauges have gains of their own, which no
+state of the model explains. Each may begin in any turn; the mixture over the first turn is exact, because until
 then the rival's belief is the model's. The ratio of the evidence of a rival to that of the model is an
 e-process: its mean under the predictions of the model is one at every turn, so that it ever exceeds a
 threshold c with a probability of at most 1 / c, however often one looks (Ville 1939; Ramdas, Grünwald, Vovk
@@ -39,12 +39,16 @@ COMMAND = "uav-twin discrepancy run --from-run DIR"
 _PREFIX = "notice/"
 _FROM_THE_START = 0.5
 """Prior share of faults that are there from the first turn; the others begin at a later one."""
+_FREE = 0.5
+"""Prior probability that a gauge has a gain of its own, where no state explains all of them."""
 _GAINS = (-2.5, -1.0, 1.0, 2.5)
 """Gain errors of a gauge that is off, in those that are to be found; larger ones are found by the largest."""
 _DRAWS = 15
 """Draws of the parameter that are kept apart here: evidence is compared, and no fine posterior is needed."""
 _LARGEST = 20_000_000
 """Numbers that the beliefs of the rivals may take: each turn that is kept holds them."""
+_CLEARLY = float(np.log(10.0))
+"""A single gauge is the simpler explanation: several must be so much better for the alarm to say so."""
 _NAMED_SHARE = 0.1
 _NAMED_DEVIATIONS = 2.0
 _MOST_NAMED = 6
@@ -62,7 +66,8 @@ class MonitorSettings:
     gauge_gain : float
         Gain error of a single gauge that is to be found; less than half of it raises no alarm.
     all_gain : float
-        Prior standard deviation of the gain error of every gauge where no state of the model explains them.
+        Prior standard deviation of the gains of gauges that have one of their own, where no state of the model
+        explains all of them.
     memory_turns : float
         Turns after which what was learnt of these gains has faded to 1 / e.
     onset_turns : float
@@ -227,7 +232,7 @@ class WatchfulEstimator:
             "none_onset": np.zeros(1),
             "model_squares": np.zeros(sensors),
             "gauge_squares": np.zeros((sensors, gains)),
-            "none_statistics": np.zeros((1, sensors, 6)),
+            "none_statistics": np.tile([_FREE, 0.0, 0.0, 0.0, 0.0], (sensors, 1)),
             "count": np.zeros(sensors),
             "turns": np.zeros(1),
             "alarmed": np.zeros(2),
@@ -258,10 +263,10 @@ class WatchfulEstimator:
         mix_onset(
             own["model"], own["none"], own["log_none"], np.full(1, inflow), turn, own["none_onset"], kept
         )
-        own["none_statistics"][..., :5] *= kept[0] * np.exp(-1.0 / self._settings.memory_turns)
-        own["none_statistics"][..., 5] = (
-            kept[0] * own["none_statistics"][..., 5] + (1.0 - kept[0]) * own["model_squares"]
-        )
+        statistics, fresh = own["none_statistics"], 1.0 - kept[0]
+        statistics[:, 0] += fresh * (_FREE - statistics[:, 0])
+        statistics[:, [1, 4]] += fresh * (own["model_squares"][:, None] - statistics[:, [1, 4]])
+        statistics[:, 2:4] *= kept[0] * np.exp(-1.0 / self._settings.memory_turns)
         return own
 
     def _packed(self, own: Arrays) -> Arrays:
@@ -355,13 +360,13 @@ class WatchfulEstimator:
         """
         gauge, none = suspicion.log_evidence_any_gauge, suspicion.log_evidence_none
         threshold, notices = np.log(self._settings.threshold), []
-        if gauge >= max(threshold, none) and not own["alarmed"][0]:
+        if gauge >= max(threshold, none - _CLEARLY) and not own["alarmed"][0]:
             own["alarmed"][0] = 1.0
             notices.append(self._gauge_alarm(own, gauge, turn))
-        if none >= max(threshold, gauge) and not own["alarmed"][1]:
+        if none >= max(threshold, gauge + _CLEARLY) and not own["alarmed"][1]:
             own["alarmed"][1] = 1.0
-            sums = own["none_statistics"][0]
-            deviations = np.abs(sums[:, 4]) / np.sqrt(1.0 + sums[:, 2])
+            sums = own["none_statistics"]
+            deviations = np.abs(sums[:, 3]) / np.sqrt(1.0 + sums[:, 2])
             order = np.argsort(-deviations, kind="stable").tolist()
             named = [g for g in order if deviations[g] >= _NAMED_DEVIATIONS][:_MOST_NAMED] or order[:1]
             what = f"no state of the model explains all gauges together, least {self._words.sensors(named)}"

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fe.compilation import compiled
-from twin_master.learning.kernels import regression
 from twin_master.network.kernels import _exp
 
 __all__ = ["forecast_rows", "mix_onset", "weigh_gauges", "weigh_model", "weigh_none"]
@@ -187,16 +186,16 @@ def weigh_none(
     belief: Single,
     statistics: Float,
 ) -> float:
-    """Assimilate one observation under the rival that the gain of every gauge is free; return log evidence.
+    """Assimilate one observation under the rival that some gauges have gains of their own; return its log.
 
-    belief (E, S) and statistics (1, G, 6), the sums of the regressions, are brought up to date. The sum of
-    squares is that of the innovations over their spread (West and Harrison 1997, section 4.6), so that what a
-    gain explained once stays explained.
+    Which ones is not known: the predictive density of each gauge is a mixture of that without a gain and that
+    with a free one. belief (E, S) and statistics (G, 5) are brought up to date: probability that the gain is
+    free, sum of squares without, sums c² and cx of the regression, and sum of squares of its innovations over
+    their spread (West and Harrison 1997, section 4.6).
     """
     draws, states, sensors = value.shape
-    fitted = np.zeros_like(statistics)
-    regression(statistics, fitted)
     log_value = np.empty((draws, states))
+    free = np.zeros((draws, states, sensors))
     best = -np.inf
     for e in range(draws):
         for s in range(states):
@@ -207,13 +206,21 @@ def weigh_none(
             for g in range(sensors):
                 if np.isnan(observation[g]):
                     continue
-                left = degrees + statistics[0, g, 5]
-                c = gain * value[e, s, g] * inverse_deviation[s, g]
-                x = (observation[g] - value[e, s, g]) * inverse_deviation[s, g] - c * fitted[0, g, 1]
-                spread = 1.0 + c * c * fitted[0, g, 4]
-                total += 0.5 * math.log((degrees + squares_of_model[g]) / (left * spread))
                 power = 0.5 * (degrees + count[g] + 1.0)
-                total += power * math.log(known[e, s, g] / (1.0 + x * x / (left * spread)))
+                x = (observation[g] - value[e, s, g]) * inverse_deviation[s, g]
+                left = degrees + statistics[g, 1]
+                log_without = power * math.log(known[e, s, g] / (1.0 + x * x / left))
+                log_without += 0.5 * math.log((degrees + squares_of_model[g]) / left)
+                c = gain * value[e, s, g] * inverse_deviation[s, g]
+                x -= c * statistics[g, 3] / (1.0 + statistics[g, 2])
+                left = (degrees + statistics[g, 4]) * (1.0 + c * c / (1.0 + statistics[g, 2]))
+                log_with = power * math.log(known[e, s, g] / (1.0 + x * x / left))
+                log_with += 0.5 * math.log((degrees + squares_of_model[g]) / left)
+                largest = max(log_with, log_without)
+                own = statistics[g, 0] * _exp(log_with - largest)
+                both = own + (1.0 - statistics[g, 0]) * _exp(log_without - largest)
+                free[e, s, g] = own / both
+                total += largest + math.log(both)
             log_value[e, s] = total
             best = max(best, total)
     mass = 0.0
@@ -222,21 +229,39 @@ def weigh_none(
             if belief[e, s] > 0.0:
                 log_value[e, s] = belief[e, s] * _exp(log_value[e, s] - best)
                 mass += log_value[e, s]
+    if mass == 0.0:
+        return -np.inf
     for e in range(draws):
         for s in range(states):
-            if belief[e, s] == 0.0:
-                continue
-            share = log_value[e, s] / mass
-            belief[e, s] = share
+            belief[e, s] = log_value[e, s] / mass if belief[e, s] > 0.0 else 0.0
+    for g in range(sensors):
+        if not np.isnan(observation[g]):
+            _learn_gain(
+                observation[g], value[:, :, g], inverse_deviation[:, g], gain, belief, free[:, :, g],
+                statistics[g],
+            )  # fmt: skip
+    return float(best + math.log(mass))
+
+
+@compiled
+def _learn_gain(
+    seen: float, value: Float, inverse_deviation: Float, gain: float, belief: Single, free: Float, sums: Float
+) -> None:
+    """Bring the statistics (5,) of one gauge up to date, expected over draws and states."""
+    fitted, spread = sums[3] / (1.0 + sums[2]), 1.0 / (1.0 + sums[2])
+    added = np.zeros(5)
+    for e in range(belief.shape[0]):
+        for s in range(belief.shape[1]):
+            share = belief[e, s]
             if share < NEGLIGIBLE_SHARE:
                 continue
-            for g in range(sensors):
-                if np.isnan(observation[g]):
-                    continue
-                x = (observation[g] - value[e, s, g]) * inverse_deviation[s, g]
-                c = gain * value[e, s, g] * inverse_deviation[s, g]
-                statistics[0, g, 2] += share * c * c
-                statistics[0, g, 4] += share * c * x
-                x -= c * fitted[0, g, 1]
-                statistics[0, g, 5] += share * x * x / (1.0 + c * c * fitted[0, g, 4])
-    return float(best + math.log(mass)) if mass > 0.0 else -np.inf
+            x = (seen - value[e, s]) * inverse_deviation[s]
+            c = gain * value[e, s] * inverse_deviation[s]
+            added[0] += share * free[e, s]
+            added[1] += share * x * x
+            added[2] += share * c * c
+            added[3] += share * c * x
+            x -= c * fitted
+            added[4] += share * x * x / (1.0 + c * c * spread)
+    sums[0] = added[0]
+    sums[1:] += added[1:]

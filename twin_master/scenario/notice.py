@@ -22,7 +22,7 @@ class Noticing(Section):
     gauge_gain: Annotated[float, Field(strict=True, gt=0.0, le=_LARGEST_GAIN)] = 0.2
     """Gain error of a single sensor that is to be found; less than half of it raises no alarm."""
     all_gain: Annotated[float, Field(strict=True, gt=0.0, le=1.0)] = 0.1
-    """Prior standard deviation of the gain of every sensor where no state explains them."""
+    """Prior standard deviation of the gains of sensors that have one, where no state explains all of them."""
     memory_turns: Positive = 20.0
     """Turns after which what was learnt of these gains has faded to 1 / e."""
     onset_turns: Positive = 50.0
