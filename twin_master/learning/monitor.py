@@ -3,8 +3,8 @@
 Beside the model as it is (every gauge shows what the state, a draw of the parameter and noise of unknown
 scale say) run rivals with filters of their own, so that state and parameter are marginalised under each: that
 a gauge shows a stated share too much or too little, and that several gauges have gains of their own, which no
-state of the model explains. Each may begin in any turn; the mixture over the first turn is exact, because until
-then the rival's belief is the model's. The ratio of the evidence of a rival to that of the model is an
+state of the model explains. Each may begin in any turn; the mixture over the first turn is exact, because
+until then the rival's belief is the model's. The ratio of the evidence of a rival to that of the model is an
 e-process: its mean under the predictions of the model is one at every turn, so that it ever exceeds a
 threshold c with a probability of at most 1 / c, however often one looks (Ville 1939; Ramdas, Grünwald, Vovk
 and Shafer 2023).
@@ -66,8 +66,8 @@ class MonitorSettings:
     gauge_gain : float
         Gain error of a single gauge that is to be found; less than half of it raises no alarm.
     all_gain : float
-        Prior standard deviation of the gains of gauges that have one of their own, where no state of the model
-        explains all of them.
+        Prior standard deviation of the gains of gauges that have one of their own, where no state explains
+        all of them.
     memory_turns : float
         Turns after which what was learnt of these gains has faded to 1 / e.
     onset_turns : float
