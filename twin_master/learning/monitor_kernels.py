@@ -223,17 +223,9 @@ def weigh_none(
                 total += largest + math.log(both)
             log_value[e, s] = total
             best = max(best, total)
-    mass = 0.0
-    for e in range(draws):
-        for s in range(states):
-            if belief[e, s] > 0.0:
-                log_value[e, s] = belief[e, s] * _exp(log_value[e, s] - best)
-                mass += log_value[e, s]
+    mass = _weigh(belief, log_value, best)
     if mass == 0.0:
         return -np.inf
-    for e in range(draws):
-        for s in range(states):
-            belief[e, s] = log_value[e, s] / mass if belief[e, s] > 0.0 else 0.0
     for g in range(sensors):
         if not np.isnan(observation[g]):
             _learn_gain(
@@ -241,6 +233,22 @@ def weigh_none(
                 statistics[g],
             )  # fmt: skip
     return float(best + math.log(mass))
+
+
+@compiled
+def _weigh(belief: Single, log_value: Float, best: float) -> float:
+    """Multiply a belief (E, S) by likelihoods, and normalise it; return its sum before, over exp(best)."""
+    mass = 0.0
+    for e in range(belief.shape[0]):
+        for s in range(belief.shape[1]):
+            if belief[e, s] > 0.0:
+                log_value[e, s] = belief[e, s] * _exp(log_value[e, s] - best)
+                mass += log_value[e, s]
+    for e in range(belief.shape[0]):
+        for s in range(belief.shape[1]):
+            if belief[e, s] > 0.0:
+                belief[e, s] = log_value[e, s] / mass
+    return mass
 
 
 @compiled
