@@ -178,8 +178,13 @@ class _Reader:
         for where, values in block.data:
             given = [value for value in values if value]
             if "GENERATE" in block.parameters:
-                first, last, *step = (self._whole(where, value) for value in given)
-                members.extend(range(first, last + 1, *step))
+                numbers = [self._whole(where, value) for value in given]
+                if len(numbers) not in (2, 3) or min(numbers) < 1:
+                    _fail(
+                        where,
+                        f"first, last and step are expected with GENERATE, but {','.join(given)!r} came.",
+                    )
+                members.extend(range(numbers[0], numbers[1] + 1, *numbers[2:]))
                 continue
             for value in given:
                 other = self._other(sets, value)

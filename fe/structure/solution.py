@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from fe.full.modes import lowest_eigenpairs
 from fe.full.statics import Factorisation
+from fe.runtime.errors import SolutionError
 
 from .affine import AffineStructure
 from .operators import Structure
@@ -67,8 +68,15 @@ def natural_frequencies(structure: AffineStructure, count: int) -> tuple[FloatAr
     Raises
     ------
     SolutionError
-        If the iteration did not converge.
+        If there is no mass, there are not so many modes, or the iteration did not converge.
     """
+    if count >= structure.unknowns:
+        raise SolutionError(
+            f"{count} modes were asked for, but a structure of {structure.unknowns} free unknowns gives at "
+            f"most {structure.unknowns - 1}."
+        )
+    if not structure.mass().diagonal().any():
+        raise SolutionError("The structure has no mass, hence no modes; give its materials a density.")
     values, shapes = lowest_eigenpairs(structure.stiffness(), structure.mass(), count)
     shapes = shapes / np.sqrt(np.einsum("im,im->m", shapes, structure.mass() @ shapes))
     return np.sqrt(values) / (2.0 * np.pi), shapes

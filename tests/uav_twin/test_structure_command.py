@@ -125,6 +125,8 @@ def test_a_fault_ends_in_one_sentence(
 ) -> None:
     assert call(monkeypatch, "info", str(file), "--memory-limit", "0.1") == 1
     assert "24 unknowns would take about" in capsys.readouterr().err
+    assert call(monkeypatch, "info", str(file), "--modes", "12") == 1
+    assert "12 free unknowns gives at most 11" in capsys.readouterr().err
     file.write_text(STRUCTURE.replace('"ROOT"', '"WALL"'))
     assert call(monkeypatch, "info", str(file)) == 1
     assert "no set of nodes or faces named 'WALL'; there are ROOT, END." in capsys.readouterr().err

@@ -139,6 +139,8 @@ def test_a_deck_is_read_with_its_sets(tmp_path: Path) -> None:
         ("1, 4, 3\n", "1, 7, 3\n", "the set 'root' names node 7, which is not there"),
         ("left, RIGHT", "left, 55", "the set 'BODY' names element 55, which is not there"),
         ("20, S2", "20, S7", r"line 32: a face S1 to S6 of 8-node hexahedra is expected, but 'S7' came"),
+        ("1, 4, 3\n", "1\n", r"line 24: first, last and step are expected with GENERATE, but '1' came"),
+        ("1, 4, 3\n", "1, 4, 0\n", r"first, last and step are expected with GENERATE, but '1,4,0' came"),
         ("*HEADING", "*PART", r"line 1: a deck with \*PART is not read"),
         ("*NSET, NSET=Both", "*NSET", r"line 26: \*NSET must say NSET=a name"),
         ("11, 12, 15, 14\n", "11, 14, 15, 12\n", r"1 of 2 elements .* flat .* element 10 at \(0\.5, "),
