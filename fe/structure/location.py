@@ -100,7 +100,9 @@ class Locator:
             values, slopes = kind.shape_functions(local)
             residual = point - np.einsum("na,nai->ni", values, nodes)
             jacobian = np.einsum("nai,naj->nij", nodes, slopes)
-            step = np.linalg.solve(jacobian + 1e-300 * np.eye(3), residual[..., None])[..., 0]
+            # Outside its cell the map may fold: such a place is no solution, wherever the next step leads.
+            jacobian[np.linalg.det(jacobian) == 0.0] = np.eye(3)
+            step = np.linalg.solve(jacobian, residual[..., None])[..., 0]
             local = np.clip(local + step, -2.0, 3.0)
             if np.abs(step).max() < 1e-13:
                 break
