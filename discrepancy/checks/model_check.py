@@ -211,16 +211,17 @@ def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, used: NDAr
 def _plausible(campaign: Campaign, name: str, trial: str) -> tuple[tuple[float, float], ...]:
     """Return the factors of unit slips that a channel can have, and by which factor physics may be off.
 
-    Those between two units of the channel, or of what drives the trial.
+    Those between two units of the channel, or of what drives the trial, and no others in a driven trial.
     """
     inputs = next(item for item in campaign.trials if item.name == trial)
+    driven = inputs.kind is TrialKind.DRIVEN
     found = set()
     own = campaign.channels[name].quantity
     for quantity in (own, *_INPUTS.get(inputs.kind, ()), *(item.quantity for item in inputs.inputs)):
         sizes = [si_value("1.0", quantity, unit) for unit in units_of(quantity)]
         found |= {one / other for one in sizes for other in sizes if not 1.0 / 5.0 < one / other < 5.0}
-        found |= _UNLISTED.get(quantity, set())
-    if inputs.kind is not TrialKind.DRIVEN:
+        found |= set() if driven else _UNLISTED.get(quantity, set())
+    if not driven:
         return tuple(slip for slip in _SLIPS if any(abs(slip[0] / item - 1.0) < 1e-3 for item in found))
     return tuple((factor, 3.0 if not 5e-3 < factor < 200.0 else 1.35) for factor in sorted(found))
 

@@ -11,6 +11,8 @@ from scipy.interpolate import CubicSpline
 
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS as PORT_LAWS
+from fe.runtime.laws.overflow import Overflow
+from fe.runtime.laws.sine_force import SineForce
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import (
     BoucWen,
@@ -33,6 +35,8 @@ LAWS: tuple[PortForce, ...] = (
     FreePlay(PLANFORM, 90.0, 0.004),
     MicroSlip(PLANFORM, 12.0, 1500.0, -0.3, 8),
     BoucWen(PLANFORM, 800.0, 0.01, 1.5),
+    SineForce(PLANFORM, 3.0, 2.0, 0.1),
+    Overflow(PLANFORM, 5.0, 1.0, 0.2, 0.1),
 )
 
 
