@@ -32,7 +32,7 @@ from twin_master.learning.kernels import (
     normalise,
     regression,
 )
-from twin_master.learning.posterior import INTERVAL, draws_posterior
+from twin_master.learning.posterior import INTERVAL, DrawsPosterior
 from twin_master.network.estimator import Carried, Estimate, Learnt
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import ObservationContext
@@ -163,6 +163,10 @@ class LearningFilter:
         self._offset: Float = np.broadcast_to(np.asarray(priors.offset, np.float64), (sensors,)).copy()
         self._regresses = bool(np.any(self._gain > 0.0) or np.any(self._offset > 0.0))
         self._learns_gauges = self._regresses or priors.noise_degrees > 0.0
+        self._of_draws = (
+            None if priors.draws is None else DrawsPosterior(priors.draws, sensor_model.draw_weight)
+        )
+        self._of_factors = DrawsPosterior(priors.transition_factors, np.full(factors, 1.0 / factors))
 
     @property
     def model(self) -> GraphicalModel:
@@ -275,14 +279,12 @@ class LearningFilter:
         weight = filtered.sum(axis=1)  # of each hypothesis
         result: dict[str, Learnt] = {}
         factors = np.asarray(self.priors.transition_factors)
-        if self.priors.parameter is not None and self.priors.draws is not None:
+        if self.priors.parameter is not None and self._of_draws is not None:
             own = weight.reshape(len(factors), -1).sum(axis=0)
-            result[self.priors.parameter] = draws_posterior(
-                self.priors.draws, self._sensor_model.draw_weight, own
-            )
+            result[self.priors.parameter] = self._of_draws.of(own)
         if len(factors) > 1:
             own = weight.reshape(len(factors), -1).sum(axis=1)
-            result["transition_factor"] = draws_posterior(factors, np.full(len(own), 1.0 / len(own)), own)
+            result["transition_factor"] = self._of_factors.of(own)
         if self._learns_gauges:
             result |= self._learnt_of_gauges(weight, statistics, count)
         return result

@@ -9,8 +9,8 @@ from scipy.stats import multivariate_normal, multivariate_t
 
 from twin_master.errors import InvalidModelError
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
-from twin_master.learning.posterior import draws_posterior
-from twin_master.network.estimator import Carried, Estimate, ExactFilter
+from twin_master.learning.posterior import DrawsPosterior
+from twin_master.network.estimator import Carried, Estimate, ExactFilter, Learnt
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.sensor_model import GaussianSensorModel
 
@@ -160,13 +160,12 @@ def test_the_interval_of_a_parameter_does_not_depend_on_where_its_draws_lie() ->
     """Draws wider apart than the posterior: the evidence between them is interpolated."""
     fine, coarse = np.linspace(-3, 3, 2001), np.linspace(-3, 3, 25)
 
-    def posterior(values: Float) -> tuple[Float, Float]:
+    def posterior(values: Float) -> Learnt:
         prior = np.exp(-0.5 * values**2) / np.exp(-0.5 * values**2).sum()
         weight = prior * np.exp(-0.5 * ((values - 0.61) / 0.08) ** 2)
-        return prior, weight / weight.sum()
+        return DrawsPosterior(values, prior).of(weight / weight.sum())
 
-    exact = draws_posterior(fine, *posterior(fine))
-    rough = draws_posterior(coarse, *posterior(coarse))
+    exact, rough = posterior(fine), posterior(coarse)
     assert rough.mean == pytest.approx(exact.mean, abs=0.005)
     assert rough.standard_deviation == pytest.approx(exact.standard_deviation, rel=0.05)
     assert (rough.lower, rough.upper) == pytest.approx((exact.lower, exact.upper), abs=0.01)
@@ -175,10 +174,25 @@ def test_the_interval_of_a_parameter_does_not_depend_on_where_its_draws_lie() ->
 
 
 def test_draws_that_are_the_same_or_few_give_their_own_posterior() -> None:
-    found = draws_posterior([2.0, 1.0, 2.0], [0.25, 0.5, 0.25], [0.4, 0.2, 0.4])
+    found = DrawsPosterior([2.0, 1.0, 2.0], [0.25, 0.5, 0.25]).of([0.4, 0.2, 0.4])
     assert (found.mean, found.lower, found.upper) == pytest.approx((1.8, 1.0, 2.0))
-    single = draws_posterior([2.0], [1.0], [1.0], "Pa")
+    single = DrawsPosterior([2.0], [1.0], "Pa").of([1.0])
     assert (single.mean, single.standard_deviation, single.unit) == (2.0, 0.0, "Pa")
+
+
+def test_a_prepared_spline_gives_what_a_spline_of_the_moment_gives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One posterior in the course of many, narrow and wide, is that of draws that were never seen before."""
+    chance = np.random.default_rng(4)
+    draws, prior = chance.normal(size=60), np.full(60, 1.0 / 60)
+    prepared = DrawsPosterior(draws, prior)
+    for width in (3.0, 0.5, 0.2, 0.1, 0.07, 0.05, 0.03, 0.02, 0.015, 0.01, 0.5):
+        weight = np.exp(-0.5 * ((draws - 0.3) / width) ** 2)
+        found = prepared.of(weight / weight.sum())
+        with monkeypatch.context() as patched:
+            patched.setattr("twin_master.learning.posterior._DRAWS_PREPARED", 0)
+            anew = DrawsPosterior(draws, prior).of(weight / weight.sum())
+        for name in ("mean", "standard_deviation", "lower", "upper"):
+            assert getattr(found, name) == pytest.approx(getattr(anew, name), rel=1e-9, abs=1e-12), name
 
 
 def test_a_belief_that_underflows_comes_back() -> None:
