@@ -5,7 +5,7 @@ It holds no asset and no truth.
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -260,7 +260,8 @@ class Twin:
         Returns
         -------
         TwinTurn
-            What the twin now concludes in its last turn.
+            What the twin now concludes in its last turn, with the notices of all turns filtered anew: what
+            the late observation brings to light in a turn before would never be told.
 
         Raises
         ------
@@ -281,13 +282,15 @@ class Twin:
         rows += [(seen.observation, seen.estimate.control_index) for seen in list(self._seen)[at + 1 :]]
         before = self._seen[at - 1].estimate if at else None
         anew: list[_Seen] = []
+        notices: list[Notice] = []
         for number, (given, in_force) in enumerate(rows, start=turn):
             estimate = self.estimator.turn(before, given, in_force, number)
             before = estimate.carried
             anew.append(_Seen(given, before))
+            notices += estimate.notices
         for position, seen in enumerate(anew, start=at):
             self._seen[position] = seen
-        return self._decided(estimate)
+        return self._decided(replace(estimate, notices=tuple(notices)))
 
     def observed(self, turn: int) -> Float:
         """Return what was observed in a turn that is kept: (G,), NaN where nothing was received."""

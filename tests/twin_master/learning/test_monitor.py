@@ -200,6 +200,23 @@ def test_a_twin_that_was_saved_goes_on_to_the_last_bit() -> None:
         np.testing.assert_array_equal(one.log_evidence_gauge, other.log_evidence_gauge)
 
 
+def test_a_late_observation_tells_what_it_brings_to_light_in_its_turn() -> None:
+    model, sensors = small()
+    twin = Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful(), lag=8)
+    seen = drawn(np.random.default_rng(5), 10)
+    late = seen[5].copy()
+    late[1] = 1e9
+    for turn, row in enumerate(seen):
+        twin.turn(np.full(3, np.nan) if turn == 5 else row, 0)
+    told = twin.revise(5, late)
+    assert told.turn == 9
+    assert [(notice.kind, notice.sensors) for notice in told.notices] == [
+        ("gauge_left_out", (2,)),
+        ("gauge_back", (2,)),
+    ]
+    assert "Turn 5: gauge 2 shows 1e+09" in told.notices[0].sentence
+
+
 def test_a_model_that_takes_the_place_of_another_begins_without_suspicion() -> None:
     model, sensors = small()
     taught = GaussianSensorModel(1.2 * sensors.value_per_draw, 1.0)
