@@ -57,7 +57,10 @@ def parse_request(text: str | bytes) -> Request:
     ValueError
         It is no such request.
     """
-    content = json.loads(text)
+    try:
+        content = json.loads(text)
+    except RecursionError:
+        raise ValueError("a request is not nested") from None
     names = Request.__dataclass_fields__
     if not isinstance(content, dict) or set(content) != set(names):
         raise ValueError(f"a request is an object with {', '.join(names)}")

@@ -69,7 +69,8 @@ class _Viewers:
     def _answer(self, viewer: "_Turns") -> None:
         if self._fault:
             viewer.tell(json.dumps({"error": self._fault}))
-        answer = self._teller.answer(self._waiting[viewer])
+        request = self._waiting.get(viewer)  # one that cannot be told any more has left
+        answer = None if request is None else self._teller.answer(request)
         if answer is not None:
             del self._waiting[viewer]
             viewer.tell(answer)

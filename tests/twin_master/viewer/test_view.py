@@ -208,7 +208,8 @@ def test_printed_units_and_bands(run: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "{}", '{"number": 1}', "x" * 100, json.dumps(asked().__dict__ | {"turn": 1.5})]
+    "text",
+    ["", "[]", "[" * 4000, "{}", '{"number": 1}', "x" * 100, json.dumps(asked().__dict__ | {"turn": 1.5})],
 )
 def test_a_request_of_another_form_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"request|JSON|Expecting"):
