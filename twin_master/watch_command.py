@@ -68,6 +68,7 @@ def watch(
 
     if (model_patch is None) != (from_turn is None) or (model_patch is not None and not resume):
         raise typer.BadParameter("--model-patch and --from-turn go together, with --resume.")
+    _check_source(observations, follow, ca_file)
     overrides = Overrides(seed=seed, calibration=calibration, library=library)
     with shown(view) as begun:
         watched, lock = _opened(scenario, out, overrides, resume=resume, replace=replace)
@@ -117,16 +118,33 @@ def _opened(
     return begin_watch(loaded, folder, overrides, progress, replace_run=replace)
 
 
+def _check_source(observations: str, follow: bool, ca_file: Path | None) -> None:
+    """Find slips of the pen before a model is built and a folder made."""
+    from twin_master.errors import MissionInputError
+    from twin_master.watch.feeds import check_file
+    from twin_master.watch.mqtt import broker_of
+
+    if _is_broker(observations):
+        broker_of(observations, ca_file)
+    elif observations != "-":
+        check_file(Path(observations), follow=follow)
+    elif follow:
+        raise MissionInputError("--follow belongs to a CSV file; standard input is read to its end anyway.")
+
+
+def _is_broker(observations: str) -> bool:
+    return observations.startswith(("mqtt://", "mqtts://"))
+
+
 def _feed(
     observations: str, watched: "Watch", follow: bool, ca_file: Path | None
 ) -> "tuple[Feed, Callable[[Mapping[str, Any]], None], Callable[[], None]]":
     """Return where observations come from, who is told the decisions, and what ends both."""
-    from twin_master.errors import MissionInputError
     from twin_master.watch.feeds import JsonLinesFeed, file_feed
     from twin_master.watch.mqtt import MqttFeed, broker_of
 
     scenario = watched.scenario
-    if observations.startswith(("mqtt://", "mqtts://")):
+    if _is_broker(observations):
         broker = broker_of(observations, ca_file)
         mqtt = MqttFeed(broker, scenario, watched.folder, lambda text: typer.echo(text, err=True))
 
@@ -135,8 +153,6 @@ def _feed(
             mqtt.decide(decision)
 
         return mqtt, publish, mqtt.close
-    if follow and observations == "-":
-        raise MissionInputError("--follow belongs to a CSV file; standard input is read to its end anyway.")
     if observations == "-":
         return JsonLinesFeed(scenario), lambda decision: _say(decision, flush=True), lambda: None
     feed = file_feed(Path(observations), scenario, follow=follow)

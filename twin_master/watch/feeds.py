@@ -6,6 +6,8 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Mapping
+from hashlib import sha256
+from itertools import islice
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,6 +19,7 @@ from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, array_of, read_records
 from twin_master.scenario.schema import Scenario
+from twin_master.watch.intake import MISSING
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 
 Fed = tuple[Message | Refused, str]
@@ -57,7 +60,7 @@ class CsvFeed:
         except (OSError, ValueError) as error:
             raise MissionInputError(f"{path} cannot be read as CSV: {error}.") from None
         self._names = ["turn" if name in _TURN_COLUMNS else name for name in names]
-        sensors = [place for place, name in enumerate(self._names) if name not in _OTHERS]
+        sensors = [place for place, name in enumerate(self._names) if name not in _OTHERS and name[:1] != "_"]
         try:
             columns = [self._reader.column(self._names[place]) for place in sensors]
         except Refused as refusal:
@@ -73,6 +76,10 @@ class CsvFeed:
         if twice:
             raise MissionInputError(f"{path}: two columns say the same; {', '.join(names)[:300]} came.")
 
+    def beginning(self, count: int) -> str:
+        """Return the hash of the header and the first `count` rows."""
+        return _hash_of_lines(self._path, 1 + count)
+
     def messages(self, after: int) -> Iterator[Fed]:
         """Return the rows behind the first `after` of them."""
         with self._path.open("rb") as file:
@@ -85,6 +92,9 @@ class CsvFeed:
             return line
         try:
             cells = _cells(line)
+        except ValueError as error:
+            return Refused(f"it is no line of CSV: {str(error)[:80]}")
+        try:
             if len(cells) != len(self._names):
                 return Refused(f"{len(self._names)} cells are expected, and {len(cells)} came")
             return self._row(cells)
@@ -100,7 +110,7 @@ class CsvFeed:
         record: dict[str, object] = {
             name: cells[place]
             if name == "control"
-            else int(cells[place])
+            else _whole(cells[place])
             if name == "turn"
             else float(cells[place])
             for place, name in enumerate(self._names)
@@ -150,6 +160,10 @@ class RunFeed:
                 f"expected, and `observed/{role}` has the shape {self._values.shape}."
             )
 
+    def beginning(self, count: int) -> str:
+        """Return the hash of the first `count` steps."""
+        return sha256(self._turn[:count].tobytes() + self._values[:count].tobytes()).hexdigest()
+
     def messages(self, after: int) -> Iterator[Fed]:
         """Return the steps behind the first `after` of them."""
         for row in range(after, len(self._values)):
@@ -174,9 +188,13 @@ class FolderFeed:
         if not self._path.is_file():
             raise MissionInputError(f"{folder} holds no journal of a run or a watch ({JOURNAL_NAME}).")
 
+    def beginning(self, count: int) -> str:
+        """Return the hash of the first lines, which have `count` observations or a few less."""
+        return _hash_of_lines(self._path, 1 + count)
+
     def messages(self, after: int) -> Iterator[Fed]:
         """Return the observations behind the first `after` of them."""
-        records = (record for record, _ in read_records(self._path) if "observed" in record)
+        records = (record for record, _ in read_records(self._path) if _came(record))
         for number, record in enumerate(records, start=1):
             if number > after:
                 yield self._message(record), f"line {number}"
@@ -200,6 +218,10 @@ class JsonLinesFeed:
     def __init__(self, scenario: Scenario, stream: IO[bytes] | None = None) -> None:
         self._reader = MessageReader(scenario)
         self._stream = stream
+
+    def beginning(self, count: int) -> str:
+        """Return nothing: a stream goes on where it is."""
+        return ""
 
     def messages(self, after: int) -> Iterator[Fed]:
         """Return what comes."""
@@ -225,15 +247,30 @@ def file_feed(path: Path, scenario: Scenario, *, follow: bool = False) -> CsvFee
     MissionInputError
         It cannot be read, or a recorded one is to be followed.
     """
-    if not path.exists():
-        raise MissionInputError(f"there is no file {path} to read observations from.")
-    if path.is_file() and path.suffix.lower() != ".nc":
-        return CsvFeed(path, scenario, follow=follow)
-    if follow:
-        raise MissionInputError(f"{path} is recorded: only a CSV file can be followed.")
+    check_file(path, follow=follow)
     if path.is_dir():
         return FolderFeed(path, scenario)
-    return RunFeed(path, scenario)
+    if _is_netcdf(path):
+        return RunFeed(path, scenario)
+    return CsvFeed(path, scenario, follow=follow)
+
+
+def check_file(path: Path, *, follow: bool = False) -> None:
+    """Check what can be known of a source before a watch is prepared.
+
+    Raises
+    ------
+    MissionInputError
+        It is not there, or a recorded one is to be followed.
+    """
+    if not path.exists():
+        raise MissionInputError(f"there is no file {path} to read observations from.")
+    if follow and (path.is_dir() or _is_netcdf(path)):
+        raise MissionInputError(f"{path} is recorded: only a CSV file can be followed.")
+
+
+def _is_netcdf(path: Path) -> bool:
+    return path.suffix.lower() == ".nc"
 
 
 def _lines(file: IO[bytes], *, follow: bool = False) -> Iterator[bytes | Refused]:
@@ -258,10 +295,34 @@ def _lines(file: IO[bytes], *, follow: bool = False) -> Iterator[bytes | Refused
             part, too_long = b"", False
 
 
+def _whole(cell: str) -> int:
+    """Return a whole number, also one that a table of floating-point numbers has written as `12.0`."""
+    number, point, zeros = cell.partition(".")
+    return int(number if point and not zeros.strip("0") else cell)
+
+
+def _came(record: Mapping[str, Any]) -> bool:
+    """Return whether a line of a journal is of something observed, not of a turn for which nothing came."""
+    given = record.get("intake", {}).get("given", "")
+    predicted = given.endswith(str(MISSING)) and record.get("observation_turn") == record.get("turn")
+    return "observed" in record and not predicted
+
+
+def _hash_of_lines(path: Path, count: int) -> str:
+    found = sha256()
+    with path.open("rb") as file:
+        for line in islice(_lines(file), count):
+            found.update(b"" if isinstance(line, Refused) else line)
+    return found.hexdigest()
+
+
 def _cells(line: bytes) -> list[str]:
     text = line.decode("utf-8-sig").rstrip("\r\n")
     if '"' in text:
-        return [cell.strip() for cell in next(csv.reader([text]), [])]
+        try:
+            return [cell.strip() for cell in next(csv.reader([text]), [])]
+        except csv.Error as error:
+            raise ValueError(str(error)) from None
     return [cell.strip() for cell in text.split(",")]
 
 

@@ -23,8 +23,10 @@ Float = NDArray[np.float64]
 REJECTED_NAME = "rejected.jsonl"
 REJECTED_KEPT = 10_000
 """Refused messages that are written down; further ones are counted only, so that a flood fills no disk."""
+RECOGNISED_BY = 8
+"""First messages of a source by which it is recognised when a watch is taken up again."""
 _TEXT_KEPT = 200
-_MISSING, _ASSUMED, _GIVEN = 0, 1, 2
+MISSING, _ASSUMED, _GIVEN = 0, 1, 2
 """Of a turn: not received; received; received with its control."""
 
 
@@ -33,6 +35,9 @@ class Feed(Protocol):
 
     replayable: bool
     """Whether it begins anew with every process, so that what was read before is read again."""
+
+    def beginning(self, count: int) -> str:
+        """Return what tells its first `count` messages from those of another source."""
 
     def messages(self, after: int) -> Iterator[tuple[Message | Refused, str]]:
         """Return the messages behind the first `after` of them, each with the begin of its text."""
@@ -124,6 +129,8 @@ class Intake:
         self._feed = feed
         self._rejected = rejected
         self._messages: Iterator[tuple[Message | Refused, str]] | None = None
+        self._read = 0  # messages of this feed, in this process and before
+        self._beginning = (0, "")
         self._pending: deque[tuple[int, Reading, int]] = deque()
         self._given: deque[int] = deque(maxlen=scenario.watch.lag + 1)
         self._origin: float | None = None
@@ -135,26 +142,43 @@ class Intake:
     def state(self) -> dict[str, Any]:
         """Return what is needed to go on, as JSON."""
         # The message behind a gap is read again, until its own turn is written down.
-        counts = vars(self.counts) | {"received": self.counts.received - bool(self._pending)}
-        return {"counts": counts, "origin": self._origin, "given": "".join(map(str, self._given))}
+        waiting = bool(self._pending)
+        counts = vars(self.counts) | {"received": self.counts.received - waiting}
+        read = self._read - waiting
+        if self._beginning[0] != min(read, RECOGNISED_BY):
+            self._beginning = min(read, RECOGNISED_BY), self._feed.beginning(min(read, RECOGNISED_BY))
+        return {
+            "counts": counts,
+            "given": "".join(map(str, self._given)),
+            "origin": self._origin,
+            "source": {"beginning": self._beginning[1], "read": read},
+        }
 
     def restore(self, state: Mapping[str, Any] | None) -> None:
-        """Go on from a state; None is the begin."""
+        """Go on from a state; None is the begin.
+
+        A file that was read before is read on; another one is read from its first message.
+        """
+        again = self._feed.replayable
         if state is not None:
             self.counts = Counts(**state["counts"])
             self._origin = state["origin"]
             self._given.extend(map(int, state["given"]))
-        self._rejected.go_back(self.counts.received if self._feed.replayable else LARGEST_SEED)
+            read = int(state["source"]["read"])
+            again &= state["source"]["beginning"] == self._feed.beginning(min(read, RECOGNISED_BY))
+            self._read = read if again else 0
+        self._rejected.go_back(self.counts.received if again else LARGEST_SEED)
 
     def read(self, twin: Twin) -> Reading | None:
         """Return the next reading, see `Source.read`."""
         if self._messages is None:
-            self._messages = self._feed.messages(self.counts.received if self._feed.replayable else 0)
+            self._messages = self._feed.messages(self._read)
         while not self._pending:
             message, self._text = next(self._messages, (None, ""))
             if message is None:
                 return None
             self.counts.received += 1
+            self._read += 1
             try:
                 if isinstance(message, Refused):
                     raise message
@@ -165,10 +189,10 @@ class Intake:
         self.observation_turn = turn
         if reading.revises is None:
             self._given.append(given)
-            self.counts.missing += given == _MISSING
+            self.counts.missing += given == MISSING
         else:
             place = turn - twin.turns
-            self.counts.missing -= self._given[place] == _MISSING
+            self.counts.missing -= self._given[place] == MISSING
             self.counts.late += 1
             self._given[place] = max(given, self._given[place])
         return reading
@@ -193,7 +217,10 @@ class Intake:
             raise Refused("it has a time and no turn, and the scenario has no `watch.seconds_per_turn`")
         if self._origin is None:
             self._origin = message.time - self._section.seconds_per_turn * twin.turns
-        turn = round((message.time - self._origin) / self._section.seconds_per_turn)
+        try:
+            turn = round((message.time - self._origin) / self._section.seconds_per_turn)
+        except OverflowError:
+            raise Refused("its time lies too far from the first") from None
         if turn < 0:
             raise Refused(f"its time lies {-turn} turns before the first")
         return turn
@@ -211,7 +238,7 @@ class Intake:
             self._sort_late(twin, turn, message, given)
             return
         lost = np.full(self._sensors, np.nan)
-        self._pending += [(twin.turns + gap, Reading(lost), _MISSING) for gap in range(ahead)]
+        self._pending += [(twin.turns + gap, Reading(lost), MISSING) for gap in range(ahead)]
         self._pending.append((turn, Reading(message.observed, message.control), given))
 
     def _sort_late(self, twin: Twin, turn: int, message: Message, given: int) -> None:
@@ -224,7 +251,7 @@ class Intake:
         if not np.array_equal(before[both], message.observed[both]):
             raise Refused(f"it contradicts what was received of turn {turn} before")
         control = message.control
-        if control is not None and control != twin.control_of(turn) and known != _MISSING:
+        if control is not None and control != twin.control_of(turn) and known != MISSING:
             raise Refused(f"it contradicts the control of turn {turn}")
         new = np.isnan(before) & ~np.isnan(message.observed)
         if not new.any() and (control is None or control == twin.control_of(turn)):

@@ -98,7 +98,7 @@ class MqttFeed:
     Raises
     ------
     MissionInputError
-        paho-mqtt is not installed.
+        paho-mqtt is not installed, or the authority's file holds no certificate.
     """
 
     replayable = False
@@ -130,7 +130,10 @@ class MqttFeed:
         if broker.user is not None:
             self._client.username_pw_set(broker.user, os.environ.get(PASSWORD_VARIABLE))
         if broker.tls:
-            self._client.tls_set(ca_certs=None if broker.authority is None else str(broker.authority))
+            try:
+                self._client.tls_set(ca_certs=None if broker.authority is None else str(broker.authority))
+            except OSError as error:
+                raise MissionInputError(f"{broker.authority} holds no certificate: {error}.") from None
         self._client.max_queued_messages_set(_DECISIONS_WAITING)
         self._client.on_message = self._on_message
         self._client.on_connect = self._on_connect
@@ -170,6 +173,10 @@ class MqttFeed:
                 told = True
                 time.sleep(wait)
                 wait = min(2.0 * wait, longest)
+
+    def beginning(self, count: int) -> str:
+        """Return nothing: the broker knows what was acknowledged."""
+        return ""
 
     def messages(self, after: int) -> Iterator[Fed]:
         """Return what comes, without end; a message is acknowledged when the next one is asked for."""

@@ -205,7 +205,8 @@ def test_times_stand_for_turns(knowledge: Knowledge, strains: np.ndarray) -> Non
     assert (twin.turns, intake.counts.missing) == (10, 1)
     np.testing.assert_array_equal(twin.observed(9), strains[9])
     early = json.dumps({"time": 1.6e9, "strain_1": 1e-4}).encode() + b"\n"
-    assert watched(timed, [*lines, early])[1].counts.rejected == 1
+    endless = json.dumps({"time": 1.7e308, "strain_1": 1e-4}).encode() + b"\n"
+    assert watched(timed, [*lines, early, endless])[1].counts.rejected == 2
 
 
 def test_units_and_names(knowledge: Knowledge) -> None:
@@ -259,6 +260,13 @@ def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_p
     assert "`strain_1_microstrain` is not finite" in str(infinite)
     assert isinstance(fine, Message)
     np.testing.assert_allclose(fine.observed[:2], [5e-6, np.nan], rtol=1e-15)
+    path.write_text("turn,_rain,strain_1\n12.0,wet,1e-4\n12.5,wet,1e-4\n", encoding="utf-8")
+    whole, half = (fed[0] for fed in feeds.CsvFeed(path, knowledge.scenario).messages(0))
+    assert isinstance(whole, Message)
+    assert (whole.turn, whole.observed[0]) == (12, 1e-4)
+    assert "no number" in str(half)
+    path.write_bytes(b'strain_1\n"' + b"x" * 200_000 + b'"\na\r"b\n\xff\n"\n')
+    assert all(isinstance(fed[0], Refused) for fed in feeds.CsvFeed(path, knowledge.scenario).messages(0))
     for twice in ("strain_1,strain_1_1", "turn,step,strain_1"):
         path.write_text(f"{twice}\n", encoding="utf-8")
         with pytest.raises(Exception, match="two columns say the same"):

@@ -196,6 +196,44 @@ def test_what_comes_behind_a_gap_is_not_lost_when_the_watch_ends_within_it(
     assert ends[0] == ends[1]
 
 
+def belief_of(watch: Watch) -> object:
+    return json.loads((watch.folder / JOURNAL_NAME).read_text().splitlines()[-1][65:])["filtered"]
+
+
+def test_another_file_is_read_from_its_beginning(base: Watch, mission: Flight, tmp_path: Path) -> None:
+    """A logger that begins a file each day; and the first of them once more, which says nothing new."""
+    whole = write_csv(tmp_path / "m.csv", mission.observed, mission.control_index)
+    header, *rows = whole.read_text().splitlines()
+    for day, of_day in enumerate((rows[:30], rows[30:45], [*rows[30:45], *rows[45:]])):
+        (tmp_path / f"{day}.csv").write_text("\n".join([header, "-", *of_day]) + "\n")
+    watch = begun(base, tmp_path / "watch")
+    for day in (0, 1, 2):  # the last is that before it, which has grown
+        counts = watch.run(CsvFeed(tmp_path / f"{day}.csv", watch.scenario), lambda _decision: None)
+    assert (counts.received, counts.missing, counts.duplicates, counts.rejected) == (52, 0, 0, 2)
+    assert belief_of(watch) == mission.filtered[-1].tolist()
+    counts = watch.run(CsvFeed(tmp_path / "1.csv", watch.scenario), lambda _decision: None)
+    assert (counts.missing, counts.late, counts.duplicates) == (0, 0, 0)
+    again = watch.run(CsvFeed(whole, watch.scenario), lambda _decision: None)
+    assert (again.missing, again.late, again.duplicates, again.rejected) == (0, 0, 13, 2 + 37)
+    assert belief_of(watch) == mission.filtered[-1].tolist()
+
+
+def test_a_folder_tells_what_came_late_into_a_gap(base: Watch, mission: Flight, tmp_path: Path) -> None:
+    controls = mission.control_index.copy()
+    controls[20] = 1 - controls[20]  # not what was assumed while nothing was known of it
+    header, *rows = write_csv(tmp_path / "m.csv", mission.observed, controls).read_text().splitlines()
+    late = [*rows[:20], *rows[21:25], rows[20], *rows[25:]]
+    (tmp_path / "late.csv").write_text("\n".join([header, *late]) + "\n")
+    first, second = begun(base, tmp_path / "first"), begun(base, tmp_path / "second")
+    told = first.run(CsvFeed(tmp_path / "late.csv", first.scenario), lambda _decision: None)
+    feed = file_feed(first.folder, second.scenario)
+    for turns in (22, 23, None):
+        counts = second.run(feed, lambda _decision: None, turns=turns)
+    assert (told.late, told.rejected, told.missing) == (1, 0, 0)
+    assert (counts.late, counts.rejected, counts.missing) == (1, 0, 0)
+    assert belief_of(second) == belief_of(first)
+
+
 def test_a_watch_that_learns_goes_on_as_if_it_had_never_ended(
     base: Watch, mission: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -431,7 +469,7 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(
     assert all(decision["probability"] >= 0.5 for decision in heard)
 
 
-def test_addresses_of_brokers() -> None:
+def test_addresses_of_brokers(base: Watch, tmp_path: Path) -> None:
     assert broker_of("mqtt://host/a/b").port == 1883
     assert broker_of("mqtts://me@host:1/a").user == "me"
     for wrong, match in (
@@ -443,3 +481,20 @@ def test_addresses_of_brokers() -> None:
     ):
         with pytest.raises(MissionInputError, match=match):
             broker_of(wrong)
+    (tmp_path / "authority.pem").write_text("no certificate")
+    with pytest.raises(MissionInputError, match=r"authority.pem holds no certificate"):
+        MqttFeed(broker_of("mqtts://host/a", tmp_path / "authority.pem"), base.scenario, tmp_path, print)
+
+
+def test_a_slip_of_the_pen_makes_no_folder(scenario: LoadedScenario, tmp_path: Path) -> None:
+    (tmp_path / "run.nc").touch()
+    for source, said in (
+        (["missing.csv"], "there is no file"),
+        ([str(tmp_path / "run.nc"), "--follow"], "only a CSV file can be followed"),
+        (["-", "--follow"], "--follow belongs to a CSV file"),
+        (["mqtt://host"], "is expected"),
+    ):
+        options = ["--out", str(tmp_path / "watch"), "--observations", *source]
+        result = CliRunner().invoke(app(), ["watch", str(scenario.path), *options])
+        assert said in str(result.exception)
+        assert not (tmp_path / "watch").exists()
