@@ -71,7 +71,7 @@ def watch(
     _check_source(observations, follow, ca_file)
     overrides = Overrides(seed=seed, calibration=calibration, library=library)
     with shown(view) as begun:
-        watched, lock = _opened(scenario, out, overrides, resume=resume, replace=replace)
+        watched, lock = _opened(scenario, observations, out, overrides, resume=resume, replace=replace)
         if begun is not None:
             begun(watched.folder)
         patched = None if model_patch is None or from_turn is None else Patched(model_patch, from_turn)
@@ -94,10 +94,12 @@ def watch(
 
 
 def _opened(
-    scenario: str | None, out: Path | None, overrides: "Overrides", *, resume: bool, replace: bool
-) -> "tuple[Watch, int]":
+    scenario: str | None, observations: str, out: Path | None, overrides: "Overrides", *, resume: bool,
+    replace: bool,
+) -> "tuple[Watch, int]":  # fmt: skip
     """Return the watch, begun or taken up, and what holds its folder."""
     from twin_master.assets.resolution import Overrides
+    from twin_master.errors import MissionInputError
     from twin_master.scenario.reading import load_scenario
     from twin_master.watch.folder import begin_watch, resume_watch
 
@@ -115,6 +117,12 @@ def _opened(
     folder = out or Path("runs") / loaded.scenario.mission.name
     if resume:
         return resume_watch(folder, loaded, progress)
+    source = Path(observations).resolve()
+    if replace and folder.resolve() in (source, *source.parents):
+        raise MissionInputError(
+            f"--replace would remove the observations in {observations} before they are read: choose another "
+            "--out."
+        )
     return begin_watch(loaded, folder, overrides, progress, replace_run=replace)
 
 

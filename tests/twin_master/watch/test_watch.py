@@ -498,3 +498,14 @@ def test_a_slip_of_the_pen_makes_no_folder(scenario: LoadedScenario, tmp_path: P
         result = CliRunner().invoke(app(), ["watch", str(scenario.path), *options])
         assert said in str(result.exception)
         assert not (tmp_path / "watch").exists()
+
+
+def test_what_is_watched_is_not_replaced_by_its_watch(
+    scenario: LoadedScenario, whole: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(whole, tmp_path / "watch")
+    for source in (tmp_path / "watch", tmp_path / "watch" / "run.nc"):
+        options = ["--out", str(tmp_path / "watch"), "--replace", "--observations", str(source)]
+        result = CliRunner().invoke(app(), ["watch", str(scenario.path), *options])
+        assert "choose another --out" in str(result.exception)
+    assert (tmp_path / "watch" / JOURNAL_NAME).read_bytes() == (whole / JOURNAL_NAME).read_bytes()
