@@ -333,7 +333,10 @@ def resume_watch(folder: Path, loaded: LoadedScenario | None, progress: Progress
         return Watch(folder, config, located_scenario(scenario, folder), progress), lock
     except NotResumableError as error:
         os.close(lock)
-        error.add_note(f"Another watch may take in what this one observed: `--observations {folder}`.")
+        error.add_note(
+            "--replace would remove what was observed; another watch, in another folder, takes it in with "
+            f"`--observations {folder}`."
+        )
         raise
     except BaseException:
         os.close(lock)

@@ -112,8 +112,8 @@ def replay(
         and last["next_control"] != found.twin.proposed_control
     ):
         raise NotResumableError(
-            f"the journal decided otherwise after turn {last['turn']} than this version does: begin again "
-            "with --replace."
+            f"the journal decided otherwise after turn {last['turn']} than this version does: begin "
+            f"another watch, in another folder, with `--observations {path.parent}`."
         )
     return found
 
