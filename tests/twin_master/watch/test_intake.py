@@ -265,7 +265,7 @@ def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_p
     assert isinstance(whole, Message)
     assert (whole.turn, whole.observed[0]) == (12, 1e-4)
     assert "no number" in str(half)
-    path.write_bytes(b'strain_1\n"' + b"x" * 200_000 + b'"\na\r"b\n\xff\n"\n')
+    path.write_bytes(b'strain_1\n"' + b"x" * 200_000 + b'"\na\r"b\n\xff\n')
     assert all(isinstance(fed[0], Refused) for fed in feeds.CsvFeed(path, knowledge.scenario).messages(0))
     for twice in ("strain_1,strain_1_1", "turn,step,strain_1"):
         path.write_text(f"{twice}\n", encoding="utf-8")
