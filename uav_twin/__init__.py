@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from fe.wing.design import load_design
     from fmu_asset.door.session import FmiAsset
     from fmu_asset.packing.wing_fmu import build_fmu
+    from twin_master.learning.monitor import WatchfulEstimator
     from twin_master.mission.preparation import prepare_twin
     from twin_master.network.estimator import Carried, Estimate, ExactFilter
     from twin_master.network.graphical_model import GraphicalModel
@@ -42,6 +43,7 @@ __all__ = [
     "GaussianSensorModel",
     "GraphicalModel",
     "Twin",
+    "WatchfulEstimator",
     "assemble",
     "build_fmu",
     "calibrate",
@@ -73,6 +75,7 @@ _HOMES = {
     "GaussianSensorModel": "twin_master.network.sensor_model",
     "GraphicalModel": "twin_master.network.graphical_model",
     "Twin": "twin_master.network.twin",
+    "WatchfulEstimator": "twin_master.learning.monitor",
     "assemble": "fe.full.operators",
     "build_fmu": "fmu_asset.packing.wing_fmu",
     "calibrate": "calibration.wing.three_steps:calibrate_wing",
