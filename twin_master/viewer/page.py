@@ -2,6 +2,7 @@
 
 import html
 import json
+import math
 from collections.abc import Sequence
 from importlib import resources
 
@@ -218,8 +219,9 @@ class _Figures:
                 "x": planform.gauges[:, 0].tolist(),
                 "y": planform.gauges[:, 1].tolist(),
                 "title": list(sensors.titles),
-                "observed": [None] * len(planform.gauges),
-                "lost": [None] * len(planform.gauges),
+                # Not None, which is drawn as zero: until the first turn nothing is known, and nothing lost.
+                "observed": [math.nan] * len(planform.gauges),
+                "lost": [math.nan] * len(planform.gauges),
             },
             name="places",
         )

@@ -31,6 +31,7 @@ from twin_master.report.reading import open_run
 from twin_master.scenario.reading import load_scenario
 from twin_master.viewer.flight import Flight
 from twin_master.viewer.messages import LATEST, Request, Teller, parse_request
+from twin_master.viewer.page import page_html
 from twin_master.viewer.scene import scene_of
 from twin_master.workflow import new_run
 
@@ -214,6 +215,15 @@ def test_printed_units_and_bands(run: Path) -> None:
 def test_a_request_of_another_form_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"request|JSON|Expecting"):
         parse_request(text)
+
+
+def test_before_the_first_turn_no_gauge_is_lost(run: Path) -> None:
+    """A null would be drawn as zero, as a cross on every gauge."""
+    text = page_html(scene_of(run, Flight(run).knowledge), {})
+    found = re.search(r'\["lost", \[(.*?)\]\]', text)
+    assert found is not None
+    assert found[1].count("nan") == 24
+    assert "null" not in found[1]
 
 
 def test_the_wing_stands_in_its_place(run: Path) -> None:
