@@ -168,6 +168,8 @@ def _feed(
 
 
 def _say(decision: Mapping[str, Any], *, flush: bool) -> None:
+    for notice in decision["alarms"]:  # also where the decisions go to a program
+        typer.echo(notice["sentence"], err=True)
     if not terminal.loudness.quiet:
         sys.stdout.write(json.dumps(decision) + "\n")
         if flush:

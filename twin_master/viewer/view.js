@@ -224,14 +224,16 @@ function drawNotices(rows, turns) {
   element("notices").replaceChildren(...newest.map(([sentence, [first, last]]) => {
     const item = document.createElement("li");
     const when = first === last ? `${scene.step_name} ${first}` : `${scene.step_name}s ${first} to ${last}`;
-    item.textContent = `${when}: ${sentence}`;
+    const saysWhen = sentence.toLowerCase().startsWith(`${scene.step_name} `.toLowerCase());
+    item.textContent = saysWhen ? sentence : `${when}: ${sentence}`;
     return item;
   }));
   element("told").hidden = newest.length === 0;
 }
 
 function drawLearnt(now) {
-  const entries = Object.entries(now.learnt);
+  const entries = Object.entries(now.learnt).sort(([a], [b]) =>
+    a.includes("[") - b.includes("[") || a.localeCompare(b, "en", { numeric: true })); // those of a sensor last
   element("learnt").replaceChildren(...entries.map(([name, learnt]) => {
     const [row, term, value] = ["div", "dt", "dd"].map((tag) => document.createElement(tag));
     const [mean, lower, upper] = [learnt.mean, learnt.lower, learnt.upper].map((number) => number.toPrecision(4));

@@ -39,9 +39,11 @@ TURNS = 50
 TOLD = {
     "notices": [
         {"kind": "alarm", "sentence": "Look at <b>gauge 3</b>.", "sensors": [3], "value": 120.0},
+        {"kind": "alarm", "sentence": "Turn 49: gauge 4 is off.", "sensors": [4], "value": 110.0},
     ],
     "learnt": {
-        "e": {"mean": 0.95123, "standard_deviation": 0.006, "lower": 0.94, "upper": 0.96, "unit": "1"},
+        name: {"mean": 0.95123, "standard_deviation": 0.006, "lower": 0.94, "upper": 0.96, "unit": "1"}
+        for name in ("a[10]", "a[9]", "e")
     },
 }
 """What an estimator that learns would have added to a turn."""
@@ -314,8 +316,10 @@ def test_the_page_in_a_browser(begun: Path, lines: list[bytes], tmp_path: Path) 
         first.wait("window.painted.at(-1)[0] === 49")
         assert first.value("element('latest').getAttribute('aria-pressed')") == "true"
         assert first.picture(tmp_path / "turn_49.png") != before
-        assert first.value("element('notices').textContent") == "turn 49: Look at <b>gauge 3</b>."
-        assert first.value("element('learnt').textContent") == "e0.9512 (0.9400 to 0.9600)"
+        said = first.value("[...element('notices').children].map((item) => item.textContent)")
+        assert said == ["Turn 49: gauge 4 is off.", "turn 49: Look at <b>gauge 3</b>."]
+        learnt = "".join(f"{name}0.9512 (0.9400 to 0.9600)" for name in ("e", "a[9]", "a[10]"))
+        assert first.value("element('learnt').textContent") == learnt
         # Everything came from this server, and nothing went wrong.
         for tab in tabs:
             tab.value("1")
