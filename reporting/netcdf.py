@@ -65,6 +65,9 @@ def read_groups(path: Path) -> xr.DataTree:
 def _answer(path: Path, writing: int) -> NoReturn:
     """Send the groups of a file, or why there are none, and end this process."""
     try:
+        # A fork inherits the lock of a run folder, which must end with the process if that is killed.
+        os.closerange(3, writing)
+        os.closerange(writing + 1, os.sysconf("SC_OPEN_MAX"))
         gc.disable()  # what is garbage here is in use there: finalizers end workers and remove folders
         faulthandler.disable()
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # the C library's last words

@@ -142,3 +142,18 @@ def test_a_warning_of_threads_is_no_error(path: Path, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(os, "fork", warned)
     assert read_groups(path).attrs["schema"] == "outer"
+
+
+def test_the_fork_holds_no_file_of_this_process(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or the lock of a run folder would outlive a process that is killed while a file is read."""
+    monkeypatch.setattr(
+        netcdf, "_groups", lambda path: " ".join(found.name for found in Path("/proc/self/fd").iterdir())
+    )
+    with path.open("rb") as held:
+        with pytest.raises(DamagedFileError) as raised:
+            read_groups(path)
+        number = str(held.fileno())
+    listed = str(raised.value).partition("(")[2].rstrip(")").split()
+    assert {"0", "1", "2"} < set(listed)
+    assert number not in listed
+    assert len(listed) <= 6  # the pipe, the null device beside its place as 2, and this listing
