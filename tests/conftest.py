@@ -35,13 +35,20 @@ settings.load_profile("ci" if os.environ.get("CI") else "developer")
 SHARED = ("coarse_reduction", "coarse_patch_arrays", "virtual_model")
 """Fixtures of several files that take seven to ten seconds each."""
 
+LONG = "takes minutes of processor time; set UAV_TWIN_LONG_TESTS to run it"
+
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Let one worker run all tests that share what is made once, unless they name a group.
 
-    That is all tests of a file, and of all files that use a fixture of `SHARED`.
+    That is all tests of a file, and of all files that use a fixture of `SHARED`. Tests marked `long` are
+    skipped unless they are asked for.
     """
+    if not os.environ.get("UAV_TWIN_LONG_TESTS"):
+        for item in items:
+            if item.get_closest_marker("long"):
+                item.add_marker(pytest.mark.skip(LONG))
     group: dict[Path, str] = {}
     for item in items:
         own = str(item.path.relative_to(config.rootpath))
@@ -49,8 +56,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if shared or item.path not in group:
             group[item.path] = shared[0] if shared else own
     for item in items:
-        if item.get_closest_marker("xdist_group") is None:
+        named = item.get_closest_marker("xdist_group")
+        if named is None:
             item.add_marker(pytest.mark.xdist_group(group[item.path]))
+        # pytest-xdist hands groups over as an ending of the node's name, and pytest 9.2 has it elsewhere than
+        # pytest-xdist 3.8 writes to (pytest-xdist, issue 1386): without this no group is kept together.
+        if getattr(config.option, "loadgroup", False) and hasattr(item, "_id"):
+            name = named.args[0] if named else group[item.path]
+            item._id = type(item._id).parse(f"{item.nodeid}@{name}")
 
 
 LONGEST_COMPARED = 10_000

@@ -6,7 +6,6 @@ Each page has a namespace and a folder of its own, which holds what the page say
 from __future__ import annotations
 
 import itertools
-import os
 import re
 import shutil
 import subprocess
@@ -211,7 +210,7 @@ MADE_ONCE = {
 """Folders that fixtures make, and where the page has them."""
 
 MINUTES = {"docs/real_wing.md"}
-"""Pages whose search takes minutes of processor time: run where UAV_TWIN_LONG_TESTS is set."""
+"""Pages whose search takes minutes of processor time."""
 
 MODULES = {"docs/use_the_wing_in.md": "libcosimpy"}
 """What the page tells the reader to install; without it the blocks before are run."""
@@ -246,12 +245,13 @@ def calibrated_wing(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(WITH_PYTHON))
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(page, marks=pytest.mark.long if page in MINUTES else ()) for page in sorted(WITH_PYTHON)],
+)
 def test_the_blocks_of_a_page_run_as_printed(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
-    if name in MINUTES and not os.environ.get("UAV_TWIN_LONG_TESTS"):
-        pytest.skip("takes minutes of processor time; set UAV_TWIN_LONG_TESTS to run it")
     for prepare in READER_HAS.get(name, ()):
         prepare(tmp_path)
     if name in MADE_ONCE:

@@ -1,6 +1,5 @@
 """Rigs that others measured: their files as published become campaigns, and what the search says of them."""
 
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -145,10 +144,7 @@ def test_readings_at_the_end_of_the_level_sensor_are_left_out(tanks: Rig) -> Non
         assert float(trial.values[trial.used].max()) < 10.0
 
 
-@pytest.mark.skipif(
-    not os.environ.get("UAV_TWIN_LONG_TESTS"),
-    reason="takes a minute of processor time; set UAV_TWIN_LONG_TESTS to run it",
-)
+@pytest.mark.long
 def test_the_tanks_have_a_root_of_the_level_and_an_overflow_in_part(tanks: Rig) -> None:
     verdict = judged(tanks, "outflow", "overflow", "logger_clock")
     assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
