@@ -14,7 +14,7 @@ from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
 from discrepancy.sources.from_run import CALIBRATION_FILE, DESIGN_FILE, patch_of_run, run_model
-from fe.reduction.reduced_basis import Progress
+from fe.reduction.stages import Progress
 from fe.runtime.errors import FiniteElementError
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
 from reporting.provenance import hash_file, hash_record

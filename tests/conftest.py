@@ -11,7 +11,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import importlib.util
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -210,3 +210,76 @@ def foreign_fmu(tmp_path_factory: pytest.TempPathFactory) -> Any:
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)
     return module.Workshop(tmp_path_factory.mktemp("foreign"))
+
+
+BEAM = """
+name = "beam"
+mesh = "beam.vtu"
+length_unit = "mm"
+set = [
+    { name = "root", of = "nodes", box = [[0, 0, 0], [0, 20, 10]] },
+    { name = "end", of = "nodes", box = [[100, 0, 0], [100, 20, 10]] },
+    { name = "inner", of = "cells", box = [[0, 0, 0], [25, 20, 10]] },
+    { name = "outer", of = "cells", box = [[50, 0, 0], [75, 20, 10]] },
+]
+parameter = [{ name = "e" }]
+control = [
+    { name = "load_factor", minimum = -4, maximum = 6 },
+    { name = "push", unit = "N", nominal = 50 },
+]
+support = [{ set = "root", hold = ["x", "y", "z"] }]
+load = [
+    { name = "weight", control = "load_factor", acceleration = [0, 0, -9.81] },
+    { name = "pushed", control = "push", set = "end", force = [0, 0, 1] },
+]
+damage = [{ name = "z1", set = "inner" }, { name = "z2", set = "outer" }]
+mass = [{ name = "pump", point = [80, 10, 10], mass = 0.05, free = true }]
+gauge = [
+    { name = "g1", point = [20, 10, 10], direction = [1, 0, 0] },
+    { name = "g2", point = [60, 10, 10], direction = [1, 0, 0], length = 5 },
+    { name = "g3", point = [60, 4, 10], direction = [1, 1, 0] },
+]
+displacement = [{ name = "tip", point = [100, 10, 5], direction = [0, 0, 1] }]
+acceleration = [{ name = "shake", point = [100, 10, 5], direction = [0, 0, 1] }]
+damping = { alpha = 5.0, beta = 2e-5 }
+
+[[material]]
+name = "alloy"
+density = 2700
+young_modulus = 7e10
+poisson_ratio = 0.33
+scaled_by = "e"
+"""
+
+
+@pytest.fixture(scope="session")
+def write_beam() -> Callable[..., Path]:
+    """A writer of a structure file with its mesh: regions, a parameter, a free mass, two controls, gauges.
+
+    It takes the folder, texts to exchange in the file, and the number of 20-node hexahedra along the beam.
+    """
+    import meshio
+
+    from fe.structure.elements import KINDS
+
+    kind = KINDS["hexahedron20"]
+    corners = np.array(
+        [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
+    )
+
+    def write(folder: Path, changes: Mapping[str, str] | None = None, cells: int = 4) -> Path:
+        nodes = np.array([corners + np.array([number, 0, 0]) for number in range(cells)], dtype=float)
+        middles = [0.5 * (nodes[:, a] + nodes[:, b]) for a, b in kind.edges]
+        whole = np.concatenate([nodes, *(middle[:, None] for middle in middles)], axis=1).reshape(-1, 3)
+        points, numbers = np.unique(whole, axis=0, return_inverse=True)
+        points *= [100.0 / cells, 20.0, 10.0]
+        meshio.write(folder / "beam.vtu", meshio.Mesh(points, [("hexahedron20", numbers.reshape(cells, 20))]))
+        text = BEAM
+        for old, new in (changes or {}).items():
+            assert old in text
+            text = text.replace(old, new)
+        file = folder / "beam.toml"
+        file.write_text(text, encoding="utf-8")
+        return file
+
+    return write

@@ -9,6 +9,8 @@ import typer
 
 from reporting import terminal
 from uav_twin.console_table import console_table
+from uav_twin.structure_arguments import File, MemoryLimit, assembled
+from uav_twin.structure_reduce import reduce
 
 if TYPE_CHECKING:
     from fe.structure.operators import Structure
@@ -18,29 +20,17 @@ DISPLACEMENT_LIMIT, STRAIN_LIMIT, FREQUENCY_LIMIT = 1e-5, 1e-5, 1e-6
 """Largest differences to CalculiX, each relative to the largest of its kind."""
 
 structure_app = typer.Typer(
-    no_args_is_help=True, help="Look at a structure from a mesh, or verify its model against CalculiX."
+    no_args_is_help=True,
+    help="Look at a structure from a mesh, verify its model against CalculiX, reduce it.",
 )
 
-File = Annotated[Path, typer.Argument(help="A structure file (TOML) beside its mesh.", show_default=False)]
 Modes = Annotated[int, typer.Option(min=1, max=50, help="Number of modes.")]
-MemoryLimit = Annotated[
-    float | None, typer.Option(min=0.1, help="GiB that it may take; what the machine has left by default.")
-]
-
-
-def _model(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool = False) -> "Structure":
-    from fe.structure.memory import GIB
-    from fe.structure.operators import load_and_assemble
-
-    limit = None if memory_limit is None else memory_limit * GIB
-    with terminal.progress().stage("Reading the mesh and assembling"):
-        return load_and_assemble(file, limit, mass_as_stiffness=mass_as_stiffness)
 
 
 @structure_app.command("info")
 def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: terminal.Json = False) -> None:
     """Say what a structure is made of, what it weighs, how it vibrates and what its loads do to it."""
-    structure = _model(file, memory_limit)
+    structure = assembled(file, memory_limit)
     with terminal.progress().stage("Solving the loads and the modes"):
         record = structure_record(structure, modes)
     if json:
@@ -178,7 +168,7 @@ def verify(
         )
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileNotWrittenError(f"{out} exists and is not an empty folder: choose another --out.")
-    structure = _model(file, memory_limit, mass_as_stiffness=True)
+    structure = assembled(file, memory_limit, mass_as_stiffness=True)
     with (
         tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch,
         terminal.progress().stage("CalculiX on the same mesh"),
@@ -220,3 +210,6 @@ def _differences(agreement: "StructureAgreement") -> Iterator[tuple[str, str, fl
         if load.strain is not None:
             yield f"load {load.load}", "gauge strains", load.strain, STRAIN_LIMIT
     yield f"{len(agreement.ours)} modes", "frequencies", agreement.frequency, FREQUENCY_LIMIT
+
+
+structure_app.command("reduce")(reduce)

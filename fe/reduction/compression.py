@@ -1,28 +1,33 @@
 """Offline: fewer static basis vectors for the same certified bound."""
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from fe.runtime.reduced import ReducedModel
+from fe.runtime.reduced_arrays import AffineArrays
 
+from .certified_basis import Judgement, State
+
+_Model = TypeVar("_Model", bound=AffineArrays)
 FloatArray = npt.NDArray[np.float64]
 
 
-def compressed(model: ReducedModel, directions: FloatArray) -> ReducedModel:
+def compressed(model: _Model, directions: FloatArray) -> _Model:
     """Return the model on fewer static basis vectors, its residuals on as few as they then need.
 
     Parameters
     ----------
-    model : ReducedModel
+    model : AffineArrays
         A model with N static basis vectors.
     directions : (N, K) ndarray
         Orthonormal combinations of them.
 
     Returns
     -------
-    ReducedModel
+    AffineArrays
         The Galerkin model on the combinations; its bound is as certified as before.
     """
     stiffness = directions.T @ model.static_stiffness @ directions
@@ -31,27 +36,32 @@ def compressed(model: ReducedModel, directions: FloatArray) -> ReducedModel:
         axis=1,
     )
     orthonormal, factor = np.linalg.qr(residual)
+    loads = model.residual_load.shape[1]
     return replace(
         model,
         static_stiffness=0.5 * (stiffness + stiffness.transpose(0, 2, 1)),
         static_load=model.static_load @ directions,
         static_output=model.static_output @ directions,
-        residual_load=np.ascontiguousarray(factor[:, :2]),
-        residual_stiffness=np.ascontiguousarray(factor[:, 2:].reshape(len(factor), len(stiffness), -1)),
+        residual_load=np.ascontiguousarray(factor[:, :loads]),
+        residual_stiffness=np.ascontiguousarray(factor[:, loads:].reshape(len(factor), len(stiffness), -1)),
         dual_correction=model.dual_correction @ orthonormal,
         cross_mass=model.cross_mass @ directions,
     )
 
 
-def fewest_directions(model: ReducedModel, states: list[tuple[float, ...]], tolerance: float) -> FloatArray:
+def fewest_directions(
+    model: _Model, judgement: Judgement[_Model], states: list[State], tolerance: float
+) -> FloatArray:
     """Return the fewest singular directions of the reduced solutions that keep the bound below a tolerance.
 
     Parameters
     ----------
-    model : ReducedModel
+    model : AffineArrays
         The model that the greedy search made.
+    judgement : Judgement
+        Its solutions and its bound.
     states : list of tuple
-        States (e, z1, ...) to look at.
+        States to look at.
     tolerance : float
         Relative bound wanted.
 
@@ -61,27 +71,35 @@ def fewest_directions(model: ReducedModel, states: list[tuple[float, ...]], tole
         Orthonormal combinations of its static basis vectors; all of them if fewer do not suffice.
     """
     solutions = []
-    for e, *losses in states:
-        for load in ((1.0, 0.0), (0.0, 1.0)):
-            coordinates = model.static_response(e, tuple(losses), *load).coordinates
+    for state in states:
+        for coordinates in judgement.solutions(model, state):
             solutions.append(coordinates / np.linalg.norm(coordinates))
     directions = np.linalg.svd(np.array(solutions).T)[0]
-    low, high = 2, directions.shape[1]
+    low, high = min(2, directions.shape[1]), directions.shape[1]
     while low < high:
         middle = (low + high) // 2
         smaller = compressed(model, directions[:, :middle])
-        if max(relative_bound(smaller, state) for state in states) <= tolerance:
+        if max(judgement.bound(smaller, state) for state in states) <= tolerance:
             high = middle
         else:
             low = middle + 1
     return np.asarray(directions[:, :low])
 
 
-def relative_bound(model: ReducedModel, parameters: tuple[float, ...]) -> float:
-    """Return the larger certified strain error bound of the two loads, relative to the largest strain."""
+def relative_bound(model: ReducedModel, parameters: State) -> float:
+    """Return the larger relative bound of a wing's strains under either load; of its largest strain."""
     e, *losses = parameters
     worst = 0.0
     for load in ((1.0, 0.0), (0.0, 1.0)):
         response = model.static_response(e, tuple(losses), *load)
         worst = max(worst, response.strain_error_bound / float(np.abs(response.strain).max()))
     return worst
+
+
+def _solutions(model: ReducedModel, parameters: State) -> list[FloatArray]:
+    e, *losses = parameters
+    return [model.static_response(e, tuple(losses), *load).coordinates for load in ((1.0, 0.0), (0.0, 1.0))]
+
+
+WING_JUDGEMENT = Judgement(_solutions, relative_bound)
+"""Of a wing: its strains under lift alone and under tip force alone."""

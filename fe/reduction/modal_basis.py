@@ -7,9 +7,11 @@ in it; then the modes of many states, computed in the working basis, are compres
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
 from scipy.linalg import eigh
 
 from fe.full.affine import AffineSystem, affine_sum
@@ -17,6 +19,9 @@ from fe.full.subspace import Norm, OrthonormalBasis
 from fe.runtime.errors import ReductionError
 
 FloatArray = npt.NDArray[np.float64]
+
+ModalState = tuple[FloatArray, FloatArray]
+"""Coefficients of the stiffness terms (T,) and of the mass terms (1 + P,)."""
 
 START_ITERATIONS = 4
 MOST_GRID_REGIONS = 3
@@ -56,12 +61,24 @@ class ModalData:
     mode_count: int
 
 
+class MatrixTerms(Protocol):
+    """What the modes of a structure are made of: terms csr (n, n) of its stiffness and mass."""
+
+    @property
+    def stiffness_terms(self) -> tuple[sparse.csr_array, ...]:
+        """Terms of the stiffness."""
+
+    @property
+    def mass_terms(self) -> tuple[sparse.csr_array, ...]:
+        """Terms of the mass."""
+
+
 class _WorkingBasis:
     """Basis orthonormal in the reference norm, with the projected terms."""
 
-    def __init__(self, system: AffineSystem, norm: Norm) -> None:
+    def __init__(self, system: MatrixTerms, norm: Norm) -> None:
         self.system, self.norm = system, norm
-        self.basis = OrthonormalBasis(len(system.load_lift), norm, drop=1e-6)
+        self.basis = OrthonormalBasis(system.stiffness_terms[0].shape[0], norm, drop=1e-6)
         self.stiffness = np.empty((len(system.stiffness_terms), 0, 0))
         self.mass = np.empty((len(system.mass_terms), 0, 0))
 
@@ -107,7 +124,7 @@ def loss_corners(regions: int) -> list[tuple[int, ...]]:
     return [(0,) * regions, *alone, *others, (1,) * regions]
 
 
-def sampled_states(box: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+def sampled_states(box: FloatArray) -> list[ModalState]:
     """Return the states at which the working basis is refined: `loss_corners`, with e and masses mixed in.
 
     Each entry holds the coefficients of the stiffness terms (K + 2,) and of the mass terms (3,).
@@ -129,7 +146,7 @@ def sampled_states(box: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     return states
 
 
-def compression_states(box: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+def compression_states(box: FloatArray) -> list[ModalState]:
     """Return the states whose modes are compressed together: a grid over the whole box.
 
     With more than `MOST_GRID_REGIONS` the losses are `loss_corners`, the same halfway.
@@ -186,31 +203,74 @@ def reduce_modes(
     ReductionError
         If the modes of a sampled state do not converge, or there are too few unknowns for the modes.
     """
-    unknowns = len(system.load_lift)
+    basis, stiffness, mass = modal_basis(
+        system,
+        norm,
+        np.array((1.0, *np.mean(box[-2:], axis=1))),
+        sampled_states(box),
+        compression_states(box),
+        settings,
+        advance,
+    )
+    data = ModalData(basis, stiffness, mass, np.empty((2, 0)), settings.mode_count)
+    shapes = _flapwise(data, system, nominal_masses)
+    return ModalData(data.basis, stiffness, mass, shapes, settings.mode_count)
+
+
+def modal_basis(
+    system: MatrixTerms,
+    norm: Norm,
+    middle: FloatArray,
+    sampled: list[ModalState],
+    compression: list[ModalState],
+    settings: ModalSettings,
+    advance: Callable[[], object],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Make a basis for the first modes of any structure.
+
+    Parameters
+    ----------
+    system : MatrixTerms
+        The full model.
+    norm : Norm
+        The energy norm of one of its stiffnesses.
+    middle : (1 + P,) ndarray
+        Coefficients of the mass terms with which the search begins.
+    sampled, compression : list of ModalState
+        Where the working basis is refined, and whose modes are compressed together.
+    settings, advance
+        As of `reduce_modes`, as are the errors.
+
+    Returns
+    -------
+    basis : (n, Nm) ndarray
+        The basis.
+    stiffness, mass : (T, Nm, Nm), (1 + P, Nm, Nm) ndarray
+        The terms in it.
+    """
+    unknowns = system.stiffness_terms[0].shape[0]
     count = settings.mode_count + 2  # two more, because modes change places
     if unknowns <= 2 * count:
         raise ReductionError(
             f"{settings.mode_count} modes cannot be had from {unknowns} unknowns; ask for fewer or refine."
         )
     working = _WorkingBasis(system, norm)
-    matrix = affine_sum((1.0, *np.mean(box[-2:], axis=1)), system.mass_terms)
+    matrix = affine_sum(middle, system.mass_terms)
     # inverse iteration on a block; what it leaves is refined below
     vectors = np.random.default_rng(1).normal(size=(unknowns, count + 4))
     for _ in range(START_ITERATIONS):
         vectors = np.linalg.qr(norm.riesz(np.asarray(matrix @ vectors)))[0]
     working.extend(vectors)
-    for theta, mass_theta in sampled_states(box):
+    for theta, mass_theta in sampled:
         _refine(working, theta, mass_theta, count, settings)
         advance()
-    basis = _compress(working, compression_states(box), count, settings)
+    basis = _compress(working, compression, count, settings)
     stiffness, mass = (
         # What rounding made of the symmetry of large entries is averaged out.
         0.5 * (terms + terms.transpose(0, 2, 1))
         for terms in (basis.T @ working.stiffness @ basis, basis.T @ working.mass @ basis)
     )
-    data = ModalData(working.basis.vectors @ basis, stiffness, mass, np.empty((2, 0)), settings.mode_count)
-    shapes = _flapwise(data, system, nominal_masses)
-    return ModalData(data.basis, stiffness, mass, shapes, settings.mode_count)
+    return working.basis.vectors @ basis, stiffness, mass
 
 
 def _refine(
@@ -238,7 +298,7 @@ def _refine(
 
 
 def _compress(
-    working: _WorkingBasis, states: list[tuple[FloatArray, FloatArray]], count: int, settings: ModalSettings
+    working: _WorkingBasis, states: list[ModalState], count: int, settings: ModalSettings
 ) -> FloatArray:
     """Return the fewest singular directions (k, Nm) of many states' modes that keep every frequency."""
     modes = [working.modes(*state, count) for state in states]

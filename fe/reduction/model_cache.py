@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     from fe.wing.design import WingDesign
 
     from .patch_basis import PatchSettings
-    from .reduced_basis import Progress
     from .settings import ReductionSettings
+    from .stages import Progress
 
 MODELLING_ROOMS = ("runtime", "wing", "full", "reduction")
 """The rooms that decide what a reduced model holds; a change in any of their files makes a new entry."""
 
 
-def modelling_hash() -> str:
-    """Return the SHA-256 of the modelling code, hexadecimal."""
+def modelling_hash(rooms: tuple[str, ...] = MODELLING_ROOMS) -> str:
+    """Return the SHA-256 of the modelling code of some rooms, hexadecimal."""
     digest = hashlib.sha256()
     package = Path(__file__).parents[1]
-    for room in MODELLING_ROOMS:
+    for room in rooms:
         for path in sorted((package / room).rglob("*.py")):
             content = path.read_bytes()
             digest.update(f"{path.relative_to(package).as_posix()} {len(content)}\n".encode())
@@ -160,7 +160,7 @@ def assembled(design: "WingDesign", progress: "Progress | None") -> "Iterator[Af
 
     from fe.full.operators import assemble
 
-    from .reduced_basis import stage_of
+    from .stages import stage_of
 
     with threadpool_limits(1):
         with stage_of(progress, "Meshing and assembling the wing"):

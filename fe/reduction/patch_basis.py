@@ -19,8 +19,8 @@ from fe.full.patch_operators import PatchOperators, assemble_patch_operators
 from fe.full.subspace import Norm
 from fe.runtime.patch_arrays import PatchArrays
 
-from .reduced_basis import Progress, stage_of
 from .settings import ReductionSettings
+from .stages import Progress, stage_of
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from fe.wing.design import WingDesign
 
     from .patch_basis import PatchSettings
-    from .reduced_basis import Progress
+    from .stages import Progress
 
 
 def patch_arrays(

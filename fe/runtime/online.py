@@ -1,26 +1,47 @@
-"""Arrays of a reduced model, laid out for the fewest operations in an evaluation.
+"""The certified static solution online, of arrays laid out for the fewest operations in an evaluation.
 
-NumPy only: this file is copied into the FMU.
+NumPy only: this file is copied into the FMU. The equations are in `docs/reduced_model.md`.
 """
 
+from bisect import bisect_right
 from dataclasses import dataclass
+from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numpy import einsum
+from numpy.linalg import solve
+
+from .reduced_arrays import AffineArrays
 
 FloatArray = npt.NDArray[np.float64]
+multiply_outer = np.multiply.outer
 
 
 @dataclass(frozen=True, slots=True)
 class DualArrays:
-    """Approximate dual solutions at one anchor: `correction` (G + 1, R) and `factor` (T (G + 1), T)."""
+    """Approximate dual solutions at one anchor: `correction` (O, R) and `factor` (T O, T)."""
 
     correction: FloatArray
     factor: FloatArray
 
 
+class CertifiedSolution(NamedTuple):
+    """Coordinates (N,), outputs (O,) and certified bounds (O,) of their errors, rounding left out."""
+
+    coordinates: FloatArray
+    output: FloatArray
+    bound: FloatArray
+
+
 class OnlineArrays:
-    """What `ReducedModel.static_response` multiplies; the parameters are fields of `ReducedModel`.
+    """T stiffness terms, L loads and O outputs in N basis vectors, with the arrays of the error bound.
+
+    Parameters
+    ----------
+    arrays : AffineArrays
+        Arrays of the reduced model.
 
     Attributes
     ----------
@@ -28,46 +49,69 @@ class OnlineArrays:
         (N, N).
     stiffness : (T, N N) ndarray
         Stiffness terms, flat.
-    residual : (R, 2 + T N) ndarray
-        Times the loads, then the stiffness coefficients times the coordinates: the residual.
-    limits : tuple of (float, float)
-        Validity limits of e, of the losses, of load factor and tip force.
-    reference : tuple of float
-        `bound_reference`.
     splits : tuple of list of float
-        `dual_split` of each region.
-    dual : list of DualArrays
-        Approximate dual solutions by anchor.
+        `dual_split` of each damage region.
     """
 
-    __slots__ = ("dual", "limits", "reference", "residual", "splits", "square", "stiffness")
+    __slots__ = (
+        "_allowance", "_dual", "_load", "_output", "_reference", "_residual", "splits", "square", "stiffness"
+    )  # fmt: skip
 
-    def __init__(
-        self,
-        *,
-        static_stiffness: FloatArray,
-        validity_box: FloatArray,
-        bound_reference: FloatArray,
-        residual_load: FloatArray,
-        residual_stiffness: FloatArray,
-        dual_counts: npt.NDArray[np.int64],
-        dual_split: FloatArray,
-        dual_correction: FloatArray,
-        dual_residual: FloatArray,
-    ) -> None:
-        self.square = static_stiffness.shape[1:]
-        self.stiffness = np.ascontiguousarray(static_stiffness.reshape(len(static_stiffness), -1))
-        self.residual = np.concatenate(
-            (residual_load, -residual_stiffness.reshape(len(residual_load), -1)), axis=1
+    def __init__(self, arrays: AffineArrays) -> None:
+        stiffness = arrays.static_stiffness
+        self.square = stiffness.shape[1:]
+        self.stiffness = np.ascontiguousarray(stiffness.reshape(len(stiffness), -1))
+        self._load, self._output = arrays.static_load, arrays.static_output
+        residual = arrays.residual_load
+        # times the loads, then the stiffness coefficients times the coordinates: the residual
+        self._residual = np.concatenate(
+            (residual, -arrays.residual_stiffness.reshape(len(residual), -1)), axis=1
         )
-        self.limits = tuple((float(low), float(high)) for low, high in validity_box[:-2])
-        self.reference = tuple(float(value) for value in bound_reference)
-        ends = np.cumsum(dual_counts - 1)[:-1]
-        self.splits = tuple([float(value) for value in split] for split in np.split(dual_split, ends))
-        # to be multiplied by (e, 1 - z1, ..., 1), as the stiffness
-        factors = np.concatenate((-dual_residual[..., 1:], dual_residual[..., :1]), axis=-1)
-        terms = len(static_stiffness)
-        self.dual = [
-            DualArrays(np.ascontiguousarray(correction), np.ascontiguousarray(factor.reshape(-1, terms)))
-            for correction, factor in zip(dual_correction, factors, strict=True)
+        self._allowance = arrays.residual_allowance
+        self._reference = (*arrays.bound_reference.tolist(), 1.0)
+        ends = np.cumsum(arrays.dual_counts - 1)[:-1]
+        self.splits = tuple([float(value) for value in split] for split in np.split(arrays.dual_split, ends))
+        # to be multiplied by theta, as the stiffness
+        dual = arrays.dual_residual
+        factors = np.concatenate((-dual[..., 1:], dual[..., :1]), axis=-1)
+        self._dual = [
+            DualArrays(
+                np.ascontiguousarray(correction), np.ascontiguousarray(factor.reshape(-1, len(stiffness)))
+            )
+            for correction, factor in zip(arrays.dual_correction, factors, strict=True)
         ]
+
+    def solution(self, theta: FloatArray, load: FloatArray, loss: tuple[float, ...]) -> CertifiedSolution:
+        """Return the static solution and its bounds.
+
+        Parameters
+        ----------
+        theta : (T,) ndarray
+            Coefficients of the stiffness terms.
+        load : (L,) ndarray
+            Coefficients of the loads.
+        loss : tuple of float
+            Stiffness losses of the damage regions, by which the approximate dual solution is chosen.
+        """
+        stiffness = (theta @ self.stiffness).reshape(self.square)
+        coordinates = np.asarray(solve(stiffness, load @ self._load), dtype=np.float64)
+        output = self._output @ coordinates
+
+        # |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha, norms dual to the reference
+        coefficients = np.empty(self._residual.shape[1])
+        loads = load.size
+        coefficients[:loads] = load
+        multiply_outer(theta, coordinates, out=coefficients[loads:].reshape(theta.size, -1))
+        residual = self._residual @ coefficients
+        number = 0
+        for split, value in zip(self.splits, loss, strict=True):
+            number = number * (len(split) + 1) + bisect_right(split, value)
+        anchor = self._dual[number]
+        dual = (anchor.factor @ theta).reshape(-1, theta.size)
+        coercivity = min(
+            value / reference for value, reference in zip(theta.tolist(), self._reference, strict=True)
+        )
+        outside = self._allowance * sqrt(coordinates @ coordinates)
+        remainder = (sqrt(residual @ residual) + outside) / coercivity
+        bound = remainder * np.sqrt(einsum("ij,ij->i", dual, dual)) + np.abs(anchor.correction @ residual)
+        return CertifiedSolution(coordinates, output, bound)

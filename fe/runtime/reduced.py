@@ -4,14 +4,12 @@ NumPy and relative imports only: this file is copied into the FMU. The offline p
 is `fe.reduction.reduced_basis`; the equations are in `docs/reduced_model.md`.
 """
 
-from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import isfinite, sqrt
 
 import numpy as np
 import numpy.typing as npt
-from numpy import einsum
 from numpy.linalg import solve
 
 from .errors import OutsideModelError
@@ -23,7 +21,6 @@ from .state import Losses
 __all__ = ["Modes", "ReducedModel", "StaticResponse"]
 
 FloatArray = npt.NDArray[np.float64]
-multiply_outer = np.multiply.outer
 
 
 @dataclass(frozen=True, repr=False)
@@ -35,24 +32,14 @@ class ReducedModel(ReducedArrays):
     """
 
     _online: OnlineArrays = field(init=False, repr=False, compare=False)
+    _limits: tuple[tuple[float, float], ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(
-            self,
-            "_online",
-            OnlineArrays(
-                static_stiffness=self.static_stiffness,
-                validity_box=self.validity_box,
-                bound_reference=self.bound_reference,
-                residual_load=self.residual_load,
-                residual_stiffness=self.residual_stiffness,
-                dual_counts=self.dual_counts,
-                dual_split=self.dual_split,
-                dual_correction=self.dual_correction,
-                dual_residual=self.dual_residual,
-            ),
-        )
+        # of e, of the losses, of load factor and tip force
+        limits = tuple((float(low), float(high)) for low, high in self.validity_box[:-2])
+        object.__setattr__(self, "_limits", limits)
+        object.__setattr__(self, "_online", OnlineArrays(self))
 
     def __repr__(self) -> str:
         return (
@@ -128,34 +115,13 @@ class ReducedModel(ReducedArrays):
         online = self._online
         loss = stiffness_loss if len(stiffness_loss) == len(online.splits) else self.losses(stiffness_loss)
         given = (e, *loss, load_factor, tip_force)
-        for value, (low, high) in zip(given, online.limits, strict=True):
+        for value, (low, high) in zip(given, self._limits, strict=True):
             if not low <= value <= high:
                 self.check_validity(**dict(zip(self.parameter_names, given, strict=False)))
-        remaining = [1.0 - value for value in loss]
-        values = np.array((e, *remaining, 1.0, load_factor, tip_force))
-        theta, load = values[:-2], values[-2:]
-        stiffness = (theta @ online.stiffness).reshape(online.square)
-        coordinates = np.asarray(solve(stiffness, load @ self.static_load), dtype=np.float64)
-        output = self.static_output @ coordinates
+        values = np.array((e, *(1.0 - value for value in loss), 1.0, load_factor, tip_force))
+        coordinates, output, bound = online.solution(values[:-2], values[-2:], loss)
         strain = output[:-1]
         tip_displacement = float(output[-1])
-
-        # |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha, norms dual to bound_reference
-        coefficients = np.empty(online.residual.shape[1])
-        coefficients[:2] = load
-        multiply_outer(theta, coordinates, out=coefficients[2:].reshape(theta.size, -1))
-        residual = online.residual @ coefficients
-        number = 0
-        for split, value in zip(online.splits, loss, strict=True):
-            number = number * (len(split) + 1) + bisect_right(split, value)
-        anchor = online.dual[number]
-        dual = (anchor.factor @ theta).reshape(-1, theta.size)
-        coercivity = 1.0
-        for value, reference in zip((e, *remaining), online.reference, strict=True):
-            coercivity = min(coercivity, value / reference)
-        outside = self.residual_allowance * sqrt(coordinates @ coordinates)
-        remainder = (sqrt(residual @ residual) + outside) / coercivity
-        bound = remainder * np.sqrt(einsum("ij,ij->i", dual, dual)) + np.abs(anchor.correction @ residual)
         rounding = self.rounding_allowance
         return StaticResponse(
             strain=strain,

@@ -46,6 +46,10 @@ class AffineStructure:
     ----------
     parameters, masses, controls : dict of str to float
         Nominal values of the parameters [1], free masses [kg] and controls [each in its unit].
+    control_units : dict of str to str
+        Their units.
+    ranges : dict of str to (float, float)
+        Least and largest value for which a reduced model is to hold, of these and of the losses, by name.
     regions : tuple of str
         Names of the damage regions.
     stiffness_terms : tuple of StiffnessTerm
@@ -73,6 +77,8 @@ class AffineStructure:
     parameters: dict[str, float]
     masses: dict[str, float]
     controls: dict[str, float]
+    control_units: dict[str, str]
+    ranges: dict[str, tuple[float, float]]
     regions: tuple[str, ...]
     stiffness_terms: tuple[StiffnessTerm, ...]
     mass_terms: tuple[sparse.csr_array, ...]

@@ -7,14 +7,14 @@ import hashlib
 import itertools
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from fe.full.assembly import rotate_elasticity
-from fe.runtime.errors import DesignFileError, InvalidDesignError
+from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.runtime.state import MOST_REGIONS
 from fe.wing.parts import Modulus, Part
 from reporting.section import checked
@@ -58,19 +58,66 @@ class NamedSet(Part):
         return self
 
 
-class Parameter(Part):
+class Ranged(Part):
+    """A quantity that can be chosen, and from where to where the reduced model is to hold."""
+
+    name: Name
+    minimum: float | None = None
+    maximum: float | None = None
+
+    usual: ClassVar[tuple[float, float]]
+    """Ends of the range where none are given, as multiples of the nominal value."""
+
+    @property
+    def middle(self) -> float:
+        """Nominal value."""
+        raise NotImplementedError
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Least and largest value."""
+        low, high = sorted(share * self.middle for share in self.usual)
+        return (
+            low if self.minimum is None else self.minimum,
+            high if self.maximum is None else self.maximum,
+        )
+
+    @model_validator(mode="after")
+    def _range_holds_the_nominal_value(self) -> "Ranged":
+        low, high = self.range
+        if not low <= self.middle <= high:
+            raise ValueError(
+                f"its nominal value {self.middle:g} must lie between minimum {low:g} and maximum {high:g}"
+            )
+        return self
+
+
+class Parameter(Ranged):
     """Factor on the stiffness of materials, to be calibrated; 1 unless `nominal` says otherwise."""
 
-    name: Name
     nominal: float = Field(default=1.0, gt=0.0, le=1e3)
+    minimum: float | None = Field(default=None, gt=0.0)
+
+    usual = (0.9, 1.1)
+
+    @property
+    def middle(self) -> float:
+        """Nominal value."""
+        return self.nominal
 
 
-class Control(Part):
+class Control(Ranged):
     """What commands loads; a load is its numbers times the value of its control."""
 
-    name: Name
-    unit: str = "1"
+    unit: str = Field(default="1", pattern=r"^\S+$")
     nominal: float = 1.0
+
+    usual = (-10.0, 10.0)
+
+    @property
+    def middle(self) -> float:
+        """Nominal value."""
+        return self.nominal
 
 
 class Material(Part):
@@ -196,19 +243,27 @@ class Load(Part):
 
 
 class Damage(Part):
-    """Region whose cells may lose stiffness; `name` is that of its loss."""
+    """Region whose cells may lose stiffness, up to `largest_loss`; `name` is that of its loss."""
 
     name: Name
     set: SetName
+    largest_loss: float = Field(default=0.8, gt=0.0, le=0.95)
 
 
-class PointMass(Part):
+class PointMass(Ranged):
     """Mass [kg] at a point of the structure; `free` where it is to be calibrated or chosen later."""
 
-    name: Name
     point: Vector
     mass: float = Field(ge=0.0, lt=1e6)
     free: bool = False
+    minimum: float | None = Field(default=None, ge=0.0)
+
+    usual = (0.5, 1.5)
+
+    @property
+    def middle(self) -> float:
+        """Nominal value."""
+        return self.mass
 
 
 class Gauge(Part):
@@ -343,9 +398,18 @@ def load_structure(path: Path | str) -> StructureDesign:
 
 
 def structure_hash(design: StructureDesign, mesh_file: Path) -> str:
-    """SHA-256 of the design and of the bytes of its mesh file, 64 hexadecimal digits."""
+    """SHA-256 of the design and of the bytes of its mesh file, 64 hexadecimal digits.
+
+    Raises
+    ------
+    MeshError
+        If the mesh file cannot be read.
+    """
     content = design.model_dump(mode="json")
     del content["mesh"]  # its bytes count, not its name
     digest = hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode())
-    digest.update(mesh_file.read_bytes())
+    try:
+        digest.update(mesh_file.read_bytes())
+    except OSError as error:
+        raise MeshError(f"The mesh file {mesh_file} cannot be read: {error.strerror}.") from None
     return digest.hexdigest()

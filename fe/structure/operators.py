@@ -221,6 +221,9 @@ def assemble(
         parameters={part.name: part.nominal for part in design.parameter},
         masses={part.name: part.mass for part in free},
         controls={part.name: part.nominal for part in design.control},
+        control_units={part.name: part.unit for part in design.control},
+        ranges={part.name: part.range for part in (*design.parameter, *free, *design.control)}
+        | {part.name: (0.0, part.largest_loss) for part in design.damage},
         regions=tuple(part.name for part in design.damage),
         stiffness_terms=_stiffness_terms(design, mesh, material_of, region_of, held),
         mass_terms=tuple(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -132,3 +133,26 @@ def test_a_fault_ends_in_one_sentence(
     assert "no set of nodes or faces named 'WALL'; there are ROOT, END." in capsys.readouterr().err
     assert call(monkeypatch, "info", str(file.parent / "none.toml")) == 1
     assert "none.toml" in capsys.readouterr().err
+
+
+def test_a_structure_is_reduced_and_compared(
+    write_beam: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """`structure reduce` says ranges and measured errors; a second call finds the model in the cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    file = str(write_beam(tmp_path))
+    assert call(monkeypatch, "reduce", file, "--json", "--states", "2", "--quiet") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["ranges"]["z1"] == [0.0, 0.8]
+    assert record["errors"]["strain"] < record["errors"]["bound"] < 1e-3
+    kept = list((tmp_path / "cache" / "uav-twin").glob("structure-*.npz"))
+    before = kept[0].stat().st_mtime_ns
+    assert call(monkeypatch, "reduce", file, "--states", "0") == 0
+    assert "load_factor" in capsys.readouterr().out
+    assert kept[0].stat().st_mtime_ns == before
+    write_beam(tmp_path, {'name = "z1",': 'name = "z1", largest_loss = 2,'})
+    assert call(monkeypatch, "reduce", file) != 0
+    assert "largest_loss" in capsys.readouterr().err

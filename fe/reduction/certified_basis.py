@@ -1,0 +1,292 @@
+"""Offline: the static part of a reduced model by a certified greedy search (pyMOR), for any affine structure.
+
+The method and what it reaches are in `docs/reduced_model.md`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from pymor.algorithms.greedy import WeakGreedySurrogate, weak_greedy
+from pymor.core.exceptions import ExtensionError
+from pymor.core.logger import set_log_levels
+from scipy import sparse
+
+from fe.full.affine import affine_sum
+from fe.full.subspace import (
+    Norm,
+    OrthonormalBasis,
+    conjugate_gradients,
+    triangular_factors,
+)
+from fe.runtime.reduced_arrays import AffineArrays
+
+FloatArray = npt.NDArray[np.float64]
+State = tuple[float, ...]
+_Model = TypeVar("_Model", bound=AffineArrays)
+
+SEARCH_MARGIN = 0.5
+"""The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""
+DUAL_TOLERANCE = 0.05
+"""Relative residual of the approximate dual solutions at their own anchors."""
+FIRST_TOLERANCE, SNAPSHOT_TOLERANCE = 1e-10, 1e-6
+"""Relative residual of the first full solutions and of the others."""
+ROUNDING_FACTOR, LEAST_ROUNDING = 8.0, 5e-6
+"""Rounding allowance as a multiple of the difference seen at the first full solutions, and its least value:
+with condition numbers of 1e10, full solutions differ by 1e-6 among themselves."""
+
+
+@dataclass(frozen=True)
+class AffineProblem:
+    """A structure as its reduction sees it.
+
+    Attributes
+    ----------
+    stiffness_terms, mass_terms : tuple of csr (n, n)
+        Positive semi-definite terms; the last of the stiffness is always times one.
+    loads : (n, L) ndarray
+        Loads.
+    outputs : (n, O) ndarray
+        Static outputs.
+    groups : tuple of slice
+        Outputs of one kind, whose errors are measured against the largest of them.
+    theta : callable
+        Coefficients (T,) of the stiffness terms at a state.
+    """
+
+    stiffness_terms: tuple[sparse.csr_array, ...]
+    mass_terms: tuple[sparse.csr_array, ...]
+    loads: FloatArray
+    outputs: FloatArray
+    groups: tuple[slice, ...]
+    theta: Callable[[State], FloatArray]
+
+
+@dataclass(frozen=True)
+class Judgement(Generic[_Model]):
+    """How a reduced model is judged at a state: its solutions (N,) to each load alone, and its largest bound.
+
+    Attributes
+    ----------
+    solutions : callable
+        Coordinates of the solution to each load.
+    bound : callable
+        Certified bound relative to the largest output, of the load where that is largest.
+    """
+
+    solutions: Callable[[_Model, State], list[FloatArray]]
+    bound: Callable[[_Model, State], float]
+
+
+@dataclass(frozen=True)
+class _DualData:
+    """Approximate dual solutions: products with X (A, n, O) and factors of their residuals."""
+
+    products: FloatArray
+    factors: FloatArray
+
+
+class StaticReduction:
+    """State of the greedy search: the bases that full solutions have given.
+
+    Parameters
+    ----------
+    problem : AffineProblem
+        The full model.
+    norm : Norm
+        Energy norm at `reference`.
+    reference : (T - 1,) ndarray
+        Coefficients of the stiffness terms of the norm, without the last.
+    anchors : list of (T,) ndarray
+        Coefficients at which the dual problems are solved.
+    farthest : (T - 1,) ndarray
+        Largest distance of each coefficient from its reference.
+    advance : callable
+        Told one more part, and of what.
+    """
+
+    def __init__(
+        self,
+        problem: AffineProblem,
+        norm: Norm,
+        reference: FloatArray,
+        anchors: list[FloatArray],
+        farthest: FloatArray,
+        advance: Callable[[int, str], object],
+    ) -> None:
+        self.problem, self.norm, self.reference, self.advance = problem, norm, reference, advance
+        self.farthest = farthest
+        n = len(problem.loads)
+        self.basis = OrthonormalBasis(n, norm, drop=1e-7)
+        self.images = [
+            np.empty((n, 0)) for _ in problem.stiffness_terms
+        ]  # stiffness terms times basis vectors
+        self.rounding = 0.0
+        self.residual_basis = OrthonormalBasis(n, norm, drop=1e-8, functionals=True)
+        self.residual_basis.extend(norm.riesz(problem.loads), problem.loads)
+        self.dual = self._approximate_duals(anchors)
+        self.snapshots: list[State] = []
+
+    def _approximate_duals(self, anchors: list[FloatArray]) -> _DualData:
+        """Solve the dual problems at the anchors, and prepare the norms of their residuals elsewhere."""
+        stiffness_terms, outputs = self.problem.stiffness_terms, self.problem.outputs
+        terms, (n, count) = len(stiffness_terms), outputs.shape
+        products = np.empty((len(anchors), n, count))
+        factors = np.empty((len(anchors), count, terms, terms))
+        at_reference = self.norm.riesz(outputs)
+        for number, theta in enumerate(anchors):
+            # a rough solution will do: the norm of what it leaves is computed, not assumed
+            dual = conjugate_gradients(
+                affine_sum(theta, stiffness_terms),
+                self.norm,
+                outputs,
+                at_reference,
+                tolerance=DUAL_TOLERANCE,
+            )
+            images = [np.asarray(term @ dual) for term in stiffness_terms]
+            lifted = [self.norm.riesz(image) for image in images[:-1]]
+            # X^-1 K_base dual, since X is the sum of all terms at the reference
+            base = dual - sum(t * part for t, part in zip(self.reference, lifted, strict=True))
+            factors[number] = triangular_factors(
+                np.stack((at_reference - base, *lifted), axis=2),
+                np.stack((outputs - images[-1], *images[:-1]), axis=2),
+            )
+            products[number] = self.norm.product(dual)
+            self.advance(1, "dual solutions")
+        return _DualData(products, factors)
+
+    def add_snapshot(self, state: State) -> None:
+        """Solve the full model for all loads and extend the bases."""
+        theta, loads = self.problem.theta(state), self.problem.loads
+        matrix = affine_sum(theta, self.problem.stiffness_terms)
+        start = np.zeros_like(loads)
+        if self.basis.size:
+            image = sum(t * k for t, k in zip(theta, self.images, strict=True))
+            start = self.basis.vectors @ np.linalg.solve(
+                self.basis.vectors.T @ image, self.basis.vectors.T @ loads
+            )
+        # a basis vector may be rough, since errors are bounded by residuals; the first one measures rounding
+        tolerance = SNAPSHOT_TOLERANCE if self.snapshots else FIRST_TOLERANCE
+        solution = conjugate_gradients(matrix, self.norm, loads, start, tolerance=tolerance)
+        before = self.basis.size
+        self.basis.extend(solution, self.norm.product(solution))
+        new = self.basis.vectors[:, before:]
+        if not new.shape[1]:
+            raise ExtensionError  # rounding is reached; what the search reached is judged after it
+        images = [np.asarray(term @ new) for term in self.problem.stiffness_terms]
+        self.images = [np.concatenate(pair, axis=1) for pair in zip(self.images, images, strict=True)]
+        varying = np.concatenate(images[:-1], axis=1)
+        self.residual_basis.extend(
+            np.concatenate((new, self.norm.riesz(varying)), axis=1),
+            np.concatenate((self.basis.products[:, before:], varying), axis=1),
+        )
+        if not self.snapshots:
+            self.rounding = self._rounding(theta, self.problem.outputs.T @ solution)
+        self.snapshots.append(state)
+
+    def _rounding(self, theta: FloatArray, wanted: FloatArray) -> float:
+        """Return the relative difference of outputs between full solutions and the basis that holds them."""
+        basis = self.basis.vectors
+        image = sum(t * k for t, k in zip(theta, self.images, strict=True))
+        coordinates = np.linalg.solve(basis.T @ image, basis.T @ self.problem.loads)
+        difference = np.abs(self.problem.outputs.T @ (basis @ coordinates) - wanted)
+        return max(
+            float(np.divide(largest, size, out=np.zeros_like(size), where=size > 0.0).max())
+            for rows in self.problem.groups
+            for largest, size in ((difference[rows].max(axis=0), np.abs(wanted[rows]).max(axis=0)),)
+        )
+
+    def arrays(self) -> dict[str, Any]:
+        """Return the static fields of `AffineArrays`, and `cross_mass` with the static basis alone."""
+        problem, basis, residual = self.problem, self.basis.vectors, self.residual_basis.vectors
+        stiffness = np.stack([basis.T @ image for image in self.images])
+        return {
+            "static_stiffness": 0.5 * (stiffness + stiffness.transpose(0, 2, 1)),
+            "static_load": problem.loads.T @ basis,
+            "static_output": problem.outputs.T @ basis,
+            "bound_reference": self.reference,
+            "residual_load": residual.T @ problem.loads,
+            "residual_stiffness": np.stack([residual.T @ image for image in self.images], axis=1),
+            # |sum c_q a_j d_qj| <= |c| |a| |d|; plus rounding
+            "residual_allowance": self._largest_coefficients()
+            * float(np.sqrt(self.residual_basis.dropped_square))
+            + 1e-7,
+            "rounding_allowance": max(ROUNDING_FACTOR * self.rounding, LEAST_ROUNDING),
+            "dual_correction": np.swapaxes(self.dual.products, 1, 2) @ residual,
+            "dual_residual": self.dual.factors,
+        }
+
+    def cross_mass(self, modal_basis: FloatArray) -> FloatArray:
+        """Return the mass terms (1 + P, Nm, N) between a modal basis (n, Nm) and the static one."""
+        images = [np.asarray(term @ self.basis.vectors) for term in self.problem.mass_terms]
+        return np.stack([modal_basis.T @ image for image in images])
+
+    def _largest_coefficients(self) -> float:
+        """Return the largest length of (1, theta - reference), by which parts of a residual are multiplied.
+
+        The residual is f - X u - sum (theta_q - reference_q) K_q u, and the basis was offered X u and K_q u.
+        """
+        return float(np.sqrt(1.0 + self.farthest @ self.farthest))
+
+
+def greedy(
+    static: StaticReduction,
+    model: Callable[[], _Model],
+    judgement: Judgement[_Model],
+    states: list[State],
+    *,
+    tolerance: float,
+    most_snapshots: int,
+) -> list[float]:
+    """Run pyMOR's weak greedy search with the certified bound as its surrogate.
+
+    Parameters
+    ----------
+    static : StaticReduction
+        Takes the full solutions.
+    model : callable
+        The reduced model of its present bases.
+    judgement : Judgement
+        The bound.
+    states : list of State
+        Where it is looked at.
+    tolerance : float
+        Relative bound wanted; the search goes on to `SEARCH_MARGIN` of it.
+    most_snapshots : int
+        Limit of full solutions.
+
+    Returns
+    -------
+    list of float
+        Largest bound before each full solution and at the end.
+    """
+    set_log_levels({"pymor.algorithms.greedy": "WARN"})
+
+    class Surrogate(WeakGreedySurrogate):  # type: ignore[misc]
+        """The reduced model's own bound, as pyMOR's search wants it."""
+
+        def evaluate(self, mus: list[Any], return_all_values: bool = False) -> Any:
+            """Return the largest bound and where it is, or all bounds."""
+            if not static.basis.size:  # nothing to bound yet: begin in the middle
+                bounds = np.array([-sum((np.array(mu) - np.mean(mus, axis=0)) ** 2) for mu in mus]) + 1e3
+            else:
+                present = model()
+                bounds = np.array([judgement.bound(present, mu) for mu in mus])
+            if return_all_values:
+                return bounds
+            worst = int(bounds.argmax())
+            return float(bounds[worst]), mus[worst]
+
+        def extend(self, mu: State) -> None:
+            """Add the full solutions at the worst state."""
+            static.add_snapshot(mu)
+            static.advance(1, f"full solution {len(static.snapshots)}")
+
+    result = weak_greedy(Surrogate(), states, atol=SEARCH_MARGIN * tolerance, max_extensions=most_snapshots)
+    bounds = [float(value) for value in result["max_errs"][1:]]
+    if len(bounds) < len(static.snapshots):  # stopped by the limit: the last bound was not evaluated
+        present = model()
+        bounds.append(max(judgement.bound(present, mu) for mu in states))
+    return bounds

@@ -1,0 +1,363 @@
+"""Offline: make the `StructureModel` of a structure from its full model.
+
+The certified search and the modes are those of the wing; see `docs/reduced_model.md`.
+"""
+
+import itertools
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.stats import qmc
+
+from fe.full.affine import affine_sum
+from fe.full.subspace import Norm
+from fe.runtime.errors import ReductionError
+from fe.runtime.structure_model import StructureModel
+from fe.structure.affine import AffineStructure
+
+from .certified_basis import AffineProblem, Judgement, State, StaticReduction, greedy
+from .compression import compressed, fewest_directions
+from .modal_basis import ModalSettings, ModalState, loss_corners, modal_basis
+from .settings import default_anchors, loss_splits, remaining_levels
+from .stages import Progress, stage_of
+
+FloatArray = npt.NDArray[np.float64]
+
+LEAST_COSINE = 1e-4
+"""A load whose outputs are smaller than this part of what its energy could do to them is judged by that part:
+nothing of the structure sees it there."""
+SAMPLED_INSIDE = 10
+"""States inside the box at which the modes are refined."""
+CHOSEN_STATES = 128
+"""States inside the box on the training set, beside corners."""
+
+
+@dataclass(frozen=True)
+class StructureSettings:
+    """How well the reduced model of a structure is to hold; where is said in the structure file.
+
+    Attributes
+    ----------
+    bound_tolerance : float
+        The certified bound wanted everywhere on the training set, for each load alone, of strains relative to
+        the largest strain and of displacements relative to the largest of them.
+    most_snapshots : int
+        Limit of the greedy search.
+    modal : ModalSettings
+        Accuracy and number of modes.
+    """
+
+    bound_tolerance: float = 6e-4
+    most_snapshots: int = 40
+    modal: ModalSettings = field(default_factory=ModalSettings)
+
+
+@dataclass(frozen=True)
+class StructureReduction:
+    """A reduced structure with the bases that made it, as `fe.reduction.reduced_basis.Reduction`."""
+
+    model: StructureModel
+    static_basis: FloatArray
+    modal_basis: FloatArray
+    snapshots: tuple[State, ...]
+    bound_history: tuple[float, ...]
+
+
+class _Terms:
+    """What the reduction takes of a structure: terms merged by what they are times, the constant one last."""
+
+    def __init__(self, structure: AffineStructure) -> None:
+        self.structure = structure
+        parameters, controls = list(structure.parameters), list(structure.controls)
+        masses, regions = list(structure.masses), list(structure.regions)
+
+        def number(names: list[str], name: str | None) -> int:
+            return 0 if name is None else 1 + names.index(name)
+
+        terms = [
+            (term.matrix, (number(parameters, term.parameter), number(regions, term.region)))
+            for term in structure.stiffness_terms
+        ]
+        if terms[-1][1] != (0, 0):  # the error bound has a constant term
+            terms.append((sparse.csr_array(terms[0][0].shape), (0, 0)))
+        self.stiffness_factors = np.array([factors for _, factors in terms], dtype=np.int64)
+        columns: dict[tuple[int, int], FloatArray] = {}
+        for load in structure.load_terms:
+            place = (number(controls, structure.loads[load.load]), number(masses, load.mass))
+            columns[place] = columns[place] + load.vector if place in columns else load.vector
+        columns = {place: vector for place, vector in columns.items() if vector.any()}
+        self.load_factors = np.array(list(columns), dtype=np.int64).reshape(-1, 2)
+        outputs = sparse.vstack((structure.gauge_output, structure.displacement_output)).T
+        count, gauges = outputs.shape[1], len(structure.gauges)
+        groups = (slice(0, gauges), slice(gauges, count))
+        self.problem = AffineProblem(
+            stiffness_terms=tuple(matrix for matrix, _ in terms),
+            mass_terms=structure.mass_terms,
+            loads=np.stack(list(columns.values()), axis=1) if columns else np.empty((structure.unknowns, 0)),
+            outputs=np.asarray(outputs.toarray()),
+            groups=tuple(part for part in groups if part.stop > part.start),
+            theta=self.theta,
+        )
+        self.parameters = [structure.ranges[name] for name in parameters]
+        self.losses = [structure.ranges[name] for name in regions]
+        self.masses = [structure.ranges[name] for name in masses]
+        self.counts = default_anchors(len(regions))
+        self.reference = self._coefficients(
+            np.array([np.mean(ends) for ends in self.parameters]),
+            np.array([remaining_levels(ends, 1)[0] for ends in self.losses]),
+        )
+
+    def _coefficients(self, parameters: FloatArray, kept: FloatArray) -> FloatArray:
+        """Coefficients (T,) of the stiffness terms at parameters and what the regions have kept."""
+        factor, left = np.append(1.0, parameters), np.append(1.0, kept)
+        return np.asarray(factor[self.stiffness_factors[:, 0]] * left[self.stiffness_factors[:, 1]])
+
+    def theta(self, state: State) -> FloatArray:
+        """Coefficients (T,) of the stiffness terms at parameters and losses."""
+        values, count = np.array(state), len(self.parameters)
+        return self._coefficients(values[:count], 1.0 - values[count:])
+
+    def anchors(self) -> list[FloatArray]:
+        """Coefficients at which the dual problems are solved."""
+        middle = np.array([np.mean(ends) for ends in self.parameters])
+        levels = [remaining_levels(ends, count) for ends, count in zip(self.losses, self.counts, strict=True)]
+        return [self._coefficients(middle, np.array(kept)) for kept in itertools.product(*levels)]
+
+    def corners(self) -> list[State]:
+        """Corners of parameters and losses: all of a few, else those of `loss_corners`."""
+        box = (*self.parameters, *self.losses)
+        return [
+            tuple(float(span[end]) for span, end in zip(box, ends, strict=True))
+            for ends in loss_corners(len(box))
+        ]
+
+    def training(self) -> list[State]:
+        """States on which the greedy search looks for the largest bound: corners, and points between them."""
+        points = qmc.Halton(len(self.parameters) + len(self.losses), scramble=False).random(CHOSEN_STATES)
+        return [*self.corners(), *self.inside(points)]
+
+    def inside(self, shares: FloatArray) -> list[State]:
+        """States at shares (B, P + K) of the ranges; a loss goes by equal ratios of what is kept."""
+        columns = [
+            low + (high - low) * share for (low, high), share in zip(self.parameters, shares.T, strict=False)
+        ] + [
+            1.0 - (1.0 - low) * ((1.0 - high) / (1.0 - low)) ** share
+            for (low, high), share in zip(self.losses, shares.T[len(self.parameters) :], strict=True)
+        ]
+        return [tuple(state) for state in np.column_stack(columns).tolist()]
+
+    def sampled_modes(self) -> list[ModalState]:
+        """Corners under least and largest masses in turns, and a few states inside."""
+        at_corners = [
+            (
+                self.theta(state),
+                np.array((1.0, *(ends[(number + place) % 2] for place, ends in enumerate(self.masses)))),
+            )
+            for number, state in enumerate(self.corners())
+        ]
+        return [*at_corners, *self._modes_inside(SAMPLED_INSIDE)]
+
+    def compressed_modes(self) -> list[ModalState]:
+        """Corners under all least and largest masses, at most 64 of them, and states inside."""
+        masses = list(itertools.islice(itertools.product(*self.masses), 64))
+        at_corners = [
+            (self.theta(state), np.array((1.0, *chosen))) for state in self.corners() for chosen in masses
+        ]
+        return [*at_corners, *self._modes_inside(4 * SAMPLED_INSIDE)]
+
+    def _modes_inside(self, count: int) -> list[ModalState]:
+        """States of a Halton sequence, masses among them."""
+        varied = len(self.parameters) + len(self.losses)
+        points = qmc.Halton(varied + len(self.masses), scramble=False).random(1 + count)[1:]
+        low, high = np.array(self.masses).reshape(-1, 2).T
+        masses = low + (high - low) * points[:, varied:]
+        return [
+            (self.theta(state), np.array((1.0, *chosen)))
+            for state, chosen in zip(self.inside(points[:, :varied]), masses, strict=True)
+        ]
+
+    def farthest(self) -> FloatArray:
+        """Largest distance (T,) of each coefficient from its reference."""
+        factor = np.array([(1.0, 1.0), *self.parameters])[self.stiffness_factors[:, 0]]
+        kept = 1.0 - np.array([(0.0, 0.0), *self.losses])[self.stiffness_factors[:, 1]]
+        ends = (factor[:, :, np.newaxis] * kept[:, np.newaxis, :]).reshape(len(factor), -1)
+        return np.asarray(np.abs(ends - self.reference[:, np.newaxis]).max(axis=1))
+
+    @property
+    def middle_mass(self) -> FloatArray:
+        """Coefficients (1 + P,) of the mass terms in the middle."""
+        return np.array([1.0, *(np.mean(span) for span in self.masses)])
+
+
+def reduce_structure(
+    structure: AffineStructure,
+    name: str,
+    settings: StructureSettings | None = None,
+    progress: Progress | None = None,
+) -> StructureReduction:
+    """Make the reduced model of a structure.
+
+    Parameters
+    ----------
+    structure : AffineStructure
+        The full model.
+    name : str
+        What the structure is called.
+    settings : StructureSettings, optional
+        How well it is to hold.
+    progress : Progress, optional
+        Where to report.
+
+    Raises
+    ------
+    ReductionError
+        If there is nothing to reduce it for, or the accuracy asked for is not reached.
+    SolutionError
+        If the full model cannot be solved.
+    """
+    settings = settings or StructureSettings()
+    terms = _Terms(structure)
+    _check(terms, name)
+    with stage_of(progress, "Factorising the structure"):
+        norm = Norm(affine_sum(terms.reference, terms.problem.stiffness_terms))
+    with stage_of(progress, "Reducing the modes") as stage:
+        modes = modal_basis(
+            terms.problem,
+            norm,
+            terms.middle_mass,
+            terms.sampled_modes(),
+            terms.compressed_modes(),
+            settings.modal,
+            stage.advance,
+        )
+    with stage_of(progress, "Reducing the statics") as stage:
+        static = StaticReduction(
+            terms.problem,
+            norm,
+            terms.reference[:-1],
+            terms.anchors(),
+            terms.farthest()[:-1],
+            stage.advance,
+        )
+        judgement, states = _judgement(terms, norm), terms.training()
+        history = greedy(
+            static,
+            lambda: _model(static, terms, name, modes, settings.modal.mode_count),
+            judgement,
+            states,
+            tolerance=settings.bound_tolerance,
+            most_snapshots=settings.most_snapshots,
+        )
+    if history[-1] > settings.bound_tolerance:
+        raise ReductionError(
+            f"After {len(static.snapshots)} full solutions the error bound of {name} is {history[-1]:.2g} of "
+            f"the largest output, but {settings.bound_tolerance:.2g} was asked for; narrow the ranges of "
+            "parameters and losses, or allow a looser tolerance."
+        )
+    model = _model(static, terms, name, modes, settings.modal.mode_count)
+    directions = fewest_directions(model, judgement, states, settings.bound_tolerance)
+    return StructureReduction(
+        compressed(model, directions),
+        static.basis.vectors @ directions,
+        modes[0],
+        tuple(static.snapshots),
+        tuple(history),
+    )
+
+
+def _check(terms: _Terms, name: str) -> None:
+    """Refuse a structure that a twin can do nothing with; raises `ReductionError`."""
+    structure = terms.structure
+    for missing, what in (
+        (not structure.regions, "[[damage]]: a twin needs a region that may lose stiffness"),
+        (not len(terms.load_factors), "[[load]] that does anything: nothing would strain it"),
+        (not terms.problem.groups, "[[gauge]] and no [[displacement]]: nothing could be observed"),
+    ):
+        if missing:
+            raise ReductionError(f"The structure {name} has no {what}.")
+    if not structure.mass().diagonal().any():
+        raise ReductionError(
+            f"The structure {name} has no mass, hence no modes; give its materials a density."
+        )
+
+
+def _model(
+    static: StaticReduction,
+    terms: _Terms,
+    name: str,
+    modes: tuple[FloatArray, FloatArray, FloatArray],
+    mode_count: int,
+) -> StructureModel:
+    """Return the reduced model of the present bases."""
+    structure, problem, basis = terms.structure, terms.problem, modes[0]
+    chosen = (*structure.parameters, *structure.regions, *structure.masses, *structure.controls)
+    nominal = structure.parameters | structure.masses | structure.controls
+    return StructureModel(
+        design_hash=structure.design_hash,
+        name=name,
+        region_names=" ".join(structure.regions),
+        parameter_names=" ".join(structure.parameters),
+        mass_names=" ".join(structure.masses),
+        control_names=" ".join(structure.controls),
+        control_units=" ".join(structure.control_units[name] for name in structure.controls),
+        gauge_names=" ".join(structure.gauges),
+        displacement_names=" ".join(structure.displacements),
+        acceleration_names=" ".join(structure.accelerations),
+        validity_box=np.array([structure.ranges[name] for name in chosen], dtype=np.float64),
+        nominal=np.array([nominal.get(name, 0.0) for name in chosen], dtype=np.float64),
+        damping=np.array((structure.damping_alpha, structure.damping_beta)),
+        stiffness_factors=terms.stiffness_factors,
+        load_factors=terms.load_factors,
+        dual_counts=np.array(terms.counts, dtype=np.int64),
+        dual_split=np.concatenate(
+            [loss_splits(ends, count) for ends, count in zip(terms.losses, terms.counts, strict=True)]
+        ),
+        modal_stiffness=modes[1],
+        modal_mass=modes[2],
+        modal_load=problem.loads.T @ basis,
+        modal_output=np.concatenate((problem.outputs.T @ basis, structure.acceleration_output @ basis)),
+        cross_mass=static.cross_mass(basis),
+        mode_count=mode_count,
+        **static.arrays(),
+    )
+
+
+def _judgement(terms: _Terms, norm: Norm) -> Judgement[StructureModel]:
+    """Return how the model is judged: each load alone, gauges and displacements each by their largest."""
+    problem = terms.problem
+
+    def length(functionals: FloatArray) -> FloatArray:
+        squares = np.einsum("ik,ik->k", functionals, norm.riesz(functionals))
+        return np.asarray(np.sqrt(np.maximum(squares, 0.0)), dtype=np.float64)
+
+    loads, outputs = length(problem.loads), length(problem.outputs)
+    gauges = len(terms.structure.gauges)
+    least = LEAST_COSINE * np.array(
+        [loads * outputs[part].max(initial=0.0) for part in (slice(0, gauges), slice(gauges, None))]
+    )
+    unit = np.eye(len(loads))
+
+    def vector(model: StructureModel, state: State) -> FloatArray:
+        found = model.nominal.copy()
+        found[: len(state)] = state
+        return found
+
+    def bound(model: StructureModel, state: State) -> float:
+        chosen, worst = vector(model, state), 0.0
+        for number, load in enumerate(unit):
+            found = model.static_response(chosen, load)
+            for values, error, floor in (
+                (found.strain, found.strain_error_bound, least[0, number]),
+                (found.displacement, found.displacement_error_bound, least[1, number]),
+            ):
+                if values.size:
+                    worst = max(worst, error / max(float(np.abs(values).max()), floor))
+        return worst
+
+    def solutions(model: StructureModel, state: State) -> list[FloatArray]:
+        chosen = vector(model, state)
+        return [model.static_response(chosen, load).coordinates for load in unit]
+
+    return Judgement(solutions, bound)

@@ -1,0 +1,38 @@
+"""What the commands of `uav-twin structure` share."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from reporting import terminal
+
+if TYPE_CHECKING:
+    from fe.runtime.structure_model import StructureModel
+    from fe.structure.operators import Structure
+
+File = Annotated[Path, typer.Argument(help="A structure file (TOML) beside its mesh.", show_default=False)]
+MemoryLimit = Annotated[
+    float | None, typer.Option(min=0.1, help="GiB that it may take; what the machine has left by default.")
+]
+
+
+def assembled(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool = False) -> "Structure":
+    """Return the full model; `memory_limit` in GiB."""
+    from fe.structure.operators import load_and_assemble
+
+    with terminal.progress().stage("Reading the mesh and assembling"):
+        return load_and_assemble(file, _bytes(memory_limit), mass_as_stiffness=mass_as_stiffness)
+
+
+def reduced(file: Path, memory_limit: float | None) -> "StructureModel":
+    """Return the reduced model, from the cache where it is there."""
+    from fe.reduction.structure_cache import reduced_structure
+
+    return reduced_structure(file, progress=terminal.progress(), memory_limit=_bytes(memory_limit))
+
+
+def _bytes(memory_limit: float | None) -> float | None:
+    from fe.structure.memory import GIB
+
+    return None if memory_limit is None else memory_limit * GIB
