@@ -1,4 +1,4 @@
-"""What to run: scenario files, bindings and models of assets, shipped as package data."""
+"""What to run: scenario files, bindings, models of assets and recordings, shipped as package data."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 SCENARIO_FOLDER = Path(str(resources.files(__name__)))
 BINDING_FOLDER = SCENARIO_FOLDER / "bindings"
 ASSET_FOLDER = SCENARIO_FOLDER / "assets"
+RECORDING_FOLDER = SCENARIO_FOLDER / "recordings"
 
 
 def scenario_files() -> dict[str, Path]:
@@ -23,3 +24,8 @@ def binding_files() -> dict[str, Path]:
 def asset_scripts() -> dict[str, Path]:
     """Return the shipped model scripts by name, in alphabetical order."""
     return {path.stem: path for path in sorted(ASSET_FOLDER.glob("*.py")) if path.stem != "__init__"}
+
+
+def recording_files() -> dict[str, Path]:
+    """Return the shipped recordings of observations by name, in alphabetical order."""
+    return {path.stem: path for path in sorted(RECORDING_FOLDER.glob("*.csv"))}

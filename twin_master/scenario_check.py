@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import prod
 
-from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
+from twin_master.assets.resolution import Overrides, asset_source, believed_source, resolve_scenario
 from twin_master.network.memory import scenario_bytes
 from twin_master.scenario.reading import LoadedScenario
+from twin_master.scenario.schema import WATCHED_KIND
 
 
 @dataclass(frozen=True)
@@ -72,14 +73,15 @@ def check_scenario(loaded: LoadedScenario) -> ScenarioCheck:
         The binding or the design is wrong.
     """
     scenario = resolve_scenario(loaded, Overrides())
-    source = asset_source(scenario)
+    watched = scenario.asset.kind == WATCHED_KIND
+    source = believed_source(scenario) if watched else asset_source(scenario)
     source.check()
     origin, mission, calibration = source.origin, scenario.mission, scenario.calibration
     levels = {factor.name: len(factor.levels) for factor in scenario.state}
     return ScenarioCheck(
         name=mission.name,
         title=mission.title,
-        flown=origin.asset,
+        flown="nothing, a real asset is watched" if watched else origin.asset,
         believed=origin.model,
         uncertain=f"{calibration.parameter}, from {calibration.source.replace('_', ' ')}",
         draws=1 if calibration.source == "fixed" else calibration.draws,

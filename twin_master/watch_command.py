@@ -2,7 +2,9 @@
 
 import json
 import os
+import shlex
 import sys
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,17 +17,25 @@ from twin_master.viewer.command import View, shown
 
 if TYPE_CHECKING:
     from twin_master.assets.resolution import Overrides
+    from twin_master.scenario.reading import LoadedScenario
+    from twin_master.scenario.schema import Scenario
     from twin_master.watch.folder import Watch
     from twin_master.watch.intake import Feed
 
+    Decide = Callable[[Mapping[str, Any]], None]
+
 Observations = Annotated[
-    str,
+    str | None,
     typer.Option(
         metavar="SOURCE",
         help="A CSV or NetCDF file, the folder of a run or watch, `-` for JSON lines on standard input, or "
         "mqtt://[USER@]HOST[:PORT]/TOPIC (mqtts:// with TLS).",
+        show_default="the recording of the scenario, else -",
     ),
 ]
+
+_WORTH_SAYING = 0.05
+"""Probability that no state explains the sensors, from which on a line for people says so."""
 
 
 def watch(
@@ -33,13 +43,17 @@ def watch(
         str | None,
         typer.Argument(metavar="[SCENARIO]", help="A shipped scenario, or the path of a TOML file."),
     ] = None,
-    observations: Observations = "-",
+    observations: Observations = None,
     out: Annotated[
         Path | None, typer.Option(help="The folder of the watch.", show_default="runs/SCENARIO")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Take up the watch in --out.")] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the folder if it exists.")] = False,
     follow: Annotated[bool, typer.Option("--follow", help="Wait at the end of a CSV file for more.")] = False,
+    pace: Annotated[
+        float,
+        typer.Option(min=0.0, max=3600.0, help="Seconds to wait after each turn, to look at a recording."),
+    ] = 0.0,
     turns: Annotated[int | None, typer.Option(min=0, help="End after so many turns in all.")] = None,
     model_patch: Annotated[
         Path | None,
@@ -64,21 +78,27 @@ def watch(
     kept in the folder after every turn. Ctrl-C ends a watch in order; --resume takes it up again.
     """
     from twin_master.assets.resolution import Overrides
+    from twin_master.scenario.reading import load_scenario
     from twin_master.watch.folder import Patched
 
     if (model_patch is None) != (from_turn is None) or (model_patch is not None and not resume):
         raise typer.BadParameter("--model-patch and --from-turn go together, with --resume.")
-    _check_source(observations, follow, ca_file)
+    loaded = None if scenario is None else load_scenario(scenario)
+    if observations is None and loaded is not None:
+        observations = _recording(loaded.scenario.moved(loaded.path.parent))
+    if observations is not None:
+        _check_source(observations, follow, ca_file)
     overrides = Overrides(seed=seed, calibration=calibration, library=library)
     with shown(view) as begun:
-        watched, lock = _opened(scenario, observations, out, overrides, resume=resume, replace=replace)
+        watched, lock = _opened(loaded, observations, out, overrides, resume=resume, replace=replace)
         if begun is not None:
             begun(watched.folder)
         patched = None if model_patch is None or from_turn is None else Patched(model_patch, from_turn)
         try:
-            feed, decide, close = _feed(observations, watched, follow, ca_file)
+            source = observations or _recording(watched.scenario) or "-"
+            feed, decide, close = _feed(source, watched, follow, ca_file)
             try:
-                counts = watched.run(feed, decide, turns=turns, patched=patched)
+                counts = watched.run(feed, _paced(decide, pace), turns=turns, patched=patched)
             finally:
                 close()
             watched.store(counts, last=last, report=not no_report)
@@ -93,14 +113,27 @@ def watch(
         typer.echo(f"Watch: {watched.folder}, {counts.received} messages{refused}.", err=True)
 
 
+def _recording(scenario: "Scenario") -> str | None:
+    return None if scenario.watch.recording is None else str(scenario.watch.recording)
+
+
+def _paced(decide: "Decide", seconds: float) -> "Decide":
+    """Return what waits after each decision."""
+
+    def waiting(decision: Mapping[str, Any]) -> None:
+        decide(decision)
+        time.sleep(seconds)
+
+    return waiting if seconds else decide
+
+
 def _opened(
-    scenario: str | None, observations: str, out: Path | None, overrides: "Overrides", *, resume: bool,
-    replace: bool,
+    loaded: "LoadedScenario | None", observations: str | None, out: Path | None, overrides: "Overrides", *,
+    resume: bool, replace: bool,
 ) -> "tuple[Watch, int]":  # fmt: skip
     """Return the watch, begun or taken up, and what holds its folder."""
     from twin_master.assets.resolution import Overrides
     from twin_master.errors import MissionInputError
-    from twin_master.scenario.reading import load_scenario
     from twin_master.watch.folder import begin_watch, resume_watch
 
     if resume and (replace or overrides != Overrides()):
@@ -108,7 +141,6 @@ def _opened(
             "a watch is taken up with what its folder holds: give nothing that would change it.",
             param_hint="--resume",
         )
-    loaded = None if scenario is None else load_scenario(scenario)
     progress = terminal.progress()
     if loaded is None:
         if out is None or not resume:
@@ -117,7 +149,7 @@ def _opened(
     folder = out or Path("runs") / loaded.scenario.mission.name
     if resume:
         return resume_watch(folder, loaded, progress)
-    source = Path(observations).resolve()
+    source = Path(observations or "-").resolve()
     if replace and folder.resolve() in (source, *source.parents):
         raise MissionInputError(
             f"--replace would remove the observations in {observations} before they are read: choose another "
@@ -146,7 +178,7 @@ def _is_broker(observations: str) -> bool:
 
 def _feed(
     observations: str, watched: "Watch", follow: bool, ca_file: Path | None
-) -> "tuple[Feed, Callable[[Mapping[str, Any]], None], Callable[[], None]]":
+) -> "tuple[Feed, Decide, Callable[[], None]]":
     """Return where observations come from, who is told the decisions, and what ends both."""
     from twin_master.watch.feeds import JsonLinesFeed, file_feed
     from twin_master.watch.mqtt import MqttFeed, broker_of
@@ -157,20 +189,40 @@ def _feed(
         mqtt = MqttFeed(broker, scenario, watched.folder, lambda text: typer.echo(text, err=True))
 
         def publish(decision: Mapping[str, Any]) -> None:
-            _say(decision, flush=True)
+            _say(watched, decision, flush=True)
             mqtt.decide(decision)
 
         return mqtt, publish, mqtt.close
     if observations == "-":
-        return JsonLinesFeed(scenario), lambda decision: _say(decision, flush=True), lambda: None
+        return JsonLinesFeed(scenario), lambda decision: _say(watched, decision, flush=True), lambda: None
     feed = file_feed(Path(observations), scenario, follow=follow)
-    return feed, lambda decision: _say(decision, flush=follow), sys.stdout.flush
+    return feed, lambda decision: _say(watched, decision, flush=follow), sys.stdout.flush
 
 
-def _say(decision: Mapping[str, Any], *, flush: bool) -> None:
+def _say(watched: "Watch", decision: Mapping[str, Any], *, flush: bool) -> None:
     for notice in decision["alarms"]:  # also where the decisions go to a program
-        typer.echo(notice["sentence"], err=True)
+        sentence = notice["sentence"].replace(" DIR", f" {shlex.quote(str(watched.folder))}")
+        typer.secho(sentence, fg="yellow", err=True)
     if not terminal.loudness.quiet:
-        sys.stdout.write(json.dumps(decision) + "\n")
-        if flush:
+        people = sys.stdout.isatty()
+        sys.stdout.write((_line(watched.scenario, decision) if people else json.dumps(decision)) + "\n")
+        if flush or people:
             sys.stdout.flush()
+
+
+def _line(scenario: "Scenario", decision: Mapping[str, Any]) -> str:
+    """Return a decision for people: a line of a terminal."""
+    from twin_master.report.view import printed_state
+
+    health = []
+    for name, known in decision["health"].items():
+        scale, unit = printed_state(known["unit"])
+        digits = ".0f" if unit == "%" else ".3g"
+        mean, deviation = (f"{scale * known[moment]:{digits}}" for moment in ("mean", "standard_deviation"))
+        health.append(f"{name} {mean} ± {deviation} {unit}")
+    line = (
+        f"{scenario.mission.step_name} {decision['turn']}: {decision['control']}, {', '.join(health)}; "
+        f"next {decision['next_control']} with probability {decision['probability']:.3f}"
+    )
+    none = decision.get("none_of_these", 0.0)
+    return line + (f"; none of the states with {none:.2f}" if none >= _WORTH_SAYING else "")

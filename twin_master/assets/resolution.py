@@ -192,3 +192,10 @@ def asset_source(scenario: Scenario) -> AssetSource:
     if believed is flown:
         return flown
     return PairedSource(flown, believed, differ=scenario.another_model)
+
+
+def believed_source(scenario: Scenario) -> AssetSource:
+    """Return what the twin of a scenario believes; what flies is asked only where it is believed itself."""
+    check_scenario_fits(scenario)
+    source: AssetSource = scenario.belief.source(scenario, scenario.asset.source(scenario))
+    return source

@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, SerializeAsAny, model_validator
 
+from scenarios import recording_files
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
 from twin_master.scenario.learning import Learning
 from twin_master.scenario.notice import Noticing
@@ -221,12 +222,26 @@ WATCHED_KIND = "watched"
 class WatchSection(Section):
     """How a real asset is watched."""
 
+    observations: str | None = None
+    """A recorded file that is watched where nothing else is given, or the name of a shipped one."""
     lag: Count = 50
     """Turns back over which the twin smooths, and which a message may be late."""
     longest_gap: Count = 1000
     """Turns that a message may be ahead of the next one; those between are predicted through."""
     seconds_per_turn: Positive | None = None
     """Of messages that have a time in the place of a turn."""
+
+    @property
+    def recording(self) -> Path | None:
+        """The recorded file."""
+        name = self.observations
+        return None if name is None else recording_files().get(name, Path(name))
+
+    def moved(self, folder: Path) -> Self:
+        """Return the table with the path of the recorded file from a folder; a run folder has no copy."""
+        if self.observations is None or self.observations in recording_files():
+            return self
+        return self.model_copy(update={"observations": str(folder / self.observations)})
 
 
 class Scenario(Section):
@@ -293,7 +308,8 @@ class Scenario(Section):
 
     def moved(self, folder: Path) -> Self:
         """Return the scenario with its relative paths from a folder."""
-        return self.model_copy(update={name: part.moved(folder) for name, part in self._files().items()})
+        parts = {**self._files(), "watch": self.watch}
+        return self.model_copy(update={name: part.moved(folder) for name, part in parts.items()})
 
     def portable(self) -> Self:
         """Return the scenario with the paths of the copies inside a run folder."""

@@ -18,7 +18,13 @@ from reporting.progress import Progress
 from reporting.provenance import collect_provenance, hash_file, hash_record
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.design_source import DesignBelief
-from twin_master.assets.resolution import Overrides, located_scenario, portable_scenario, resolve_scenario
+from twin_master.assets.resolution import (
+    Overrides,
+    believed_source,
+    located_scenario,
+    portable_scenario,
+    resolve_scenario,
+)
 from twin_master.errors import ImpossibleObservation, MissionInputError, NotResumableError
 from twin_master.mission.journal import (
     JOURNAL_NAME,
@@ -31,7 +37,6 @@ from twin_master.mission.journal import (
 from twin_master.mission.kept_knowledge import keep_knowledge
 from twin_master.mission.loop import Reading, operate
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.network.memory import check_scenario_fits
 from twin_master.network.twin import Twin, TwinTurn
 from twin_master.run_folder import (
     CONFIG_NAME,
@@ -341,13 +346,6 @@ def resume_watch(folder: Path, loaded: LoadedScenario | None, progress: Progress
     except BaseException:
         os.close(lock)
         raise
-
-
-def believed_source(scenario: Scenario) -> AssetSource:
-    """Return what the twin of a scenario believes; what flies is asked only where it is believed itself."""
-    check_scenario_fits(scenario)
-    source: AssetSource = scenario.belief.source(scenario, scenario.asset.source(scenario))
-    return source
 
 
 class _Keeper:

@@ -302,6 +302,27 @@ def test_a_changed_journal_and_other_folders_are_refused(
         assert CliRunner().invoke(app(), ["watch", *options]).exit_code != 0
 
 
+def test_the_shipped_recording_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The gauge that comes loose at turn 10, and the skin that softens from turn 25 on."""
+    monkeypatch.setattr(Watch, "store", lambda *_arguments, **_options: None)
+    folder = tmp_path / "a b"
+    result = CliRunner().invoke(app(), ["watch", "watched_wing", "--out", str(folder), "--pace", "0.001"])
+    assert result.exit_code == 0, result.output
+    decisions = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [decision["turn"] for decision in decisions] == list(range(60))
+    alarms = [(d["turn"], notice) for d in decisions for notice in d["alarms"]]
+    (first, gauge), (second, none) = alarms
+    assert 10 < first < 25 < second < 40
+    assert gauge["sensors"] == [4]
+    assert "no state of the model explains all gauges" in none["sentence"]
+    assert decisions[24]["none_of_these"] < 0.1
+    assert decisions[-1]["none_of_these"] > 0.999
+    assert f"--from-run '{folder}'" in result.stderr
+    again = CliRunner().invoke(app(), ["watch", "--resume", "--out", str(folder)])
+    assert again.stdout == ""
+    assert "60 messages." in again.stderr
+
+
 def app() -> object:
     from uav_twin.cli import app as application
 
