@@ -308,8 +308,8 @@ class Scenario(Section):
 
     def moved(self, folder: Path) -> Self:
         """Return the scenario with its relative paths from a folder."""
-        parts = {**self._files(), "watch": self.watch}
-        return self.model_copy(update={name: part.moved(folder) for name, part in parts.items()})
+        parts: dict[str, Section] = {name: part.moved(folder) for name, part in self._files().items()}
+        return self.model_copy(update=parts | {"watch": self.watch.moved(folder)})
 
     def portable(self) -> Self:
         """Return the scenario with the paths of the copies inside a run folder."""
