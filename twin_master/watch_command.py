@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from twin_master.assets.resolution import Overrides
     from twin_master.scenario.reading import LoadedScenario
     from twin_master.scenario.schema import Scenario
-    from twin_master.watch.folder import Watch
-    from twin_master.watch.intake import Feed
+    from twin_master.watch.folder import Patched, Watch
+    from twin_master.watch.intake import Counts, Feed
 
     Decide = Callable[[Mapping[str, Any]], None]
 
@@ -78,16 +78,11 @@ def watch(
     kept in the folder after every turn. Ctrl-C ends a watch in order; --resume takes it up again.
     """
     from twin_master.assets.resolution import Overrides
-    from twin_master.scenario.reading import load_scenario
     from twin_master.watch.folder import Patched
 
     if (model_patch is None) != (from_turn is None) or (model_patch is not None and not resume):
         raise typer.BadParameter("--model-patch and --from-turn go together, with --resume.")
-    loaded = None if scenario is None else load_scenario(scenario)
-    if observations is None and loaded is not None:
-        observations = _recording(loaded.scenario.moved(loaded.path.parent))
-    if observations is not None:
-        _check_source(observations, follow, ca_file)
+    loaded, observations = _asked(scenario, observations, follow, ca_file)
     overrides = Overrides(seed=seed, calibration=calibration, library=library)
     with shown(view) as begun:
         watched, lock = _opened(loaded, observations, out, overrides, resume=resume, replace=replace)
@@ -96,11 +91,8 @@ def watch(
         patched = None if model_patch is None or from_turn is None else Patched(model_patch, from_turn)
         try:
             source = observations or _recording(watched.scenario) or "-"
-            feed, decide, close = _feed(source, watched, follow, ca_file)
-            try:
-                counts = watched.run(feed, _paced(decide, pace), turns=turns, patched=patched)
-            finally:
-                close()
+            feed = _feed(source, watched, follow, ca_file)
+            counts = _watched(watched, feed, pace, turns, patched)
             watched.store(counts, last=last, report=not no_report)
         except Exception as error:
             error.add_note(
@@ -125,6 +117,21 @@ def _paced(decide: "Decide", seconds: float) -> "Decide":
         time.sleep(seconds)
 
     return waiting if seconds else decide
+
+
+def _watched(
+    watched: "Watch",
+    fed: "tuple[Feed, Decide, Callable[[], None]]",
+    pace: float,
+    turns: int | None,
+    patched: "Patched | None",
+) -> "Counts":
+    """Watch until the end, and end what the observations come from."""
+    feed, decide, close = fed
+    try:
+        return watched.run(feed, _paced(decide, pace), turns=turns, patched=patched)
+    finally:
+        close()
 
 
 def _opened(
@@ -156,6 +163,20 @@ def _opened(
             "--out."
         )
     return begin_watch(loaded, folder, overrides, progress, replace_run=replace)
+
+
+def _asked(
+    scenario: str | None, observations: str | None, follow: bool, ca_file: Path | None
+) -> "tuple[LoadedScenario | None, str | None]":
+    """Return the scenario, and where its observations come from, as far as either is said."""
+    from twin_master.scenario.reading import load_scenario
+
+    loaded = None if scenario is None else load_scenario(scenario)
+    if observations is None and loaded is not None:
+        observations = _recording(loaded.scenario.moved(loaded.path.parent))
+    if observations is not None:
+        _check_source(observations, follow, ca_file)
+    return loaded, observations
 
 
 def _check_source(observations: str, follow: bool, ca_file: Path | None) -> None:

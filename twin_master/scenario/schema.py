@@ -11,7 +11,6 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, SerializeAsAny, model_validator
 
-from scenarios import recording_files
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
 from twin_master.scenario.learning import Learning
 from twin_master.scenario.notice import Noticing
@@ -21,7 +20,6 @@ from twin_master.scenario.section import (
     NotNegative,
     Number,
     PerSensor,
-    Positive,
     Probability,
     Section,
     Seed,
@@ -29,6 +27,7 @@ from twin_master.scenario.section import (
     short,
 )
 from twin_master.scenario.truth import TruthSection
+from twin_master.scenario.watch import WatchSection
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of probabilities from one, as the graphical model has it."""
@@ -217,31 +216,6 @@ class Calibration(FileSection):
 
 WATCHED_KIND = "watched"
 """Kind of the asset of a scenario without `[asset]`."""
-
-
-class WatchSection(Section):
-    """How a real asset is watched."""
-
-    observations: str | None = None
-    """A recorded file that is watched where nothing else is given, or the name of a shipped one."""
-    lag: Count = 50
-    """Turns back over which the twin smooths, and which a message may be late."""
-    longest_gap: Count = 1000
-    """Turns that a message may be ahead of the next one; those between are predicted through."""
-    seconds_per_turn: Positive | None = None
-    """Of messages that have a time in the place of a turn."""
-
-    @property
-    def recording(self) -> Path | None:
-        """The recorded file."""
-        name = self.observations
-        return None if name is None else recording_files().get(name, Path(name))
-
-    def moved(self, folder: Path) -> Self:
-        """Return the table with the path of the recorded file from a folder; a run folder has no copy."""
-        if self.observations is None or self.observations in recording_files():
-            return self
-        return self.model_copy(update={"observations": str(folder / self.observations)})
 
 
 class Scenario(Section):
