@@ -15,7 +15,7 @@ demo: $(VENV)/.runtime ## Set up, fly the paper's mission and say where the repo
 
 .PHONY: test
 test: $(VENV)/.dev ## Set up and run all tests
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
 .PHONY: setup
 setup: $(VENV)/.dev ## Make .venv with everything that development needs

@@ -146,6 +146,7 @@ def fly_mission(
     known: Sequence[Primitive] = (),
     scenario: str = "growing_damage",
     turns: int = TURNS,
+    draws: int = 100,
 ) -> Flown:
     """Fly a mission into a run folder, without its report.
 
@@ -163,6 +164,8 @@ def fly_mission(
         A shipped one.
     turns : int
         Length of the mission.
+    draws : int
+        Of the calibrated parameter.
     """
     lines = {}
     for name, primitives in (("asset", hidden), ("belief", known)):
@@ -171,6 +174,7 @@ def fly_mission(
             lines[name] = f'patch = "{file.name}"\n'
     text = scenario_files()[scenario].read_text(encoding="utf-8")
     text = text.replace("steps = 50", f"steps = {turns}", 1)
+    text = text.replace("draws = 100", f"draws = {draws}", 1)
     if depends_on_temperature(hidden):
         text = scenario_in_air(text, folder.parent, f"{folder.name}_wing", patch_text(hidden))
     else:

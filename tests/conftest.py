@@ -40,30 +40,36 @@ LONG = "takes minutes of processor time; set UAV_TWIN_LONG_TESTS to run it"
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Let one worker run all tests that share what is made once, unless they name a group.
+    """Let one worker run all tests that share what is made once.
 
-    That is all tests of a file, and of all files that use a fixture of `SHARED`. Tests marked `long` are
-    skipped unless they are asked for.
+    That is all tests of a file, of all files that use a fixture of `SHARED`, and of all files in which a test
+    names the same group. Groups with slow tests come first: at the end a long one would keep one worker
+    alone. Tests marked `long` are skipped unless they are asked for.
     """
     if not os.environ.get("UAV_TWIN_LONG_TESTS"):
         for item in items:
             if item.get_closest_marker("long"):
                 item.add_marker(pytest.mark.skip(LONG))
-    group: dict[Path, str] = {}
+    if not getattr(config.option, "loadgroup", False):  # not in a worker of `--dist loadgroup`
+        return
+    group = {item.path: str(item.path.relative_to(config.rootpath)) for item in items}
     for item in items:
-        own = str(item.path.relative_to(config.rootpath))
         shared = [name for name in SHARED if name in getattr(item, "fixturenames", ())]
-        if shared or item.path not in group:
-            group[item.path] = shared[0] if shared else own
+        if shared:
+            group[item.path] = shared[0]
     for item in items:
         named = item.get_closest_marker("xdist_group")
-        if named is None:
+        if named:
+            group[item.path] = named.args[0]
+    slow = {group[item.path] for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: group[item.path] not in slow)
+    for item in items:
+        if not item.get_closest_marker("xdist_group"):
             item.add_marker(pytest.mark.xdist_group(group[item.path]))
         # pytest-xdist hands groups over as an ending of the node's name, and pytest 9.2 has it elsewhere than
         # pytest-xdist 3.8 writes to (pytest-xdist, issue 1386): without this no group is kept together.
-        if getattr(config.option, "loadgroup", False) and hasattr(item, "_id"):
-            name = named.args[0] if named else group[item.path]
-            item._id = type(item._id).parse(f"{item.nodeid}@{name}")
+        if hasattr(item, "_id"):
+            item._id = type(item._id).parse(f"{item.nodeid}@{group[item.path]}")
 
 
 LONGEST_COMPARED = 10_000

@@ -14,14 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.study_hidden_effects import fly_mission
-from discrepancy.campaign.records import Quantity
+from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.catalogue.entry import Setting
+from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import choice_of_run
-from discrepancy.models.interface import Conditions
+from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.memo import MemoModel
 from discrepancy.models.sensing import observe
 from discrepancy.sources.from_run import RunPlan, held_out_turns, run_campaign, run_model
@@ -31,6 +32,16 @@ from fe.runtime.patch import ModelPatch, SensorDrift, SensorGain, SensorRotation
 
 TURNS = 24
 DRIFT = SensorDrift("strain[17]", -1.2e-3, float(TURNS))
+RIVALS = [
+    effect_by_identifier(name, library())
+    for name in (
+        "gauge_zero_drift",
+        "gauge_gain",
+        "stiffness_drift",
+        "local_stiffness_loss",
+        "inertia_relief",
+    )
+]
 
 
 @pytest.fixture(scope="module")
@@ -40,14 +51,28 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def campaign(run: Path) -> Campaign:
+    return run_campaign(run)
+
+
+@pytest.fixture(scope="module")
+def model(run: Path) -> Model:
+    return run_model(run)
+
+
+@pytest.fixture(scope="module")
+def tree(run: Path) -> xr.DataTree:
+    return tree_of(run)
+
+
 def tree_of(folder: Path) -> xr.DataTree:
     with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
         return tree.load()
 
 
 @pytest.mark.xdist_group("wing")
-def test_every_turn_is_in_one_trial_as_it_was_observed(run: Path) -> None:
-    campaign, tree = run_campaign(run), tree_of(run)
+def test_every_turn_is_in_one_trial_as_it_was_observed(campaign: Campaign, tree: xr.DataTree) -> None:
     assert [trial.held_out for trial in campaign.trials] == [False, True]
     time = np.concatenate([trial.time for trial in campaign.trials])
     order = np.argsort(time)
@@ -61,21 +86,22 @@ def test_every_turn_is_in_one_trial_as_it_was_observed(run: Path) -> None:
 
 
 @pytest.mark.xdist_group("wing")
-def test_the_truth_is_not_read(run: Path, tmp_path: Path) -> None:
+def test_the_truth_is_not_read(run: Path, campaign: Campaign, tmp_path: Path) -> None:
     bare = tmp_path / "bare"
     shutil.copytree(run, bare)
     tree = tree_of(run)
     del tree["truth"]
     (bare / "run.nc").unlink()
     tree.to_netcdf(bare / "run.nc", engine="h5netcdf")
-    for one, other in zip(run_campaign(run).trials, run_campaign(bare).trials, strict=True):
+    for one, other in zip(campaign.trials, run_campaign(bare).trials, strict=True):
         np.testing.assert_array_equal(one.values, other.values)
         np.testing.assert_array_equal(one.health, other.health)
 
 
 @pytest.mark.xdist_group("wing")
-def test_the_model_of_the_run_gives_the_strains_that_the_fmu_had(run: Path) -> None:
-    tree, model = tree_of(run), run_model(run)
+def test_the_model_of_the_run_gives_the_strains_that_the_fmu_had(
+    run: Path, model: Model, tree: xr.DataTree
+) -> None:
     trial = run_campaign(run, RunPlan(held_out_share=0.0)).trials[0]
     values = [1.0073 if item.name == "young_modulus_factor" else item.mean for item in model.parameters]
     outputs = tuple((f"strain[{number}]", Quantity.STRAIN) for number in range(1, 25))
@@ -93,7 +119,7 @@ def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path: Path) 
         SensorDrift("strain[17]", 4e-4, 1.0, exponent=0.0), SensorGain("*", 0.05, "strain"),
     )  # fmt: skip
     folder = tmp_path / "known"
-    fly_mission(folder, 7, known, known, turns=4)
+    fly_mission(folder, 7, known, known, turns=4, draws=10)
     tree, model = tree_of(folder), run_model(folder)
     campaign = run_campaign(folder, RunPlan(held_out_share=0.0))
     values = [1.0073 if item.name == "young_modulus_factor" else item.mean for item in model.parameters]
@@ -121,8 +147,9 @@ def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path: Path) 
 
 
 @pytest.mark.xdist_group("wing")
-def test_derivatives_by_uncertain_health_are_in_the_order_of_the_unknowns(run: Path) -> None:
-    campaign, model = run_campaign(run), run_model(run)
+def test_derivatives_by_uncertain_health_are_in_the_order_of_the_unknowns(
+    campaign: Campaign, model: Model
+) -> None:
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     point = problem.start(Candidate())
     generator = np.random.default_rng(1)
@@ -140,8 +167,8 @@ def test_derivatives_by_uncertain_health_are_in_the_order_of_the_unknowns(run: P
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
-def test_a_drifting_gauge_is_found_in_the_run(run: Path) -> None:
-    found = investigate(run_campaign(run), run_model(run), thorough=False)
+def test_a_drifting_gauge_is_found_in_the_run(campaign: Campaign, model: Model) -> None:
+    found = investigate(campaign, model, RIVALS, thorough=False)
     assert found.verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP)
     members = {(effect.identifier, effect.place) for effect in found.verdict.effects}
     assert ("gauge_zero_drift", "g17") in members
