@@ -14,7 +14,7 @@ from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate, absolute_tests, shape_gate
 
-DRAWS = 3000
+DRAWS = 1500
 
 
 def null_gates(kit, freedom, kinds, samples, draws=DRAWS, gap=0.0):  # type: ignore[no-untyped-def]
@@ -45,7 +45,7 @@ def null_gates(kit, freedom, kinds, samples, draws=DRAWS, gap=0.0):  # type: ign
     ],
 )
 def test_absolute_gate_has_its_level(kit, freedom: float, kinds: tuple[str, ...], samples: int) -> None:  # type: ignore[no-untyped-def]
-    """Rejected at most 1e-3 of the time where nothing is missing; of 3000 draws more than 10 are too many."""
+    """Rejected at most 1e-3 of the time where nothing is missing; of 1500 draws more than 7 are too many."""
     _, _, passed = null_gates(kit, freedom, kinds, samples)
     assert passed.count(False) <= binom.isf(1e-3, DRAWS, ABSOLUTE_LEVEL)
 

@@ -15,17 +15,15 @@ from discrepancy.judgement.naming import name
 from discrepancy.verdict import VerdictKind
 
 FloatArray = NDArray[np.float64]
-CHOSEN = (
-    "coulomb_friction", "quadratic_damping", "structural_damping", "cubic_stiffness", "free_play",
-    "gauge_gain", "clock_error", "unmodelled_mode", "high_pass",
-)  # fmt: skip
+CHOSEN = ("coulomb_friction", "quadratic_damping", "gauge_gain", "unmodelled_mode", "high_pass")
+"""A law with its rival, and what else could take a slow remainder for itself."""
 
 
 @pytest.fixture(scope="module")
 def rig(kit):  # type: ignore[no-untyped-def]
-    """Four releases, one of them held out, and static trials."""
+    """Three releases, one of them held out, and static trials."""
     return kit.chain_bench(
-        amplitudes=(0.02, 0.012, 0.009, 0.006), samples=300, dynamic_channels=("x3", "g1"), held_out=True
+        amplitudes=(0.02, 0.012, 0.006), samples=300, dynamic_channels=("x3", "g1"), held_out=True
     )
 
 
@@ -77,7 +75,7 @@ def test_a_remainder_alone_gets_no_name(rig, effects, seed: int) -> None:  # typ
     assert verdict.effects == ()
 
 
-@pytest.mark.parametrize("seed", [5, 6])
+@pytest.mark.parametrize("seed", [5, pytest.param(6, marks=pytest.mark.long)])
 def test_coloured_noise_with_a_short_record_is_no_gap(rig, effects, seed: int) -> None:  # type: ignore[no-untyped-def]
     """Correlation 0.5 from sample to sample, in the trials and in a record of 100 samples."""
     coloured = remainder(0.0, 0.0)

@@ -29,6 +29,15 @@ CHOSEN = (
     "point_mass", "root_compliance", "coulomb_friction", "quadratic_damping", "cubic_stiffness",
     "stiffness_drift", "seating_offset", "gauge_gain", "load_place", "load_cell", "clock_error",
 )  # fmt: skip
+FEW = (
+    "coulomb_friction",
+    "quadratic_damping",
+    "cubic_stiffness",
+    "seating_offset",
+    "gauge_gain",
+    "load_cell",
+)
+"""Where more rivals would only take time."""
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +49,11 @@ def small(kit):  # type: ignore[no-untyped-def]
 @pytest.fixture(scope="module")
 def effects(catalogue):  # type: ignore[no-untyped-def]
     return tuple(effect for effect in catalogue if effect.identifier in CHOSEN)
+
+
+@pytest.fixture(scope="module")
+def few(catalogue):  # type: ignore[no-untyped-def]
+    return tuple(effect for effect in catalogue if effect.identifier in FEW)
 
 
 TRUTHS = {
@@ -103,7 +117,7 @@ def test_a_law_that_has_become_another_one_is_not_named(small, catalogue) -> Non
     assert "slip_ratio of joint_micro_slip beside its prior" in verdict.sentence
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", [1, 2, *(pytest.param(seed, marks=pytest.mark.long) for seed in (3, 4))])
 def test_nothing_is_missing_where_nothing_is(small, catalogue, seed: int) -> None:  # type: ignore[no-untyped-def]
     """With the whole catalogue."""
     verdict, _, _ = name(small.problem(small.measured(seed)), catalogue)
@@ -112,10 +126,10 @@ def test_nothing_is_missing_where_nothing_is(small, catalogue, seed: int) -> Non
     assert verdict.effects == ()
 
 
-def test_two_effects_are_found_together(small, effects) -> None:  # type: ignore[no-untyped-def]
+def test_two_effects_are_found_together(small, few) -> None:  # type: ignore[no-untyped-def]
     patch = small.patch("gauge_gain", {"gain_error": 0.10}, "g1")
     patch = patch + small.patch("quadratic_damping", {"equivalent_damping_ratio": 0.01}, "end")
-    verdict, found, _ = name(small.problem(small.measured(5, patch)), effects)
+    verdict, found, _ = name(small.problem(small.measured(5, patch)), few)
     assert verdict.kind is VerdictKind.NAMED, verdict.sentence
     assert sorted(item.identifier for item in verdict.effects) == ["gauge_gain", "quadratic_damping"]
     # both were tried alone as well: deletion has its comparison
@@ -143,10 +157,12 @@ def test_static_displacement_gives_a_group(kit, effects) -> None:  # type: ignor
     assert {"root_compliance", "load_place"} <= set(verdict.group)
 
 
-@pytest.mark.parametrize("left_out", ["coulomb_friction", "quadratic_damping"])
-def test_what_the_catalogue_lacks_gets_no_wrong_name(small, effects, left_out: str) -> None:  # type: ignore[no-untyped-def]
+@pytest.mark.parametrize(
+    "left_out", [pytest.param("coulomb_friction", marks=pytest.mark.long), "quadratic_damping"]
+)
+def test_what_the_catalogue_lacks_gets_no_wrong_name(small, few, left_out: str) -> None:  # type: ignore[no-untyped-def]
     values, place = TRUTHS[left_out]
-    rest = tuple(effect for effect in effects if effect.identifier != left_out)
+    rest = tuple(effect for effect in few if effect.identifier != left_out)
     campaign = small.measured(7, small.patch(left_out, values, place))
     verdict, _, _ = name(small.problem(campaign), rest)
     assert verdict.kind in (VerdictKind.UNEXPLAINED, VerdictKind.FAMILY), verdict.sentence
@@ -182,7 +198,7 @@ def outliers(generator, shape):  # type: ignore[no-untyped-def]
     [{"noise_scale": 3.0}, {"noise_scale": 0.4}, {"noise": coloured}, {"noise": outliers}],
     ids=["understated", "overstated", "correlated", "outliers"],
 )
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_wrong_noise_makes_no_name(small, effects, how, seed: int) -> None:  # type: ignore[no-untyped-def]
     """Records that say a third of the noise, or too much, or white where it is not: nothing is named."""
     verdict, _, _ = name(small.problem(small.measured(seed, **how)), effects)
@@ -190,11 +206,13 @@ def test_wrong_noise_makes_no_name(small, effects, how, seed: int) -> None:  # t
 
 
 @pytest.mark.parametrize(
-    "how", [{"noise_scale": 2.0}, {"noise": coloured}], ids=["understated", "correlated"]
+    "how",
+    [pytest.param({"noise_scale": 2.0}, marks=pytest.mark.long), {"noise": coloured}],
+    ids=["understated", "correlated"],
 )
-def test_wrong_noise_makes_no_wrong_name(small, effects, how) -> None:  # type: ignore[no-untyped-def]
+def test_wrong_noise_makes_no_wrong_name(small, few, how) -> None:  # type: ignore[no-untyped-def]
     patch = small.patch("gauge_gain", {"gain_error": 0.10}, "g1")
-    verdict, _, _ = name(small.problem(small.measured(3, patch, **how)), effects)
+    verdict, _, _ = name(small.problem(small.measured(3, patch, **how)), few)
     if verdict.kind is VerdictKind.NAMED:
         assert [item.identifier for item in verdict.effects] == ["gauge_gain"]
 
@@ -230,12 +248,12 @@ def test_without_a_noise_record_the_sentence_says_so(kit) -> None:  # type: igno
     assert "record" not in verdict.sentence
 
 
-def test_members_that_do_not_fit_are_no_part_of_a_group(small, effects) -> None:  # type: ignore[no-untyped-def]
+def test_members_that_do_not_fit_are_no_part_of_a_group(small, few) -> None:  # type: ignore[no-untyped-def]
     """Patch and proof are those of a member; the probability is that of the members together."""
     values, place = TRUTHS["coulomb_friction"]
     problem = small.problem(small.measured(11, small.patch("coulomb_friction", values, place)))
-    _, found, _ = name(problem, effects)
-    candidate = Candidate((Term(next(item for item in effects if item.identifier == "load_cell")),))
+    _, found, _ = name(problem, few)
+    candidate = Candidate((Term(next(item for item in few if item.identifier == "load_cell")),))
     wrong = fit(problem, candidate, problem.start(candidate))
     found.keep(wrong, exact=True)
     right = ("coulomb_friction",)
@@ -252,11 +270,11 @@ def test_members_that_do_not_fit_are_no_part_of_a_group(small, effects) -> None:
 # ---------------------------------------------------------------- families
 
 
-def test_a_law_between_two_named_ones_is_their_family_once(small, effects) -> None:  # type: ignore[no-untyped-def]
+def test_a_law_between_two_named_ones_is_their_family_once(small, few) -> None:  # type: ignore[no-untyped-def]
     """|v|^0.5 lies between dry friction and viscous damping: one family, beside those of other laws."""
     law = PowerDamping("end", 1.0, 0.5, 0.0, 1.0, 1.0)
     campaign = small.measured(3, ModelPatch((law,)))
-    verdict, found, fit = name(small.problem(campaign), effects)
+    verdict, found, fit = name(small.problem(campaign), few)
     assert verdict.kind is VerdictKind.FAMILY, verdict.sentence
     families = [item for item in found.exact.values() if item.candidate.is_family]
     laws = [(term.effect.family, term.place) for item in families for term in item.candidate.terms]
@@ -270,13 +288,13 @@ def test_a_law_between_two_named_ones_is_their_family_once(small, effects) -> No
     assert fit.candidate.is_family
 
 
-def test_a_law_of_free_shape_beside_two_effects_is_no_verdict(small, effects) -> None:  # type: ignore[no-untyped-def]
+def test_a_law_of_free_shape_beside_two_effects_is_no_verdict(small, few) -> None:  # type: ignore[no-untyped-def]
     """With three effects and a shape to choose nearly anything fits."""
     law = ModelPatch((PowerDamping("end", 0.15, 1.0, 0.0, 1.0, 1.0),))
     others = small.patch("gauge_gain", {"gain_error": 0.08}, "g1")
-    run = next(item for item in effects if item.identifier == "seating_offset").places(small.setting)[0]
+    run = next(item for item in few if item.identifier == "seating_offset").places(small.setting)[0]
     others = others + small.patch("seating_offset", {"offset_ratio": 0.05}, run)
-    verdict, found, _ = name(small.problem(small.measured(3, law + others)), effects)
+    verdict, found, _ = name(small.problem(small.measured(3, law + others)), few)
     assert len(found.best().candidate.terms) == SEARCH.largest_set
     assert verdict.kind is VerdictKind.UNEXPLAINED, verdict.sentence
     assert "shape of its own" in verdict.sentence
