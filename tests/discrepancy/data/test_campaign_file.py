@@ -222,7 +222,7 @@ def same(one: object, other: object) -> bool:
 
 
 @given(campaigns())
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
 def test_round_trip_is_exact(tmp_path_factory: pytest.TempPathFactory, campaign: Campaign) -> None:
     folder = tmp_path_factory.mktemp("campaign")
     again = read_campaign(write_campaign(campaign, folder))

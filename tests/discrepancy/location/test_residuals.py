@@ -39,13 +39,13 @@ def test_restored_residuals_are_white_with_unit_variance(make_bench, held_out: b
     bench = make_bench(count=40, noise_freedom=np.inf, held_out=(False, held_out))
     generator = np.random.default_rng(11)
     draws = np.array([
-        np.concatenate([part.ravel() for part in bench.fit(generator).white(generator)]) for _ in range(3000)
+        np.concatenate([part.ravel() for part in bench.fit(generator).white(generator)]) for _ in range(1200)
     ])  # fmt: skip
     covariance = draws.T @ draws / len(draws)
     plain = np.abs(covariance - np.eye(len(covariance)))
-    # Standard deviations of the entries are sqrt(2 / 3000) on and sqrt(1 / 3000) off the diagonal.
-    assert np.max(np.diag(plain)) < 5.0 * np.sqrt(2.0 / 3000)
-    assert np.max(plain - np.diag(np.diag(plain))) < 6.0 * np.sqrt(1.0 / 3000)
+    # Standard deviations of the entries are sqrt(2 / 1200) on and sqrt(1 / 1200) off the diagonal.
+    assert np.max(np.diag(plain)) < 5.0 * np.sqrt(2.0 / 1200)
+    assert np.max(plain - np.diag(np.diag(plain))) < 6.0 * np.sqrt(1.0 / 1200)
 
 
 def test_without_restoring_the_early_samples_are_too_quiet(make_bench) -> None:
