@@ -46,6 +46,7 @@ from twin_master.run_folder import (
 )
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.store.learnt import learnt_record
 from twin_master.store.outcome import RunOutcome, finished_run, read_outcome
 from twin_master.store.results import MissionResult
 from twin_master.store.summary import control_changes, noticed, summarise
@@ -375,7 +376,8 @@ def _store(
     controls = knowledge.scenario.control_names
     said = {"control": control_changes(controls, result.flight.control_index, mission.step_name)}
     origin = {"asset": source.origin.asset, "twin_model": source.origin.model}
-    heading |= said | origin | {"asset_and_model_differ": source.origin.differ} | noticed(result)
+    heading |= said | origin | {"asset_and_model_differ": source.origin.differ}
+    heading |= learnt_record(result.learnt) | noticed(result)
     write_summary(folder, figures, heading)
 
 

@@ -178,6 +178,13 @@ class LearningFilter:
         """Predictions and assumed noise."""
         return self._sensor_model
 
+    @property
+    def prior(self) -> Mapping[str, Learnt]:
+        """What is believed of all that is learnt before the first observation, by name."""
+        sensors = self._sensor_model.sensor_count
+        weight = np.exp(self._log_weight)[:, None]
+        return self._learnt(weight, np.zeros((len(weight), sensors, 6)), np.zeros(sensors))
+
     def turn(self, before: Carried | None, observation: Float, control_index: int, turn: int) -> Estimate:
         """Advance belief and what is learnt to turn t, and correct them by an observation.
 

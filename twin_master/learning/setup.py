@@ -1,17 +1,19 @@
 """The estimator that a scenario asks for: one that learns, one that gives notice, or both."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
 from twin_master.learning.monitor import MonitorSettings, WatchfulEstimator, Words
-from twin_master.network.estimator import Estimator, ExactFilter
+from twin_master.network.estimator import Estimator, ExactFilter, Learnt
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
 
-__all__ = ["scenario_estimator"]
+__all__ = ["prior_of_learnt", "scenario_estimator"]
 
 
 def scenario_estimator(
@@ -47,6 +49,20 @@ def scenario_estimator(
         MonitorSettings(**dict(scenario.notice)),
         _words(scenario),
     )
+
+
+def prior_of_learnt(
+    scenario: Scenario,
+    model: GraphicalModel,
+    sensor_model: GaussianSensorModel,
+    draws: NDArray[np.float64],
+) -> Mapping[str, Learnt]:
+    """Return what is believed of all that a scenario learns before the first observation, by name.
+
+    Parameters and errors are those of `scenario_estimator`; empty where nothing is learnt.
+    """
+    learning = _learning_filter(scenario, model, sensor_model, draws)
+    return {} if learning is None else learning.prior
 
 
 def _words(scenario: Scenario) -> Words:

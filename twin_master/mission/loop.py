@@ -6,7 +6,7 @@ A mission is the loop with a simulated asset as its source, and at its end the h
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -131,6 +131,10 @@ class Flight:
         How well the model explains the sensors in each turn; empty where that is not watched.
     notices : tuple of (int, Notice)
         Turns, and what the operator should know of them.
+    learnt_names : tuple of str
+        The N quantities that are learnt, as the estimator names them.
+    learnt : (T, N, 4)
+        Mean, standard deviation and bounds of the central 90 % interval of each after each turn.
     """
 
     observed: Float
@@ -146,6 +150,17 @@ class Flight:
     first_turn: int = 0
     suspicion: tuple[Suspicion, ...] = ()
     notices: tuple[tuple[int, Notice], ...] = ()
+    learnt_names: tuple[str, ...] = ()
+    learnt: Float = field(default_factory=lambda: np.empty((0, 0, 4)))
+
+    def behind(self, skipped: int) -> "Flight":
+        """Return the turns behind the first `skipped` of a watched asset; the notices stay those of all."""
+        by_turn = (
+            "observed", "control_index", "filtered", "log_evidence", "smoothed", "predicted",
+            "decision_probability", "suspicion", "learnt",
+        )  # fmt: skip
+        cut = {name: getattr(self, name)[skipped:] for name in by_turn}
+        return replace(self, **cut, first_turn=self.first_turn + skipped)
 
     @property
     def happened(self) -> PlantRecord:
@@ -258,6 +273,8 @@ class Beliefs:
     decision_probability: list[Float] = field(default_factory=list)
     suspicion: list[Suspicion] = field(default_factory=list)
     notices: list[tuple[int, Notice]] = field(default_factory=list)
+    learnt_names: tuple[str, ...] = ()
+    learnt: list[Float] = field(default_factory=list)
 
     def add(self, observed: Float, turn: TwinTurn) -> None:
         """Keep a turn."""
@@ -270,6 +287,9 @@ class Beliefs:
         if turn.suspicion is not None:
             self.suspicion.append(turn.suspicion)
         self.notices += [(turn.turn, notice) for notice in turn.notices]
+        if turn.learnt:
+            self.learnt_names = tuple(turn.learnt)
+            self.learnt.append(np.array([learnt.figures for learnt in turn.learnt.values()]))
 
     def flight(
         self,
@@ -295,6 +315,8 @@ class Beliefs:
             first_turn=first_turn,
             suspicion=tuple(self.suspicion),
             notices=tuple(self.notices),
+            learnt_names=self.learnt_names,
+            learnt=np.array(self.learnt).reshape(len(self.learnt), len(self.learnt_names), 4),
         )
 
 

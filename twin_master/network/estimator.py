@@ -64,6 +64,11 @@ class Learnt:
     upper: float
     unit: str = "1"
 
+    @property
+    def figures(self) -> tuple[float, float, float, float]:
+        """Mean, standard deviation and the bounds of the interval."""
+        return self.mean, self.standard_deviation, self.lower, self.upper
+
 
 @dataclass(frozen=True)
 class Notice:

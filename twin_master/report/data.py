@@ -78,6 +78,28 @@ class PolicyTable:
 
 
 @dataclass(frozen=True)
+class LearntCourse:
+    """A quantity that was learnt, of the whole asset or of each sensor.
+
+    Attributes
+    ----------
+    name, unit : str
+        As stored.
+    course : (T, 4) or (T, G, 4)
+        Mean, standard deviation and bounds of the 90 % interval after each step.
+    prior : (4,) or (G, 4)
+        Before the first step.
+    truth : () or (G,), or None
+    """
+
+    name: str
+    unit: str
+    course: Float
+    prior: Float
+    truth: Float | None
+
+
+@dataclass(frozen=True)
 class RunRecord:
     """One run: T steps, S joint states of K factors, G sensors, U controls, R rewards, H predicted steps.
 
@@ -127,6 +149,10 @@ class RunRecord:
         Unit and name of each sensor; empty where all have the unit of the observation, and no names.
     parameter_unit : str
         Unit of the draws.
+    learnt : tuple of LearntCourse
+        What was learnt; empty where nothing is.
+    first_step : int
+        Number of the first step.
     """
 
     state_names: tuple[str, ...]
@@ -160,6 +186,8 @@ class RunRecord:
     sensor_units: tuple[str, ...] = ()
     sensor_titles: tuple[str, ...] = ()
     parameter_unit: str = "1"
+    learnt: tuple[LearntCourse, ...] = ()
+    first_step: int = 0
 
     @property
     def step_word(self) -> str:

@@ -22,6 +22,7 @@ from twin_master.report.calibration import (
 )
 from twin_master.report.check import check_figure, predictive_check
 from twin_master.report.data import RunRecord
+from twin_master.report.learnt import learnt_caption, learnt_figure, learnt_tables
 from twin_master.report.mission import mission_figure
 from twin_master.report.network import network_figure
 from twin_master.report.reading import read_run
@@ -144,6 +145,9 @@ def report_figures(run: RunRecord | Path | str, now: int | None = None) -> Itera
         title = f"The whole mission, seen from its last {step}"
         yield ReportFigure("mission_whole", drawing, title, mission_caption(record, last))
     yield ReportFigure("belief", belief_figure(record), "The belief about the state", belief_caption(record))
+    learnt = learnt_figure(record)
+    if learnt is not None:
+        yield ReportFigure("learnt", learnt, "What the twin learnt", learnt_caption(record))
     policy = policy_figure(record)
     if policy is not None:
         yield ReportFigure("policy", policy, "The policy", policy_caption(record))
@@ -155,7 +159,10 @@ def report_figures(run: RunRecord | Path | str, now: int | None = None) -> Itera
     if view is not None:
         drawing = calibration_figure(view)
         yield ReportFigure(
-            "calibration", drawing, "What the model was tailored with", calibration_caption(view)
+            "calibration",
+            drawing,
+            "What the model was tailored with" + (" before the flight" if record.learnt else ""),
+            calibration_caption(view),
         )
     title = f"The dynamic decision network for a few {step}s"
     yield ReportFigure("network", network_figure(), title, network_caption(record))
@@ -176,6 +183,7 @@ def render_page(record: RunRecord, drawings: Sequence[Drawing]) -> str:
     for title, names in (
         ("The mission", (MAIN_FIGURE, "mission_whole")),
         ("What the twin believes", ("belief",)),
+        ("What the twin learnt", ("learnt",)),
         ("What the twin decides", ("policy",)),
         ("Whether the data agree", ("check",)),
         ("The model", ("calibration", "network")),
@@ -187,6 +195,9 @@ def render_page(record: RunRecord, drawings: Sequence[Drawing]) -> str:
             page.add_figure(figure.svg, figure.caption, title=figure.title)
             if figure.name == "calibration":
                 _add_calibrated_wing(page, calibration_view(record))
+            if figure.name == "learnt":
+                for table, caption, title in learnt_tables(record):
+                    page.add_table(table, caption, title=title)
     page.add_section("The run")
     _add_run(page, record)
     return page.render()
@@ -254,6 +265,12 @@ def _highlights(record: RunRecord) -> list[tuple[str, str]]:
         items.append((f"{record.step_word} {first}", f"left {before} for {after}"))
     else:
         items.append((record.controls[record.control_index[0]], f"control of every {record.step_word}"))
+    for learnt in record.learnt:
+        if learnt.name == record.parameter_name:
+            mean, deviation = learnt.course[-1, :2]
+            truth = "" if learnt.truth is None else f" (truth {float(learnt.truth):.4g})"
+            label = learnt.name.replace("_", " ")
+            items.append((f"{mean:.3f}\u00a0±\u00a0{deviation:.3f}", f"{label} learnt{truth}"))
     check = predictive_check(record)
     if check is not None and np.isfinite(check.overall_coverage):
         items.append(
@@ -314,7 +331,8 @@ def _loss_notices(record: RunRecord) -> list[str]:
         return ["The run holds no observations, so the figures show the twin's beliefs only."]
     view = calibration_view(record)
     notices = []
-    if view is not None and (off := departure(view)) is not None and off > TRUTH_IS_OFF:
+    fixed = view is not None and all(learnt.name != view.parameter for learnt in record.learnt)
+    if view is not None and fixed and (off := departure(view)) is not None and off > TRUTH_IS_OFF:
         notices.append(
             f"The asset flown has a {view.parameter.replace('_', ' ')} of {number(view.true_value)}, "
             f"{off:.1f} standard deviations from what the twin was calibrated with: it flies with the model "

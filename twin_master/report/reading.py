@@ -13,7 +13,16 @@ from reporting.folders import restore_folder
 from reporting.json_file import read_json
 from reporting.netcdf import read_groups
 from twin_master.errors import RunFolderError
-from twin_master.report.data import NORMAL_95, Estimate, PolicyTable, RunRecord, Uncertain, moments
+from twin_master.report.data import (
+    NORMAL_95,
+    Estimate,
+    LearntCourse,
+    PolicyTable,
+    RunRecord,
+    Uncertain,
+    moments,
+)
+from twin_master.store.learnt import MOMENTS
 
 Float = NDArray[np.floating[Any]]
 
@@ -201,14 +210,13 @@ def _record(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], fol
     sensor_count = 0 if observation is None else observation.shape[1]
     sensors = np.asarray([int(name) for name in _names(groups, "sensor", sensor_count)], dtype=np.int64)
     unit = "1" if observed is None or role not in observed else str(observed[role].attrs.get("units", "1"))
-    control_count = int(control_index.max()) + 1
     return RunRecord(
         state_names=names,
         state_titles=_titles(config, names),
         levels=tuple(np.unique(coordinates[:, k]) for k in range(len(names))),
         coordinates=coordinates,
         sensors=sensors,
-        controls=_names(groups, "control", control_count),
+        controls=_names(groups, "control", int(control_index.max()) + 1),
         rewards=_names(groups, "reward", 0),
         observation=observation,
         observation_name=role,
@@ -234,7 +242,28 @@ def _record(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], fol
         sensor_units=_sensor_texts(observed, "sensor_unit"),
         sensor_titles=_sensor_texts(observed, "sensor_title"),
         parameter_unit=_draw_unit(draws_group),
+        learnt=_learnt(groups.get("learnt"), truth),
+        first_step=0 if observed is None else int(observed["step"].values[0]),
     )
+
+
+def _learnt(dataset: xr.Dataset | None, truth: xr.Dataset | None) -> tuple[LearntCourse, ...]:
+    """Return what was learnt, in the order in which it is stored."""
+    found = []
+    for variable in () if dataset is None else dataset.data_vars:
+        name = str(variable).removesuffix(f"_prior_{MOMENTS[0]}")
+        if dataset is None or name == variable:
+            continue
+        sensor = ("sensor",) if "sensor" in dataset[variable].dims else ()
+        course = [_needed(dataset, "learnt", f"{name}_{moment}", "step", *sensor) for moment in MOMENTS]
+        prior = [_needed(dataset, "learnt", f"{name}_prior_{moment}", *sensor) for moment in MOMENTS]
+        unit = str(dataset[variable].attrs.get("units", "1"))
+        found.append(
+            LearntCourse(
+                name, unit, np.stack(course, axis=-1), np.stack(prior, axis=-1), _array(truth, name, *sensor)
+            )
+        )
+    return tuple(found)
 
 
 def _state_units(groups: Mapping[str, xr.Dataset], names: tuple[str, ...]) -> tuple[str, ...]:

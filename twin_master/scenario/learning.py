@@ -37,7 +37,25 @@ class Learning(Section):
             raise ValueError("`learning.transition_factors` needs two or more factors to choose from")
         return self
 
+    @property
+    def figure_names(self) -> tuple[str, ...]:
+        """Names of the figures of the summary on what is learnt beside the parameter."""
+        names = [f"transition_factor_{moment}" for moment in ("mean", "standard_deviation")]
+        names = names if self.transition_factors else []
+        for name, learnt in (
+            ("noise_scale", self.noise),
+            ("gauge_offset", _any(self.gauge_offset)),
+            ("gauge_gain", _any(self.gauge_gain)),
+        ):
+            if learnt:
+                names += [f"{name}_{figure}" for figure in ("mean", "most", "most_standard_deviation")]
+        return tuple(names)
+
     def check_sensors(self, count: int) -> None:
         """Check that what is given for each sensor is given once, or once for each of `count`."""
         check_one_or_each("learning.gauge_gain", self.gauge_gain, count)
         check_one_or_each("learning.gauge_offset", self.gauge_offset, count)
+
+
+def _any(value: float | tuple[float, ...]) -> bool:
+    return any(number > 0.0 for number in (value if isinstance(value, tuple) else (value,)))

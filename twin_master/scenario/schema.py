@@ -264,7 +264,13 @@ class Scenario(Section):
         names += [f"filtered_rms_error_{name}" for name in self.state_names]
         names += [f"mean_reward_{name}" for name in REWARD_NAMES]
         names += [f"{self.calibration.parameter}_{moment}" for moment in ("mean", "standard_deviation")]
+        if self.learning is not None and self.learning.parameter:
+            moments = ["prior_mean", "prior_standard_deviation"]
+            moments += ["true"] * (self.calibration.parameter in self.asset.true_parameters)
+            names += [f"{self.calibration.parameter}_{moment}" for moment in moments]
         names += ["log_evidence"]
+        if self.learning is not None:
+            names += self.learning.figure_names
         if self.truth.received or any(fault.kind == "dropout" for fault in self.truth.sensor_faults):
             names += ["lost_observations", "blind_steps"]
         if self.another_model:

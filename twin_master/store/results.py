@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from twin_master.learning.setup import prior_of_learnt
 from twin_master.mission.loop import Flight
 from twin_master.mission.truth import SensorStatus, Truth
 from twin_master.network.graphical_model import GraphicalModel
@@ -16,6 +18,7 @@ from twin_master.network.planner import PlannedPolicy
 from twin_master.network.rewards import REWARD_NAMES, RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
+from twin_master.store.learnt import MOMENTS, LearntQuantity, learnt_quantities
 
 Float = NDArray[np.float64]
 
@@ -75,6 +78,20 @@ class MissionResult:
         """Unit of the uncertain parameter."""
         return self.units.get(self.scenario.calibration.parameter, "1")
 
+    @cached_property
+    def learnt(self) -> tuple[LearntQuantity, ...]:
+        """What was learnt; empty where nothing is."""
+        if not self.flight.learnt_names:
+            return ()
+        return learnt_quantities(
+            self.scenario,
+            self.flight.learnt_names,
+            self.flight.learnt,
+            prior_of_learnt(self.scenario, self.model, self.sensor_model, self.draws),
+            {self.scenario.calibration.parameter: self.parameter_unit, "gauge_offset": self.observation_unit},
+            simulated=self.truth is not None,
+        )
+
 
 def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.DataTree:
     """Return the groups of `run.nc`; every variable carries its unit and a description.
@@ -104,6 +121,8 @@ def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.Data
             }
         ).assign_attrs(parameter=result.scenario.calibration.parameter),
     }
+    if result.learnt:
+        groups["learnt"] = _learnt(result, labels)
     if result.flight.suspicion:
         groups["notice"] = _notice(result, labels)
     if result.truth is not None:
@@ -310,6 +329,31 @@ def _policy(result: MissionResult, labels: _Labels) -> xr.Dataset:
     )
 
 
+_MOMENT_TITLES = dict(
+    zip(MOMENTS, ("mean", "standard deviation", "5 % quantile", "95 % quantile"), strict=True)
+)
+
+
+def _learnt(result: MissionResult, labels: _Labels) -> xr.Dataset:
+    variables: dict[str, Variable] = {}
+    for quantity in result.learnt:
+        sensor = ("sensor",) if quantity.of_sensors else ()
+        for index, (moment, text) in enumerate(_MOMENT_TITLES.items()):
+            variables[f"{quantity.name}_{moment}"] = (
+                ("step", *sensor),
+                quantity.course[..., index],
+                quantity.unit,
+                f"{quantity.title}: {text} given observations up to the step",
+            )
+            variables[f"{quantity.name}_prior_{moment}"] = (
+                sensor,
+                quantity.prior[..., index],
+                quantity.unit,
+                f"{quantity.title}: {text} before the first step",
+            )
+    return labels.dataset(variables)
+
+
 def _notice(result: MissionResult, labels: _Labels) -> xr.Dataset:
     turns = result.flight.suspicion
     sensor = ("step", "sensor")
@@ -380,6 +424,14 @@ def _truth(result: MissionResult, labels: _Labels, truth: Truth) -> xr.Dataset:
             "what each sensor really does: 0 healthy, 1 lost, 2 drifting",
         ),
     }
+    for quantity in result.learnt:
+        if quantity.truth is not None:
+            variables[quantity.name] = (
+                ("sensor",) if quantity.of_sensors else (),
+                quantity.truth,
+                quantity.unit,
+                f"true {quantity.title}",
+            )
     for name, values in sorted(record.monitors.items()):  # a checkpoint does not keep their order
         variables[name] = (("step",), values, result.units.get(name, "1"), f"{name}, as the asset reports it")
     return labels.dataset(variables)

@@ -14,6 +14,7 @@ from twin_master.mission.plant import PlantRecord
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.rewards import REWARD_NAMES
 from twin_master.scenario.schema import FALLBACK_FIGURES, MISFIT_FIGURES, NOTICE_FIGURES, Reference
+from twin_master.store.learnt import printed_learnt
 from twin_master.store.results import MissionResult
 
 Float = NDArray[np.float64]
@@ -155,15 +156,11 @@ def summarise(
         known = reward_mean[np.isfinite(reward_mean[:, index]), index]
         mean = float(known.mean()) if len(known) else None
         figures.append(Figure(f"mean_reward_{name}", f"mean reward for {name}", mean))
-    label = draws.name.replace("_", " ")
-    for key, title, value in (
-        ("mean", "posterior mean", draws.mean),
-        ("standard_deviation", "posterior standard deviation", draws.standard_deviation),
-    ):
-        figures.append(Figure(f"{draws.name}_{key}", f"{title} of the {label}", value))
+    figures += _parameter_figures(result, draws)
     figures.append(
         Figure("log_evidence", "log evidence of all observations", float(flight.log_evidence.sum()))
     )
+    figures += _learnt_figures(result)
     figures += _sensor_figures(flight.observed, scenario.mission.step_name)
     if misfit is not None:
         figures += _misfit_figures(misfit)
@@ -178,6 +175,67 @@ def summarise(
         figures += _notice_figures(flight, scenario.mission.step_name)
     references = {entry.figure: entry for entry in scenario.reference}
     return tuple(_beside(figure, references.get(figure.key)) for figure in figures)
+
+
+def _parameter_figures(result: MissionResult, draws: ParameterDraws) -> list[Figure]:
+    """Return what is known of the calibrated parameter before the flight, and after it where it is learnt."""
+    name, label = draws.name, draws.name.replace("_", " ")
+    own = next((quantity for quantity in result.learnt if quantity.name == name), None)
+    if own is None:
+        return [
+            Figure(f"{name}_mean", f"posterior mean of the {label}", draws.mean),
+            Figure(
+                f"{name}_standard_deviation",
+                f"posterior standard deviation of the {label}",
+                draws.standard_deviation,
+            ),
+        ]
+    mean, deviation = own.course[-1, :2].tolist()
+    figures = [
+        Figure(f"{name}_mean", f"{label} learnt, mean", mean),
+        Figure(f"{name}_standard_deviation", f"{label} learnt, standard deviation", deviation),
+        Figure(f"{name}_prior_mean", f"{label} before the first turn, mean", draws.mean),
+        Figure(
+            f"{name}_prior_standard_deviation",
+            f"{label} before the first turn, standard deviation",
+            draws.standard_deviation,
+        ),
+    ]
+    if own.truth is not None:
+        figures.append(Figure(f"{name}_true", f"{label}, true", float(own.truth)))
+    return figures
+
+
+_LEARNT_WORDS = {
+    "noise_scale": "noise factor",
+    "gauge_offset": "offset",
+    "gauge_gain": "gain error",
+    "transition_factor": "transition factor",
+}
+
+
+def _learnt_figures(result: MissionResult) -> list[Figure]:
+    """Return what was learnt beside the parameter; the sensor that departs most stands for all of them."""
+    figures = []
+    sensor_word = "gauge" if result.scenario.observation.role == "strain" else "sensor"
+    for quantity in result.learnt:
+        if quantity.name == result.scenario.calibration.parameter:
+            continue
+        factor, unit = printed_learnt(quantity.name, quantity.unit)
+        word, last = f"{_LEARNT_WORDS[quantity.name]} learnt", factor * quantity.course[-1]
+        if quantity.of_sensors:
+            departure = np.abs(last[:, 0] - factor * quantity.prior[:, 0]) / last[:, 1]
+            most = int(np.nanargmax(departure))
+            mean = f"{word}, mean of the {sensor_word}s"
+            figures.append(Figure(f"{quantity.name}_mean", mean, float(np.nanmean(last[:, 0])), unit))
+            key, of, shown = f"{quantity.name}_most", f"{sensor_word} {most + 1}", last[most]
+            figures.append(Figure(key, f"{word}, {of} (departs most)", float(shown[0]), unit))
+        else:
+            key, of, shown = quantity.name, "", last
+            figures.append(Figure(f"{key}_mean", f"{word}, mean", float(shown[0]), unit))
+        deviation = ", ".join(part for part in (word, of, "standard deviation") if part)
+        figures.append(Figure(f"{key}_standard_deviation", deviation, float(shown[1]), unit))
+    return figures
 
 
 def noticed(result: MissionResult) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
@@ -50,6 +50,7 @@ from twin_master.run_folder import (
 )
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.store.learnt import learnt_record
 from twin_master.store.results import MissionResult
 from twin_master.store.summary import Figure, control_changes, noticed, summarise
 from twin_master.store.writing import store_mission, values_of, write_summary
@@ -203,17 +204,14 @@ class Watch:
             return
         first = max(0, turns - last)
         found = self._replayed(first, lag=False)
-        skipped = first - found.first_turn
         flight = found.beliefs.flight(
             found.twin.smoothed()[-(turns - found.first_turn) :], None, first_turn=found.first_turn
         )
-        beliefs = ("filtered", "log_evidence", "smoothed", "predicted", "decision_probability", "suspicion")
-        cut = {name: getattr(flight, name)[skipped:] for name in ("observed", "control_index", *beliefs)}
         knowledge, mission = self.models[-1].knowledge, self.scenario.mission
         result = MissionResult(
             scenario=self.scenario, model=knowledge.model, sensor_model=knowledge.sensor_model,
             draws=knowledge.draws.values, rewards=knowledge.rewards, plan=knowledge.plan, truth=None,
-            flight=replace(flight, **cut, first_turn=first),
+            flight=flight.behind(first - found.first_turn),
         )  # fmt: skip
         provenance, origin = self._config["provenance"], self._source.origin
         attributes = {
@@ -248,7 +246,7 @@ class Watch:
                     self.scenario.control_names, result.flight.control_index, mission.step_name
                 ),
                 "asset": WATCHED, "twin_model": origin.model, "asset_and_model_differ": False,
-                **noticed(result),
+                **learnt_record(result.learnt), **noticed(result),
             }  # fmt: skip
             write_summary(self.folder, figures, heading)
         if report:

@@ -1,0 +1,172 @@
+"""What a twin learnt, in `run.nc`, summary, console and report, beside what was believed before."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.special import gammaln
+from scipy.stats import invgamma
+from typer.testing import CliRunner
+
+from scenarios import scenario_files
+from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.report.learnt import learnt_figure, learnt_tables
+from twin_master.report.page import render_page
+from twin_master.report.reading import open_run, read_run
+from twin_master.scenario.reading import load_scenario
+from twin_master.workflow import resume_run
+from uav_twin.cli import app
+
+MOMENTS = ("mean", "standard_deviation", "lower", "upper")
+TURNS = 9
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("learnt") / "mine.toml"
+    text = scenario_files()["level_turns_learning"].read_text().replace("steps = 50", f"steps = {TURNS}")
+    offsets = [50.0] * 23 + [0.0]
+    learnt = f"gauge_gain_percent = 2\ngauge_offset_microstrain = {offsets}\n"
+    learnt += "transition_factors = [0.5, 1, 2]\n"
+    file.write_text(text.replace("draws = 60", "draws = 8").replace("[learning]\n", "[learning]\n" + learnt))
+    return file
+
+
+@pytest.fixture(scope="module")
+def folder(scenario: Path) -> Path:
+    run = scenario.parent / "run"
+    result = CliRunner().invoke(app, ["run", str(scenario), "--out", str(run), "--no-report", "--json"])
+    assert result.exit_code == 0, result.output
+    (scenario.parent / "said.json").write_text(result.stdout)
+    return run
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path) -> xr.DataTree:
+    return open_run(folder)
+
+
+@pytest.fixture(scope="module")
+def learnt(run: xr.DataTree) -> xr.Dataset:
+    return run["learnt"].to_dataset()
+
+
+@pytest.fixture(scope="module")
+def summary(folder: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return record
+
+
+def value_of(learnt: xr.Dataset, name: str, moment: str) -> np.ndarray[Any, Any]:
+    base, _, sensor = name.rstrip("]").partition("[")
+    values = learnt[f"{base}_{moment}"]
+    return (values.sel(sensor=int(sensor)) if sensor else values).values
+
+
+def test_the_store_holds_what_the_twin_said_in_every_turn(folder: Path, learnt: xr.Dataset) -> None:
+    lines = [json.loads(line[65:])["learnt"] for line in (folder / JOURNAL_NAME).read_text().splitlines()[1:]]
+    assert len(lines) == TURNS
+    assert len(lines[0]) == 1 + 1 + 24 + 24 + 23  # parameter, transitions, noise, gain, offset
+    for name in lines[0]:
+        for moment in MOMENTS:
+            said = [line[name][moment] for line in lines]
+            np.testing.assert_array_equal(value_of(learnt, name, moment), said)
+    assert np.isnan(learnt["gauge_offset_mean"].sel(sensor=24)).all()
+    assert learnt["gauge_offset_prior_upper"].sel(sensor=1) > 0
+    for variable in learnt.data_vars.values():
+        assert variable.attrs["units"] == "1"  # strains and factors
+        assert variable.attrs["long_name"]
+
+
+def test_the_prior_is_that_of_the_scenario(learnt: xr.Dataset, run: xr.DataTree) -> None:
+    draws = run["calibration"]["draw_value"].values
+    mean, wide = (learnt[f"young_modulus_factor_prior_{name}"].item() for name in MOMENTS[:2])
+    assert mean == pytest.approx(draws.mean(), abs=0.1 * draws.std())  # between the draws as well
+    assert wide == pytest.approx(draws.std(), rel=0.1)
+    assert float(learnt["transition_factor_prior_mean"]) == pytest.approx(3.5 / 3)
+    # lambda² ~ inverse gamma(5, 5); gain | lambda ~ N(0, (0.02 lambda)²), whose variance is 0.02² E[lambda²]
+    squared = invgamma(5.0, scale=5.0)
+    noise = [float(learnt[f"noise_scale_prior_{moment}"].sel(sensor=7)) for moment in MOMENTS]
+    mean = np.sqrt(5.0) * np.exp(gammaln(4.5) - gammaln(5.0))
+    wide = np.sqrt(squared.mean() - mean**2)
+    np.testing.assert_allclose(noise, [mean, wide, *np.sqrt(squared.ppf([0.05, 0.95]))], rtol=1e-10)
+    gain = float(learnt["gauge_gain_prior_standard_deviation"].sel(sensor=7))
+    assert gain == pytest.approx(0.02 * np.sqrt(squared.mean()))
+
+
+def test_the_truth_stands_where_the_scenario_tells_it(run: xr.DataTree) -> None:
+    truth = run["truth"].to_dataset()
+    assert float(truth["young_modulus_factor"]) == 0.95
+    np.testing.assert_allclose(truth["noise_scale"], 150 / 125)
+    np.testing.assert_array_equal(truth["gauge_gain"], 0.0)
+    assert "transition_factor" not in truth  # scripted damage has no probability
+
+
+def test_the_summary_says_what_was_learnt_and_what_was_believed_before(
+    scenario: Path, folder: Path, learnt: xr.Dataset, summary: dict[str, Any]
+) -> None:
+    figures = {figure["key"]: figure for figure in summary["figures"]}
+    assert tuple(figures) == load_scenario(scenario).scenario.figure_names
+    assert figures["young_modulus_factor_mean"]["value"] == learnt["young_modulus_factor_mean"].values[-1]
+    assert figures["young_modulus_factor_mean"]["title"] == "young modulus factor learnt, mean"
+    assert figures["young_modulus_factor_prior_mean"]["value"] == pytest.approx(1.0)
+    assert figures["young_modulus_factor_true"]["value"] == 0.95
+    assert figures["noise_scale_mean"]["value"] == learnt["noise_scale_mean"].values[-1].mean()
+    last = learnt.isel(step=-1)
+    most = int(np.argmax(abs(last["gauge_gain_mean"].values) / last["gauge_gain_standard_deviation"].values))
+    assert figures["gauge_gain_most"]["title"] == f"gain error learnt, gauge {most + 1} (departs most)"
+    assert figures["gauge_gain_most"]["value"] == pytest.approx(100 * last["gauge_gain_mean"].values[most])
+    said = json.loads((folder.parent / "said.json").read_text())
+    assert said["learnt"] == summary["learnt"]
+    noise = summary["learnt"]["noise_scale"]
+    assert noise["posterior"]["upper"] == last["noise_scale_upper"].values.tolist()
+    assert noise["truth"] == [1.2] * 24
+    assert summary["learnt"]["gauge_offset"]["posterior"]["mean"][23] is None
+
+
+def test_the_report_draws_and_lists_what_was_learnt(folder: Path, learnt: xr.Dataset) -> None:
+    record = read_run(folder)
+    figure = learnt_figure(record)
+    assert figure is not None
+    assert len(figure.axes) == 2 + 3 * 2
+    parameter = figure.axes[0]
+    np.testing.assert_array_equal(parameter.get_lines()[0].get_ydata(), learnt["young_modulus_factor_mean"])
+    assert parameter.get_lines()[-1].get_ydata()[0] == 0.95  # the truth
+    (whole, caption, _), (sensors, _, _) = learnt_tables(record)
+    assert [row[0] for row in whole.rows] == ["Young modulus factor", "Factor on the transitions"]
+    assert "0.05 in 2g, 0.1 in 3g" in caption
+    assert len(sensors.rows) == 24
+    assert sensors.rows[23][[column.name for column in sensors.columns].index("Offset")] == "—"
+    text = render_page(record, [])
+    assert "young modulus factor learnt (truth 0.95)" in text
+    assert "posterior mean of the young" not in text
+
+
+def test_a_run_that_was_cut_off_learns_the_same(folder: Path) -> None:
+    cut = folder.parent / "cut"
+    shutil.copytree(folder, cut)
+    journal = cut / JOURNAL_NAME
+    journal.write_text("".join(journal.read_text().splitlines(keepends=True)[:6]))
+    kept = {name: (cut / name).read_bytes() for name in ("run.nc", "summary.json")}
+    for name in kept:
+        (cut / name).unlink()
+    resume_run(cut, report=False)
+    assert {name: (cut / name).read_bytes() for name in kept} == kept
+
+
+def test_a_watch_keeps_the_last_turns_of_what_it_learnt(
+    scenario: Path, folder: Path, learnt: xr.Dataset
+) -> None:
+    out = folder.parent / "watch"
+    arguments = ["watch", str(scenario), "--observations", str(folder), "--out", str(out), "--no-report"]
+    said = CliRunner().invoke(app, [*arguments, "--last", "4"])
+    assert said.exit_code == 0, said.output
+    watched = open_run(out)["learnt"].to_dataset()
+    assert watched["step"].values.tolist() == [5, 6, 7, 8]
+    for name, flown in learnt.data_vars.items():
+        tail = flown.isel(step=slice(5, None)) if "step" in flown.dims else flown
+        np.testing.assert_array_equal(watched[name].values, tail.values)
