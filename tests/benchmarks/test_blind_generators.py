@@ -390,7 +390,14 @@ def test_distance_is_zero_for_what_calibration_absorbs_and_large_for_what_it_can
     assert known.distance(_signals(Changes(laws=(law,)))) > 1e4
 
 
-@pytest.mark.parametrize("identifier", LUMPED)
+# all of them take a minute
+@pytest.mark.parametrize(
+    "identifier",
+    [
+        pytest.param(name, marks=() if name in {"coulomb_friction", "cubic_stiffness"} else pytest.mark.long)
+        for name in LUMPED
+    ],
+)
 def test_every_effect_of_the_rig_is_detectable_and_repeats_bit_for_bit(identifier: str) -> None:
     order = Order("case-1", "catalogue", "lumped", (identifier,), 5)
     one, two = make_case(order), make_case(order)

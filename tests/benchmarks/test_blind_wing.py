@@ -14,7 +14,7 @@ from benchmarks.blind.wing_rig import WingRig
 from fe.full.modes import eigenmodes
 from fe.full.statics import solve_static
 
-pytestmark = pytest.mark.slow  # the full model is projected once, in about 20 s
+pytestmark = pytest.mark.long  # the full model is projected once, in about 20 s
 
 STATE = {
     "young_modulus_factor": 1.013,

@@ -69,7 +69,7 @@ def test_files_that_are_missing_or_wrong_end_in_one_sentence(
     assert not out.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_leaves_a_design_a_record_and_a_report(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], data: Path, tmp_path: Path
 ) -> None:
