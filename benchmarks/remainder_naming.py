@@ -41,6 +41,7 @@ from benchmarks.blind_naming import model_of
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import library
 from discrepancy.errors import DiscrepancyError
+from discrepancy.verdict import Verdict
 from discrepancy.workflow import investigate
 
 FloatArray = NDArray[np.float64]
@@ -220,10 +221,14 @@ def judge(out: Path, seed: int, number: int, *, colour: bool) -> dict[str, Any]:
         found = investigate(read_campaign(folder), model_of(folder), library(), thorough=False)
     except DiscrepancyError as error:
         return truth | {"kind": "error", "sentence": str(error), "outcome": "error", "seconds": 0.0}
-    verdict = found.verdict
+    return truth | scored(found.verdict, truth["identifiers"]) | {"seconds": time.perf_counter() - began}
+
+
+def scored(verdict: Verdict, true: list[str]) -> dict[str, Any]:
+    """Return what a verdict says and its outcome: its kind if right, else wrong; nothing where nothing is."""
     named = sorted(item.identifier for item in verdict.effects)
     families = {item.identifier: item.family for item in library()}
-    kind, true = verdict.kind.value, truth["identifiers"]
+    kind = verdict.kind.value
     if kind == "group":
         outcome = "group" if true and true[0] in verdict.group else "wrong"
     elif kind in ("named", "named in part", "family"):
@@ -234,9 +239,9 @@ def judge(out: Path, seed: int, number: int, *, colour: bool) -> dict[str, Any]:
     else:
         outcome = kind if true or kind == "unexplained" else "nothing"
     explained = verdict.explained
-    return truth | {
+    return {
         "kind": kind, "named": named, "outcome": outcome, "sentence": verdict.sentence,
-        "probability": verdict.probability, "seconds": time.perf_counter() - began,
+        "probability": verdict.probability,
         "share": None if explained is None else [explained.low, explained.value, explained.high],
         "hypotheses": [[list(item.identifiers), item.log_evidence] for item in verdict.hypotheses[:6]],
         "gates": [gate.reason for gate in verdict.gates if gate.passed is False],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator, model_validator
@@ -51,6 +51,15 @@ class StatedNoise(Section):
     source: Literal["stated", "repeats", "pre-trigger"] = "stated"
 
 
+def input_columns(kinds: Iterable[TrialKind]) -> tuple[str, ...]:
+    """Return the columns that no channel may have beside trials of these kinds.
+
+    The force is a column of static and forced trials only: a load cell may be called so in a driven one.
+    """
+    forced = any(kind in (TrialKind.STATIC, TrialKind.FORCED) for kind in kinds)
+    return tuple(name for name in INPUT_COLUMNS if name != "force" or forced)
+
+
 class ColumnSection(Section):
     """What a channel and an input have in common: a column of the tables."""
 
@@ -84,12 +93,6 @@ class ChannelSection(ColumnSection):
             )
         if self.name == EVERY_CHANNEL or self.name.startswith("#"):
             raise ValueError(f"a channel cannot be called {self.name!r}")
-        if self.table_column in INPUT_COLUMNS:
-            raise ValueError(
-                f"the column {self.table_column!r} holds an input of the trial: give the channel "
-                f"{self.name!r} "
-                "another column"
-            )
         return self
 
 
@@ -254,6 +257,13 @@ class CampaignSection(Section):
             raise ValueError(
                 f"more than one {what} reads the column {twice[0]!r}: give each its own `column`"
             )
+        taken = input_columns(item.kind for item in self.trial)
+        for channel in self.channel:
+            if channel.table_column in taken:
+                raise ValueError(
+                    f"the column {channel.table_column!r} holds an input of the trial: give the channel "
+                    f"{channel.name!r} another column"
+                )
         scales = {item.unit for item in every if item.quantity is Quantity.TEMPERATURE}
         if len(scales) > 1:
             raise ValueError("temperatures are given in degC and in K: give all of them in one of the two")

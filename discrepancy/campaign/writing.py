@@ -21,7 +21,7 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.campaign.schema import FORMAT, INPUT_COLUMNS
+from discrepancy.campaign.schema import FORMAT, input_columns
 from discrepancy.campaign.units import UNITS, in_unit, sum_text
 from discrepancy.errors import CampaignFileError
 from reporting.files import atomic_write_text
@@ -60,7 +60,7 @@ def write_campaign(campaign: Campaign, folder: str | Path) -> Path:
     """
     folder = Path(folder)
     for name in campaign.channels:
-        if name in INPUT_COLUMNS:
+        if name in input_columns(trial.kind for trial in campaign.trials):
             raise CampaignFileError(
                 f"A channel cannot be called {name!r} in a file, which is an input: rename it."
             )

@@ -33,6 +33,9 @@ STEP = 0.02
 TORQUE_NOISE = 0.02
 """Deviation of the pendulum's torque by the (median) sixth differences of its slower record [N m]."""
 
+THE_WING = "real_wing"
+"""Among the rigs of the command line, the one with a model of its own (`real_wing.write_wing_campaign`)."""
+
 PHONE = """format = 1
 name = "Body that falls"
 mass = 1.0
@@ -145,7 +148,7 @@ def write_rig_campaign(rig: str, data: Path, folder: Path) -> Path:
         As `reporting.files.atomic_file`.
     """
     if rig not in RIGS:
-        raise CampaignFileError(f"There is no rig {rig!r}: give one of {', '.join(RIGS)}.")
+        raise CampaignFileError(f"There is no rig {rig!r}: give one of {', '.join((THE_WING, *RIGS))}.")
     texts = RIGS[rig](Path(data))
     last = "campaign.toml"
     for name in (*(name for name in texts if name != last), last):

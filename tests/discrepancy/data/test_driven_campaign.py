@@ -122,3 +122,20 @@ def test_a_wrong_input_is_named_in_one_sentence(tmp_path: Path, old: str, new: s
         read_campaign(folder_of(tmp_path, TOML.replace(old, new, 1)))
     assert sentence in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_load_cell_of_driven_trials_may_be_called_force(tmp_path: Path) -> None:
+    angle = 'name = "turned"\nquantity = "angle"\nunit = "deg"'
+    toml = TOML.replace(angle, 'name = "force"\nquantity = "force"\nunit = "kN"')
+    folder_of(tmp_path, toml)
+    for name, text in (("first.csv", FIRST), ("second.csv", SECOND)):
+        (tmp_path / name).write_text(text.replace("turned", "force"))
+    campaign = read_campaign(tmp_path)
+    assert campaign.trials[0].values[2, 1] == 180e3
+    write_campaign(campaign, tmp_path / "again")
+    again = read_campaign(tmp_path / "again")
+    np.testing.assert_array_equal(again.trials[0].values, campaign.trials[0].values)
+    forced = toml.replace('name = "second"\nkind = "driven"', 'name = "second"\nkind = "forced"')
+    (tmp_path / "campaign.toml").write_text(forced)
+    with pytest.raises(CampaignFileError, match="the column 'force' holds an input of the trial"):
+        read_campaign(tmp_path)

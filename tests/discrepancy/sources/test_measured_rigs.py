@@ -94,7 +94,7 @@ def test_the_command_writes_what_run_reads(tmp_path: Path) -> None:
 def test_what_is_not_as_published_is_refused_in_a_sentence_and_nothing_is_written(tmp_path: Path) -> None:
     out, data = tmp_path / "out", write_falls(tmp_path / "data")
     with pytest.raises(
-        CampaignFileError, match="There is no rig 'wing': give one of falling_phone, two_tanks"
+        CampaignFileError, match="There is no rig 'wing': give one of real_wing, falling_phone, two_tanks"
     ):
         write_rig_campaign("wing", data, out)
     for name, missing in (("two_tanks", r"dataBenchmark\.csv"), ("pendulum", r"pd_trajectory\.csv")):

@@ -1,0 +1,99 @@
+"""The generator of the blind test on open rigs: its equations beside the model files, and what it writes."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.open_rigs.campaigns import ALONE, GAPS, SHARES, Bench, drawn, simulate, write
+from benchmarks.open_rigs.rigs import RIGS, Truth
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.models.interface import Conditions
+from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.lumped_file import parse_lumped
+from fe.runtime.patch import BoucWen, FreePlay, ModelPatch, Overflow, PowerDamping, PowerStiffness, Primitive
+
+SAMPLES = 40
+
+
+def small(name: str) -> Bench:
+    return Bench(RIGS[name], np.random.default_rng(3), SAMPLES)
+
+
+LAWS: dict[str, tuple[str, float, Primitive]] = {
+    "cart": ("quadratic_damping", 0.3, PowerDamping("rail", 0.3 * 6.0, 2.0, 0.0, 1.5, 1.0)),
+    "damper": ("cubic_stiffness", 0.3, PowerStiffness("piston", 0.3 * 60.0, 3.0, 0, 0.02)),
+    "servo": ("coulomb_friction", 0.1, PowerDamping("bearing", 0.2, 0.0, 0.0, 1.0, 1.0)),
+    "support moved": ("free_play", 0.3, FreePlay("mount", 0.3 * 200.0, 0.3 * 0.04)),
+    "support shaken": ("bouc_wen_hysteresis", 0.3, BoucWen("mount", 0.3 * 200.0, 0.3 * 0.04, 1.0)),
+    "stores": ("overflow", 0.4, Overflow("upper outlet", 0.4 * 0.02, 1.5, 0.3, 0.7)),
+    "heated": ("natural_convection", 0.4, PowerDamping("surface", 0.4 * 80.0, 1.25, 0.0, 40.0, 1.0)),
+}
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_equations_and_model_files_agree(name: str, tmp_path: Path) -> None:
+    """As they are and with a law, to less than half of the noise, though two integrators moved them."""
+    bench = small(name)
+    write(tmp_path / "case", bench, Truth(bench.factors), "plain", (1, 2))
+    campaign = read_campaign(tmp_path / "case")
+    model = LumpedModel(parse_lumped(tomllib.loads((tmp_path / "case/model.toml").read_text("utf-8"))))
+    outputs = tuple((channel.output, channel.quantity) for channel in campaign.channels.values())
+    factors = np.array([bench.factors[item.name] for item in model.parameters])
+    law, size, primitive = LAWS[name]
+    for truth, patch in (
+        (Truth(bench.factors), ModelPatch()),
+        (Truth(bench.factors, law, size), ModelPatch((primitive,))),
+    ):
+        expected = simulate(bench.rig, truth, bench.courses[:1], bench.stamps[:1])[0]
+        found = model.respond(campaign.trials[0], outputs, patch, Conditions(factors), refinement=4).values
+        assert np.sqrt(np.mean(((found - expected) / bench.noise) ** 2)) < 0.5
+    assert bench.left(truth, bench.bare) > 1.0  # the law is seen beside calibration and zeros
+
+
+@pytest.mark.parametrize("number", [1, 4])
+def test_what_is_hidden_has_its_size(number: int) -> None:
+    bench, truth, facts = drawn(number, 1, SAMPLES)
+    assert GAPS[0] * 0.9 < facts["gap"] < GAPS[1] * 1.1
+    assert SHARES[0] * 0.9 < facts["remainder"] / facts["gap"] < SHARES[1] * 1.1
+    without = bench.stacked(replace(truth, amount=0.0))
+    assert bench.left(truth, without) == pytest.approx(facts["remainder"])
+
+
+def test_the_last_campaigns_hide_a_remainder_alone() -> None:
+    _, truth, facts = drawn(27, 1, SAMPLES)
+    assert facts["identifiers"] == []
+    assert truth.law == ""
+    assert ALONE[0] * 0.9 < facts["remainder"] < ALONE[1] * 1.1
+
+
+def test_campaigns_repeat_and_variants_change_what_they_say(tmp_path: Path) -> None:
+    bench = small("damper")
+    truth = Truth(bench.factors, "coulomb_friction", 0.1)
+
+    def made(name: str, variant: str) -> tuple[str, np.ndarray]:
+        write(tmp_path / name / "case", bench, truth, variant, (1, 2))
+        read_campaign(tmp_path / name / "case")
+        rows = np.genfromtxt(tmp_path / name / "case/1.csv", delimiter=",", skip_header=1)
+        return (tmp_path / name / "case/campaign.toml").read_text("utf-8"), rows
+
+    text, plain = made("one", "plain")
+    again, rows = made("two", "plain")
+    assert text == again
+    np.testing.assert_array_equal(plain, rows)
+    _, rows = made("blanks", "blanks")
+    assert np.isnan(rows[: SAMPLES // 5, 2]).all()
+    np.testing.assert_array_equal(rows[SAMPLES // 5 :], plain[SAMPLES // 5 :])
+    _, rows = made("gaps", "gaps")
+    assert 0 < np.isnan(rows[:, 2]).sum() < 0.2 * SAMPLES
+    _, rows = made("jitter", "jitter")
+    steps = np.diff(rows[:, 0]) / bench.rig.interval
+    assert 0.005 < steps.std() < 0.1
+    changed, rows = made("offset", "offset")
+    assert "offset_deviation = 0.0003" in changed
+    np.testing.assert_array_equal(rows[:, :2], plain[:, :2])
+    assert np.abs(rows[:, 2] - plain[:, 2]).max() > bench.noise[0]
