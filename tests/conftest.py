@@ -21,7 +21,9 @@ from hypothesis import settings
 
 if TYPE_CHECKING:
     from calibration.wing.result import CalibrationResult
+    from fe.reduction.structure_basis import StructureReduction
     from fe.runtime.patch_arrays import PatchArrays
+    from fe.structure.operators import Structure
 
 LEVELS = (0, 20, 40, 60, 80)
 
@@ -32,8 +34,8 @@ settings.register_profile("developer", deadline=None)
 settings.load_profile("ci" if os.environ.get("CI") else "developer")
 
 
-SHARED = ("coarse_reduction", "coarse_patch_arrays", "virtual_model")
-"""Fixtures of several files that take seven to ten seconds each."""
+SHARED = ("coarse_reduction", "coarse_patch_arrays", "virtual_model", "beam_reduction")
+"""Fixtures of several files that take three to ten seconds each."""
 
 LONG = "takes minutes of processor time; set UAV_TWIN_LONG_TESTS to run it"
 
@@ -289,3 +291,25 @@ def write_beam() -> Callable[..., Path]:
         return file
 
     return write
+
+
+@pytest.fixture(scope="session")
+def beam_file(write_beam: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The structure file of the beam."""
+    return write_beam(tmp_path_factory.mktemp("beam"))
+
+
+@pytest.fixture(scope="session")
+def beam(beam_file: Path) -> Structure:
+    """Its full model."""
+    from fe.structure.operators import load_and_assemble
+
+    return load_and_assemble(beam_file)
+
+
+@pytest.fixture(scope="session")
+def beam_reduction(beam: Structure) -> StructureReduction:
+    """Its reduction."""
+    from fe.reduction.structure_basis import reduce_structure
+
+    return reduce_structure(beam, "beam")

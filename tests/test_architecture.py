@@ -34,7 +34,7 @@ ROOMS = {
     "fe": ("designs", "runtime", "wing", "full", "structure", "reduction", "compilation", "verification"),
     "fmu_asset": (
         "errors", "folders", "slaves", "description", "instances", "worker", "archive", "compiled", "door",
-        "packing", "companions", "coupling", "check", "ssp",
+        "packing", "companions", "structures", "coupling", "check", "ssp",
     ),
     "calibration": (
         "errors", "lab_folder", "static", "geometry", "dynamics", "published_strains", "joint",
@@ -66,6 +66,7 @@ LONGER: dict[str, str] = {
     "discrepancy/report/law_figures.py:force_figure": "One figure: panels that share axes and scales.",
     "discrepancy/report/motion_figures.py:history_figure": "One figure: panels that share a time axis.",
     "fmu_asset/slaves/variables.py:variable_table": "A table: one call a variable.",
+    "fmu_asset/structures/table.py:structure_table": "A table: one call a variable.",
 }
 """What may be longer, each with its reason."""
 

@@ -10,6 +10,7 @@ import typer
 from reporting import terminal
 from uav_twin.console_table import console_table
 from uav_twin.structure_arguments import File, MemoryLimit, assembled
+from uav_twin.structure_fmu import fmu
 from uav_twin.structure_reduce import reduce
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ DISPLACEMENT_LIMIT, STRAIN_LIMIT, FREQUENCY_LIMIT = 1e-5, 1e-5, 1e-6
 
 structure_app = typer.Typer(
     no_args_is_help=True,
-    help="Look at a structure from a mesh, verify its model against CalculiX, reduce it.",
+    help="Look at a structure from a mesh, verify its model against CalculiX, reduce it, pack it.",
 )
 
 Modes = Annotated[int, typer.Option(min=1, max=50, help="Number of modes.")]
@@ -213,3 +214,4 @@ def _differences(agreement: "StructureAgreement") -> Iterator[tuple[str, str, fl
 
 
 structure_app.command("reduce")(reduce)
+structure_app.command("fmu")(fmu)

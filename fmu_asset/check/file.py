@@ -45,12 +45,13 @@ def _schema(description: FmuDescription) -> Iterator[Finding]:
 
 
 def _content(description: FmuDescription) -> Iterator[Finding]:
-    """Compare the GUID of a wing FMU of ours with its content."""
+    """Compare the GUID of a wing or structure FMU of ours with its content."""
     with zipfile.ZipFile(description.path) as archive:
         names = set(archive.namelist())
     ours = {"resources/start.json", "resources/reduced_model.npz"}
     ours_compiled = {"resources/reduced_model.bin", "sources/wing_variables.h"}
-    if not (ours <= names or ours_compiled <= names):
+    ours_structure = {"resources/start.json", "resources/structure.npz"}
+    if not any(parts <= names for parts in (ours, ours_compiled, ours_structure)):
         return
     try:
         declared, actual = recorded_content_hash(description.path)
@@ -58,7 +59,7 @@ def _content(description: FmuDescription) -> Iterator[Finding]:
         yield Finding(
             "content",
             "problem",
-            "Its parts are not those of a wing FMU as it was built: the file was changed after its build.",
+            "Its parts are not those of an FMU as we build it: the file was changed after its build.",
         )
         return
     if declared == actual:

@@ -219,6 +219,6 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
         members = {name: data for name, data in members.items() if not name.startswith("binaries/")}
         tag = root.split('modelIdentifier="uav_wing_', 1)[1].split('"', 1)[0]
     else:
-        tag = members["resources/slavemodule.txt"].decode("ascii").strip().removeprefix("uav_wing_")
+        tag = members["resources/slavemodule.txt"].decode("ascii").strip()[-len(PLACEHOLDER) :]
     declared = root.split('guid="', 1)[1].split('"', 1)[0]
     return declared, guid_of(content_hash_of(emptied(members, tag, declared)))

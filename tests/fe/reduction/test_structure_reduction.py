@@ -11,39 +11,27 @@ from scipy.linalg import expm
 
 from fe.full.modes import lowest_eigenpairs
 from fe.full.statics import Factorisation
-from fe.reduction.structure_basis import StructureReduction, reduce_structure
+from fe.reduction.structure_basis import StructureReduction
 from fe.reduction.structure_cache import reduced_structure
 from fe.reduction.structure_errors import measured_errors
 from fe.runtime.errors import MeshError, OutsideModelError, ReducedModelFileError, ReductionError
 from fe.runtime.structure_model import StructureModel
 from fe.runtime.structure_motion import StructureMotion, StructureMotionState
-from fe.structure.operators import Structure, load_and_assemble
+from fe.structure.operators import Structure
 
 HURT = {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 3.0, "push": -120.0}
 
 
-@pytest.fixture(scope="module")
-def beam(write_beam: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Structure:
-    """The full model."""
-    return load_and_assemble(write_beam(tmp_path_factory.mktemp("beam")))
-
-
-@pytest.fixture(scope="module")
-def reduction(beam: Structure) -> StructureReduction:
-    """Its reduction."""
-    return reduce_structure(beam, "beam")
-
-
-def test_random_states_against_the_full_model(beam: Structure, reduction: StructureReduction) -> None:
+def test_random_states_against_the_full_model(beam: Structure, beam_reduction: StructureReduction) -> None:
     """Strains and displacements err by less than their bound, which keeps its tolerance; modes by 2e-5."""
-    errors = measured_errors(beam, reduction.model, 6, seed=7)
+    errors = measured_errors(beam, beam_reduction.model, 6, seed=7)
     assert max(errors.strain, errors.displacement) < errors.bound < 1e-3
     assert errors.frequency < 2e-5
 
 
-def test_a_state_in_all_its_parts(beam: Structure, reduction: StructureReduction) -> None:
+def test_a_state_in_all_its_parts(beam: Structure, beam_reduction: StructureReduction) -> None:
     """Parameter times loss, controls, and the weight of a free mass are those of the full sums."""
-    model = reduction.model
+    model = beam_reduction.model
     stiffness = beam.stiffness({"e": 1.05}, {"z1": 0.6, "z2": 0.3})
     load = beam.load("weight", 3.0, {"pump": 0.07}) + beam.load("pushed", -120.0)
     full = Factorisation(stiffness).solve(load)
@@ -59,8 +47,8 @@ def test_a_state_in_all_its_parts(beam: Structure, reduction: StructureReduction
     np.testing.assert_allclose(np.abs(modes.output[:4]), wanted, atol=2e-3 * wanted.max())
 
 
-def test_many_states_at_once_are_the_same(reduction: StructureReduction) -> None:
-    model = reduction.model
+def test_many_states_at_once_are_the_same(beam_reduction: StructureReduction) -> None:
+    model = beam_reduction.model
     low, high = model.validity_box.T
     vectors = low + (high - low) * np.random.default_rng(3).random((5, len(low)))
     for vector, outputs in zip(vectors, model.static_outputs(vectors), strict=True):
@@ -68,9 +56,9 @@ def test_many_states_at_once_are_the_same(reduction: StructureReduction) -> None
         np.testing.assert_allclose(outputs, [*single.strain, *single.displacement], rtol=1e-11, atol=1e-16)
 
 
-def test_a_released_beam_moves_as_the_full_model(beam: Structure, reduction: StructureReduction) -> None:
+def test_a_released_beam_moves_as_the_full_model(beam: Structure, beam_reduction: StructureReduction) -> None:
     """Ring-down after a push: once the high modes have died away, strain, position and acceleration agree."""
-    model = reduction.model
+    model = beam_reduction.model
     vector = model.vector({**HURT, "load_factor": 0.0, "push": 100.0})
     let_go = model.vector({**HURT, "load_factor": 0.0, "push": 0.0})
     motion = StructureMotion(model, vector, beam.damping_alpha, beam.damping_beta)
@@ -104,11 +92,13 @@ def test_a_released_beam_moves_as_the_full_model(beam: Structure, reduction: Str
     np.testing.assert_allclose(taken, motion.outputs(state), rtol=1e-6, atol=1e-9 * float(size.max()))
 
 
-def test_the_file_gives_the_model_back(reduction: StructureReduction) -> None:
-    content = reduction.model.to_bytes()
+def test_the_file_gives_the_model_back(beam_reduction: StructureReduction) -> None:
+    content = beam_reduction.model.to_bytes()
     again = StructureModel.from_bytes(content)
     assert again.to_bytes() == content
-    assert np.array_equal(again.static_response(HURT).strain, reduction.model.static_response(HURT).strain)
+    assert np.array_equal(
+        again.static_response(HURT).strain, beam_reduction.model.static_response(HURT).strain
+    )
     with pytest.raises(ReducedModelFileError):
         StructureModel.from_bytes(content[:-100])
 
@@ -122,10 +112,10 @@ def test_the_file_gives_the_model_back(reduction: StructureReduction) -> None:
     ],
 )
 def test_values_outside_are_refused(
-    reduction: StructureReduction, values: dict[str, float], sentence: str
+    beam_reduction: StructureReduction, values: dict[str, float], sentence: str
 ) -> None:
     with pytest.raises(OutsideModelError, match=sentence):
-        reduction.model.static_response(values)
+        beam_reduction.model.static_response(values)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,109 @@
+"""Packing a reduced structure as an FMU, by the machinery that packs the wing; equal input, equal bytes."""
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from importlib.resources import files
+
+from fe.runtime.structure_model import StructureModel
+from fmu_asset.errors import FmuBuildError
+from fmu_asset.packing.contents import (
+    PLACEHOLDER,
+    FmuInfo,
+    check_start,
+    checked_target,
+    room_members,
+    sealed,
+    write_fmu,
+)
+from fmu_asset.packing.python_fmu import python_members
+from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
+
+from .table import structure_table
+
+_IMPORTS = """from .structures.slave import StructureSlave as _Slave
+from .structures.slave import load_contents
+"""
+_COMPANION_FILES = ("slave.py", "table.py")
+_OWN_FILES = ("__init__.py", "behaviour.py", "slave.py", "table.py")
+_ACCELERATION = Unit("m/s2", (("m", 1), ("s", -2)))
+
+
+def build_structure_fmu(
+    model: StructureModel,
+    path: str | os.PathLike[str],
+    *,
+    start: Mapping[str, float] | None = None,
+    replace: bool = False,
+) -> FmuInfo:
+    """Pack a reduced structure as an FMI 2.0 co-simulation FMU that runs in Python.
+
+    Parameters
+    ----------
+    model : StructureModel
+        The structure.
+    path : path-like
+        Where to write, with the suffix .fmu.
+    start : mapping of str to float, optional
+        Start values by variable name that take the place of the nominal ones.
+    replace : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    FmuBuildError
+        If a start value does not fit, a name is taken by a variable of the FMU, the file exists, the suffix
+        is wrong, or the wrong pythonfmu is installed.
+    """
+    target = checked_target(path, replace=replace)
+    content, content_hash = structure_fmu_bytes(model, start)
+    return write_fmu(target, content, content_hash, stem_of(model), model.design_hash)
+
+
+def stem_of(model: StructureModel) -> str:
+    """Return the name of a structure as an identifier of C."""
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", model.name).strip("_")[:40]
+    return plain if plain[:1].isalpha() else f"structure_{plain}".rstrip("_")
+
+
+def structure_fmu_bytes(model: StructureModel, start: Mapping[str, float] | None = None) -> tuple[bytes, str]:
+    """Return the archive and its content hash; see `build_structure_fmu`."""
+    given = {name: float(value) for name, value in (start or {}).items()}
+    try:
+        table = structure_table(model, given)
+    except ValueError as error:
+        raise FmuBuildError(f"The FMU of the structure {model.name} cannot be built: {error}.") from error
+    check_start(table)
+    name = stem_of(model)
+    runtime = f"resources/{name}_{PLACEHOLDER}_runtime"
+    members = python_members(
+        name,
+        "Structure_",
+        imports=_IMPORTS,
+        table=table,
+        description=(
+            f"Structure {model.name}: strains, displacements, accelerations and modes from a reduced finite "
+            "element model under its loads, with regions that can lose stiffness."
+        ),
+        resources={
+            "structure.npz": model.to_bytes(),
+            "start.json": (json.dumps(given, sort_keys=True) + "\n").encode(),
+        },
+        units=_units(table),
+    ) | room_members("fe.runtime", f"{runtime}/fe")
+    for room, names in (("companions", _COMPANION_FILES), ("structures", _OWN_FILES)):
+        own = files(f"fmu_asset.{room}")
+        for file in names:
+            source = (own / file).read_bytes().replace(b"from fe.runtime", b"from ..fe")
+            members[f"{runtime}/{room}/{file}"] = source
+    members[f"{runtime}/companions/__init__.py"] = b'"""What small slaves have in common."""\n'
+    return sealed(members)
+
+
+def _units(table: tuple[FmuVariable, ...]) -> tuple[Unit, ...]:
+    """Return the units of the table; of a control's unit that is not known no more than its name is told."""
+    known = (*UNITS, _ACCELERATION)
+    names = {unit.name for unit in known}
+    others = sorted({row.unit for row in table if row.unit is not None} - names)
+    return (*known, *(Unit(name) for name in others))

@@ -1,0 +1,111 @@
+"""The FMU of a structure against the reduced model that was packed, quasi-static and in motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe.reduction.structure_basis import StructureReduction
+from fe.runtime.structure_model import StructureModel
+from fe.runtime.structure_motion import StructureMotion
+from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.check.file import check_file
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.errors import FmuBuildError
+from fmu_asset.structures.binding import structure_binding
+from fmu_asset.structures.build import build_structure_fmu, structure_fmu_bytes
+
+
+@pytest.fixture(scope="module")
+def model(beam_reduction: StructureReduction) -> StructureModel:
+    """The reduced beam."""
+    return beam_reduction.model
+
+
+@pytest.fixture(scope="module")
+def fmu(model: StructureModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its FMU."""
+    return build_structure_fmu(model, tmp_path_factory.mktemp("fmu") / "beam.fmu").path
+
+
+def _inputs(model: StructureModel, steps: int) -> list[dict[str, float]]:
+    random = np.random.default_rng(11)
+    return [
+        {name: float(random.uniform(*model.validity[name])) for name in (*model.controls, *model.regions)}
+        for _ in range(steps)
+    ]
+
+
+def test_every_step_is_that_of_the_model(model: StructureModel, fmu: Path) -> None:
+    """Quasi-static: strains, displacements and bounds to 1e-12 of the largest; accelerations are zero."""
+    with FmiAsset(
+        fmu, structure_binding(model), parameters={"e": 1.06, "pump": 0.03}, isolated=False
+    ) as asset:
+        for chosen in _inputs(model, 20):
+            seen = asset.step(
+                {name: chosen[name] for name in model.controls},
+                {name: chosen[name] for name in model.regions},
+            )
+            found = model.static_response({**chosen, "e": 1.06, "pump": 0.03})
+            wanted = [*found.strain, *found.displacement, 0.0]
+            np.testing.assert_allclose(
+                seen.values, wanted, rtol=1e-12, atol=1e-12 * np.abs(found.strain).max()
+            )
+            assert seen.extra["strain_error_bound"] == pytest.approx(found.strain_error_bound, rel=1e-12)
+
+
+def test_motion_is_that_of_the_model(model: StructureModel, fmu: Path) -> None:
+    """Transient, health changing on the way; a state that is restored goes on to the bit."""
+    steps = _inputs(model, 12)
+    for number in range(1, 6):  # the load jumps while health stays
+        steps[number] |= {name: steps[0][name] for name in model.regions}
+    binding = structure_binding(model)
+    binding = binding.model_copy(update={"binding": binding.binding.model_copy(update={"step_size": 1e-3})})
+    seen, kept, after = [], b"", []
+    with FmiAsset(fmu, binding, parameters={"response": 2}, isolated=False) as asset:
+        for number, chosen in enumerate(steps):
+            if number == 8:
+                kept = asset.save_state()
+            values = asset.step(
+                {name: chosen[name] for name in model.controls},
+                {name: chosen[name] for name in model.regions},
+            ).values
+            seen.append(values)
+        asset.restore_state(kept)
+        for chosen in steps[8:]:
+            after.append(
+                asset.step(
+                    {name: chosen[name] for name in model.controls},
+                    {name: chosen[name] for name in model.regions},
+                ).values
+            )
+    assert np.array_equal(after, seen[8:])
+    motion = StructureMotion(model, model.nominal, *model.damping)
+    state = motion.at_rest(model.load_coefficients(model.nominal))
+    wanted, health = [], dict.fromkeys(model.regions, 0.0)
+    for chosen in steps:
+        vector = model.vector(chosen)
+        if health != (health := {name: chosen[name] for name in model.regions}):
+            before, motion = motion, StructureMotion(model, vector, *model.damping)
+            state = motion.take_over(state, before)
+        state = motion.advance(state, 1e-3, model.load_coefficients(vector))
+        wanted.append(motion.outputs(state))
+    largest = np.abs(wanted).max(axis=0)
+    np.testing.assert_allclose(np.array(seen) / largest, np.array(wanted) / largest, atol=1e-12, rtol=0)
+    assert largest[-1] > 1.0  # m/s^2
+
+
+def test_the_check_of_the_file_finds_nothing(fmu: Path) -> None:
+    findings = {finding.check: finding.verdict for finding in check_file(read_fmu(fmu))}
+    assert set(findings.values()) == {"ok"}
+    assert {"fmpy validate", "content", "units", "ranges"} <= set(findings)
+
+
+def test_equal_models_make_equal_bytes_and_bad_starts_are_refused(model: StructureModel, fmu: Path) -> None:
+    assert structure_fmu_bytes(model)[0] == fmu.read_bytes()
+    with pytest.raises(FmuBuildError, match="'z9'"):
+        structure_fmu_bytes(model, {"z9": 1.0})
+    with pytest.raises(FmuBuildError, match=r"health\.z1"):
+        structure_fmu_bytes(model, {"health.z1": 0.9})
