@@ -56,7 +56,7 @@ from twin_master.mission.preparation import prepare_knowledge
 from twin_master.run_folder import create_run_folder
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.store.results import MissionResult
+from twin_master.store.mission_result import MissionResult
 from twin_master.store.writing import store_mission
 from twin_master.study import in_credible_set
 

@@ -47,8 +47,8 @@ from twin_master.run_folder import (
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.learnt import learnt_record
+from twin_master.store.mission_result import MissionResult
 from twin_master.store.outcome import RunOutcome, finished_run, read_outcome
-from twin_master.store.results import MissionResult
 from twin_master.store.summary import control_changes, noticed, summarise
 from twin_master.store.writing import (
     store_mission,

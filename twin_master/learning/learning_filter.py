@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv, gammaln
 
 from twin_master.errors import InvalidModelError
+from twin_master.learning.hypotheses import Hypotheses, shown_by
 from twin_master.learning.kernels import (
     forecast_all,
     gauge_statistics,
@@ -214,6 +215,7 @@ class LearningFilter:
             log_evidence=evidence,
             carried=Carried(control_index, arrays),
             learnt=_Posteriors(lambda: self._learnt(filtered, statistics, count)),
+            expected=lambda: self._expected(filtered, statistics, count, control_index),
         )
 
     def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
@@ -248,10 +250,56 @@ class LearningFilter:
         )  # fmt: skip
         return result
 
+    def hypotheses(self, carried: Carried) -> Hypotheses:
+        """Return what is believed of each hypothesis after a turn."""
+        arrays = carried.arrays
+        return self._hypotheses(np.exp(arrays["log_belief"]), arrays["statistics"], arrays["count"])
+
+    def _hypotheses(self, weight: Float, statistics: Float, count: Float) -> Hypotheses:
+        fitted = np.zeros_like(statistics)
+        if self._learns_gauges:
+            regression(statistics, fitted)
+        scale2, offset, gain = self._scale2(fitted, count), self._offset, self._gain
+        covariance = np.stack(
+            [offset**2 * fitted[..., 2], offset * gain * fitted[..., 3], gain**2 * fitted[..., 4]], axis=-1
+        )
+        return Hypotheses(
+            weight, self._draw, offset * fitted[..., 0], gain * fitted[..., 1],
+            scale2[..., None] * covariance, scale2,
+        )  # fmt: skip
+
+    def _scale2(self, fitted: Float, count: Float) -> Float:
+        """Return the posterior mean of the squared noise scale of each hypothesis and sensor: (K, G)."""
+        degrees = self.priors.noise_degrees
+        if not degrees > 0.0:
+            return np.ones_like(fitted[..., 5])
+        return np.asarray((degrees + fitted[..., 5]) / np.maximum(degrees + count - 2.0, 1.0))
+
+    def _expected(
+        self, filtered: Float, statistics: Float, count: Float, control: int
+    ) -> tuple[Float, Float]:
+        """Return for each sensor what it shows in the mean, and the deviation of its noise: two of (G,)."""
+        own = self._hypotheses(filtered, statistics, count).counting(filtered)
+        model = self._sensor_model
+        in_force = slice(control, control + 1)
+        shown = shown_by(
+            own, model.value_per_draw[:, :, in_force], model.total_standard_deviation[:, in_force]
+        )
+        weight = own.weight.ravel() / own.weight.sum()
+        mean, noise2 = (
+            weight @ np.broadcast_to(part, shown.mean.shape).reshape(weight.size, -1)
+            for part in (shown.mean, shown.noise2)
+        )
+        return mean, np.sqrt(noise2)
+
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""
+        return np.asarray(self.smoothed_hypotheses(carried).sum(axis=1))
+
+    def smoothed_hypotheses(self, carried: Sequence[Carried]) -> Float:
+        """Return p(D_i, k | o_0..o_t) for the turns i of `carried`, which end at t: (n, K, S)."""
         size, controls = self._model.states.size, len(self._model.controls)
-        result = np.zeros((len(carried), size))
+        result = np.zeros((len(carried), len(self._draw), size))
         if not len(carried):
             return result
         rows = np.array([turn.arrays["log_belief"] for turn in carried])  # (n, K, S)
@@ -268,7 +316,7 @@ class LearningFilter:
                 self._sparse.start, self._sparse.source, self._sparse.probability,
                 self._sparse.log_probability, control + self._factor[k] * controls, np.exp(own), own, part,
             )  # fmt: skip
-            result += weight[k] * part
+            result[:, k] = weight[k] * part
         return result
 
     def _averaged_anew(self, log_belief: Float) -> Float:
@@ -301,10 +349,9 @@ class LearningFilter:
         regression(statistics, fitted)
         degrees = self.priors.noise_degrees
         result: dict[str, Learnt] = {}
-        scale2 = np.ones_like(fitted[..., 5])
+        scale2 = self._scale2(fitted, count)
         if degrees > 0.0:
             shape, left = 0.5 * (degrees + count), weight @ (degrees + fitted[..., 5])
-            scale2 = (degrees + fitted[..., 5]) / np.maximum(2.0 * shape - 2.0, 1.0)
             # The square is inverse gamma (shape, left / 2): its quantiles, and the moments of its root.
             low, high = (np.sqrt(0.5 * left / gammaincinv(shape, level)) for level in INTERVAL[::-1])
             mean = np.sqrt(0.5 * left) * np.exp(gammaln(shape - 0.5) - gammaln(shape))

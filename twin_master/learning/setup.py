@@ -1,19 +1,17 @@
 """The estimator that a scenario asks for: one that learns, one that gives notice, or both."""
 
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
 from twin_master.learning.monitor import MonitorSettings, WatchfulEstimator, Words
-from twin_master.network.estimator import Estimator, ExactFilter, Learnt
+from twin_master.network.estimator import Estimator, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
 
-__all__ = ["prior_of_learnt", "scenario_estimator"]
+__all__ = ["learning_filter", "scenario_estimator"]
 
 
 def scenario_estimator(
@@ -39,7 +37,7 @@ def scenario_estimator(
     InvalidModelError
         A transition factor makes a probability larger than one, or there are too many states to watch.
     """
-    learning = _learning_filter(scenario, model, sensor_model, draws)
+    learning = learning_filter(scenario, model, sensor_model, draws)
     if scenario.notice is None:
         return learning
     return WatchfulEstimator(
@@ -51,20 +49,6 @@ def scenario_estimator(
     )
 
 
-def prior_of_learnt(
-    scenario: Scenario,
-    model: GraphicalModel,
-    sensor_model: GaussianSensorModel,
-    draws: NDArray[np.float64],
-) -> Mapping[str, Learnt]:
-    """Return what is believed of all that a scenario learns before the first observation, by name.
-
-    Parameters and errors are those of `scenario_estimator`; empty where nothing is learnt.
-    """
-    learning = _learning_filter(scenario, model, sensor_model, draws)
-    return {} if learning is None else learning.prior
-
-
 def _words(scenario: Scenario) -> Words:
     observation = scenario.observation
     if observation.role == "strain" and set(observation.sensor_units) == {"1"}:
@@ -73,12 +57,16 @@ def _words(scenario: Scenario) -> Words:
     return Words(scenario.mission.step_name, sensor, 1.0, observation.sensor_units)
 
 
-def _learning_filter(
+def learning_filter(
     scenario: Scenario,
     model: GraphicalModel,
     sensor_model: GaussianSensorModel,
     draws: NDArray[np.float64],
 ) -> LearningFilter | None:
+    """Return the filter that learns as the scenario says, without notices; None where nothing is learnt.
+
+    Parameters and errors are those of `scenario_estimator`.
+    """
     learning = scenario.learning
     if learning is None:
         return None

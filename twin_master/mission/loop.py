@@ -16,7 +16,7 @@ from reporting.progress import Progress, SilentProgress
 from twin_master.errors import ImpossibleObservation, MissionError, NotResumableError
 from twin_master.mission.checkpoint import Checkpoint, FlownTurn
 from twin_master.mission.plant import Plant, PlantRecord
-from twin_master.network.estimator import Notice, Suspicion
+from twin_master.network.estimator import Carried, Notice, Suspicion
 from twin_master.network.twin import Twin, TwinTurn
 from twin_master.scenario.schema import Scenario
 
@@ -135,6 +135,8 @@ class Flight:
         The N quantities that are learnt, as the estimator names them.
     learnt : (T, N, 4)
         Mean, standard deviation and bounds of the central 90 % interval of each after each turn.
+    carried : tuple of Carried
+        What the estimator that learns carried on from each turn; empty where nothing is learnt.
     """
 
     observed: Float
@@ -152,12 +154,13 @@ class Flight:
     notices: tuple[tuple[int, Notice], ...] = ()
     learnt_names: tuple[str, ...] = ()
     learnt: Float = field(default_factory=lambda: np.empty((0, 0, 4)))
+    carried: tuple[Carried, ...] = ()
 
     def behind(self, skipped: int) -> "Flight":
         """Return the turns behind the first `skipped` of a watched asset; the notices stay those of all."""
         by_turn = (
             "observed", "control_index", "filtered", "log_evidence", "smoothed", "predicted",
-            "decision_probability", "suspicion", "learnt",
+            "decision_probability", "suspicion", "learnt", "carried",
         )  # fmt: skip
         cut = {name: getattr(self, name)[skipped:] for name in by_turn}
         return replace(self, **cut, first_turn=self.first_turn + skipped)
@@ -240,7 +243,7 @@ def fly(
             beliefs.add(reading.observed, turn)
             timing.append(seconds)
             stage.advance(detail=scenario.control_names[turn.control_index])
-    return beliefs.flight(twin.smoothed(), plant.record(), tuple(timing), resumed_at=resumed_at)
+    return beliefs.flight(twin, plant.record(), tuple(timing), resumed_at=resumed_at)
 
 
 class _Flown:
@@ -275,6 +278,7 @@ class Beliefs:
     notices: list[tuple[int, Notice]] = field(default_factory=list)
     learnt_names: tuple[str, ...] = ()
     learnt: list[Float] = field(default_factory=list)
+    residual: list[Float] = field(default_factory=list)
 
     def add(self, observed: Float, turn: TwinTurn) -> None:
         """Keep a turn."""
@@ -290,23 +294,27 @@ class Beliefs:
         if turn.learnt:
             self.learnt_names = tuple(turn.learnt)
             self.learnt.append(np.array([learnt.figures for learnt in turn.learnt.values()]))
+        if turn.expected is not None:
+            mean, noise = turn.expected()
+            self.residual.append((observed - mean) / noise)
 
     def flight(
         self,
-        smoothed: Float,
+        twin: Twin,
         truth: PlantRecord | None,
         timing: tuple[TurnTiming, ...] = (),
         *,
         resumed_at: int = 0,
         first_turn: int = 0,
     ) -> Flight:
-        """Return the turns as arrays, see `Flight`."""
+        """Return the turns as arrays, see `Flight`; the twin has kept all of them."""
+        count = len(self.observed)
         return Flight(
             observed=np.array(self.observed),
             control_index=np.array(self.control_index, dtype=np.int64),
             filtered=np.array(self.filtered),
             log_evidence=np.array(self.log_evidence),
-            smoothed=smoothed,
+            smoothed=twin.smoothed()[-count:],
             predicted=np.array(self.predicted),
             decision_probability=np.array(self.decision_probability),
             truth=truth,
@@ -317,6 +325,7 @@ class Beliefs:
             notices=tuple(self.notices),
             learnt_names=self.learnt_names,
             learnt=np.array(self.learnt).reshape(len(self.learnt), len(self.learnt_names), 4),
+            carried=twin.carried[-count:] if self.learnt_names else (),
         )
 
 

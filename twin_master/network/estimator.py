@@ -5,7 +5,7 @@ estimate and is given back for the next: a twin that keeps them can smooth over 
 came late, and be stored and continued to the last bit.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -141,6 +141,9 @@ class Estimate:
         What the operator should know of this turn.
     suspicion : Suspicion or None
         How well the model explains the sensors, where that is watched.
+    expected : callable or None
+        Returns for each sensor the mean of what it shows and the standard deviation of its noise, (G,) each,
+        where the estimator knows more of the sensors than their model.
     """
 
     forecast: Float
@@ -150,6 +153,7 @@ class Estimate:
     learnt: Mapping[str, Learnt] = field(default_factory=dict)
     notices: tuple[Notice, ...] = ()
     suspicion: Suspicion | None = None
+    expected: Callable[[], tuple[Float, Float]] | None = None
 
 
 class Estimator(Protocol):

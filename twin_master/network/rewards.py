@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
 
 from twin_master.errors import InvalidModelError
 from twin_master.network.quantity import QuantityModel
@@ -23,6 +24,7 @@ __all__ = [
 ]
 
 Float = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 
 def health_reward(value: ArrayLike, limit: ArrayLike) -> Float:
@@ -64,6 +66,23 @@ def error_reward(
         count > 0, -total / np.maximum(count, 1) / (np.asarray(scale) * np.asarray(normaliser)), np.nan
     )
     return result
+
+
+def _folded_error(observation: Float, shown: Float, variance: Float, scale: Float) -> tuple[Float, Float]:
+    """Return mean and variance of the error reward where the sensors are independently normal.
+
+    The distance of a normal variable from a point has a folded normal distribution. observation is (G,),
+    shown and variance are (..., G), scale is broadcast against them.
+    """
+    seen = ~np.isnan(observation)
+    distance, squared = np.abs(observation - shown)[..., seen], variance[..., seen]
+    deviation = np.sqrt(squared)
+    share = np.divide(distance, deviation, out=np.full_like(distance, np.inf), where=deviation > 0.0)
+    folded = distance * (1.0 - 2.0 * ndtr(-share))
+    folded += deviation * np.sqrt(2.0 / np.pi) * np.exp(-0.5 * share**2)
+    unit = 1.0 / (np.broadcast_to(scale, shown.shape)[..., seen] * seen.sum())
+    left = np.maximum(distance**2 + squared - folded**2, 0.0)
+    return -(folded * unit).sum(axis=-1), (left * unit**2).sum(axis=-1)
 
 
 @dataclass(frozen=True)
@@ -211,6 +230,43 @@ class RewardModel:
             for row, seen in enumerate(observation.reshape(-1, quantity.sensor_count)):
                 mean[row, 2], variance[row, 2] = self._error_moments(flat[row], seen)
         return RewardExpectation(mean.reshape(*lead, 3), np.sqrt(variance).reshape(*lead, 3))
+
+    def expectation_of(
+        self,
+        weight: Float,
+        draw: Index,
+        controls: slice,
+        shown: Float,
+        variance: Float,
+        observation: Float | None = None,
+    ) -> RewardExpectation:
+        """Return mean and standard deviation (B, 3) under beliefs over hypotheses, states and controls.
+
+        Parameters
+        ----------
+        weight : (B, K, S, U')
+            Probabilities, which sum to one.
+        draw : (K,)
+            Draw of the parameter of each hypothesis.
+        controls : slice
+            Which of the controls the U' are.
+        shown, variance : (K, S, U', G)
+            What each sensor shows there without noise, independently normal, SI.
+        observation : (G,), optional
+            SI, NaN for a lost sensor; without it the error reward is NaN.
+        """
+        mean = np.full((3, *shown.shape[:-1]), np.nan)
+        within = np.zeros_like(mean)
+        mean[0], mean[1] = self.health_per_draw[draw][:, :, controls], self._control_reward[controls]
+        if observation is not None and not np.isnan(observation).all():
+            scale = np.asarray(self.settings.error_scale) * self._normaliser[controls, None]
+            mean[2], within[2] = _folded_error(observation, shown, variance, scale)
+        whole = np.einsum("bksu,rksu->br", weight, mean)
+        spread = np.einsum("bksu,rksu->br", weight, within)
+        for b in range(len(weight)):
+            squared = (mean - whole[b, :, None, None, None]) ** 2
+            spread[b] += np.einsum("ksu,rksu->r", weight[b], squared)
+        return RewardExpectation(whole, np.sqrt(spread))
 
     def _error_moments(self, weight: Float, observation: Float) -> tuple[float, float]:
         """Return mean and variance of the error reward under one joint belief (S, U)."""

@@ -115,6 +115,9 @@ class TwinTurn:
         What the operator should know.
     suspicion : Suspicion or None
         How well the model explains the sensors, where that is watched.
+    expected : callable or None
+        Returns for each sensor the mean of what it shows and the standard deviation of its noise, (G,) each,
+        where the estimator knows more of the sensors than their model.
     """
 
     turn: int
@@ -127,6 +130,7 @@ class TwinTurn:
     learnt: Mapping[str, Learnt] = field(default_factory=dict)
     notices: tuple[Notice, ...] = ()
     suspicion: Suspicion | None = None
+    expected: Callable[[], tuple[Float, Float]] | None = None
 
 
 @dataclass(frozen=True)
@@ -310,7 +314,12 @@ class Twin:
 
         The decision does not need it, and after each turn it would cost as many steps as are kept.
         """
-        return self.estimator.smoothed([seen.estimate for seen in self._recent()])
+        return self.estimator.smoothed(self.carried)
+
+    @property
+    def carried(self) -> tuple[Carried, ...]:
+        """What the estimator carried on from the turns `first_kept`..t."""
+        return tuple(seen.estimate for seen in self._recent())
 
     def save_state(self) -> bytes:
         """Return all that the twin has seen and keeps, for `restore_state`."""
@@ -383,4 +392,5 @@ class Twin:
             learnt=estimate.learnt,
             notices=estimate.notices,
             suspicion=estimate.suspicion,
+            expected=estimate.expected,
         )

@@ -81,13 +81,14 @@ def assumed_model_error(record: RunRecord) -> Float | None:
 
 def predictive_check(record: RunRecord) -> PredictiveCheck | None:
     """Compare observations with their posterior predictive distribution; None if something is missing."""
-    noise, quantity = assumed_noise(record), record.filtered.quantity
+    learnt, quantity = record.learnt_noise, record.filtered.quantity
+    noise = assumed_noise(record) if learnt is None else learnt
     if record.observation is None or quantity is None or noise is None:
         return None
     spread = record.filtered.quantity_standard_deviation
     total = np.hypot(noise, 0.0 if spread is None else spread)
     error = assumed_model_error(record)
-    if error is not None:
+    if error is not None and learnt is None:  # which has it
         total = np.hypot(total, error * quantity.mean)
     residual = (record.observation - quantity.mean) / total
     known = np.isfinite(residual)

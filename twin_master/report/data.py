@@ -153,6 +153,8 @@ class RunRecord:
         What was learnt; empty where nothing is.
     first_step : int
         Number of the first step.
+    learnt_noise : (T, G) or None
+        Standard deviation of noise and model error as learnt; None where it is the assumed one.
     """
 
     state_names: tuple[str, ...]
@@ -188,6 +190,7 @@ class RunRecord:
     parameter_unit: str = "1"
     learnt: tuple[LearntCourse, ...] = ()
     first_step: int = 0
+    learnt_noise: Float | None = None
 
     @property
     def step_word(self) -> str:

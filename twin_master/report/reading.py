@@ -202,11 +202,8 @@ def _record(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], fol
         raise ValueError("the variable filtered/probability is missing")
     policy_group, truth, draws_group = (groups.get(name) for name in ("policy", "truth", "calibration"))
     chosen = _array(policy_group, "control_index", "state")
-    policy = None
-    if chosen is not None:
-        policy = PolicyTable(
-            chosen.astype(np.int64), _array(policy_group, "action_value", "state", "control")
-        )
+    value = _array(policy_group, "action_value", "state", "control")
+    policy = None if chosen is None else PolicyTable(chosen.astype(np.int64), value)
     sensor_count = 0 if observation is None else observation.shape[1]
     sensors = np.asarray([int(name) for name in _names(groups, "sensor", sensor_count)], dtype=np.int64)
     unit = "1" if observed is None or role not in observed else str(observed[role].attrs.get("units", "1"))
@@ -244,6 +241,7 @@ def _record(groups: Mapping[str, xr.Dataset], attributes: Mapping[str, Any], fol
         parameter_unit=_draw_unit(draws_group),
         learnt=_learnt(groups.get("learnt"), truth),
         first_step=0 if observed is None else int(observed["step"].values[0]),
+        learnt_noise=_array(filtered_group, "noise_standard_deviation", "step", "sensor"),
     )
 
 

@@ -159,7 +159,10 @@ def check_caption(record: RunRecord, check: PredictiveCheck) -> str:
         title = _small(sensor_title(record, lowest))
         sentences.append(f"Lowest coverage: {title}, {100.0 * check.coverage[lowest]:.0f} %.")
     if noise is not None:
-        sentences.append(f"The twin assumes a noise of {_noise(record, noise)}{_model_error(record)}.")
+        learnt = "" if record.learnt_noise is None else ", and stands here by what it has learnt of it"
+        sentences.append(
+            f"The twin assumes a noise of {_noise(record, noise)}{_model_error(record)}{learnt}."
+        )
     return " ".join(sentences)
 
 

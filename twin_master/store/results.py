@@ -1,96 +1,20 @@
 """A flown mission as labelled arrays: what was observed, believed, predicted, decided, and true."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from twin_master.learning.setup import prior_of_learnt
-from twin_master.mission.loop import Flight
+from twin_master.learning.expectation import Expected
 from twin_master.mission.truth import SensorStatus, Truth
-from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import known_control
-from twin_master.network.planner import PlannedPolicy
-from twin_master.network.rewards import REWARD_NAMES, RewardModel
-from twin_master.network.sensor_model import GaussianSensorModel
-from twin_master.scenario.schema import Scenario
-from twin_master.store.learnt import MOMENTS, LearntQuantity, learnt_quantities
+from twin_master.network.rewards import REWARD_NAMES
+from twin_master.store.learnt import MOMENTS
+from twin_master.store.mission_result import SEVERAL_UNITS, MissionResult
 
 Float = NDArray[np.float64]
-
-SEVERAL_UNITS = "see sensor_unit"
-"""Unit of a variable over sensors of different units."""
-
-
-@dataclass(frozen=True)
-class MissionResult:
-    """Everything that a mission made, before it is stored.
-
-    Attributes
-    ----------
-    scenario : Scenario
-        What was flown.
-    model : GraphicalModel
-        S states, U controls.
-    sensor_model : GaussianSensorModel
-        The twin's predicted observations for each draw of the parameter, and their noise.
-    draws : (E,)
-        Draws of the uncertain parameter.
-    rewards : RewardModel
-        Rewards by state and control.
-    plan : PlannedPolicy
-        Value iteration.
-    truth : Truth or None
-        What the sensors really did; None where nobody knows.
-    flight : Flight
-        The mission.
-    units : dict of str to str
-        Units of control inputs, monitors and parameters; those that are missing are dimensionless.
-    """
-
-    scenario: Scenario
-    model: GraphicalModel
-    sensor_model: GaussianSensorModel
-    draws: Float
-    rewards: RewardModel
-    plan: PlannedPolicy
-    truth: Truth | None
-    flight: Flight
-    units: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def state_unit(self) -> str:
-        """Unit of the state factors; a list where they have several."""
-        return ", ".join(dict.fromkeys(factor.unit for factor in self.scenario.state))
-
-    @property
-    def observation_unit(self) -> str:
-        """Unit of the observed values; where they have several, each sensor has its own, `sensor_unit`."""
-        units = dict.fromkeys(self.scenario.observation.sensor_units)
-        return next(iter(units)) if len(units) == 1 else SEVERAL_UNITS
-
-    @property
-    def parameter_unit(self) -> str:
-        """Unit of the uncertain parameter."""
-        return self.units.get(self.scenario.calibration.parameter, "1")
-
-    @cached_property
-    def learnt(self) -> tuple[LearntQuantity, ...]:
-        """What was learnt; empty where nothing is."""
-        if not self.flight.learnt_names:
-            return ()
-        return learnt_quantities(
-            self.scenario,
-            self.flight.learnt_names,
-            self.flight.learnt,
-            prior_of_learnt(self.scenario, self.model, self.sensor_model, self.draws),
-            {self.scenario.calibration.parameter: self.parameter_unit, "gauge_offset": self.observation_unit},
-            simulated=self.truth is not None,
-        )
 
 
 def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.DataTree:
@@ -206,13 +130,22 @@ def _observed(result: MissionResult, labels: _Labels) -> xr.Dataset:
     return labels.dataset(variables)
 
 
-def _belief(
-    result: MissionResult, lead: tuple[str, ...], probability: Float, joint: Float, given: str
-) -> dict[str, Variable]:
-    """Return belief, its moments and the quantities of interest; `given` says what the belief is given."""
-    states = result.model.states
+def _expected(result: MissionResult, joint: Float, observed: Float | None) -> Expected:
+    """Return what beliefs (..., S, U) say of sensors and rewards where nothing is learnt."""
     mean, deviation = result.sensor_model.moments(joint)
     quantiles = result.sensor_model.quantiles(joint, (0.025, 0.975))
+    rewards = result.rewards.expectation(joint, observed)
+    return Expected(
+        mean, deviation, quantiles[..., 0, :], quantiles[..., 1, :], result.sensor_model.noise(joint),
+        rewards.mean, rewards.standard_deviation,
+    )  # fmt: skip
+
+
+def _belief(
+    result: MissionResult, lead: tuple[str, ...], probability: Float, expected: Expected, given: str
+) -> dict[str, Variable]:
+    """Return belief, moments, quantities of interest and rewards; `given` says what the belief is given."""
+    states = result.model.states
     role, unit = result.scenario.observation.role, result.observation_unit
     sensor = (*lead, "sensor")
     return {
@@ -229,28 +162,19 @@ def _belief(
             result.state_unit,
             f"standard deviation of each factor given {given}",
         ),
-        "quantity_mean": (sensor, mean, unit, f"mean of the noise-free {role} given {given}"),
+        "quantity_mean": (sensor, expected.mean, unit, f"mean of the noise-free {role} given {given}"),
         "quantity_standard_deviation": (
             sensor,
-            deviation,
+            expected.standard_deviation,
             unit,
             f"standard deviation of the noise-free {role} given {given}",
         ),
-        "quantity_lower": (sensor, quantiles[..., 0, :], unit, f"2.5 % quantile of the noise-free {role}"),
-        "quantity_upper": (sensor, quantiles[..., 1, :], unit, f"97.5 % quantile of the noise-free {role}"),
-    }
-
-
-def _rewards(
-    result: MissionResult, lead: tuple[str, ...], joint: Float, observed: Float | None
-) -> dict[str, Variable]:
-    expected = result.rewards.expectation(joint, observed)
-    dims = (*lead, "reward")
-    return {
-        "reward_mean": (dims, expected.mean, "1", "mean of each reward, eqs. (9)-(11)"),
+        "quantity_lower": (sensor, expected.lower, unit, f"2.5 % quantile of the noise-free {role}"),
+        "quantity_upper": (sensor, expected.upper, unit, f"97.5 % quantile of the noise-free {role}"),
+        "reward_mean": ((*lead, "reward"), expected.reward_mean, "1", "mean of each reward, eqs. (9)-(11)"),
         "reward_standard_deviation": (
-            dims,
-            expected.standard_deviation,
+            (*lead, "reward"),
+            expected.reward_standard_deviation,
             "1",
             "standard deviation of each reward",
         ),
@@ -265,10 +189,20 @@ _DECIDED_ON = {
 
 def _filtered(result: MissionResult, labels: _Labels) -> xr.Dataset:
     flight = result.flight
-    joint = known_control(flight.filtered, flight.control_index, len(result.model.controls))
-    variables = _belief(result, ("step",), flight.filtered, joint, "observations up to the step")
-    variables |= _rewards(result, ("step",), joint, flight.observed)
-    residual = (flight.observed - variables["quantity_mean"][1]) / result.sensor_model.noise(joint)
+    if result.expectation is None:
+        joint = known_control(flight.filtered, flight.control_index, len(result.model.controls))
+        expected, how = _expected(result, joint, flight.observed), "that the twin assumes"
+    else:
+        expected = result.expectation.filtered(flight.carried, flight.observed)
+        how = "that the twin has learnt"
+    variables = _belief(result, ("step",), flight.filtered, expected, "observations up to the step")
+    if result.expectation is not None:
+        variables["noise_standard_deviation"] = (
+            ("step", "sensor"),
+            expected.noise,
+            result.observation_unit,
+            "standard deviation of noise and model error of each sensor as learnt",
+        )
     variables |= {
         "decision_probability": (
             ("step", "control"),
@@ -280,9 +214,9 @@ def _filtered(result: MissionResult, labels: _Labels) -> xr.Dataset:
         "log_evidence": (("step",), flight.log_evidence, "1", "log p(observation | earlier observations)"),
         "residual": (
             ("step", "sensor"),
-            residual,
+            (flight.observed - expected.mean) / expected.noise,
             "1",
-            "observation less its filtered mean, in the standard deviations that the twin assumes",
+            f"observation less its filtered mean, in the standard deviations {how}",
         ),
         "sensors_received": (
             ("step",),
@@ -296,10 +230,12 @@ def _filtered(result: MissionResult, labels: _Labels) -> xr.Dataset:
 
 def _smoothed(result: MissionResult, labels: _Labels) -> xr.Dataset:
     flight = result.flight
-    joint = known_control(flight.smoothed, flight.control_index, len(result.model.controls))
-    variables = _belief(result, ("step",), flight.smoothed, joint, "all observations")
-    variables |= _rewards(result, ("step",), joint, flight.observed)
-    return labels.dataset(variables)
+    if result.expectation is None:
+        joint = known_control(flight.smoothed, flight.control_index, len(result.model.controls))
+        expected = _expected(result, joint, flight.observed)
+    else:
+        expected = result.expectation.smoothed(flight.carried, flight.observed)
+    return labels.dataset(_belief(result, ("step",), flight.smoothed, expected, "all observations"))
 
 
 def _predicted(result: MissionResult, labels: _Labels) -> xr.Dataset:
@@ -307,8 +243,11 @@ def _predicted(result: MissionResult, labels: _Labels) -> xr.Dataset:
     lead = ("step", "horizon")
     joint = flight.predicted[..., :, None] * result.plan.policy  # (T, H, S, U), eqs. (37)-(39)
     given = "observations up to the step, through the policy"
-    variables = _belief(result, lead, flight.predicted, joint, given)
-    variables |= _rewards(result, lead, joint, None)
+    if result.expectation is None:
+        expected = _expected(result, joint, None)
+    else:
+        expected = result.expectation.predicted(flight.carried, flight.predicted.shape[1])
+    variables = _belief(result, lead, flight.predicted, expected, given)
     variables["control_probability"] = (
         (*lead, "control"),
         joint.sum(axis=-2),

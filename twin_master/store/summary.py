@@ -15,7 +15,7 @@ from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.rewards import REWARD_NAMES
 from twin_master.scenario.schema import FALLBACK_FIGURES, MISFIT_FIGURES, NOTICE_FIGURES, Reference
 from twin_master.store.learnt import printed_learnt
-from twin_master.store.results import MissionResult
+from twin_master.store.mission_result import MissionResult
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]

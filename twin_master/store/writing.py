@@ -12,7 +12,8 @@ from reporting.errors import DamagedFileError
 from reporting.files import atomic_file, atomic_write_text
 from reporting.netcdf import read_groups
 from twin_master.run_folder import FIELD_NAME, to_json
-from twin_master.store.results import MissionResult, to_datatree
+from twin_master.store.mission_result import MissionResult
+from twin_master.store.results import to_datatree
 from twin_master.store.summary import Figure, to_record
 from twin_master.store.tables import tables_of
 

@@ -41,14 +41,19 @@ def decision_of(
 
 
 def gap_of(beliefs: Beliefs, skipped: int, sensors: GaussianSensorModel) -> dict[str, Any]:
-    """Return root mean square residual and log evidence of the turns behind `skipped`; None without any."""
+    """Return root mean square residual and log evidence of the turns behind `skipped`; None without any.
+
+    The residuals are in standard deviations of the noise that is assumed, or learnt where the twin learns.
+    """
     observed = np.array(beliefs.observed[skipped:])
     if not len(observed) or np.isnan(observed).all():
         return {"rms_residual": None, "log_evidence": None}
-    joint = known_control(
-        np.array(beliefs.filtered[skipped:]), np.array(beliefs.control_index[skipped:]), sensors.control_count
-    )
-    residual = (observed - sensors.moments(joint)[0]) / sensors.noise(joint)
+    if beliefs.residual:
+        residual = np.array(beliefs.residual[skipped:])
+    else:
+        filtered, control = np.array(beliefs.filtered[skipped:]), np.array(beliefs.control_index[skipped:])
+        joint = known_control(filtered, control, sensors.control_count)
+        residual = (observed - sensors.moments(joint)[0]) / sensors.noise(joint)
     return {
         "rms_residual": float(np.sqrt(np.nanmean(residual**2))),
         "log_evidence": float(np.sum(beliefs.log_evidence[skipped:])),

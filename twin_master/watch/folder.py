@@ -51,7 +51,7 @@ from twin_master.run_folder import (
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.learnt import learnt_record
-from twin_master.store.results import MissionResult
+from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure, control_changes, noticed, summarise
 from twin_master.store.writing import store_mission, values_of, write_summary
 from twin_master.watch.decision import decision_of, gap_of
@@ -204,9 +204,7 @@ class Watch:
             return
         first = max(0, turns - last)
         found = self._replayed(first, lag=False)
-        flight = found.beliefs.flight(
-            found.twin.smoothed()[-(turns - found.first_turn) :], None, first_turn=found.first_turn
-        )
+        flight = found.beliefs.flight(found.twin, None, first_turn=found.first_turn)
         knowledge, mission = self.models[-1].knowledge, self.scenario.mission
         result = MissionResult(
             scenario=self.scenario, model=knowledge.model, sensor_model=knowledge.sensor_model,

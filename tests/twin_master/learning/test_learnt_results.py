@@ -14,10 +14,13 @@ from typer.testing import CliRunner
 
 from scenarios import scenario_files
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.loop import Beliefs
+from twin_master.mission.preparation import prepare_twin
 from twin_master.report.learnt import learnt_figure, learnt_tables
 from twin_master.report.page import render_page
 from twin_master.report.reading import open_run, read_run
 from twin_master.scenario.reading import load_scenario
+from twin_master.watch.decision import gap_of
 from twin_master.workflow import resume_run
 from uav_twin.cli import app
 
@@ -144,6 +147,34 @@ def test_the_report_draws_and_lists_what_was_learnt(folder: Path, learnt: xr.Dat
     text = render_page(record, [])
     assert "young modulus factor learnt (truth 0.95)" in text
     assert "posterior mean of the young" not in text
+
+
+def test_what_the_gauges_are_expected_to_show_is_what_was_learnt(
+    run: xr.DataTree, learnt: xr.Dataset
+) -> None:
+    filtered = run["filtered"].to_dataset()
+    noise = 1e6 * filtered["noise_standard_deviation"].values
+    np.testing.assert_allclose(noise, 125 * learnt["noise_scale_mean"].values, rtol=0.05)
+    residual = (run["observed"]["strain"] - filtered["quantity_mean"]) / filtered["noise_standard_deviation"]
+    np.testing.assert_allclose(residual.values, filtered["residual"].values)
+    # By then 0.95 is known, so that more strain is expected than by the calibration, whose mean is 1.
+    shown = filtered["quantity_mean"].values[-1] / run["truth"]["strain"].values[-1]
+    assert np.median(shown) == pytest.approx(1.0, abs=0.02)
+    assert (filtered["quantity_lower"] < filtered["quantity_mean"]).all()
+    assert (filtered["quantity_mean"] < filtered["quantity_upper"]).all()
+    ahead = run["predicted"]["quantity_mean"].values[-1, 0] / filtered["quantity_mean"].values[-1]
+    assert np.median(ahead) == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_gap_of_a_model_is_that_of_what_was_learnt(scenario: Path, run: xr.DataTree) -> None:
+    knowledge = prepare_twin(str(scenario))
+    twin, beliefs = knowledge.twin(), Beliefs()
+    observed = run["observed"].to_dataset()
+    for row, control in zip(observed["strain"].values, observed["control_index"].values, strict=True):
+        beliefs.add(row, twin.turn(row, int(control)))
+    gap = gap_of(beliefs, 4, knowledge.sensor_model)
+    residual = run["filtered"]["residual"].values[4:]
+    assert gap["rms_residual"] == pytest.approx(np.sqrt(np.mean(residual**2)))
 
 
 def test_a_run_that_was_cut_off_learns_the_same(folder: Path) -> None:

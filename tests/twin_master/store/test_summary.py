@@ -16,7 +16,7 @@ from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Reference
-from twin_master.store.results import MissionResult
+from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import control_changes, filtered_rms_error, find_fallback, summarise
 
 MODEL = build_graphical_model(load_scenario("level_turns").scenario)

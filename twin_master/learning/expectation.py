@@ -1,0 +1,144 @@
+"""What the sensors are expected to show, and the rewards, under the belief of a learning filter.
+
+The belief is that over states and static hypotheses together, so that what the data tell of a parameter and
+of the damage in common stays in it. Moments are exact; quantiles take what a sensor shows for normal given
+the state.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin_master.learning.hypotheses import Hypotheses, quantiles_of, shown_by
+from twin_master.learning.learning_filter import LearningFilter
+from twin_master.network.estimator import Carried
+from twin_master.network.rewards import RewardModel
+
+__all__ = ["Expected", "LearntExpectation"]
+
+Float = NDArray[np.float64]
+
+_LEVELS = np.array([0.025, 0.975])
+_NEGLIGIBLE = 1e-9
+"""Share of a belief below which a state tells nothing of the quantiles."""
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What beliefs say of the G sensors and of the rewards; the leading axes are those of the beliefs.
+
+    Attributes
+    ----------
+    mean, standard_deviation, lower, upper : (..., G)
+        Of what is shown without noise, SI; the last two are the quantiles of 2.5 and 97.5 %.
+    noise : (..., G)
+        Standard deviation of noise and model error, SI.
+    reward_mean, reward_standard_deviation : (..., 3)
+        In the order of `REWARD_NAMES`.
+    """
+
+    mean: Float
+    standard_deviation: Float
+    lower: Float
+    upper: Float
+    noise: Float
+    reward_mean: Float
+    reward_standard_deviation: Float
+
+
+class LearntExpectation:
+    """Expectations of a learning filter.
+
+    Parameters
+    ----------
+    learning : LearningFilter
+    rewards : RewardModel
+    policy : (S, U)
+        p(U | D), which is predicted through.
+    """
+
+    def __init__(self, learning: LearningFilter, rewards: RewardModel, policy: Float) -> None:
+        self._learning, self._rewards, self._policy = learning, rewards, policy
+        self._value = learning.sensor_model.value_per_draw
+        self._deviation = learning.sensor_model.total_standard_deviation
+
+    def filtered(self, carried: Sequence[Carried], observed: Float) -> Expected:
+        """Return what is expected of T turns given the observations up to each; observed is (T, G)."""
+        rows = zip(carried, observed, strict=True)
+        return _stacked(self._known(self._counting(turn), turn, seen) for turn, seen in rows)
+
+    def smoothed(self, carried: Sequence[Carried], observed: Float) -> Expected:
+        """Return what is expected of T turns given all observations; observed is (T, G)."""
+        last = self._learning.hypotheses(carried[-1])
+        rows = zip(self._learning.smoothed_hypotheses(carried), carried, observed, strict=True)
+        return _stacked(self._known(last.counting(weight), turn, seen) for weight, turn, seen in rows)
+
+    def predicted(self, carried: Sequence[Carried], horizon: int) -> Expected:
+        """Return what is expected after each of T turns of the H turns to come."""
+        return _stacked(self._ahead(turn, horizon) for turn in carried)
+
+    @cached_property
+    def _closed_loop(self) -> Float:
+        """p(D' | D) under the policy: (S, S)."""
+        matrix = self._learning.model.transition.matrix
+        return np.asarray(np.einsum("su,usn->sn", self._policy, matrix))
+
+    def _counting(self, turn: Carried) -> Hypotheses:
+        found = self._learning.hypotheses(turn)
+        return found.counting(found.weight)
+
+    def _known(self, hypotheses: Hypotheses, turn: Carried, seen: Float) -> Expected:
+        u = slice(turn.control_index, turn.control_index + 1)
+        found = self._of(hypotheses, hypotheses.weight[None, :, :, None], u, seen)
+        return Expected(**{name: values[0] for name, values in vars(found).items()})
+
+    def _ahead(self, turn: Carried, horizon: int) -> Expected:
+        hypotheses = self._counting(turn)
+        rows, coming = hypotheses.weight, np.empty((horizon, *hypotheses.weight.shape))
+        step = self._learning.model.transition.matrix[turn.control_index]
+        for h in range(horizon):
+            rows, step = rows @ step, self._closed_loop
+            coming[h] = rows
+        return self._of(hypotheses, coming[..., None] * self._policy, slice(None), None)
+
+    def _of(self, hypotheses: Hypotheses, weight: Float, controls: slice, seen: Float | None) -> Expected:
+        """Return what is expected under B beliefs (B, K, S, U') over hypotheses, states and controls."""
+        weight = weight / weight.sum(axis=(1, 2, 3), keepdims=True)
+        shown = shown_by(hypotheses, self._value[:, :, controls], self._deviation[:, controls])
+        beliefs, count = len(weight), shown.mean.shape[-1]
+        flat = weight.reshape(beliefs, -1)
+        center = shown.mean[0].mean(axis=(0, 1))  # near enough that squares do not cancel
+        first = shown.mean - center
+        second = shown.variance + first**2
+        by_state = weight.sum(axis=1).reshape(beliefs, -1)
+        means = np.einsum("bksu,ksug->bsug", weight, first).reshape(beliefs, -1, count)
+        squares = np.einsum("bksu,ksug->bsug", weight, second).reshape(beliefs, -1, count)
+        mean = means.sum(axis=1)
+        deviation = np.sqrt(np.maximum(squares.sum(axis=1) - mean**2, 0.0))
+        noise = np.sqrt(flat @ np.broadcast_to(shown.noise2, shown.mean.shape).reshape(-1, count))
+        quantiles = np.empty((beliefs, 2, count))
+        for b in range(beliefs):
+            kept = np.flatnonzero(by_state[b] > _NEGLIGIBLE)
+            share = by_state[b, kept]
+            own = means[b, kept] / share[:, None]
+            wide = np.sqrt(np.maximum(squares[b, kept] / share[:, None] - own**2, 0.0))
+            quantiles_of(
+                share / share.sum(), np.ascontiguousarray(own.T), np.ascontiguousarray(wide.T), mean[b],
+                deviation[b], _LEVELS, quantiles[b],
+            )  # fmt: skip
+        rewards = self._rewards.expectation_of(
+            weight, hypotheses.draw, controls, shown.mean, shown.variance, seen
+        )
+        return Expected(
+            mean + center, deviation, quantiles[:, 0] + center, quantiles[:, 1] + center, noise,
+            rewards.mean, rewards.standard_deviation,
+        )  # fmt: skip
+
+
+def _stacked(parts: Iterable[Expected]) -> Expected:
+    """Return what is expected of several turns, which become the leading axis."""
+    found = [vars(part) for part in parts]
+    return Expected(**{name: np.array([part[name] for part in found]) for name in found[0]})
