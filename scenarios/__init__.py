@@ -9,6 +9,7 @@ SCENARIO_FOLDER = Path(str(resources.files(__name__)))
 BINDING_FOLDER = SCENARIO_FOLDER / "bindings"
 ASSET_FOLDER = SCENARIO_FOLDER / "assets"
 RECORDING_FOLDER = SCENARIO_FOLDER / "recordings"
+STRUCTURE_FOLDER = SCENARIO_FOLDER / "structures"
 
 
 def scenario_files() -> dict[str, Path]:
@@ -29,3 +30,8 @@ def asset_scripts() -> dict[str, Path]:
 def recording_files() -> dict[str, Path]:
     """Return the shipped recordings of observations by name, in alphabetical order."""
     return {path.stem: path for path in sorted(RECORDING_FOLDER.glob("*.csv"))}
+
+
+def structure_files() -> dict[str, Path]:
+    """Return the shipped structures by name, in alphabetical order; their meshes lie beside them."""
+    return {path.stem: path for path in sorted(STRUCTURE_FOLDER.glob("*.toml"))}

@@ -10,6 +10,7 @@ import typer
 from reporting import terminal
 from uav_twin.console_table import console_table
 from uav_twin.structure_arguments import File, MemoryLimit, assembled
+from uav_twin.structure_field import field
 from uav_twin.structure_fmu import fmu
 from uav_twin.structure_reduce import reduce
 
@@ -215,3 +216,4 @@ def _differences(agreement: "StructureAgreement") -> Iterator[tuple[str, str, fl
 
 structure_app.command("reduce")(reduce)
 structure_app.command("fmu")(fmu)
+structure_app.command("field")(field)

@@ -23,7 +23,7 @@ def fmu(
 ) -> None:
     """Pack the reduced model of a structure as an FMI 2.0 FMU; equal input gives equal bytes."""
     from fmu_asset.packing.contents import checked_target
-    from fmu_asset.structures.binding import structure_binding_text
+    from fmu_asset.structures.binding import names_of_model, structure_binding_text
     from fmu_asset.structures.build import build_structure_fmu
     from reporting.errors import FileNotWrittenError
     from reporting.files import atomic_write_text
@@ -35,5 +35,5 @@ def fmu(
     info = build_structure_fmu(model, target, replace=replace)
     terminal.say(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
     if binding is not None:
-        atomic_write_text(binding, structure_binding_text(model))
+        atomic_write_text(binding, structure_binding_text(names_of_model(model)))
         terminal.say(f"{binding}: its binding")

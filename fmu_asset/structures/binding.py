@@ -1,48 +1,94 @@
 """The binding of a structure's FMU, which follows from its names."""
 
 import json
+from collections.abc import Mapping
+from typing import NamedTuple
 
 from fe.runtime.structure_model import StructureModel
+from fe.structure.design import StructureDesign
 from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.errors import BindingError
 from reporting.toml_file import parse_toml
 
 
-def structure_binding_text(model: StructureModel) -> str:
-    """Return the binding file of a structure's FMU: controls, health, parameters, observations, monitors."""
-    tables: list[str] = [
-        f"[binding]\nname = {json.dumps(model.name)}\nstep_size = 1.0 # s; no matter where quasi-static\n"
-    ]
+class StructureNames(NamedTuple):
+    """Names of all that a structure's FMU takes and gives; controls with their units."""
+
+    name: str
+    controls: Mapping[str, str]
+    regions: tuple[str, ...]
+    parameters: tuple[str, ...]
+    masses: tuple[str, ...]
+    gauges: tuple[str, ...]
+    displacements: tuple[str, ...]
+    accelerations: tuple[str, ...]
+
+
+def names_of_model(model: StructureModel) -> StructureNames:
+    """Return the names of a reduced structure."""
+    return StructureNames(
+        model.name,
+        dict(zip(model.controls, model.control_units.split(), strict=True)),
+        model.regions,
+        model.parameters,
+        model.masses,
+        model.gauges,
+        model.displacements,
+        model.accelerations,
+    )
+
+
+def names_of_design(design: StructureDesign) -> StructureNames:
+    """Return the names that the reduced model of a structure file will have."""
+    return StructureNames(
+        design.name,
+        {part.name: part.unit for part in design.control},
+        tuple(part.name for part in design.damage),
+        tuple(part.name for part in design.parameter),
+        tuple(part.name for part in design.mass if part.free),
+        tuple(part.name for part in design.gauge),
+        tuple(part.name for part in design.displacement),
+        tuple(part.name for part in design.acceleration),
+    )
+
+
+def structure_binding_text(names: StructureNames) -> str:
+    """Return the binding file of a structure's FMU: control, health, parameters, observations, monitors."""
+    title = json.dumps(names.name)
+    tables = [f"[binding]\nname = {title}\nstep_size = 1.0 # s; no matter where quasi-static\n"]
 
     def scalar(role: str, name: str, variable: str, unit: str) -> None:
         tables.append(f'[{role}.{name}]\nvariable = "{variable}"\nunit = {json.dumps(unit)}\n')
 
-    for name, unit in zip(model.controls, model.control_units.split(), strict=True):
+    for name, unit in names.controls.items():
         scalar("control", name, name, unit)
-    for name in model.regions:
+    for name in names.regions:
         scalar("health", name, f"health.{name}", "1")
-    for name in model.parameters:
+    for name in names.parameters:
         scalar("parameter", name, name, "1")
-    for name in model.masses:
+    for name in names.masses:
         scalar("parameter", name, f"mass.{name}", "kg")
-    scalar("parameter", "damping_alpha", "damping.alpha", "1/s")
-    scalar("parameter", "damping_beta", "damping.beta", "s")
-    scalar("parameter", "response", "response", "1")
-    for role, names, unit in (
-        ("strain", model.gauges, "1"),
-        ("displacement", model.displacements, "m"),
-        ("acceleration", model.accelerations, "m/s2"),
+    for name, variable, unit in (
+        ("damping_alpha", "damping.alpha", "1/s"),
+        ("damping_beta", "damping.beta", "s"),
+        ("response", "response", "1"),
     ):
-        if names:
-            variables = json.dumps([f"{role}.{name}" for name in names])
+        scalar("parameter", name, variable, unit)
+    for role, outputs, unit in (
+        ("strain", names.gauges, "1"),
+        ("displacement", names.displacements, "m"),
+        ("acceleration", names.accelerations, "m/s2"),
+    ):
+        if outputs:
+            variables = json.dumps([f"{role}.{name}" for name in outputs])
             tables.append(f'[observation.{role}]\nvariables = {variables}\nunit = "{unit}"\n')
-    for name, unit in (("strain_error_bound", "1"), ("displacement_error_bound", "m")):
-        if model.gauges if unit == "1" else model.displacements:
-            scalar("monitor", name, name, unit)
+    for what, outputs, unit in (("strain", names.gauges, "1"), ("displacement", names.displacements, "m")):
+        if outputs:
+            scalar("monitor", f"{what}_error_bound", f"{what}_error_bound", unit)
     return "\n".join(tables)
 
 
-def structure_binding(model: StructureModel) -> Binding:
+def structure_binding(names: StructureNames) -> Binding:
     """Return the binding of a structure's FMU."""
-    where = f"the binding of {model.name}"
-    return parse_binding(parse_toml(structure_binding_text(model), where, BindingError), where=where)
+    where = f"the binding of {names.name}"
+    return parse_binding(parse_toml(structure_binding_text(names), where, BindingError), where=where)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from scenarios import asset_scripts, binding_files, recording_files, scenario_files
+from scenarios import asset_scripts, binding_files, recording_files, scenario_files, structure_files
 from twin_master.mission.truth import Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
@@ -13,13 +13,27 @@ from twin_master.scenario.reading import load_scenario
 def test_what_is_shipped() -> None:
     wings = {"level_turns", "growing_damage", "failing_gauges", "model_mismatch", "three_fmus"}
     wings |= {"level_turns_learning"}
-    assert set(scenario_files()) == {*wings, "pump_wear", "watched_wing"}
+    assert set(scenario_files()) == {*wings, "pump_wear", "watched_wing", "bracket", "stiffened_panel"}
     assert set(binding_files()) == {"gear_pump", "three_fmus", "uav_wing", "uav_wing_laboratory"}
     assert set(asset_scripts()) == {"gear_pump"}
     assert load_scenario("watched_wing").scenario.watch.recording == recording_files()["watched_wing"]
 
 
-@pytest.mark.parametrize("name", sorted({*scenario_files()} - {"watched_wing"}))
+@pytest.mark.parametrize(
+    ("name", "states", "noise"), [("bracket", 25, (40, 4)), ("stiffened_panel", 64, (40, 6))]
+)
+def test_a_shipped_structure_is_flown_and_believed(name: str, states: int, noise: tuple[int, int]) -> None:
+    scenario = load_scenario(name).scenario
+    for section in (scenario.asset, scenario.belief):
+        assert section.kind == "structure"
+        assert section.model_dump()["structure"] == name
+    assert structure_files()[name].is_file()
+    model = build_graphical_model(scenario)
+    assert model.states.size == states
+    assert Truth(scenario, model, 0).noise.shape == noise
+
+
+@pytest.mark.parametrize("name", sorted({*scenario_files()} - {"watched_wing", *structure_files()}))
 def test_each_scenario_names_a_shipped_binding_and_can_be_flown(name: str) -> None:
     scenario = load_scenario(name).scenario
     assert scenario.asset.kind == "strain_library" or scenario.asset.binding in binding_files()

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import meshio
 import pytest
 
 from fe.verification.calculix_job import calculix_program
@@ -156,3 +157,18 @@ def test_a_structure_is_reduced_and_compared(
     write_beam(tmp_path, {'name = "z1",': 'name = "z1", largest_loss = 2,'})
     assert call(monkeypatch, "reduce", file) != 0
     assert "largest_loss" in capsys.readouterr().err
+
+
+def test_the_field_is_written_for_paraview(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A bar under 20 MPa: 100 microstrain along, none across, half the stiffness gives twice of all."""
+    out = tmp_path / "bar.vtu"
+    assert call(monkeypatch, "field", str(file), "--out", str(out), "--at", "e=0.5") == 0
+    field = meshio.read(out)
+    assert field.cell_data["strain"][0][0] == pytest.approx([2e-4, 0, 0, 0, 0, 0], abs=1e-12)
+    assert field.point_data["displacement"][:, 0].max() == pytest.approx(2e-5, rel=1e-9)
+    assert call(monkeypatch, "field", str(file), "--out", str(out)) != 0
+    assert "exists" in capsys.readouterr().err
+    for words in ("e=stiff", "e", "z9=0.1", "e=nan"):
+        assert call(monkeypatch, "field", str(file), "--out", str(out), "--replace", "--at", words) == 2

@@ -140,7 +140,7 @@ def _change_kind(table: dict[str, Any], kind: str, file: Path) -> None:
             "it out."
         )
     known = AssetSection.kinds()[kind].model_fields
-    kept = {key: value for key, value in table["asset"].items() if key in known}
+    kept = {key: value for key, value in table["asset"].items() if key in known and value != ""}
     table["asset"] = kept | {"kind": kind, "file": str(file.resolve())}
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from twin_master.report.learnt import learnt_caption, learnt_figure, learnt_tabl
 from twin_master.report.mission import mission_figure
 from twin_master.report.network import network_figure
 from twin_master.report.reading import read_run
+from twin_master.report.structure import structure_figure
 from twin_master.report.text import (
     belief_caption,
     check_caption,
@@ -106,7 +108,7 @@ def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
     record = read_run(Path(run_folder))
     folder = Path(run_folder) / FIGURE_FOLDER
     drawings = []
-    for figure in report_figures(record, now):
+    for figure in chain(report_figures(record, now), _structure_picture(Path(run_folder), record.step_word)):
         drawing = to_svg(figure.figure)
         drawings.append(Drawing(figure.name, drawing, figure.title, figure.caption))
         atomic_write_bytes(folder / f"{figure.name}.svg", drawing)
@@ -168,6 +170,18 @@ def report_figures(run: RunRecord | Path | str, now: int | None = None) -> Itera
     yield ReportFigure("network", network_figure(), title, network_caption(record))
 
 
+def _structure_picture(run_folder: Path, step: str) -> Iterator[ReportFigure]:
+    """Draw the structure that was flown, where the run left its field."""
+    field = structure_figure(run_folder)
+    if field is not None:
+        caption = (
+            "Surface of the mesh, coloured by the stiffness that each region has lost by the twin's last "
+            f"estimate; the edges of regions are black. Displacements under the last control are shown "
+            f"{field.scale:.3g} times as large; the largest is {1e3 * field.largest:.3g} mm."
+        )
+        yield ReportFigure("structure", field.figure, f"The structure after the last {step}", caption)
+
+
 def render_page(record: RunRecord, drawings: Sequence[Drawing]) -> str:
     """Return the page: outcome, mission, belief, decision, check, model and run."""
     mission = record.scenario.get("mission")
@@ -186,7 +200,7 @@ def render_page(record: RunRecord, drawings: Sequence[Drawing]) -> str:
         ("What the twin learnt", ("learnt",)),
         ("What the twin decides", ("policy",)),
         ("Whether the data agree", ("check",)),
-        ("The model", ("calibration", "network")),
+        ("The model", ("structure", "calibration", "network")),
     ):
         present = [drawing for drawing in drawings if drawing.name in names]
         if present:

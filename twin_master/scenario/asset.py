@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self
 from pydantic import ModelWrapValidatorHandler, model_validator
 
 from reporting.section import shown
-from scenarios import asset_scripts, binding_files
+from scenarios import asset_scripts, binding_files, structure_files
 from twin_master.scenario.section import Section, short
 
 SHIPPED_DESIGN_NAME = "uav_wing"
@@ -31,7 +31,12 @@ def _shipped_designs() -> dict[str, Path]:
 class FileSection(Section):
     """A table that names files: its own, by their paths, or shipped ones, by their names."""
 
-    shipped: ClassVar = {"binding": binding_files, "design": _shipped_designs, "script": asset_scripts}
+    shipped: ClassVar = {
+        "binding": binding_files,
+        "design": _shipped_designs,
+        "script": asset_scripts,
+        "structure": structure_files,
+    }
 
     def copies(self) -> Mapping[str, str]:
         """Return for each key that names a file where its copy stands in a run folder."""

@@ -14,7 +14,7 @@ from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.check.file import check_file
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError
-from fmu_asset.structures.binding import structure_binding
+from fmu_asset.structures.binding import names_of_model, structure_binding
 from fmu_asset.structures.build import build_structure_fmu, structure_fmu_bytes
 
 
@@ -41,7 +41,7 @@ def _inputs(model: StructureModel, steps: int) -> list[dict[str, float]]:
 def test_every_step_is_that_of_the_model(model: StructureModel, fmu: Path) -> None:
     """Quasi-static: strains, displacements and bounds to 1e-12 of the largest; accelerations are zero."""
     with FmiAsset(
-        fmu, structure_binding(model), parameters={"e": 1.06, "pump": 0.03}, isolated=False
+        fmu, structure_binding(names_of_model(model)), parameters={"e": 1.06, "pump": 0.03}, isolated=False
     ) as asset:
         for chosen in _inputs(model, 20):
             seen = asset.step(
@@ -61,7 +61,7 @@ def test_motion_is_that_of_the_model(model: StructureModel, fmu: Path) -> None:
     steps = _inputs(model, 12)
     for number in range(1, 6):  # the load jumps while health stays
         steps[number] |= {name: steps[0][name] for name in model.regions}
-    binding = structure_binding(model)
+    binding = structure_binding(names_of_model(model))
     binding = binding.model_copy(update={"binding": binding.binding.model_copy(update={"step_size": 1e-3})})
     seen, kept, after = [], b"", []
     with FmiAsset(fmu, binding, parameters={"response": 2}, isolated=False) as asset:

@@ -1,0 +1,95 @@
+"""The field of a structure as a VTU file for ParaView."""
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fe.full.statics import Factorisation
+
+from .operators import Structure
+
+FloatArray = NDArray[np.float64]
+
+
+def centre_strains(structure: Structure, displacement: FloatArray) -> FloatArray:
+    """Strains (nc, 6) xx, yy, zz, yz, xz, xy, shear as engineering strain, at the centres of the cells.
+
+    Parameters
+    ----------
+    structure : Structure
+        The structure.
+    displacement : (nodes, 3) m
+        Of all nodes.
+    """
+    mesh = structure.mesh
+    centre = mesh.kind.places[: len(mesh.kind.corners)].mean(axis=0)
+    _, slopes = mesh.kind.shape_functions(centre[None])
+    jacobian = np.einsum("nai,aj->nij", mesh.nodes, slopes[0])
+    along = np.einsum("ak,nki->nai", slopes[0], np.linalg.inv(jacobian))
+    gradient = np.einsum("nai,naj->nij", displacement[mesh.cells], along)
+    strain = gradient + gradient.transpose(0, 2, 1)
+    diagonal = 0.5 * np.einsum("nii->ni", strain)
+    return np.column_stack((diagonal, strain[:, 1, 2], strain[:, 0, 2], strain[:, 0, 1]))
+
+
+def write_structure_vtu(
+    path: Path | str, structure: Structure, values: Mapping[str, float] | None = None
+) -> None:
+    """Solve the full model and write its field, whole or not at all.
+
+    Point data: `displacement` [m]. Cell data: `strain` at the centres, `material` and `region` (their numbers
+    in the file from 1, 0 for no region), `stiffness_loss`.
+
+    Parameters
+    ----------
+    path : Path or str
+        Where to write.
+    structure : Structure
+        The structure.
+    values : mapping of str to float, optional
+        Parameters, losses, free masses and controls by name; what is left out is nominal, and healthy.
+
+    Raises
+    ------
+    SolutionError
+        If the structure cannot be solved.
+    OSError
+        If the file cannot be written.
+    """
+    import meshio
+
+    given = dict(values or {})
+    parameters, losses, masses = (
+        {name: given[name] for name in names if name in given}
+        for names in (structure.parameters, structure.regions, structure.masses)
+    )
+    load = np.zeros(structure.unknowns)
+    for name, control in structure.loads.items():
+        load = load + structure.load(name, None if control is None else given.get(control), masses)
+    free = Factorisation(structure.stiffness(parameters, losses)).solve(load)
+    displacement = structure.full_displacement(free)
+    loss = np.zeros(len(structure.mesh.cells))
+    for number, name in enumerate(structure.regions):
+        loss[structure.region_of == number] = losses.get(name, 0.0)
+    mesh = meshio.Mesh(
+        structure.mesh.points,
+        [(structure.mesh.kind.file_type, structure.mesh.cells)],
+        point_data={"displacement": displacement},
+        cell_data={
+            "strain": [centre_strains(structure, displacement)],
+            "material": [structure.material_of + 1],
+            "region": [structure.region_of + 1],
+            "stiffness_loss": [loss],
+        },
+    )
+    path = Path(path)
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+            temporary = Path(folder) / "structure.vtu"
+            meshio.write(temporary, mesh, file_format="vtu")
+            temporary.replace(path)
+    except OSError as error:  # with the name that was asked for, not that of the temporary file
+        raise OSError(error.errno, error.strerror, str(path)) from error

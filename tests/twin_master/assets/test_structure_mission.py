@@ -1,0 +1,120 @@
+"""A structure from a mesh as the asset of a mission and as what the twin believes."""
+
+from __future__ import annotations
+
+import shutil
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+import pytest
+import xarray as xr
+
+from fe.full.statics import Factorisation
+from fe.runtime.errors import FiniteElementError
+from fe.structure.operators import load_and_assemble
+from scenarios import scenario_files, structure_files
+from twin_master.errors import TwinMasterError
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.workflow import new_run, resume_run
+
+PATH = scenario_files()["bracket"]
+
+
+def short(**changes: dict[str, Any]) -> LoadedScenario:
+    """The shipped mission of the bracket in ten shifts; `changes` by table."""
+    table = tomllib.loads(PATH.read_text(encoding="utf-8"))
+    table["mission"] |= {"steps": 10, "prediction_steps": 3}
+    table["asset"] |= {"isolated": False}
+    table["truth"]["gains"] = [{"state": "z_heel", "first_step": 2, "last_step": 3, "gain_percent": 20}]
+    for name, values in changes.items():
+        table[name] |= values
+    return LoadedScenario(parse_scenario(table, "short"), PATH, "0" * 64)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its run folder."""
+    return new_run(short(), tmp_path_factory.mktemp("bracket") / "run", report=False).folder
+
+
+def test_the_twin_finds_the_damage_of_the_full_model(flown: Path) -> None:
+    """The strains flown are those of the full model within their bound; the heel is accused, not the arm."""
+    with xr.open_datatree(flown / "run.nc", engine="h5netcdf") as tree:
+        tree.load()
+    structure = load_and_assemble(structure_files()["bracket"])
+    unit = structure.load("weight", 1.0)
+    truth, observed = tree["truth"], tree["observed"]
+    for step in (0, 9):
+        losses = dict(zip(structure.regions, truth["state"].values[step].tolist(), strict=True))
+        full = Factorisation(structure.stiffness({"e": 1.02}, losses)).solve(unit)
+        wanted = float(observed["load_factor"][step]) * (structure.gauge_output @ full)
+        bound = float(truth["strain_error_bound"][step])
+        assert np.abs(truth["strain"].values[step] - wanted).max() <= bound < 1e-3 * np.abs(wanted).max()
+    np.testing.assert_allclose(truth["state"].values[-1], [0.4, 0.0], atol=1e-12)
+    np.testing.assert_allclose(tree["filtered"]["mean"].values[-1], [0.4, 0.0], atol=0.1)
+
+
+def test_a_resumed_flight_is_bit_identical_after_the_files_are_gone(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, die_after_turn: Callable[..., None]
+) -> None:
+    for name in ("bracket.toml", "bracket.inp"):
+        shutil.copy(structure_files()["bracket"].with_name(name), tmp_path)
+    own = {"structure": str(tmp_path / "bracket.toml")}
+    loaded = short(asset=own, belief=own)
+    with monkeypatch.context() as patch:
+        die_after_turn(patch, 4)
+        with pytest.raises(KeyboardInterrupt):
+            new_run(loaded, tmp_path / "part", report=False)
+    for name in ("bracket.toml", "bracket.inp"):
+        (tmp_path / name).unlink()
+    moved = tmp_path / "moved"
+    (tmp_path / "part").rename(moved)
+    resume_run(moved, report=False)
+    for name in ("csv/observed.csv", "csv/estimated.csv", "csv/decisions.csv"):
+        assert (moved / name).read_bytes() == (flown / name).read_bytes(), name
+
+
+def test_the_field_of_the_last_estimate_is_written(flown: Path) -> None:
+    """`structure.vtu` holds mesh, displacement, strain, regions and losses; no file has a wing's name."""
+    field = meshio.read(flown / "structure.vtu")
+    assert field.cells[0].type == "hexahedron20"
+    displacement = field.point_data["displacement"]
+    assert 1e-4 < np.abs(displacement).max() < 5e-3
+    loss, region = field.cell_data["stiffness_loss"][0], field.cell_data["region"][0]
+    assert set(np.unique(region)) == {0, 1, 2}
+    assert np.all(loss[region == 0] == 0.0)
+    assert 0.2 < loss[region == 1].max() < 0.6
+    assert not (flown / "wing.vtu").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"asset": {"structure": "nowhere.toml"}}, r"nowhere\.toml"),
+        ({"calibration": {"parameter": "stiffness"}}, "none of the structure bracket, which has e, pump"),
+        ({"calibration": {"source": "static_test"}}, "`static_test` is for wings"),
+        ({"observation": {"role": "displacement"}}, "expects 4"),
+        ({"observation": {"count": 3, "titles": ["a", "b", "c"]}}, "expects 3"),
+        ({"asset": {"parameters": {"e": 1.0, "f": 2.0}}}, "parameter f"),
+    ],
+)
+def test_what_does_not_fit_is_refused_before_a_folder_is_made(
+    changes: dict[str, dict[str, Any]], sentence: str, tmp_path: Path
+) -> None:
+    with pytest.raises((TwinMasterError, FiniteElementError), match=sentence):
+        new_run(short(**changes), tmp_path / "run", report=False)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_mesh_that_does_not_lie_beside_its_file_is_refused(tmp_path: Path) -> None:
+    text = structure_files()["bracket"].read_text(encoding="utf-8")
+    shutil.copy(structure_files()["bracket"].with_name("bracket.inp"), tmp_path)
+    (tmp_path / "sub").mkdir()
+    file = tmp_path / "sub" / "bracket.toml"
+    file.write_text(text.replace('"bracket.inp"', '"../bracket.inp"'), encoding="utf-8")
+    with pytest.raises(TwinMasterError, match="does not lie beside it"):
+        new_run(short(asset={"structure": str(file)}), tmp_path / "run", report=False)

@@ -1,0 +1,343 @@
+"""A structure from a mesh: its file, reduced and packed as the asset, or believed as a model."""
+
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reporting.files import atomic_write_text
+from reporting.progress import Progress
+from reporting.provenance import hash_file
+from twin_master.assets.asset_source import (
+    FLOWN_DESIGN_HASH,
+    AssetSource,
+    FlownAndBelieved,
+    keep_files,
+    named_files,
+    read_files,
+)
+from twin_master.assets.fmu_source import BINDING_COPY, FmuSection, FmuSource
+from twin_master.assets.interface import Asset, AssetReading, StatelessAsset
+from twin_master.assets.parameter import ParameterDraws, draw_parameter
+from twin_master.errors import MissingObservationModelError, MissionInputError
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.scenario.asset import BeliefSection, FileSection
+from twin_master.scenario.schema import Scenario
+
+if TYPE_CHECKING:
+    from fe.runtime.structure_model import StructureModel
+    from fe.structure.design import StructureDesign
+
+Float = NDArray[np.float64]
+
+FLOWN_COPY = "asset/flown/structure.toml"
+MODEL_COPY = "asset/model/structure.toml"
+FIELD_NAME = "structure.vtu"
+
+
+class StructureFiles(FileSection):
+    """A table that names a structure file, and with it the mesh beside that."""
+
+    def all_files(self) -> dict[str, Path]:
+        """Return all files by the places of their copies, the mesh among them.
+
+        Raises
+        ------
+        InvalidDesignError
+            The structure file cannot be read or is wrong.
+        MissionInputError
+            Its mesh does not lie beside it.
+        """
+        from fe.structure.design import load_structure
+
+        found = super().all_files()
+        copy = self.copies()["structure"]
+        file = found[copy]
+        mesh = PurePosixPath(load_structure(file).mesh)
+        if mesh.is_absolute() or ".." in mesh.parts:
+            raise MissionInputError(
+                f"the mesh {mesh} of {file} does not lie beside it, and a run keeps copies of both: move the "
+                "mesh into the folder of the structure file, and name it without its folder."
+            )
+        return found | {f"{PurePosixPath(copy).parent}/{mesh}": file.parent / mesh}
+
+
+class StructureSection(StructureFiles, FmuSection):
+    """The FMU that is packed of a structure."""
+
+    kind: Literal["structure"] = "structure"
+    structure: str
+    binding: str = ""
+    """A binding of one's own; without one it follows from the structure file."""
+
+    def copies(self) -> Mapping[str, str]:
+        """Return where the copies of binding and structure stand in a run folder."""
+        return {"binding": BINDING_COPY, "structure": FLOWN_COPY}
+
+    @property
+    def binding_path(self) -> Path:
+        """The binding, where there is one.
+
+        Raises
+        ------
+        MissionInputError
+            There is none.
+        """
+        if not self.binding:
+            raise MissionInputError(
+                "the binding of the structure is needed as a file here: write it by `uav-twin structure fmu "
+                "FILE --binding NAME`, and name it as `asset.binding`."
+            )
+        return super().binding_path
+
+    def source(self, scenario: Scenario) -> "StructureFmuSource":
+        """Return the FMU of the structure."""
+        return StructureFmuSource(scenario, self)
+
+
+class StructureBelief(StructureFiles, BeliefSection):
+    """The reduced model of a structure."""
+
+    kind: Literal["structure"] = "structure"
+    structure: str
+
+    def copies(self) -> Mapping[str, str]:
+        """Return where the copy of the structure stands in a run folder."""
+        return {"structure": MODEL_COPY}
+
+    def source(self, scenario: Scenario, flown: AssetSource) -> "StructureSource":
+        """Return the model of the structure."""
+        return StructureSource(scenario, self)
+
+
+def _check_parameter(scenario: Scenario, design: "StructureDesign") -> None:
+    """Refuse a calibration that a structure cannot have; raises `MissionInputError`."""
+    calibration = scenario.calibration
+    if calibration.source not in ("normal", "fixed"):
+        raise MissionInputError(
+            f"the calibration source `{calibration.source}` is for wings: of a structure give `normal` or "
+            "`fixed`, with `mean`."
+        )
+    known = [part.name for part in design.parameter]
+    known += [part.name for part in design.mass if part.free]
+    if calibration.parameter not in known:
+        raise MissionInputError(
+            f"the calibrated parameter {calibration.parameter} is none of the structure {design.name}, which "
+            f"has {', '.join(known) or 'none: give one in a table [[parameter]]'}."
+        )
+
+
+class StructureFmuSource(FmuSource):
+    """The FMU that is packed of a structure."""
+
+    _section: StructureSection
+
+    @property
+    def origin(self) -> FlownAndBelieved:
+        """The FMU, twice."""
+        words = f"FMU of the structure {self._design().name}"
+        return FlownAndBelieved(words, words)
+
+    def _design(self) -> "StructureDesign":
+        from fe.structure.design import load_structure
+
+        return load_structure(self._section.all_files()[FLOWN_COPY])
+
+    def check(self) -> None:
+        """Read what is given where it is, without building anything.
+
+        Raises
+        ------
+        MissionInputError, InvalidDesignError, FmuError
+            A file cannot be read or is wrong, or the scenario speaks of what the structure does not have.
+        """
+        from fmu_asset.door.binding import load_binding
+        from fmu_asset.structures.binding import names_of_design, structure_binding
+
+        self.files()
+        design = self._design()
+        _check_parameter(self._scenario, design)
+        own = self._section.binding
+        binding = (
+            load_binding(self._section.binding_path) if own else structure_binding(names_of_design(design))
+        )
+        self._check_names(binding)
+        self._observed(binding)
+        self._inner_roles(binding)
+
+    def _make(self, progress: Progress) -> dict[str, str]:
+        """Reduce the structure and pack the FMU."""
+        from fe.reduction.structure_cache import reduced_structure
+        from fmu_asset.structures.binding import names_of_model, structure_binding_text
+        from fmu_asset.structures.build import build_structure_fmu
+
+        model = reduced_structure(self._path(FLOWN_COPY), progress=progress)
+        if not self._path(BINDING_COPY).exists():
+            atomic_write_text(self._path(BINDING_COPY), structure_binding_text(names_of_model(model)))
+        with progress.stage("Packing the FMU"):
+            build_structure_fmu(model, self.fmu_path(), replace=True)
+        return {FLOWN_DESIGN_HASH: model.design_hash, "fmu": hash_file(self.fmu_path())}
+
+    def draws(self, seed: int) -> ParameterDraws:
+        """Return draws of the parameter."""
+        return draw_parameter(self._scenario.calibration, seed)
+
+    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
+        """Write displacement and strain of the structure as VTU."""
+        return _write_field(path, self._path(FLOWN_COPY), {**self._section.parameters, **state, **control})
+
+
+class StructureSource:
+    """The reduced model of a structure as what is believed.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        What is flown.
+    section : StructureBelief
+        What is believed.
+    """
+
+    def __init__(self, scenario: Scenario, section: StructureBelief) -> None:
+        self._scenario = scenario
+        self._places = named_files(scenario, section)
+        self._model: StructureModel | None = None
+        self._mean: dict[str, float] = {}
+
+    @property
+    def origin(self) -> FlownAndBelieved:
+        """The reduced model, twice."""
+        words = f"reduced model of the structure {self._design().name}"
+        return FlownAndBelieved(words, words)
+
+    def _design(self) -> "StructureDesign":
+        from fe.structure.design import load_structure
+
+        return load_structure(self._places[MODEL_COPY])
+
+    def check(self) -> None:
+        """Read the structure file without building anything.
+
+        Raises
+        ------
+        MissionInputError, InvalidDesignError
+            A file cannot be read or is wrong.
+        MissingObservationModelError
+            The scenario's states, controls or sensors are not those of the structure.
+        """
+        self.files()
+        design, scenario = self._design(), self._scenario
+        _check_parameter(scenario, design)
+        observed = {"strain": len(design.gauge), "displacement": len(design.displacement)}
+        role = scenario.observation.role
+        for what, came, known in (
+            ("state", scenario.state_names, [part.name for part in design.damage]),
+            ("control input", scenario.control[0].values, [part.name for part in design.control]),
+            ("observation", [role], [name for name, count in observed.items() if count]),
+        ):
+            unknown = sorted({*came} - {*known})
+            if unknown:
+                raise MissingObservationModelError(
+                    f"the scenario has the {what} {', '.join(unknown)}, which the model of the structure "
+                    f"{design.name} does not know; it knows {', '.join(known) or 'none'}."
+                )
+        if scenario.observation.count != observed[role]:
+            raise MissingObservationModelError(
+                f"the structure {design.name} has {observed[role]} sensors of `{role}`, and the scenario "
+                f"expects {scenario.observation.count}."
+            )
+
+    def files(self) -> dict[str, bytes]:
+        """Return structure file and mesh as they are given.
+
+        Raises
+        ------
+        MissionInputError
+            One cannot be read.
+        """
+        return read_files(self._places)
+
+    def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
+        """Copy what is given into the run folder and reduce the structure; return the hash of its design."""
+        from fe.reduction.structure_cache import reduced_structure
+
+        keep_files(folder, self.files())
+        self._places = {copy: folder / copy for copy in self._places}
+        self._model = reduced_structure(self._places[MODEL_COPY], progress=progress)
+        return {"design": self._model.design_hash}
+
+    @property
+    def _prepared(self) -> "StructureModel":
+        if self._model is None:
+            raise MissionInputError("the model was not prepared: call `prepare` first.")
+        return self._model
+
+    def draws(self, seed: int) -> ParameterDraws:
+        """Return draws of the parameter."""
+        found = draw_parameter(self._scenario.calibration, seed)
+        self._mean = {found.name: found.mean}
+        return found
+
+    def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
+        """Return strains or displacements (E, S, U, G).
+
+        Raises
+        ------
+        OutsideModelError
+            A state, control or draw lies outside the ranges of the structure file.
+        """
+        reduced, scenario = self._prepared, self._scenario
+        states, controls = model.states.coordinates, scenario.control
+        shape = (len(draws.values), len(states), len(controls))
+        draw, state, control = (index.ravel() for index in np.indices(shape))
+        vectors = np.tile(reduced.nominal, (draw.size, 1))
+        place = reduced.chosen.index
+        vectors[:, place(draws.name)] = draws.values[draw]
+        for column, name in enumerate(scenario.state_names):
+            vectors[:, place(name)] = states[state, column]
+        for name in controls[0].values:
+            vectors[:, place(name)] = np.array([item.values[name] for item in controls])[control]
+        return reduced.static_outputs(vectors)[:, self._observed].reshape(*shape, -1)
+
+    @property
+    def _observed(self) -> slice:
+        gauges = len(self._prepared.gauges)
+        return slice(0, gauges) if self._scenario.observation.role == "strain" else slice(gauges, None)
+
+    def open(self) -> Asset:
+        """Return the model as an asset, with the parameters of the scenario's true structure."""
+        model, observed, true = self._prepared, self._observed, dict(self._scenario.asset.true_parameters)
+        known = {name: value for name, value in true.items() if name in model.chosen}
+
+        def observe(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+            found = model.static_response({**known, **health, **control})
+            outputs = np.concatenate((found.strain, found.displacement))
+            return AssetReading(outputs[observed], {"strain_error_bound": found.strain_error_bound})
+
+        return StatelessAsset(observe)
+
+    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
+        """Write displacement and strain of the structure as VTU."""
+        return _write_field(path, self._places[MODEL_COPY], {**self._mean, **state, **control})
+
+
+def _write_field(path: Path, file: Path, values: Mapping[str, float]) -> bool:
+    """Solve the full structure under values by name and write its field beside `path`.
+
+    Raises
+    ------
+    FileNotWrittenError
+        The disk is full or the folder cannot be written.
+    """
+    from fe.structure.field import write_structure_vtu
+    from fe.structure.operators import load_and_assemble
+    from reporting.files import write_error
+
+    target = path.with_name(FIELD_NAME)
+    try:
+        write_structure_vtu(target, load_and_assemble(file), values)
+    except OSError as error:
+        raise write_error(error, target) from error
+    return True
