@@ -52,8 +52,16 @@ def names_of_design(design: StructureDesign) -> StructureNames:
     )
 
 
-def structure_binding_text(names: StructureNames) -> str:
-    """Return the binding file of a structure's FMU: control, health, parameters, observations, monitors."""
+def structure_binding_text(names: StructureNames, frequencies: int = 0) -> str:
+    """Return the binding file of a structure's FMU: control, health, parameters, observations, monitors.
+
+    Parameters
+    ----------
+    names : StructureNames
+        Of the structure.
+    frequencies : int
+        How many natural frequencies are observed, too; they cost the FMU more than all the rest.
+    """
     title = json.dumps(names.name)
     tables = [f"[binding]\nname = {title}\nstep_size = 1.0 # s; no matter where quasi-static\n"]
 
@@ -82,13 +90,18 @@ def structure_binding_text(names: StructureNames) -> str:
         if outputs:
             variables = json.dumps([f"{role}.{name}" for name in outputs])
             tables.append(f'[observation.{role}]\nvariables = {variables}\nunit = "{unit}"\n')
+    if frequencies:
+        variables = json.dumps([f"frequency[{mode}]" for mode in range(1, frequencies + 1)])
+        tables.append(f'[observation.frequency]\nvariables = {variables}\nunit = "Hz"\n')
     for what, outputs, unit in (("strain", names.gauges, "1"), ("displacement", names.displacements, "m")):
         if outputs:
             scalar("monitor", f"{what}_error_bound", f"{what}_error_bound", unit)
     return "\n".join(tables)
 
 
-def structure_binding(names: StructureNames) -> Binding:
-    """Return the binding of a structure's FMU."""
+def structure_binding(names: StructureNames, frequencies: int = 0) -> Binding:
+    """Return the binding of a structure's FMU; see `structure_binding_text`."""
     where = f"the binding of {names.name}"
-    return parse_binding(parse_toml(structure_binding_text(names), where, BindingError), where=where)
+    return parse_binding(
+        parse_toml(structure_binding_text(names, frequencies), where, BindingError), where=where
+    )

@@ -129,6 +129,18 @@ def _check_parameter(scenario: Scenario, design: "StructureDesign") -> None:
         )
 
 
+def _frequencies(scenario: Scenario) -> int:
+    """Return how many natural frequencies a scenario observes; raises `MissionInputError` for too many."""
+    from fe.reduction.modal_basis import ModalSettings
+
+    if scenario.observation.role != "frequency":
+        return 0
+    count, most = scenario.observation.count, ModalSettings().mode_count
+    if count > most:
+        raise MissionInputError(f"a structure tells its first {most} frequencies, and {count} are observed.")
+    return count
+
+
 class StructureFmuSource(FmuSource):
     """The FMU that is packed of a structure."""
 
@@ -161,7 +173,9 @@ class StructureFmuSource(FmuSource):
         _check_parameter(self._scenario, design)
         own = self._section.binding
         binding = (
-            load_binding(self._section.binding_path) if own else structure_binding(names_of_design(design))
+            load_binding(self._section.binding_path)
+            if own
+            else structure_binding(names_of_design(design), _frequencies(self._scenario))
         )
         self._check_names(binding)
         self._observed(binding)
@@ -175,7 +189,8 @@ class StructureFmuSource(FmuSource):
 
         model = reduced_structure(self._path(FLOWN_COPY), progress=progress)
         if not self._path(BINDING_COPY).exists():
-            atomic_write_text(self._path(BINDING_COPY), structure_binding_text(names_of_model(model)))
+            text = structure_binding_text(names_of_model(model), _frequencies(self._scenario))
+            atomic_write_text(self._path(BINDING_COPY), text)
         with progress.stage("Packing the FMU"):
             build_structure_fmu(model, self.fmu_path(), replace=True)
         return {FLOWN_DESIGN_HASH: model.design_hash, "fmu": hash_file(self.fmu_path())}
@@ -230,7 +245,11 @@ class StructureSource:
         self.files()
         design, scenario = self._design(), self._scenario
         _check_parameter(scenario, design)
-        observed = {"strain": len(design.gauge), "displacement": len(design.displacement)}
+        observed = {
+            "strain": len(design.gauge),
+            "displacement": len(design.displacement),
+            "frequency": _frequencies(scenario) or 1,
+        }
         role = scenario.observation.role
         for what, came, known in (
             ("state", scenario.state_names, [part.name for part in design.damage]),
@@ -281,7 +300,9 @@ class StructureSource:
         return found
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return strains or displacements (E, S, U, G).
+        """Return strains, displacements or natural frequencies (E, S, U, G).
+
+        Frequencies are in rising order and do not depend on the control.
 
         Raises
         ------
@@ -294,12 +315,17 @@ class StructureSource:
         draw, state, control = (index.ravel() for index in np.indices(shape))
         vectors = np.tile(reduced.nominal, (draw.size, 1))
         place = reduced.chosen.index
+        count = scenario.observation.count
         vectors[:, place(draws.name)] = draws.values[draw]
         for column, name in enumerate(scenario.state_names):
             vectors[:, place(name)] = states[state, column]
         for name in controls[0].values:
             vectors[:, place(name)] = np.array([item.values[name] for item in controls])[control]
-        return reduced.static_outputs(vectors)[:, self._observed].reshape(*shape, -1)
+        if scenario.observation.role == "frequency":
+            first = vectors.reshape(*shape, -1)[:, :, 0].reshape(-1, vectors.shape[1])
+            found = np.array([reduced.modes(vector).frequency[:count] for vector in first])
+            return np.repeat(found.reshape(*shape[:2], 1, count), shape[2], axis=2)
+        return reduced.static_outputs(vectors)[:, self._observed].reshape(*shape, count)
 
     @property
     def _observed(self) -> slice:
@@ -309,10 +335,14 @@ class StructureSource:
     def open(self) -> Asset:
         """Return the model as an asset, with the parameters of the scenario's true structure."""
         model, observed, true = self._prepared, self._observed, dict(self._scenario.asset.true_parameters)
+        role, count = self._scenario.observation.role, self._scenario.observation.count
         known = {name: value for name, value in true.items() if name in model.chosen}
 
         def observe(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-            found = model.static_response({**known, **health, **control})
+            values = {**known, **health, **control}
+            if role == "frequency":
+                return AssetReading(model.modes(values).frequency[:count])
+            found = model.static_response(values)
             outputs = np.concatenate((found.strain, found.displacement))
             return AssetReading(outputs[observed], {"strain_error_bound": found.strain_error_bound})
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from fe.full.modes import lowest_eigenpairs
 from fe.full.statics import Factorisation
 from fe.runtime.errors import FiniteElementError
 from fe.structure.operators import load_and_assemble
@@ -25,13 +26,14 @@ PATH = scenario_files()["bracket"]
 
 
 def short(**changes: dict[str, Any]) -> LoadedScenario:
-    """The shipped mission of the bracket in ten shifts; `changes` by table."""
+    """The shipped mission of the bracket in ten shifts; `changes` by table, None for a key that goes."""
     table = tomllib.loads(PATH.read_text(encoding="utf-8"))
     table["mission"] |= {"steps": 10, "prediction_steps": 3}
     table["asset"] |= {"isolated": False}
     table["truth"]["gains"] = [{"state": "z_heel", "first_step": 2, "last_step": 3, "gain_percent": 20}]
     for name, values in changes.items():
         table[name] |= values
+        table[name] = {key: value for key, value in table[name].items() if value is not None}
     return LoadedScenario(parse_scenario(table, "short"), PATH, "0" * 64)
 
 
@@ -56,6 +58,36 @@ def test_the_twin_finds_the_damage_of_the_full_model(flown: Path) -> None:
         assert np.abs(truth["strain"].values[step] - wanted).max() <= bound < 1e-3 * np.abs(wanted).max()
     np.testing.assert_allclose(truth["state"].values[-1], [0.4, 0.0], atol=1e-12)
     np.testing.assert_allclose(tree["filtered"]["mean"].values[-1], [0.4, 0.0], atol=0.1)
+
+
+def test_damage_is_found_from_frequencies_alone(tmp_path: Path) -> None:
+    """Three natural frequencies in the place of gauges; those flown are the full model's."""
+    seen = {
+        "role": "frequency",
+        "count": 3,
+        "titles": ["f1", "f2", "f3"],
+        "unit": "Hz",
+        "standard_deviation": [0.2, 0.4, 1.2],
+        "standard_deviation_microstrain": None,
+    }
+    rewards = {"health_limit": 100.0, "error_scale": 1.0}
+    rewards |= dict.fromkeys(("health_limit_microstrain", "error_scale_microstrain"))
+    noise = {"truth": {"noise": {"standard_deviation": [0.2, 0.4, 1.2]}}}
+    flown = new_run(short(observation=seen, rewards=rewards, **noise), tmp_path / "run", report=False).folder
+    with xr.open_datatree(flown / "run.nc", engine="h5netcdf") as tree:
+        tree.load()
+    assert tree["truth"]["frequency"].attrs["units"] == "Hz"
+    structure = load_and_assemble(structure_files()["bracket"])
+    squares, _ = lowest_eigenpairs(structure.stiffness({"e": 1.02}, {"z_heel": 0.4}), structure.mass(), 3)
+    np.testing.assert_allclose(
+        tree["truth"]["frequency"].values[-1], np.sqrt(squares) / (2.0 * np.pi), rtol=2e-5
+    )
+    np.testing.assert_allclose(tree["filtered"]["mean"].values[-1], [0.4, 0.0], atol=0.12)
+    seven = {"count": 7, "titles": [f"f{number}" for number in range(7)], "standard_deviation": 1.0}
+    noise = {"truth": {"noise": {"standard_deviation": 1.0}}}
+    changed = short(observation=seen | seven, rewards=rewards, **noise)
+    with pytest.raises(TwinMasterError, match="first 6 frequencies, and 7 are observed"):
+        new_run(changed, tmp_path / "no")
 
 
 def test_a_resumed_flight_is_bit_identical_after_the_files_are_gone(
