@@ -33,7 +33,7 @@ YOUNG_MODULUS_FACTOR = 0.97
 NOISE = 150e-6
 THIRD_REGION = {"span_start": 0.5, "span_end": 0.9, "chord_start": 0.03, "chord_end": 0.6}
 """Upper skin between the two regions of the twin's model [m, fraction of the chord]."""
-LOOSE_GAUGE, LOOSE_FROM, LOOSER, LOOSEST = 4, 10, 0.03, 0.3
+LOOSE_GAUGE, LOOSE_FROM, LOOSER, LOOSEST = 4, 10, 0.1, 0.3
 """Gauge, first turn, and the gain that it loses in each turn until it has lost so much."""
 SOFT_FROM, SOFTER, SOFTEST = 25, 0.025, 0.3
 """First turn, and the stiffness that the third region loses in each turn until it has lost so much."""

@@ -62,6 +62,9 @@ def watch(
     from_turn: Annotated[
         int | None, typer.Option(min=0, help="The first turn that --model-patch is believed in.")
     ] = None,
+    teach: Annotated[
+        bool, typer.Option("--teach", help="Look for the cause of an alarm, and believe what is named.")
+    ] = False,
     ca_file: Annotated[
         Path | None, typer.Option(help="Certificate of the authority of an mqtts:// broker.")
     ] = None,
@@ -92,7 +95,7 @@ def watch(
         try:
             source = observations or _recording(watched.scenario) or "-"
             feed = _feed(source, watched, follow, ca_file)
-            counts = _watched(watched, feed, pace, turns, patched)
+            counts = _watched(watched, feed, pace, turns, patched, teach)
             watched.store(counts, last=last, report=not no_report)
         except Exception as error:
             error.add_note(
@@ -125,11 +128,15 @@ def _watched(
     pace: float,
     turns: int | None,
     patched: "Patched | None",
+    teach: bool,
 ) -> "Counts":
     """Watch until the end, and end what the observations come from."""
+    from twin_master.watch.teaching import Search
+
     feed, decide, close = fed
+    search = Search(watched.folder, watched.scenario.mission.seed) if teach else None
     try:
-        return watched.run(feed, _paced(decide, pace), turns=turns, patched=patched)
+        return watched.run(feed, _paced(decide, pace), turns=turns, patched=patched, search=search)
     finally:
         close()
 

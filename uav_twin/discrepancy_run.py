@@ -29,6 +29,8 @@ FromRun = Annotated[
     Path | None,
     typer.Option(help="Folder of a mission (uav-twin run): its flight and its twin's model are compared."),
 ]
+FromTurn = Annotated[int | None, typer.Option(min=0, help="First turn of --from-run that is compared.")]
+ToTurn = Annotated[int | None, typer.Option(min=0, help="Last turn of --from-run that is compared.")]
 Model = Annotated[
     str | None,
     typer.Option(
@@ -56,6 +58,8 @@ Calibrate = Annotated[
 def run(
     campaign: CampaignOption = None,
     from_run: FromRun = None,
+    from_turn: FromTurn = None,
+    to_turn: ToTurn = None,
     model: Model = None,
     out: Out = None,
     replace: Replace = False,
@@ -66,28 +70,26 @@ def run(
     json: terminal.Json = False,
 ) -> None:
     """Find out what the model lacks: verdict, report, patch, residuals."""
-    from discrepancy.campaign.reading import read_campaign
     from discrepancy.catalogue.library import load_catalogue
     from discrepancy.errors import CampaignFileError
     from discrepancy.judgement.separability import separability
-    from discrepancy.model_choice import choice_of_run, choose_model
-    from discrepancy.sources.from_run import run_campaign
     from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
     from discrepancy.workflow import investigate
 
     one_thread()
     if (campaign is None) == (from_run is None):
         raise CampaignFileError("Give either the folder of a campaign or --from-run with that of a mission.")
+    if from_run is None and (from_turn is not None or to_turn is not None):
+        raise CampaignFileError("--from-turn and --to-turn belong to --from-run.")
     if from_run is not None and model is not None:
         raise CampaignFileError("--from-run takes the model that the twin believed; leave --model out.")
     source = campaign if from_run is None else from_run
     assert source is not None
     folder = out if out is not None else Path("verdicts") / source.resolve().name
     check_folder(folder, replace_it=replace)
-    data = read_campaign(source) if from_run is None else run_campaign(source)
     catalogue = load_catalogue(effects or ())
     progress = terminal.progress()
-    choice = choose_model(model, progress) if from_run is None else choice_of_run(from_run)
+    data, choice = _compared(campaign, from_run, (from_turn, to_turn), model, progress)
     found = investigate(data, choice.model, catalogue, seed=seed, progress=progress)
     able, tried = None, None
     if found.problem is not None:
@@ -95,7 +97,10 @@ def run(
             able = separability(found.campaign, choice.model, found.problem.setting, catalogue)
         if calibrate is not None:
             tried = _calibrated(found, choice, catalogue, calibrate, seed, progress)
-    command = _command(source, model, seed, effects or [], calibrate, from_run=from_run is not None)
+    command = _command(
+        source, model, seed, effects or [], calibrate,
+        turns=None if from_run is None else (from_turn, to_turn),
+    )  # fmt: skip
     pack = None if choice.design is None else _packing(choice, progress)
     origin = _origin(data, choice, command, seed, effects or [])
     content = VerdictContent(found, origin, able, tried, choice.design, pack)
@@ -104,6 +109,25 @@ def run(
     if json:
         terminal.print_json(_record(folder, report=None if no_report else place))
     _conclude(found, tried, folder, f"{'Verdict' if no_report else 'Report'}: {place}", silent=json)
+
+
+def _compared(
+    campaign: Path | None, from_run: Path | None, turns: tuple[int | None, int | None], model: str | None,
+    progress: "Progress",
+) -> "tuple[Campaign, ModelChoice]":  # fmt: skip
+    """Return what is measured, and what it is compared with."""
+    from discrepancy.campaign.reading import read_campaign
+    from discrepancy.model_choice import choice_of_run, choose_model
+    from discrepancy.sources.from_run import RunPlan, run_campaign
+    from twin_master.watch.snapshot import flown
+
+    if from_run is None:
+        assert campaign is not None
+        return read_campaign(campaign), choose_model(model, progress)
+    first, last = turns
+    with flown(from_run, last, progress) as folder:
+        data = run_campaign(folder, RunPlan(first_turn=first, last_turn=last))
+        return data, choice_of_run(folder)
 
 
 def one_thread() -> None:
@@ -182,10 +206,19 @@ def _calibrated(
 
 
 def _command(
-    source: Path, model: str | None, seed: int, effects: list[Path], calibrate: int | None, *, from_run: bool
-) -> str:
+    source: Path, model: str | None, seed: int, effects: list[Path], calibrate: int | None, *,
+    turns: tuple[int | None, int | None] | None,
+) -> str:  # fmt: skip
     """Return the command without the folders of this machine."""
-    words = ["uav-twin", "discrepancy", "run", *(["--from-run"] if from_run else []), source.resolve().name]
+    words = [
+        "uav-twin",
+        "discrepancy",
+        "run",
+        *([] if turns is None else ["--from-run"]),
+        source.resolve().name,
+    ]
+    for option, turn in zip(("--from-turn", "--to-turn"), turns or (), strict=False):
+        words += [] if turn is None else [option, str(turn)]
     if model is not None:
         words += ["--model", Path(model).name]
     words += ["--seed", str(seed)]

@@ -67,6 +67,8 @@ class RunPlan:
         Share of the turns that is held out, in whole blocks spread over the flight.
     noise_deviation : float or None
         Of a strain reading [1]; by default what the scenario says of the gauges, else what its twin assumes.
+    first_turn, last_turn : int or None
+        Turns that are read; None for the first of the flight, and its last.
     """
 
     health: str = "belief"
@@ -74,6 +76,8 @@ class RunPlan:
     block: int = 4
     held_out_share: float = 0.2
     noise_deviation: float | None = None
+    first_turn: int | None = None
+    last_turn: int | None = None
 
 
 def run_campaign(folder: Path | str, plan: RunPlan | None = None) -> Campaign:
@@ -118,8 +122,15 @@ def _campaign(folder: Path, plan: RunPlan, scenario: dict[str, Any]) -> Campaign
     _refuse_others(folder, scenario)
     run = _run(folder)
     # Turns before a patch that was adopted on the way were believed with another model.
-    since = slice(run.attrs.get(PATCH_STEP), None)
+    first = max(
+        (turn for turn in (run.attrs.get(PATCH_STEP), plan.first_turn) if turn is not None), default=None
+    )
+    since = slice(first, plan.last_turn)
     observed, smoothed = (run[name].to_dataset().sel(step=since) for name in ("observed", "smoothed"))
+    if not observed.sizes["step"]:
+        raise CampaignDataError(
+            f"{folder} has turns {_ends(run)}, and none from {plan.first_turn} to {plan.last_turn}."
+        )
     strain = np.asarray(observed[STRAIN].values, dtype=np.float64)
     used = np.isfinite(strain)
     if not used.any():
@@ -277,6 +288,11 @@ def _run(folder: Path) -> xr.DataTree:
         if name not in run["observed"]:
             raise CampaignFileError(f"{path} lacks the observed {name!r}: it is no run of a wing.")
     return run
+
+
+def _ends(run: xr.DataTree) -> str:
+    steps = np.asarray(run["observed"]["step"].values).tolist()
+    return f"{steps[0]} to {steps[-1]}" if steps else "none"
 
 
 def _step_size(folder: Path) -> float:

@@ -370,7 +370,9 @@ class WatchfulEstimator:
             order = np.argsort(-deviations, kind="stable").tolist()
             named = [g for g in order if deviations[g] >= _NAMED_DEVIATIONS][:_MOST_NAMED] or order[:1]
             what = f"no state of the model explains all gauges together, least {self._words.sensors(named)}"
-            notices.append(self._alarm(turn, what, named, none, float(own["none_onset"][0])))
+            notices.append(
+                self._alarm(turn, what, named, none, _began(own, turn) + float(own["none_onset"][0]))
+            )
         return notices
 
     def _gauge_alarm(self, own: Arrays, log_value: float, turn: int) -> Notice:
@@ -378,7 +380,7 @@ class WatchfulEstimator:
         share = np.exp(log_weight - np.logaddexp.reduce(log_weight, axis=None))
         order = np.argsort(-share.sum(axis=1), kind="stable").tolist()
         named = [g for g in order if share[g].sum() >= _NAMED_SHARE][:_MOST_NAMED] or order[:1]
-        onset = float(np.sum(share * own["gauge_onset"]))
+        onset = _began(own, turn) + float(np.sum(share * own["gauge_onset"]))
         sign = share @ np.sign(self._gains)
         if len(named) > 1:
             what = f"one of {self._words.sensors(named)} does not show what the model says"
@@ -387,15 +389,22 @@ class WatchfulEstimator:
         return self._alarm(turn, what, named, log_value, onset)
 
     def _alarm(self, turn: int, what: str, gauges: list[int], log_value: float, onset: float) -> Notice:
-        odds, step = float(np.exp(min(log_value, 700.0))), self._words.step
-        since = "from the start" if onset < 0.5 else f"since about {step} {onset:.0f}"
+        odds, step, first = float(np.exp(min(log_value, 700.0))), self._words.step, round(onset)
+        since = f"since about {step} {first}" if first else "from the start"
+        command = f"{COMMAND} --from-turn {first}" if first else COMMAND
         return Notice(
             "alarm",
             f"{step.capitalize()} {turn}: {what}, {since} (evidence {odds:.3g} against the model, alarm from "
-            f"{self._settings.threshold:g}); to find the cause: {COMMAND}",
+            f"{self._settings.threshold:g}); to find the cause: {command}",
             tuple(g + 1 for g in gauges),
             odds,
+            first,
         )
+
+
+def _began(own: Arrays, turn: int) -> float:
+    """Return the first turn of this model: that of the flight, or that from which on a patch is believed."""
+    return turn + 1.0 - float(own["turns"][0])
 
 
 def _spread(draws: Float, weight: Float) -> tuple[NDArray[np.int64], Float]:

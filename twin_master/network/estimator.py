@@ -84,12 +84,15 @@ class Notice:
         Numbers of the sensors that it concerns, from 1.
     value : float or None
         The figure that it rests on.
+    since : int or None
+        The turn since about which it is so, of an alarm.
     """
 
     kind: str
     sentence: str
     sensors: tuple[int, ...] = ()
     value: float | None = None
+    since: int | None = None
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,10 @@
 import base64
 import json
 import os
-import signal
-import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import FrameType
 from typing import Any
 
 from reporting.files import atomic_write_bytes, atomic_write_text
@@ -25,19 +21,17 @@ from twin_master.assets.resolution import (
     portable_scenario,
     resolve_scenario,
 )
-from twin_master.errors import ImpossibleObservation, MissionInputError, NotResumableError
+from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
-    belief_record,
     open_journal,
-    plain,
     read_records,
 )
 from twin_master.mission.kept_knowledge import keep_knowledge
-from twin_master.mission.loop import Reading, operate
+from twin_master.mission.loop import operate
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.network.twin import Twin, TwinTurn
+from twin_master.network.twin import Twin
 from twin_master.run_folder import (
     CONFIG_NAME,
     KIND,
@@ -56,7 +50,10 @@ from twin_master.store.summary import Figure, control_changes, noticed, summaris
 from twin_master.store.writing import store_mission, values_of, write_summary
 from twin_master.watch.decision import decision_of, gap_of
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile
-from twin_master.watch.replay import SNAPSHOT_TURNS, BelievedModel, Replayed, replay
+from twin_master.watch.keeping import Keeper
+from twin_master.watch.replay import BelievedModel, Replayed, replay
+from twin_master.watch.stopping import Stopping
+from twin_master.watch.teaching import Search, Teaching, Tutor, both_patches
 
 STORED_TURNS = 1_000
 """The last turns that `run.nc` and the report show if not told otherwise; the journal has all of them."""
@@ -66,10 +63,11 @@ FLUSH_SECONDS = 1.0
 
 @dataclass(frozen=True)
 class Patched:
-    """A patch of the twin's model, and the turn from which on it is believed."""
+    """A patch of the twin's model, the turn from which on it is believed, and what is said of it."""
 
     file: Path
     from_turn: int
+    notice: Mapping[str, Any] | None = None
 
 
 class Watch:
@@ -97,16 +95,22 @@ class Watch:
         with progress.stage("Calibrating and planning"):
             knowledge = prepare_knowledge(scenario, source, scenario.mission.seed)
         self.models = [BelievedModel(0, knowledge)]
+        own = getattr(scenario.belief, "patch", None)
+        self._patches: list[Path | None] = [Path(own) if own else None]  # of these models
         self._path = folder / JOURNAL_NAME
         self._hash = hash_record(self._config)
         self._adopted: dict[str, Any] | None = None
+        self._take_up()
+        keep_knowledge(folder, self.models[-1].knowledge)
+
+    def _take_up(self) -> None:
+        """Believe the patches that were adopted, as the journal says."""
         for record, _ in read_records(self._path, self._hash):
             if "model" in record:
                 self._adopted = record["model"]
-                self.models.append(
-                    self._with_patch(folder / self._adopted["patch"], self._adopted["from_turn"])
-                )
-        keep_knowledge(folder, self.models[-1].knowledge)
+                file = self.folder / self._adopted["patch"]
+                self._patches.append(file)
+                self.models.append(self._with_patch(file, self._adopted["from_turn"]))
 
     def _with_patch(self, file: Path, from_turn: int) -> BelievedModel:
         belief = self.scenario.belief
@@ -121,7 +125,7 @@ class Watch:
 
     def run(
         self, feed: Feed, decide: Callable[[Mapping[str, Any]], None], *, turns: int | None = None,
-        patched: Patched | None = None,
+        patched: Patched | None = None, search: Search | None = None,
     ) -> Counts:  # fmt: skip
         """Watch until the feed ends, or SIGINT or SIGTERM ask for it between two turns.
 
@@ -135,29 +139,90 @@ class Watch:
             Turns in all after which to end.
         patched : Patched, optional
             To believe from a turn on.
+        search : Search, optional
+            Looks for the cause of an alarm, so that the twin is taught.
         """
         rejected = RejectedFile(self.folder / REJECTED_NAME)
         intake = Intake(self.scenario, feed, rejected)
         with open_journal(self.folder, self._hash, FLUSH_SECONDS if feed.replayable else 0.0) as journal:
             if patched is not None:
-                self._adopt(journal, patched)
+                self.adopt(journal, patched)
             found = self._replayed(None)
-            twin = found.twin
             intake.restore(None if found.last is None else found.last["intake"])
             if found.last is not None:
-                self._progress.note(f"The watch goes on at {self.scenario.mission.step_name} {twin.turns}.")
-            keep = _Keeper(journal, intake, twin)
-            source = _Stopping(intake, turns)
+                self._progress.note(
+                    f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
+                )
+            source = Stopping(intake, turns)
+            keep = Keeper(journal, intake, found.twin)
+            if search is not None:
+                keep.tutor = self._tutor(journal, keep, search, source, wait=feed.replayable)
             with source.listening():
-                for reading, turn, _ in operate(twin, source, keep):
-                    decide(decision_of(self.scenario, self.models[-1].knowledge.model, twin, reading, turn))
+                try:
+                    self._operate(found.twin, source, keep, decide)
+                finally:
+                    if keep.tutor is not None:
+                        keep.tutor.end()
         return intake.counts
+
+    def _operate(
+        self, twin: Twin, source: Stopping, keep: "Keeper", decide: Callable[[Mapping[str, Any]], None]
+    ) -> None:
+        """Watch with one twin after the other: where it is taught, another one goes on."""
+        while True:
+            keep.twin = twin
+            if keep.tutor is not None and keep.tutor.act():
+                keep.twin = twin = self._replayed(None).twin
+            for reading, turn, _ in operate(twin, source, keep):
+                decision = decision_of(self.scenario, self.models[-1].knowledge.model, twin, reading, turn)
+                decide(decision | {"alarms": [*decision["alarms"], *keep.told]})
+                if keep.tutor is not None and keep.tutor.due:
+                    break
+            else:
+                return
+
+    def _tutor(
+        self, journal: JournalFile, keep: "Keeper", search: Search, source: Stopping, *, wait: bool
+    ) -> Tutor:
+        notice = self.scenario.notice
+        if notice is None:
+            raise MissionInputError("--teach begins with an alarm: the scenario needs the table `[notice]`.")
+        teaching = Teaching(notice.threshold)
+        for record, _ in read_records(self._path, self._hash):
+            teaching.take(record)
+        pupil = _Pupil(self, journal, keep, teaching)
+        step = self.scenario.mission.step_name
+        return Tutor(pupil, teaching, search, step, wait=wait, asked_to_end=lambda: source.asked)
+
+    def gained(self, patched: Patched, first: int) -> float:
+        """Return how much more log evidence the turns from `first` on have with a patch [nats]."""
+        place = self.folder / f"asset/model_patch_{len(self.models)}.json"
+        before = self._replayed(first)
+        candidate = self._candidate(place, patched)
+        self.models.append(candidate)
+        try:
+            after = self._replayed(min(patched.from_turn, first))
+        finally:
+            self.models.pop()
+            place.unlink()
+        said = [sum(found.beliefs.log_evidence[first - found.first_turn :]) for found in (before, after)]
+        return float(said[1] - said[0])
+
+    def _candidate(self, place: Path, patched: Patched) -> BelievedModel:
+        """Return the model with a patch beside what is believed there already; its file is put in a place."""
+        believed = [m for m in range(len(self.models)) if self.models[m].from_turn <= patched.from_turn]
+        atomic_write_bytes(place, both_patches(self._patches[max(believed)], patched.file))
+        try:
+            return self._with_patch(place, patched.from_turn)
+        except BaseException:
+            place.unlink()
+            raise
 
     def _replayed(self, first_turn: int | None, *, lag: bool = True) -> Replayed:
         kept = self.scenario.watch.lag if lag else None
         return replay(self._path, self._hash, self.models, kept, first_turn=first_turn)
 
-    def _adopt(self, journal: JournalFile, patched: Patched) -> None:
+    def adopt(self, journal: JournalFile, patched: Patched) -> dict[str, Any]:
         """Believe a patched model from a turn on: it and those behind it are filtered again."""
         before = self._replayed(patched.from_turn)
         if not 0 <= patched.from_turn <= before.twin.turns or before.last is None:
@@ -165,25 +230,26 @@ class Watch:
                 f"--from-turn names one of the {before.twin.turns} turns watched so far, or the next one."
             )
         name = f"asset/model_patch_{len(self.models)}.json"
-        candidate = self._with_patch(patched.file, patched.from_turn)
-        atomic_write_bytes(self.folder / name, patched.file.read_bytes())
+        candidate = self._candidate(self.folder / name, patched)
         first, believed = patched.from_turn, self.models[-1].knowledge.sensor_model
         self.models.append(candidate)
+        self._patches.append(self.folder / name)
         after = self._replayed(patched.from_turn)
+        alarms = [vars(n) for turn, n in after.beliefs.notices if turn >= first and n.kind == "alarm"]
         model: dict[str, Any] = {
             "patch": name, "sha256": hash_file(self.folder / name), "from_turn": first,
             "before": gap_of(before.beliefs, first - before.first_turn, believed),
             "after": gap_of(after.beliefs, first - after.first_turn, candidate.knowledge.sensor_model),
+            "alarms": alarms, **({} if patched.notice is None else {"notice": dict(patched.notice)}),
         }  # fmt: skip
-        journal.append(
-            {
-                "turn": after.twin.turns - 1,
-                "next_control": after.twin.proposed_control,
-                "intake": before.last["intake"],
-                "model": model,
-                "twin_state": base64.b64encode(after.twin.save_state()).decode("ascii"),
-            }
-        )
+        line = {
+            "turn": after.twin.turns - 1,
+            "next_control": after.twin.proposed_control,
+            "intake": before.last["intake"],
+            "model": model,
+            "twin_state": base64.b64encode(after.twin.save_state()).decode("ascii"),
+        }
+        journal.append(line)
         self._adopted = model
         keep_knowledge(self.folder, candidate.knowledge)
         self._progress.note(
@@ -195,6 +261,7 @@ class Watch:
             )
             + "."
         )
+        return line
 
     def store(self, counts: Counts, *, last: int = STORED_TURNS, report: bool = True) -> None:
         """Write `run.nc`, tables, summary and report of the last turns."""
@@ -344,68 +411,22 @@ def resume_watch(folder: Path, loaded: LoadedScenario | None, progress: Progress
         raise
 
 
-class _Keeper:
-    """Writes a turn down."""
+class _Pupil:
+    """A watch that is taught, see `teaching.Pupil`."""
 
-    def __init__(self, journal: JournalFile, intake: Intake, twin: Twin) -> None:
-        self._journal, self._intake, self._twin = journal, intake, twin
+    def __init__(self, watch: Watch, journal: JournalFile, keep: Keeper, teaching: Teaching) -> None:
+        self.folder, self._watch, self._journal = watch.folder, watch, journal
+        self._keep, self._teaching = keep, teaching
 
-    def __call__(self, reading: Reading, turn: TwinTurn) -> None:
-        at = self._intake.observation_turn
-        record = {
-            "turn": turn.turn,
-            "observation_turn": at,
-            "observed": plain(reading.observed),
-            "control_index": self._twin.control_of(at),
-            "next_control": turn.next_control,
-            "intake": self._intake.state(),
-        }
-        if turn.turn % SNAPSHOT_TURNS == SNAPSHOT_TURNS - 1 and reading.revises is None:
-            record["twin_state"] = base64.b64encode(self._twin.save_state()).decode("ascii")
-        self._journal.append(record | belief_record(turn))
+    def write(self, record: Mapping[str, Any]) -> None:
+        twin = self._keep.twin
+        state = {"next_control": twin.proposed_control, "intake": self._keep.intake.state()}
+        line = {"turn": twin.turns - 1, **state, **record}
+        self._journal.append(line)
+        self._teaching.take(line)
 
+    def gained(self, file: Path, from_turn: int, first: int) -> float:
+        return self._watch.gained(Patched(file, from_turn), first)
 
-class _Stopping:
-    """A source that ends when SIGINT or SIGTERM ask for it: between two turns, never within one."""
-
-    def __init__(self, intake: Intake, turns: int | None) -> None:
-        self._intake, self._turns = intake, turns
-        self._asked = self._waiting = False
-
-    def read(self, twin: Twin) -> Reading | None:
-        """Return the next reading; None once the watch is to end."""
-        if self._asked or (self._turns is not None and twin.turns >= self._turns):
-            return None
-        self._waiting = True
-        try:
-            return self._intake.read(twin)
-        except _Asked:
-            return None
-        finally:
-            self._waiting = False
-
-    def impossible(self, reading: Reading, error: ImpossibleObservation) -> Reading:
-        """Return what is assimilated in the place of an observation that no state allows."""
-        return self._intake.impossible(reading, error)
-
-    def _ask(self, _signal: int, _frame: FrameType | None) -> None:
-        self._asked = True
-        if self._waiting:
-            raise _Asked
-
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        """Listen to the signals."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-
-class _Asked(BaseException):
-    """Somebody asked the watch to end while it waited."""
+    def adopt(self, file: Path, from_turn: int, notice: Mapping[str, Any]) -> None:
+        self._teaching.take(self._watch.adopt(self._journal, Patched(file, from_turn, notice)))

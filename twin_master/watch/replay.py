@@ -92,7 +92,7 @@ def replay(
         try:
             if "model" in record:
                 adopted += 1
-            else:
+            elif "verdict" not in record:
                 seen = array_of(record["observed"]), int(record["control_index"])
                 tail.seen[int(record["observation_turn"])] = seen
             if "twin_state" in record:

@@ -86,6 +86,15 @@ def test_every_turn_is_in_one_trial_as_it_was_observed(campaign: Campaign, tree:
 
 
 @pytest.mark.xdist_group("wing")
+def test_some_turns_alone_are_read(run: Path) -> None:
+    campaign = run_campaign(run, RunPlan(first_turn=5, last_turn=18))
+    time = np.sort(np.concatenate([trial.time for trial in campaign.trials]))
+    np.testing.assert_array_equal(time, np.arange(6.0, 20.0))
+    with pytest.raises(CampaignDataError, match="has turns 0 to 23, and none from 30 to None"):
+        run_campaign(run, RunPlan(first_turn=30))
+
+
+@pytest.mark.xdist_group("wing")
 def test_the_truth_is_not_read(run: Path, campaign: Campaign, tmp_path: Path) -> None:
     bare = tmp_path / "bare"
     shutil.copytree(run, bare)

@@ -268,7 +268,10 @@ def test_a_gauge_that_is_off_is_named(
     assert [alarm.sensors for alarm in alarms] == [(gauge,)]
     assert alarms[0].kind == "alarm"
     assert f"gauge {gauge} shows too {word}, " in alarms[0].sentence
-    assert alarms[0].sentence.endswith("uav-twin discrepancy run --from-run DIR")
+    command = alarms[0].sentence.split("to find the cause: ")[1]
+    turn = f" --from-turn {alarms[0].since}" if alarms[0].since else ""
+    assert command == f"uav-twin discrepancy run --from-run DIR{turn}"
+    assert abs(alarms[0].since - begin) <= 6
     assert not any(estimate.notices for estimate in estimates[:begin])
     last = estimates[-1].suspicion
     assert last is not None

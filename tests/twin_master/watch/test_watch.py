@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import os
 import random
 import shutil
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -28,14 +30,17 @@ from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.journal import JOURNAL_NAME, read_records
 from twin_master.mission.loop import Flight, fly
 from twin_master.network.estimator import ExactFilter
+from twin_master.scenario.notice import Noticing
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.watch.feeds import CsvFeed, file_feed
 from twin_master.watch.folder import Patched, Watch, begin_watch, resume_watch
 from twin_master.watch.mqtt import PASSWORD_VARIABLE, MqttFeed, broker_of
 from twin_master.watch.replay import BelievedModel
+from twin_master.watch.snapshot import flown
+from twin_master.watch.teaching import Question, Search, Teaching, both_patches
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +97,7 @@ def begun(base: Watch, folder: Path) -> Watch:
     shutil.copytree(base.folder, folder)
     watch = copy.copy(base)
     watch.folder, watch._path, watch.models = folder, folder / JOURNAL_NAME, list(base.models)
+    watch._patches = [None]
     return watch
 
 
@@ -111,7 +117,7 @@ def whole(base: Watch, recorded: Path, tmp_path_factory: pytest.TempPathFactory)
 
 def test_a_recorded_mission_is_watched_as_it_was_flown(mission: Flight, whole: Path) -> None:
     run = uav_twin.open_run(whole)
-    for group, name, flown in (
+    for group, name, found in (
         ("observed", "strain", mission.observed),
         ("observed", "control_index", mission.control_index),
         ("filtered", "probability", mission.filtered),
@@ -120,7 +126,7 @@ def test_a_recorded_mission_is_watched_as_it_was_flown(mission: Flight, whole: P
         ("smoothed", "probability", mission.smoothed),
         ("predicted", "probability", mission.predicted),
     ):
-        np.testing.assert_array_equal(run[group][name].values, flown, err_msg=f"{group}/{name}")
+        np.testing.assert_array_equal(run[group][name].values, found, err_msg=f"{group}/{name}")
     assert "truth" not in run.children
     decisions = json.loads((whole / "decisions.json").read_text())
     assert [d["next_control"] for d in decisions[:-1]] == [d["control"] for d in decisions[1:]]
@@ -237,7 +243,7 @@ def test_a_folder_tells_what_came_late_into_a_gap(base: Watch, mission: Flight, 
 def test_a_watch_that_learns_goes_on_as_if_it_had_never_ended(
     base: Watch, mission: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("folder", "replay"):
+    for module in ("keeping", "replay"):
         monkeypatch.setattr(f"twin_master.watch.{module}.SNAPSHOT_TURNS", 8)
     learning = load_scenario("level_turns_learning").scenario.learning
     scenario = base.scenario.model_copy(update={"learning": learning})
@@ -262,7 +268,7 @@ def test_a_watch_that_learns_goes_on_as_if_it_had_never_ended(
 def test_a_long_watch_goes_on_from_its_snapshot(
     base: Watch, mission: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("folder", "replay"):
+    for module in ("keeping", "replay"):
         monkeypatch.setattr(f"twin_master.watch.{module}.SNAPSHOT_TURNS", 16)
     path = write_csv(tmp_path / "m.csv", mission.observed, mission.control_index)
     watch = begun(base, tmp_path / "watch")
@@ -365,6 +371,179 @@ def test_a_patch_is_believed_from_a_stated_turn_on(base: Watch, mission: Flight,
         for figure in json.loads((tmp_path / "later" / "summary.json").read_text())["figures"]
     }
     assert figures["gap_after_patch_20"] < 0.97 * figures["gap_before_patch_20"]
+
+
+# A search that knows its answer: it waits for a gate, and leaves what `discrepancy run` leaves.
+ANSWER = """
+import json, pathlib, sys, time
+words, (answer, gate) = sys.argv[3:], sys.argv[1:3]
+out = pathlib.Path(words[words.index("--out") + 1])
+while gate != "-" and not pathlib.Path(gate).exists():
+    time.sleep(0.01)
+kind, patch = json.loads(pathlib.Path(answer).read_text())
+if kind is None:
+    sys.exit("Nothing can be said.")
+place = out.with_name("." + out.name)
+place.mkdir()
+(place / "verdict.json").write_text(json.dumps({"verdict": {"kind": kind, "sentence": "It is so."}}))
+(place / "patch.json").write_text(json.dumps(patch))
+place.rename(out)
+"""
+
+
+def patch_of(gain: float, channel: str = "g5") -> dict[str, Any]:
+    effects = [{"id": "loose", "primitives": ModelPatch((SensorGain(channel, gain),)).to_list()}]
+    return {"schema": SCHEMA, "effects": effects, "channels": {channel: f"strain[{channel[1:]}]"}}
+
+
+def search(watch: Watch, place: Path, kind: str | None, gain: float, gate: str = "-") -> Search:
+    answer, script = place / f"{kind}_{gain}.json", place / "answer.py"
+    answer.write_text(json.dumps([kind, patch_of(gain)]))
+    script.write_text(ANSWER)
+    return Search(watch.folder, 7, (sys.executable, str(script), str(answer), gate))
+
+
+def watchful(base: Watch, folder: Path) -> Watch:
+    watch = begun(base, folder)
+    watch.scenario = watch.scenario.model_copy(update={"notice": Noticing()})
+    watch.models = [BelievedModel(0, replace(base.models[0].knowledge, scenario=watch.scenario))]
+    watch._take_up()
+    return watch
+
+
+@pytest.fixture(scope="module")
+def loose(mission: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The mission with a gauge that shows 30 % too little from turn 15 on."""
+    observed = mission.observed.copy()
+    observed[15:, 4] *= 0.7
+    return write_csv(tmp_path_factory.mktemp("loose") / "m.csv", observed, mission.control_index)
+
+
+def lines(watch: Watch) -> list[dict[str, Any]]:
+    return [record for record, _ in read_records(watch.folder / JOURNAL_NAME)]
+
+
+def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
+    base: Watch, mission: Flight, loose: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "whole").mkdir()
+    watch = watchful(base, tmp_path / "whole" / "watch")
+    decisions: list[dict[str, Any]] = []
+    told = search(watch, tmp_path, "named", -0.3)
+    watch.run(CsvFeed(loose, watch.scenario), lambda d: decisions.append(dict(d)), search=told)
+    records = lines(watch)
+    (verdict,) = [record["verdict"] for record in records if "verdict" in record]
+    (model,) = [record["model"] for record in records if "model" in record]
+    alarm = next(d for d in decisions for n in d["alarms"] if n["kind"] == "alarm")
+    assert verdict["to_turn"] == alarm["turn"] + 10
+    assert 12 <= verdict["from_turn"] <= 18
+    assert model["from_turn"] == verdict["from_turn"]
+    assert model["before"]["rms_residual"] > 1.4 > 1.3 > model["after"]["rms_residual"]
+    said = [notice["sentence"] for d in decisions for notice in d["alarms"]]
+    assert "named. It is so. The patch is tried" in said[1]
+    assert "is believed from turn" in said[2]
+    assert len(said) == 3
+    # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
+    last = records[-1]["filtered"]
+    assert np.abs(np.array(last) - mission.filtered[-1]).max() < 0.2
+    # Stopped within the trial, and after the adoption: the same journal.
+    stopped = watchful(base, tmp_path / "stopped")
+    asked = verdict["to_turn"]
+    for end in (asked + 5, asked + 15, None):
+        stopped.run(
+            CsvFeed(loose, stopped.scenario), lambda _d: None, turns=end,
+            search=search(stopped, tmp_path, "named", -0.3),
+        )  # fmt: skip
+        journal = (stopped.folder / JOURNAL_NAME).read_bytes()
+        again = watchful(stopped, tmp_path / f"{end}")
+        assert (again.folder / JOURNAL_NAME).read_bytes() == journal
+        stopped = again
+    assert journal == (watch.folder / JOURNAL_NAME).read_bytes()
+
+
+def test_a_wrong_name_is_not_adopted_and_a_group_is_told(base: Watch, loose: Path, tmp_path: Path) -> None:
+    for kind, gain, sentence in (
+        ("named", 0.3, "and is not adopted."),
+        ("group", -0.3, "--model-patch DIR/teaching/turns_"),
+        (None, 0.0, "the search ended without a verdict: Nothing can be said."),
+    ):
+        watch = watchful(base, tmp_path / f"{kind}{gain}")
+        finder = search(watch, tmp_path, kind, gain)
+        watch.run(CsvFeed(loose, watch.scenario), lambda _d: None, turns=44, search=finder)
+        records = lines(watch)
+        assert not any("model" in record for record in records)
+        notices = [n["sentence"] for record in records for n in record.get("notices", [])]
+        assert any(sentence in text for text in notices)
+        assert sum("searched for the cause" in text for text in notices) == 2
+
+
+def test_live_turns_do_not_wait_for_the_search(base: Watch, loose: Path, tmp_path: Path) -> None:
+    watch = watchful(base, tmp_path / "watch")
+    feed, gate = CsvFeed(loose, watch.scenario), tmp_path / "gate"
+    feed.replayable = False  # as a broker
+    finder = search(watch, tmp_path, "group", -0.3, str(gate))
+
+    def decide(decision: Any) -> None:
+        if decision["turn"] == 40:
+            gate.touch()
+            for _ in range(1000):
+                if any((watch.folder / "teaching").glob("turns*/verdict.json")):
+                    return
+                time.sleep(0.02)
+
+    watch.run(feed, decide, search=finder)
+    (verdict, *_) = [record for record in lines(watch) if "verdict" in record]
+    assert (verdict["turn"], verdict["verdict"]["turn"]) == (40, 40)
+    assert verdict["verdict"]["to_turn"] < 35
+
+
+def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:
+    return {"turn": number, "notices": list(alarms), "suspicion": {"log_evidence_none": evidence}}
+
+
+def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns() -> None:
+    teaching = Teaching(100.0)
+    alarm = {"kind": "alarm", "sentence": "a", "since": 3}
+    for number in range(12):
+        teaching.take(turn(number, 10.0, *([alarm] if number == 5 else [])))
+    for number in (12, 13, 14, 15):
+        teaching.take(turn(number, math.log(100.0) - 0.1))
+    assert teaching.question is None  # it did not hold ten turns after the alarm
+    teaching.take(turn(16, math.log(100.0)))
+    assert teaching.question == Question(3, 16)
+    told = {"kind": "verdict", "sentence": "v"}
+    teaching.take({"turn": 16, "verdict": {"to_turn": 16, "turn": 16, "tried": False, "notice": told}})
+    assert teaching.question is None
+    assert teaching.untold == [told]
+    for number in range(17, 40):
+        teaching.take(turn(number, 10.0))
+        assert (teaching.question is not None) == (number >= 27)
+    assert teaching.question == Question(3, 27)
+    assert teaching.untold == []
+    teaching.take({"turn": 40, "model": {"from_turn": 8, "notice": told, "alarms": [alarm]}})
+    assert (teaching.question, teaching.untold) == (None, [told, alarm])
+    for number in range(41, 60):
+        teaching.take(turn(number, 10.0))
+    assert teaching.question == Question(8, 49)  # the alarm of the new model, and not before it was believed
+
+
+def test_a_second_patch_stands_beside_the_first(tmp_path: Path) -> None:
+    for number, channel in enumerate(("g5", "g7")):
+        (tmp_path / str(number)).write_text(json.dumps(patch_of(-0.1, channel)))
+    both = json.loads(both_patches(tmp_path / "0", tmp_path / "1"))
+    assert [effect["primitives"][0]["channel"] for effect in both["effects"]] == ["g5", "g7"]
+    assert both["channels"] == {"g5": "strain[5]", "g7": "strain[7]"}
+    assert both_patches(None, tmp_path / "1") == (tmp_path / "1").read_bytes()
+
+
+def test_a_watch_is_read_up_to_a_turn_while_it_goes_on(whole: Path) -> None:
+    before = (whole / JOURNAL_NAME).read_bytes()
+    with flown(whole, 20, SilentProgress()) as copy:
+        ended = [record for record, _ in read_records(copy / JOURNAL_NAME)]
+        assert (copy / "run.nc").is_file()
+    assert [record["turn"] for record in ended] == list(range(21))
+    assert not copy.exists()
+    assert (whole / JOURNAL_NAME).read_bytes() == before
 
 
 PASSWORD = "a password"

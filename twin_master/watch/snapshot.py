@@ -1,0 +1,62 @@
+"""A watch as it stood after a turn: a copy of its folder, ended there, while the watch itself goes on."""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from reporting.json_file import read_json
+from reporting.progress import Progress
+from twin_master.assets.resolution import located_scenario
+from twin_master.errors import NotResumableError
+from twin_master.mission.journal import JOURNAL_NAME, read_lines, record_of
+from twin_master.run_folder import CONFIG_NAME
+from twin_master.scenario.reading import parse_scenario
+from twin_master.watch.folder import Watch
+from twin_master.watch.intake import Counts
+
+
+@contextmanager
+def flown(folder: Path, last: int | None, progress: Progress) -> Iterator[Path]:
+    """Give the run folder of a flight up to a turn: of a watch, which may go on, a copy that ended there.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a run, which is given as it is, or of a watch, which is only read.
+    last : int or None
+        The last turn; None for all that are in the journal.
+    progress : Progress
+        Shows stages.
+
+    Raises
+    ------
+    NotResumableError
+        The journal was changed or is damaged.
+    """
+    config = read_json(folder / CONFIG_NAME, NotResumableError) if (folder / CONFIG_NAME).is_file() else None
+    if not isinstance(config, dict) or not config.get("watched"):
+        yield folder
+        return
+    with TemporaryDirectory(prefix="uav_twin_") as place:
+        copy = Path(place) / folder.resolve().name
+        copy.mkdir()
+        shutil.copy(folder / CONFIG_NAME, copy)
+        shutil.copytree(folder / "asset", copy / "asset")
+        end = _end_of(folder / JOURNAL_NAME, last)
+        with (folder / JOURNAL_NAME).open("rb") as journal:
+            (copy / JOURNAL_NAME).write_bytes(journal.read(end))
+        scenario = parse_scenario(config["scenario"], str(folder / CONFIG_NAME))
+        Watch(copy, config, located_scenario(scenario, copy), progress).store(Counts(), report=False)
+        yield copy
+
+
+def _end_of(path: Path, last: int | None) -> int:
+    """Return where the lines of the turns up to a last one end [bytes]."""
+    end = 0
+    for number, (text, after) in enumerate(read_lines(path, None)):
+        if number and last is not None and int(record_of(path, number, text).get("turn", -1)) > last:
+            break
+        end = after
+    return end

@@ -1,0 +1,58 @@
+"""The end of a watch that is asked for: between two turns, never within one."""
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from twin_master.errors import ImpossibleObservation
+from twin_master.mission.loop import Reading
+from twin_master.network.twin import Twin
+from twin_master.watch.intake import Intake
+
+
+class Stopping:
+    """A source that ends when SIGINT or SIGTERM ask for it: between two turns, never within one."""
+
+    def __init__(self, intake: Intake, turns: int | None) -> None:
+        self._intake, self._turns = intake, turns
+        self.asked = self._waiting = False
+
+    def read(self, twin: Twin) -> Reading | None:
+        """Return the next reading; None once the watch is to end."""
+        if self.asked or (self._turns is not None and twin.turns >= self._turns):
+            return None
+        self._waiting = True
+        try:
+            return self._intake.read(twin)
+        except _Asked:
+            return None
+        finally:
+            self._waiting = False
+
+    def impossible(self, reading: Reading, error: ImpossibleObservation) -> Reading:
+        """Return what is assimilated in the place of an observation that no state allows."""
+        return self._intake.impossible(reading, error)
+
+    def _ask(self, _signal: int, _frame: FrameType | None) -> None:
+        self.asked = True
+        if self._waiting:
+            raise _Asked
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Listen to the signals."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+class _Asked(BaseException):
+    """Somebody asked the watch to end while it waited."""

@@ -1,0 +1,341 @@
+"""Teaching: from an alarm to a verdict on what the model lacks, to a trial of its patch, to its adoption.
+
+What is asked when is a pure function of the journal (`Teaching`), so that a watch that was killed and taken
+up again asks, tries and adopts the same. The search for the cause is a process of its own, of low priority:
+the very command that the alarm names. Its verdict is a line of the journal behind the turn in which it came.
+"""
+
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from fe.runtime.errors import FiniteElementError
+from fmu_asset.errors import FmuError
+from reporting.errors import DamagedFileError
+from reporting.json_file import read_json
+from twin_master.errors import TwinMasterError
+
+SETTLE_TURNS = 10
+"""Turns that an alarm must hold before its cause is looked for; they also show what it is."""
+TRIAL_TURNS = 10
+"""Turns behind a verdict, none of which it has seen, in which model and patched model are compared."""
+TRIED = ("named", "named in part")
+"""Verdicts whose patch is tried; of a group it would be one of several that fit alike."""
+FOLDER = "teaching"
+_COURTESY = 10
+"""Niceness of the search: the watch comes first."""
+_LOOK_AGAIN = 0.05
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked: which effect the turns `from_turn` to `to_turn` hold that the model lacks."""
+
+    from_turn: int
+    to_turn: int
+
+    def folder(self, watch: Path) -> Path:
+        """Return where the verdict is put."""
+        return watch / FOLDER / f"turns_{self.from_turn}_to_{self.to_turn}"
+
+
+@dataclass
+class Teaching:
+    """Where the teaching of a watch stands, after the lines of its journal so far.
+
+    Parameters
+    ----------
+    threshold : float
+        Evidence from which on an alarm holds.
+
+    Attributes
+    ----------
+    turn : int
+        The last turn.
+    question : Question or None
+        What is to be answered.
+    trial : dict or None
+        The verdict whose patch is on trial.
+    untold : list
+        Notices that go with the next turn.
+    """
+
+    threshold: float
+    turn: int = -1
+    question: Question | None = None
+    trial: dict[str, Any] | None = None
+    untold: list[dict[str, Any]] = field(default_factory=list)
+    _alarm: tuple[int, int] | None = None
+    _ask_at: int = 0
+    _since: int = 0
+
+    def take(self, record: Mapping[str, Any]) -> None:
+        """Take in a line of the journal."""
+        if "model" in record:
+            self.question = self.trial = self._alarm = None
+            self._since = int(record["model"]["from_turn"])
+            self.untold += [record["model"]["notice"]] if "notice" in record["model"] else []
+            # An alarm of the turns that were filtered anew: the patch was not all that the model lacks.
+            again = record["model"].get("alarms", [])
+            self.untold += again
+            self._alarms(again)
+        elif "verdict" in record:
+            self._verdict(record["verdict"])
+        else:
+            self.turn = int(record["turn"])
+            told = {notice["sentence"] for notice in self.untold}
+            notices = [n for n in record.get("notices", []) if n["sentence"] not in told]
+            self.untold = []
+            self._alarms(notices)
+            self._ask(record.get("suspicion", {}))
+
+    def _alarms(self, notices: Sequence[Mapping[str, Any]]) -> None:
+        for notice in notices:
+            if notice["kind"] == "alarm":
+                self._alarm = self.turn, int(notice.get("since") or 0)
+                self._ask_at = self.turn + SETTLE_TURNS
+
+    def _ask(self, suspicion: Mapping[str, Any]) -> None:
+        if self._alarm is None or self.question or self.trial or self.turn < self._ask_at:
+            return
+        evidence = max(
+            suspicion.get("log_evidence_none", -math.inf), suspicion.get("log_evidence_any_gauge", -math.inf)
+        )
+        if evidence >= math.log(self.threshold):
+            self.question = Question(max(self._alarm[1], self._since), self.turn)
+
+    def _verdict(self, verdict: dict[str, Any]) -> None:
+        self.untold.append(verdict["notice"])
+        if verdict["tried"]:
+            self.trial, self.question = verdict, None
+            return
+        # More turns may tell what these could not: asked again with twice as many behind the alarm.
+        asked, self.question, self.trial = int(verdict["to_turn"]), None, None
+        if self._alarm is not None:
+            self._ask_at = asked + max(SETTLE_TURNS, asked - self._alarm[0])
+
+
+@dataclass
+class Search:
+    """The search for a cause, as a process.
+
+    Parameters
+    ----------
+    watch : Path
+        Folder of the watch.
+    seed : int
+        Of its draws.
+    command : sequence of str
+        What begins with a search; by default this package's `discrepancy run`.
+    """
+
+    watch: Path
+    seed: int
+    command: Sequence[str] = (sys.executable, "-m", "uav_twin", "discrepancy", "run")
+    _process: "subprocess.Popen[bytes] | None" = None
+
+    def words(self, question: Question) -> list[str]:
+        """Return the options of the command that answers a question."""
+        turns = ["--from-turn", str(question.from_turn), "--to-turn", str(question.to_turn)]
+        out = ["--out", str(question.folder(self.watch)), "--seed", str(self.seed)]
+        return ["--from-run", str(self.watch), *turns, *out]
+
+    def answer(self, question: Question, *, wait: bool, asked_to_end: Callable[[], bool]) -> Path | None:
+        """Return the folder of the verdict; None while it is looked for.
+
+        Raises
+        ------
+        TwinMasterError
+            The search ended without a verdict; the sentence is the last one that it said.
+        """
+        folder = question.folder(self.watch)
+        while not (folder / "verdict.json").is_file():
+            if self._process is None:
+                self._begin(question)
+            elif (code := self._process.poll()) is not None and not (folder / "verdict.json").is_file():
+                self._process = None
+                raise TwinMasterError(self._last_words(question, code))
+            if not wait or asked_to_end():
+                return None
+            time.sleep(_LOOK_AGAIN)
+        self.end()
+        return folder
+
+    def _log(self, question: Question) -> Path:
+        folder = question.folder(self.watch)
+        return folder.with_name(folder.name + ".log")
+
+    def _begin(self, question: Question) -> None:
+        log = self._log(question)
+        log.parent.mkdir(exist_ok=True)
+        with log.open("wb") as file:
+            self._process = subprocess.Popen(
+                [*self.command, *self.words(question)],
+                stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True,
+            )  # fmt: skip
+        with suppress(ProcessLookupError):
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, _COURTESY)
+
+    def _last_words(self, question: Question, code: int) -> str:
+        lines = self._log(question).read_text(encoding="utf-8", errors="replace").split("\n")
+        return next((line.strip() for line in reversed(lines) if line.strip()), f"exit code {code}")
+
+    def end(self) -> None:
+        """End the process, if there is one; a watch that is taken up again asks again."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+            self._process.wait()
+        self._process = None
+
+
+def verdict_of(
+    watch: Path, question: Question, folder: Path | TwinMasterError, turn: int, step: str
+) -> dict[str, Any]:
+    """Return what the journal keeps of a verdict, and what the operator is told.
+
+    Parameters
+    ----------
+    watch : Path
+        Folder of the watch.
+    question : Question
+    folder : Path or TwinMasterError
+        Where the verdict is, or why there is none.
+    turn : int
+        The last turn before it came.
+    step : str
+        What a turn is called.
+    """
+    asked = {"from_turn": question.from_turn, "to_turn": question.to_turn, "turn": turn}
+    where = f"{step.capitalize()}s {question.from_turn} to {question.to_turn} were searched for the cause"
+    if isinstance(folder, TwinMasterError):
+        sentence = f"{where}, and the search ended without a verdict: {folder}"
+        return {**asked, "tried": False, "kind": "none", "notice": notice_of("verdict", sentence)}
+    try:
+        verdict = read_json(folder / "verdict.json", DamagedFileError)["verdict"]
+        kind, said = str(verdict["kind"]), str(verdict["sentence"])
+    except (DamagedFileError, KeyError, TypeError) as error:
+        return verdict_of(watch, question, TwinMasterError(f"{folder.name}: {error}"), turn, step)
+    tried, patch = kind in TRIED and (folder / "patch.json").is_file(), folder / "patch.json"
+    sentence = f"{where}: {kind}. {said}"
+    if tried:
+        sentence += f" The patch is tried beside the model for {TRIAL_TURNS} {step}s."
+    elif patch.is_file():
+        options = f"--model-patch DIR/{patch.relative_to(watch)} --from-turn {question.from_turn}"
+        sentence += f" To believe it none the less: uav-twin watch --resume --out DIR {options}"
+    return {
+        **asked, "tried": tried, "kind": kind, "folder": folder.relative_to(watch).as_posix(),
+        "notice": notice_of("verdict", sentence),
+    }  # fmt: skip
+
+
+def trial_sentence(trial: Mapping[str, Any], gained: float, step: str) -> str:
+    """Return what the operator is told at the end of a trial."""
+    first = trial["from_turn"]
+    compared = f"beside the model for {TRIAL_TURNS} {step}s the patch gained {gained:.3g} nats of evidence"
+    if gained > 0.0:
+        return f"{compared}: it is believed from {step} {first} on, and these {step}s were filtered anew."
+    return f"{compared}, and is not adopted."
+
+
+def notice_of(kind: str, sentence: str) -> dict[str, Any]:
+    """Return a notice as it stands in the journal."""
+    return {"kind": kind, "sentence": sentence, "sensors": [], "value": None, "since": None}
+
+
+def both_patches(before: Path | None, found: Path) -> bytes:
+    """Return the patch that the model has and the one that was found beside it, as one file."""
+    if before is None:
+        return found.read_bytes()
+    old, new = (json.loads(file.read_text(encoding="utf-8")) for file in (before, found))
+    effects, channels = old["effects"] + new["effects"], old.get("channels", {}) | new.get("channels", {})
+    text = json.dumps({"schema": new["schema"], "effects": effects, "channels": channels}, indent=1)
+    return (text + "\n").encode()
+
+
+class Pupil(Protocol):
+    """What the tutor teaches: a watch."""
+
+    folder: Path
+
+    def write(self, record: Mapping[str, Any]) -> None:
+        """Add a line to the journal."""
+
+    def gained(self, file: Path, from_turn: int, first: int) -> float:
+        """Return the log evidence [nats] that a patch gains in the turns from `first` on."""
+
+    def adopt(self, file: Path, from_turn: int, notice: Mapping[str, Any]) -> None:
+        """Believe a patch from a turn on."""
+
+
+class Tutor:
+    """Asks, tries and adopts between two turns of a watch.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    teaching : Teaching
+        After all lines of the journal.
+    search : Search
+    step : str
+        What a turn is called.
+    wait : bool
+        Whether the turns can wait for a verdict, as those of a recorded file do: the watch then repeats bit
+        for bit.
+    asked_to_end : callable
+        Whether the watch is to end.
+    """
+
+    def __init__(
+        self, pupil: Pupil, teaching: Teaching, search: Search, step: str, *, wait: bool,
+        asked_to_end: Callable[[], bool],
+    ) -> None:  # fmt: skip
+        self._pupil, self.teaching, self._search, self._step = pupil, teaching, search, step
+        self._wait, self._asked_to_end = wait, asked_to_end
+
+    @property
+    def due(self) -> bool:
+        """Whether something may have to be done before the next turn."""
+        trial = self.teaching.trial
+        over = trial is not None and self.teaching.turn >= trial["turn"] + TRIAL_TURNS
+        return self.teaching.question is not None or over
+
+    def act(self) -> bool:
+        """Do what is due; return whether the model has changed."""
+        teaching, question = self.teaching, self.teaching.question
+        if question is not None:
+            found: Path | TwinMasterError | None
+            try:
+                found = self._search.answer(question, wait=self._wait, asked_to_end=self._asked_to_end)
+            except TwinMasterError as error:
+                found = error
+            if found is not None:
+                verdict = verdict_of(self._pupil.folder, question, found, teaching.turn, self._step)
+                self._pupil.write({"verdict": verdict})
+        trial = teaching.trial
+        if trial is None or teaching.turn < trial["turn"] + TRIAL_TURNS:
+            return False
+        file = self._pupil.folder / trial["folder"] / "patch.json"
+        try:
+            gained = self._pupil.gained(file, trial["from_turn"], trial["turn"] + 1)
+        except (TwinMasterError, FmuError, FiniteElementError) as error:
+            sentence = f"the patch cannot be believed by this twin: {error}"
+            self._pupil.write({"verdict": {**trial, "tried": False, "notice": notice_of("trial", sentence)}})
+            return False
+        notice = notice_of("trial", trial_sentence(trial, gained, self._step))
+        if gained > 0.0:
+            self._pupil.adopt(file, trial["from_turn"], notice)
+            return True
+        self._pupil.write({"verdict": {**trial, "tried": False, "notice": notice}})
+        return False
+
+    def end(self) -> None:
+        """End what is under way."""
+        self._search.end()
