@@ -34,6 +34,13 @@ Observations = Annotated[
     ),
 ]
 
+Pace = Annotated[
+    float,
+    typer.Option(min=0.0, max=3600.0, help="Seconds to wait after each turn, to look at a recording."),
+]
+Teach = Annotated[
+    bool, typer.Option("--teach", help="Look for the cause of an alarm, and believe what is named.")
+]
 _WORTH_SAYING = 0.05
 """Probability that no state explains the sensors, from which on a line for people says so."""
 
@@ -50,10 +57,7 @@ def watch(
     resume: Annotated[bool, typer.Option("--resume", help="Take up the watch in --out.")] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the folder if it exists.")] = False,
     follow: Annotated[bool, typer.Option("--follow", help="Wait at the end of a CSV file for more.")] = False,
-    pace: Annotated[
-        float,
-        typer.Option(min=0.0, max=3600.0, help="Seconds to wait after each turn, to look at a recording."),
-    ] = 0.0,
+    pace: Pace = 0.0,
     turns: Annotated[int | None, typer.Option(min=0, help="End after so many turns in all.")] = None,
     model_patch: Annotated[
         Path | None,
@@ -62,9 +66,7 @@ def watch(
     from_turn: Annotated[
         int | None, typer.Option(min=0, help="The first turn that --model-patch is believed in.")
     ] = None,
-    teach: Annotated[
-        bool, typer.Option("--teach", help="Look for the cause of an alarm, and believe what is named.")
-    ] = False,
+    teach: Teach = False,
     ca_file: Annotated[
         Path | None, typer.Option(help="Certificate of the authority of an mqtts:// broker.")
     ] = None,
