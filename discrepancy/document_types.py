@@ -4,7 +4,6 @@ A number that is not a number is null, an infinite one "Infinity" or "-Infinity"
 The records themselves (`verdict`) say what a file holds; pydantic checks it against them.
 """
 
-from dataclasses import fields
 from math import inf, isfinite, nan
 from typing import Annotated, Any
 
@@ -18,6 +17,17 @@ PRIMITIVE_UNITS: dict[str, dict[str, str]] = {kind: item.units for kind, item in
 
 _WORDS = {None: nan, "Infinity": inf, "-Infinity": -inf}
 _JSON_TYPES: dict[Any, str] = {float: "number", int: "integer", str: "string"}
+_SECONDS = {"type": ["number", "null"], "description": "[s]; null: open."}
+_WINDOWS = {
+    "type": "array",
+    "description": "It acts within these only: stretches of trials, in their time.",
+    "items": {
+        "type": "object",
+        "properties": {"trial": {"type": "string"}, "begin": _SECONDS, "end": _SECONDS},
+        "required": ["trial", "begin", "end"],
+        "additionalProperties": False,
+    },
+}
 
 
 def _number(value: object) -> float:
@@ -41,15 +51,15 @@ def _primitive_schema(primitive: type[Primitive]) -> dict[str, Any]:
     """Return the JSON Schema of one kind of primitive, from its own fields."""
     units = PRIMITIVE_UNITS[primitive.kind]
     columns: dict[str, Any] = {"kind": {"const": primitive.kind, "type": "string"}}
-    for item in fields(primitive):
-        columns[item.name] = {"type": _JSON_TYPES[item.type]}
-        if item.name in units:
-            columns[item.name]["description"] = f"[{units[item.name]}]"
+    for name, kind in primitive.values().items():
+        columns[name] = {"type": _JSON_TYPES[kind]}
+        if name in units:
+            columns[name]["description"] = f"[{units[name]}]"
     return {
         "type": "object",
         "title": primitive.__name__,
         "description": (primitive.__doc__ or "").split("\n")[0],
-        "properties": columns,
+        "properties": {**columns, **({"windows": _WINDOWS} if primitive.in_windows else {})},
         "required": list(columns),
         "additionalProperties": False,
     }

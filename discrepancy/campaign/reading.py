@@ -15,6 +15,7 @@ from discrepancy.campaign.noise_records import pre_trigger_record, with_noise
 from discrepancy.campaign.records import (
     Campaign,
     Channel,
+    Event,
     NoiseRecord,
     Quantity,
     RecordedInput,
@@ -94,7 +95,26 @@ def read_campaign(folder: str | Path) -> Campaign:
         parameters={name: (item.mean, item.deviation) for name, item in section.parameters.items()},
         data_hash=hash_record({name: hash_file(folder / name) for name in sorted(names)}),
         loggers=section.loggers,
+        events=_events(section, trials),
         remarks=(*section.remarks, *(remark for remark in remarks if remark not in section.remarks)),
+    )
+
+
+def _events(section: CampaignSection, trials: tuple[Trial, ...]) -> tuple[Event, ...]:
+    """Return the events; each must lie within the records of its trials."""
+    records = {trial.name: trial for trial in trials}
+    for event in section.event:
+        for name in event.among(section.trial):
+            time = records[name].time
+            for key, moment in (("time", event.time), ("until", event.until)):
+                if moment is not None and not time[0] <= moment <= time[-1]:
+                    raise CampaignDataError(
+                        f"The event {event.name!r} has {key} = {moment:g} s, but the record of the trial "
+                        f"{name!r} goes from {time[0]:g} to {time[-1]:g} s: times count from the trial's "
+                        "start."
+                    )
+    return tuple(
+        Event(event.name, event.among(section.trial), event.time, event.until) for event in section.event
     )
 
 

@@ -304,6 +304,28 @@ class Trial:
 
 
 @dataclass(frozen=True)
+class Event:
+    """Something that happened in trials, known from a protocol.
+
+    Attributes
+    ----------
+    name : str
+        As expressions use it; `name_until` is its end.
+    trials : tuple of str
+        Trials in which it happened.
+    time : float
+        Since each trial's start [s].
+    until : float or None
+        When it was over [s]; None where nothing is said.
+    """
+
+    name: str
+    trials: tuple[str, ...]
+    time: float
+    until: float | None = None
+
+
+@dataclass(frozen=True)
 class Campaign:
     """All trials of one structure.
 
@@ -326,6 +348,8 @@ class Campaign:
     loggers : mapping of str to tuple of str
         Channels and inputs ("force": that of forced trials) that share a clock, by the logger's name; empty
         where nothing is said, and one logger is taken to record everything.
+    events : tuple of Event
+        In the order of the file; those of one name are in different trials.
     """
 
     name: str
@@ -336,6 +360,17 @@ class Campaign:
     data_hash: str
     remarks: tuple[str, ...] = field(default=())
     loggers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    events: tuple[Event, ...] = ()
+
+    def event_times(self, trial: str) -> dict[str, float]:
+        """Return the moments in a trial [s] by the names that expressions use."""
+        found: dict[str, float] = {}
+        for event in self.events:
+            if trial in event.trials:
+                found[event.name] = event.time
+                if event.until is not None:
+                    found[f"{event.name}_until"] = event.until
+        return found
 
     @property
     def fitted(self) -> tuple[Trial, ...]:

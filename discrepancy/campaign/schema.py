@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator, model_validator
@@ -211,6 +211,46 @@ class TrialSection(Section):
         return self
 
 
+class EventSection(Section):
+    """`[[event]]`."""
+
+    name: Name
+    time: NotNegative
+    trial: Name | None = None
+    trials: tuple[Name, ...] | None = None
+    until: Number | None = None
+
+    @field_validator("trials", mode="before")
+    @classmethod
+    def _tuple(cls, value: object) -> object:
+        return tuple(value) if isinstance(value, list) else value
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.name.isidentifier():
+            raise ValueError(
+                f"the event {self.name!r} is used in expressions, so its name must be of letters, digits and "
+                "underscores, a letter first"
+            )
+        if self.trial is not None and self.trials is not None:
+            raise ValueError(f"the event {self.name!r} has `trial` and `trials`: give one of the two")
+        if self.until is not None and self.until <= self.time:
+            raise ValueError(
+                f"the event {self.name!r} begins at {self.time:g} s and must end later, but `until` is "
+                f"{self.until:g} s"
+            )
+        return self
+
+    def among(self, trials: Sequence[TrialSection]) -> tuple[str, ...]:
+        """Return the trials in which it happened: those named, or all that are samples in time."""
+        if self.trial is not None:
+            return (self.trial,)
+        if self.trials is not None:
+            return self.trials
+        still = (TrialKind.STATIC, TrialKind.FLIGHT)
+        return tuple(item.name for item in trials if item.kind not in still)
+
+
 class CampaignSection(Section):
     """The whole file."""
 
@@ -222,6 +262,7 @@ class CampaignSection(Section):
     channel: tuple[ChannelSection, ...] = Field(min_length=1)
     input: tuple[InputSection, ...] = ()
     trial: tuple[TrialSection, ...] = Field(min_length=1)
+    event: tuple[EventSection, ...] = ()
     remarks: tuple[str, ...] = ()
     loggers: dict[Name, tuple[Name, ...]] = Field(default_factory=dict)
 
@@ -232,7 +273,7 @@ class CampaignSection(Section):
             return value
         return {key: tuple(names) if isinstance(names, list) else names for key, names in value.items()}
 
-    @field_validator("channel", "input", "trial", "remarks", mode="before")
+    @field_validator("channel", "input", "trial", "event", "remarks", mode="before")
     @classmethod
     def _tuple(cls, value: object) -> object:
         return tuple(value) if isinstance(value, list) else value
@@ -268,6 +309,7 @@ class CampaignSection(Section):
         if len(scales) > 1:
             raise ValueError("temperatures are given in degC and in K: give all of them in one of the two")
         self._check_loggers()
+        self._check_events()
         known = {item.name for item in self.channel}
         for item in self.trial:
             for name in (*(item.channels or ()), *item.left_out):
@@ -298,6 +340,27 @@ class CampaignSection(Section):
                 raise ValueError(f"{name!r} must be on one of the `loggers`, and it is on {came}")
         if sum(bool(inputs & set(names)) for names in self.loggers.values()) > 1:
             raise ValueError("all inputs must be on one of the `loggers`, and they are on several")
+
+    def _check_events(self) -> None:
+        """Refuse an event in a trial that is not there or not in time, and two of a name in one trial."""
+        kinds, seen = {item.name: item.kind for item in self.trial}, set[tuple[str, str]]()
+        for event in self.event:
+            for trial in event.among(self.trial):
+                if trial not in kinds:
+                    raise ValueError(
+                        f"the event {event.name!r} names the trial {trial!r}, which is not among the trials "
+                        f"{', '.join(kinds)}"
+                    )
+                if kinds[trial] in (TrialKind.STATIC, TrialKind.FLIGHT):
+                    raise ValueError(
+                        f"the event {event.name!r} is in the trial {trial!r}, which is {kinds[trial].value} "
+                        "and has no course in time"
+                    )
+                if (event.name, trial) in seen:
+                    raise ValueError(
+                        f"there is more than one event {event.name!r} in the trial {trial!r}: rename one"
+                    )
+                seen.add((event.name, trial))
 
 
 def parse_campaign(table: Mapping[str, Any], source: str) -> CampaignSection:

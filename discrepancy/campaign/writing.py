@@ -176,6 +176,11 @@ def _campaign_text(campaign: Campaign, files: list[str], noise_interval: float |
     order = list(campaign.channels)
     for trial, file in zip(campaign.trials, files, strict=True):
         lines += ["", "[[trial]]", *_trial_lines(trial, file, order)]
+    for event in campaign.events:
+        trials = _list([_quoted(name) for name in event.trials])
+        lines += ["", "[[event]]", f"name = {_quoted(event.name)}", f"trials = {trials}"]
+        lines += [f"time = {_number(event.time)}"]
+        lines += [] if event.until is None else [f"until = {_number(event.until)}"]
     return "\n".join(lines) + "\n"
 
 

@@ -26,23 +26,35 @@ A TOML file describes one effect at its top level, or several as tables `[[effec
 Keys that may be left out: `confusable` (identifiers), `places` (names, or one of "ports", "channels",
 "strain channels", "runs"), `[[shape]]` (as a parameter, with `canonical` in place of `unit` and `magnitude`).
 Text values of a primitive (port, channel, run) are taken as they are; "place" stands for the place.
+
+Time and events of the campaign (`docs/when.md`)::
+
+    events = ["pump_on"]                                # names of [[event]] that expressions below use
+
+    [[primitives]]
+    kind = "port_load"                                  # a force at a port; "channel_offset": of a reading
+    port = "place"
+    force = "slope * max(0, time - pump_on)"            # a formula in `time` [s] of the trial
+    begin = "pump_on"                                   # of laws and sensors too: it acts from then on,
+    end = "pump_on_until"                               # until then; in trials with these events only
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import entry_points
-from math import isfinite, pi
+from math import pi
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any
 
 from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.catalogue.building import carried, channels, needs, somewhere, trial_of, trials
-from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting, ShapeParameter, nowhere_else
-from discrepancy.catalogue.expression import Expression
+from discrepancy.catalogue.effect_table import Table
+from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter, nowhere_else
 from discrepancy.errors import CatalogueError
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import PRIMITIVES, SENSORS, ModelPatch, Primitive
+from fe.runtime.expression import Expression
+from fe.runtime.patch import PRIMITIVES, SENSORS, ModelPatch, Primitive, Window
 from reporting.toml_file import read_toml
 
 GROUP = "uav_twin.effects"
@@ -96,74 +108,10 @@ def effects_of_file(path: Path) -> tuple[Effect, ...]:
         raise CatalogueError(f"The file of effects {path} has {other!r} beside its tables [[effect]].")
     if not isinstance(rows, list) or not rows:
         raise CatalogueError(f"The file of effects {path} has no table [[effect]].")
-    return tuple(_effect(_Table(row, f"{path}, effect {n}")) for n, row in enumerate(rows, start=1))
+    return tuple(_effect(Table(row, f"{path}, effect {n}")) for n, row in enumerate(rows, start=1))
 
 
-@dataclass(frozen=True)
-class _Table:
-    """A table of a TOML file that knows where it stands."""
-
-    row: Any
-    where: str
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.row, Mapping):
-            raise CatalogueError(f"{self.where} must be a table, but is {self.row!r}.")
-
-    def only(self, *keys: str) -> None:
-        """Refuse keys that are not among `keys`."""
-        for key in self.row:
-            if key not in keys:
-                raise CatalogueError(
-                    f"{self.where} has the unknown key {key!r}; known are {', '.join(keys)}."
-                )
-
-    def text(self, key: str) -> str:
-        """Return a text that must be there."""
-        value = self.row.get(key)
-        if not isinstance(value, str) or not value.strip():
-            raise CatalogueError(f"{self.where}: {key!r} must be a text, but is {value!r}.")
-        return value
-
-    def number(self, key: str) -> float:
-        """Return a finite number that must be there."""
-        value = self.row.get(key)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
-            raise CatalogueError(f"{self.where}: {key!r} must be a finite number, but is {value!r}.")
-        return float(value)
-
-    def texts(self, key: str) -> tuple[str, ...]:
-        """Return a list of texts, empty if it is not there."""
-        value = self.row.get(key, [])
-        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-            raise CatalogueError(f"{self.where}: {key!r} must be a list of texts, but is {value!r}.")
-        return tuple(value)
-
-    def tables(self, key: str) -> tuple["_Table", ...]:
-        """Return an array of tables, empty if it is not there."""
-        value = self.row.get(key, [])
-        if not isinstance(value, list):
-            raise CatalogueError(f"{self.where}: {key!r} must be an array of tables ([[{key}]]).")
-        return tuple(_Table(row, f"{self.where}, {key} {n}") for n, row in enumerate(value, start=1))
-
-    def prior(self) -> Prior:
-        """Return the table `prior`."""
-        prior = _Table(self.row.get("prior"), f"{self.where}: 'prior'")
-        prior.only("shape", "low", "high")
-        shape = prior.text("shape")
-        known = get_args(Literal["log_normal", "normal", "uniform"])
-        if shape not in known:
-            raise CatalogueError(
-                f"{prior.where}: 'shape' must be one of {', '.join(known)}, but is {shape!r}."
-            )
-        return Prior(
-            cast("Literal['log_normal', 'normal', 'uniform']", shape),
-            prior.number("low"),
-            prior.number("high"),
-        )
-
-
-def _effect(table: _Table) -> Effect:
+def _effect(table: Table) -> Effect:
     table.only(
         "id",
         "name",
@@ -174,6 +122,7 @@ def _effect(table: _Table) -> Effect:
         "acts_on",
         "confusable",
         "places",
+        "events",
         "parameters",
         "shape",
         "primitives",
@@ -188,12 +137,18 @@ def _effect(table: _Table) -> Effect:
     shape = tuple(_shape(row) for row in table.tables("shape"))
     names = frozenset([*(item.name for item in parameters), *(item.name for item in shape)])
     for name in names:
-        if not name.isidentifier() or name in {*SCALES, *PORT_SCALES, "pi", "place"}:
+        if not name.isidentifier() or name in {*SCALES, *PORT_SCALES, "pi", "place", "time"}:
             raise CatalogueError(f"{table.where}: a parameter must not be called {name!r}.")
+    events = table.texts("events")
+    for name in events:
+        if not name.isidentifier() or name in {*names, *SCALES, *PORT_SCALES, "pi", "place", "time"}:
+            raise CatalogueError(f"{table.where}: an event must not be called {name!r}.")
     rows = table.tables("primitives")
     if not rows:
         raise CatalogueError(f"{table.where} has no [[primitives]].")
-    recipes = tuple(_recipe(row, names) for row in rows)
+    moments = frozenset(word for name in events for word in (name, f"{name}_until"))
+    recipes = tuple(_recipe(row, names, moments) for row in rows)
+    _check_in_time(table, recipes, acts_on)
     places = _places(table)
     wanted = tuple(PRIMITIVES[recipe.kind] for recipe in recipes)
     structural = tuple(kind for kind in wanted if kind not in SENSORS)
@@ -211,6 +166,7 @@ def _effect(table: _Table) -> Effect:
         places=places,
         unavailable=needs(
             trial_of(frozenset(acts_on)),
+            partial(_no_event, frozenset().union(*(recipe.moments for recipe in recipes))),
             carried(*structural),
             somewhere(
                 places, f"Neither model nor campaign has a place where {table.text('id')!r} could act."
@@ -220,7 +176,7 @@ def _effect(table: _Table) -> Effect:
     )
 
 
-def _parameter(table: _Table) -> EffectParameter:
+def _parameter(table: Table) -> EffectParameter:
     table.only("name", "symbol", "unit", "description", "prior", "magnitude")
     magnitude = table.row.get("magnitude", False)
     if not isinstance(magnitude, bool):
@@ -235,7 +191,7 @@ def _parameter(table: _Table) -> EffectParameter:
     )
 
 
-def _shape(table: _Table) -> ShapeParameter:
+def _shape(table: Table) -> ShapeParameter:
     table.only("name", "symbol", "description", "canonical", "prior")
     return ShapeParameter(
         table.text("name"),
@@ -249,7 +205,7 @@ def _shape(table: _Table) -> ShapeParameter:
 # ---------------------------------------------------------------- places
 
 
-def _places(table: _Table) -> Any:
+def _places(table: Table) -> Any:
     given = table.row.get("places")
     if given is None:
         return nowhere_else
@@ -298,38 +254,111 @@ def _all_runs(setting: Setting) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Recipe:
-    """A primitive whose values are still expressions."""
+    """A primitive whose values are still expressions; `moments` are those of events that it uses."""
 
     where: str
     kind: str
     values: Mapping[str, str | int | float | Expression]
+    window: Mapping[str, Expression]
+    moments: frozenset[str]
+
+    @property
+    def in_time(self) -> bool:
+        """Whether it asks for the time of trials."""
+        return bool(self.window) or bool(PRIMITIVES[self.kind].courses)
+
+    def window_in(self, trial: str, known: Mapping[str, float]) -> Window:
+        """Return when it acts in a trial."""
+        begin, end = (
+            self.window[key].value(known) if key in self.window else None for key in ("begin", "end")
+        )
+        return Window(trial, begin, end)
+
+    def primitive(self, known: Mapping[str, float], place: str, windows: tuple[Window, ...]) -> Primitive:
+        """Return the primitive at values of the names."""
+        row: dict[str, Any] = {}
+        for name, value in self.values.items():
+            if not isinstance(value, Expression):
+                row[name] = place if value == "place" else value
+            elif name in PRIMITIVES[self.kind].courses:
+                row[name] = value.with_numbers({key: known[key] for key in value.used() if key in known})
+            else:
+                row[name] = value.value(known)
+        return replace(_primitive_of(self.kind, row), windows=windows)
 
 
-def _recipe(table: _Table, names: frozenset[str]) -> _Recipe:
+def _recipe(table: Table, names: frozenset[str], moments: frozenset[str]) -> _Recipe:
     kind = table.text("kind")
     if kind not in PRIMITIVES:
         raise CatalogueError(f"{table.where}: 'kind' is {kind!r}, but known are {', '.join(PRIMITIVES)}.")
-    types = {item.name: item.type for item in fields(PRIMITIVES[kind])}
-    table.only("kind", *types)
+    primitive = PRIMITIVES[kind]
+    types = primitive.values()
+    table.only("kind", *types, *(("begin", "end") if primitive.in_windows else ()))
+    known = names.union(SCALES, PORT_SCALES, {"pi"})
     values: dict[str, str | int | float | Expression] = {}
+    window: dict[str, Expression] = {}
     for name, value in table.row.items():
+        where = f"{table.where}: {name!r}"
         if name == "kind":
             continue
-        where = f"{table.where}: {name!r}"
-        if types[name] is str:
+        if name in ("begin", "end") and name not in types:
+            text = value if isinstance(value, str) else repr(table.number(name))
+            window[name] = _expression(text, known | moments, where)
+        elif name in primitive.courses:
+            text = value if isinstance(value, str) else repr(table.number(name))
+            values[name] = _expression(text, known | moments | {"time"}, where)
+        elif types[name] is str:
             values[name] = value if value == "" else table.text(name)
         elif isinstance(value, str):
-            values[name] = Expression(value, names.union(SCALES, PORT_SCALES, {"pi"}), where)
+            values[name] = _expression(value, known, where)
         else:
             number = table.number(name)
             values[name] = int(number) if types[name] is int and number == int(number) else number
     try:  # whether all values are there, with numbers in the place of expressions
         _primitive_of(
-            kind, {name: 1.0 if isinstance(value, Expression) else value for name, value in values.items()}
+            kind,
+            {
+                name: ("1" if name in primitive.courses else 1.0) if isinstance(value, Expression) else value
+                for name, value in values.items()
+            },
         )
     except InvalidPatchError as cause:
         raise CatalogueError(f"{table.where}: {cause}") from cause
-    return _Recipe(table.where, kind, values)
+    timed = (*window.values(), *(values[name] for name in primitive.courses))
+    used = frozenset(name for item in timed if isinstance(item, Expression) for name in item.used())
+    return _Recipe(table.where, kind, values, window, used & moments)
+
+
+def _expression(text: str, names: frozenset[str], where: str) -> Expression:
+    try:
+        return Expression(text, names, where)
+    except InvalidPatchError as cause:
+        raise CatalogueError(str(cause)) from cause
+
+
+def _check_in_time(table: Table, recipes: tuple[_Recipe, ...], acts_on: list[TrialKind]) -> None:
+    """Refuse effects that ask for the time of trials which have none."""
+    still = [kind.value for kind in acts_on if kind in (TrialKind.STATIC, TrialKind.FLIGHT)]
+    timed = [recipe for recipe in recipes if recipe.in_time]
+    if timed and still:
+        raise CatalogueError(
+            f"{timed[0].where} asks for the time of trials, but 'acts_on' has {still[0]!r}, whose rows "
+            "are no course in time."
+        )
+
+
+def _no_event(moments: frozenset[str], setting: Setting) -> str | None:
+    """Return why an effect cannot act: no trial that is fitted has all of its events."""
+    if not moments:
+        return None
+    campaign = setting.campaign
+    if any(moments <= campaign.event_times(trial.name).keys() for trial in campaign.fitted):
+        return None
+    there = {name for trial in campaign.fitted for name in campaign.event_times(trial.name)}
+    return (
+        f"No trial to fit has {' and '.join(sorted(moments))} as [[event]]; those that are fitted have "
+        f"{', '.join(sorted(there)) or 'none'}."
+    )
 
 
 def _build(
@@ -341,16 +370,18 @@ def _build(
         known |= dict(
             zip(PORT_SCALES, (port.displacement, port.stiffness, port.angular_frequency), strict=True)
         )
-    primitives = []
+    primitives: list[Primitive] = []
     for recipe in recipes:
-        row: dict[str, Any] = {}
-        for name, value in recipe.values.items():
-            if isinstance(value, Expression):
-                row[name] = value.value(known)
-            else:
-                row[name] = place if value == "place" else value
         try:
-            primitives.append(_primitive_of(recipe.kind, row))
+            if not recipe.moments and not recipe.window:
+                primitives.append(recipe.primitive(known, place, ()))
+                continue
+            for trial in setting.campaign.trials:
+                moments = setting.campaign.event_times(trial.name)
+                if trial.is_dynamic and recipe.moments <= moments.keys():
+                    there = {**known, **moments}
+                    window = recipe.window_in(trial.name, there)
+                    primitives.append(recipe.primitive(there, place, (window,)))
         except InvalidPatchError as cause:
             raise CatalogueError(f"{recipe.where}: {cause}") from cause
     return ModelPatch(tuple(primitives))
@@ -358,7 +389,7 @@ def _build(
 
 def _primitive_of(kind: str, row: Mapping[str, Any]) -> Primitive:
     """Return the primitive; whole numbers of expressions become integers where integers are wanted."""
-    types = {item.name: item.type for item in fields(PRIMITIVES[kind])}
+    types = PRIMITIVES[kind].values()
     whole = {
         name: int(value)
         for name, value in row.items()

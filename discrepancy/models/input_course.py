@@ -2,12 +2,15 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import isfinite, pi
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PPoly
 
 from discrepancy.campaign.records import Hold
+from fe.runtime.expression import Expression
 
 FloatArray = NDArray[np.float64]
 
@@ -27,6 +30,11 @@ class Course:
     time: FloatArray
     values: FloatArray
     hold: Hold
+
+    @property
+    def edges(self) -> tuple[float, ...]:
+        """Moments at which it jumps between the stamps: none."""
+        return ()
 
     @property
     def is_smooth(self) -> bool:
@@ -63,6 +71,44 @@ class Course:
         bend = np.diff(time) ** 2 / 12.0
         curve = self._spline(self._inside(time), 2)
         return found[:-1] - bend * curve[:-1], found[1:] - bend * curve[1:]
+
+
+@dataclass(frozen=True, eq=False)
+class FormulaCourse:
+    """A load by a formula in time, zero outside of its spans.
+
+    Attributes
+    ----------
+    formula : Expression
+        In `time` [s].
+    spans : tuple of (float, float)
+        Begin and end [s] of each; empty: always.
+    """
+
+    formula: Expression
+    spans: tuple[tuple[float, float], ...] = ()
+
+    is_smooth: ClassVar[bool] = True
+
+    @property
+    def edges(self) -> tuple[float, ...]:
+        """Moments at which it begins or ends [s]."""
+        return tuple(moment for span in self.spans for moment in span if isfinite(moment))
+
+    def _inside(self, time: FloatArray) -> FloatArray:
+        inside = np.full(len(time), 0.0 if self.spans else 1.0)
+        for begin, end in self.spans:
+            inside[(time >= begin) & (time < end)] = 1.0
+        return inside
+
+    def at(self, time: FloatArray) -> FloatArray:
+        """Return the values (N,) at times."""
+        return self._inside(time) * self.formula.course(time, {"pi": pi})
+
+    def ends(self, time: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the values (K,) at the begin and at the end of the steps between times (K + 1,)."""
+        inside, found = self._inside(0.5 * (time[1:] + time[:-1])), self.formula.course(time, {"pi": pi})
+        return inside * found[:-1], inside * found[1:]
 
 
 @dataclass(frozen=True, eq=False)

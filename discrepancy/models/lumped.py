@@ -28,6 +28,7 @@ from fe.runtime.patch import (
     ModelPatch,
     ModulusTemperature,
     PointMass,
+    PortLoad,
     Primitive,
     RootCompliance,
     StiffnessDrift,
@@ -102,6 +103,8 @@ class LumpedModel:
         if primitive in LAWS and not plain and not primitive.of_speed:
             n = self.description.size  # the position of a state's port means nothing
             return bool(self._ports) and all(np.any(row[:n]) for row in self._ports.values())
+        if primitive is PortLoad:
+            return bool(self._ports)
         if primitive in SENSORS or primitive in (ModulusTemperature, LoadGain, StiffnessDrift):
             return True
         if primitive is PointMass:
@@ -197,17 +200,21 @@ class LumpedModel:
             )
         self._check_outputs(outputs)
         quantities = [quantity for _, quantity in outputs]
-        structure, forces, gain, tare, along_span, along_chord = sorted_lumped(patch, self)
+        sorted_out = sorted_lumped(patch.in_trial(trial.name), self)
+        structure, forces, gain, tare, along_span, along_chord, loads = sorted_out
         try:
-            laws = laws_of(forces, self._ports) if len(forces) else NO_LAWS
+            laws = laws_of(forces, self._ports, in_windows=True) if len(forces) else NO_LAWS
         except InvalidPatchError as cause:
             raise ModelError(str(cause)) from cause
         acting = trial.force * (1.0 + gain) + tare * (trial.force != 0.0) if gain or tare else trial.force
-        if self._as_rig(trial):
+        switched = bool(laws.spans) and trial.kind is not TrialKind.RINGDOWN
+        if self._as_rig(trial) or loads or switched:
             lumped = self._rig(conditions.parameters, structure, float(trial.temperature[0]))
-            laws = laws_of(lumped.own_laws + forces, self._ports) if len(lumped.own_laws) else laws
+            if len(lumped.own_laws):
+                laws = laws_of(lumped.own_laws + forces, self._ports, in_windows=True)
             place = self._moved_place(lumped, trial, along_span, along_chord)
-            return lumped.response(trial, outputs, laws, conditions, (gain, tare, place), refinement)
+            load = (gain, tare, place, loads)
+            return lumped.response(trial, outputs, laws, conditions, load, refinement)
         rows = np.array([self._outputs[output] for output, _ in outputs]).reshape(-1, self.description.size)
         row = self._input_row(trial.load_place)
         if trial.kind is TrialKind.STATIC:

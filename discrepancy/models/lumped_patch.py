@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Model
-from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, LoadPlace, ModelPatch, Primitive
+from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, LoadPlace, ModelPatch, PortLoad, Primitive
 
 
 class SortedLumped(NamedTuple):
-    """Structure, internal forces, gain [1] and tare [N] of loads, and how far their place moves [m]."""
+    """Structure, internal forces, gain [1] and tare [N] of loads, how far they move [m], loads at ports."""
 
     structure: tuple[Primitive, ...]
     forces: ModelPatch
@@ -16,6 +16,7 @@ class SortedLumped(NamedTuple):
     tare: float
     along_span: float
     along_chord: float
+    loads: tuple[PortLoad, ...]
 
 
 def sorted_lumped(patch: ModelPatch, model: Model) -> SortedLumped:
@@ -26,7 +27,7 @@ def sorted_lumped(patch: ModelPatch, model: Model) -> SortedLumped:
     ModelError
         If the model cannot carry one of them.
     """
-    structure, forces = [], []
+    structure, forces, loads = [], [], []
     gain, tare, along_span, along_chord = 0.0, 0.0, 0.0, 0.0
     for item in patch:
         if isinstance(item, SENSORS):
@@ -35,10 +36,14 @@ def sorted_lumped(patch: ModelPatch, model: Model) -> SortedLumped:
             forces.append(item)
         elif not model.supports(type(item)):
             raise ModelError(f"The lumped model {model.name!r} cannot carry the primitive {item.kind!r}.")
+        elif isinstance(item, PortLoad):
+            loads.append(item)
         elif isinstance(item, LoadGain):
             gain, tare = (1.0 + gain) * (1.0 + item.gain) - 1.0, tare + item.tare
         elif isinstance(item, LoadPlace):
             along_span, along_chord = along_span + item.along_span, along_chord + item.along_chord
         else:
             structure.append(item)
-    return SortedLumped(tuple(structure), ModelPatch(tuple(forces)), gain, tare, along_span, along_chord)
+    return SortedLumped(
+        tuple(structure), ModelPatch(tuple(forces)), gain, tare, along_span, along_chord, tuple(loads)
+    )

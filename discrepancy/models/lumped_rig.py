@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 
 from discrepancy.campaign.records import Hold, Quantity, RecordedInput, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.input_course import Course, Drive
+from discrepancy.models.input_course import Course, Drive, FormulaCourse
 from discrepancy.models.interface import Conditions, Response
 from discrepancy.models.lumped_controllers import loops
 from discrepancy.models.lumped_file import LumpedDescription, matrix_of
@@ -18,7 +18,7 @@ from discrepancy.models.lumped_sections import InputSection
 from discrepancy.models.rig import Rig, RigMotion, order_of
 from discrepancy.models.rig_records import Acting, Shown
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
-from fe.runtime.patch import ModelPatch
+from fe.runtime.patch import ModelPatch, PortLoad, course_of
 
 FloatArray = NDArray[np.float64]
 
@@ -248,18 +248,29 @@ class LumpedRig:
         outputs: Sequence[tuple[str, Quantity]],
         laws: Laws,
         conditions: Conditions,
-        load: tuple[float, float, FloatArray | None],
+        load: tuple[float, float, FloatArray | None, Sequence[PortLoad]],
         refinement: int,
     ) -> Response:
-        """Return the response of a trial; `load`: gain, tare and moved row of its force.
+        """Return the response of a trial; `load`: gain, tare and moved row of its force, and loads at ports.
 
         Raises
         ------
         ModelError
-            If the trial is a ring-down, or begins at rest where there is none.
+            If the trial is a ring-down, or begins at rest where there is none, or a port of a load does not
+            exist.
         """
-        gain, tare, place = load
+        gain, tare, place, at_ports = load
         name = self.description.name
+        if at_ports and not trial.is_dynamic:
+            raise ModelError(
+                f"The trial {trial.name!r} has no time, but the force at {at_ports[0].port!r} is a "
+                "formula in it."
+            )
+        if trial.kind is TrialKind.RINGDOWN and self.description.is_plain:
+            raise ModelError(
+                f"The trial {trial.name!r} is a ring-down, which no force with a course in time can act on; "
+                'say kind = "driven" and begins = "unknown".'
+            )
         if trial.kind is TrialKind.RINGDOWN:
             raise ModelError(
                 f"The trial {trial.name!r} is a ring-down, which the lumped model {name!r} cannot begin: it "
@@ -271,12 +282,25 @@ class LumpedRig:
             force = trial.force * (1.0 + gain) + tare * (trial.force != 0.0)
             return self._static(trial, force, row if place is None else place, self.shown(outputs), laws)
         rig, acting, drives = self.acting(trial, conditions, gain, tare, place)
+        if at_ports:
+            acting = replace(acting, loads=(*acting.loads, *(self._at_port(item, rig) for item in at_ports)))
         try:
             return rig.motion(acting, laws, refinement).response(
                 self.shown(outputs, drives, acting.references)
             )
         except ModelError as cause:
             raise ModelError(f"The trial {trial.name!r} of {name!r}: {cause}") from cause
+
+    def _at_port(self, load: PortLoad, rig: Rig) -> tuple[FloatArray, FormulaCourse]:
+        """Return the row and the course of a load at a port."""
+        row = rig.acting_rows.get(load.port)
+        if row is None:
+            raise ModelError(
+                f"A force acts at the port {load.port!r}, which {self.description.name!r} does not have; it "
+                f"has {', '.join(rig.ports) or 'none'}."
+            )
+        spans = tuple(window.span for window in load.windows)
+        return row, FormulaCourse(course_of(load.force, load.kind), spans)
 
     def _static(
         self, trial: Trial, force: FloatArray, row: FloatArray, shown: Sequence[Shown], laws: Laws

@@ -222,7 +222,8 @@ class Rig:
         stamps = np.concatenate((known[:1], times)) if early else times
         smooth = bool(acting.drives) or any(course.is_smooth for _, course in acting.loads)
         least = SMOOTH_PARTS if smooth else 1
-        boundaries = substeps(self.modal, laws, stamps, refinement, least)
+        edges = (*laws.edges, *(moment for _, course in acting.loads for moment in course.edges))
+        boundaries = substeps(self.modal, laws, stamps, refinement, least, edges)
         count, whole = len(self.angular_frequency), self.shapes.shape[1]
         begin, end = self._modal_forces(acting, boundaries)
         steps = exact_steps(self.free, boundaries.lengths)
@@ -253,9 +254,12 @@ class Rig:
         speeds = [root * float(item.at(first, 1)[0]) for item in acting.drives]
         if acting.begins is Start.SETTLED:
             still = self._force_of(acting, first, moving=False)
-            at_rest, states, memory = self.settled(still, drive, laws)
+            acts = laws.act_at(float(first[0]))
+            at_rest, states, memory = self.settled(still, drive, laws.only(acts) if laws.spans else laws)
             states[0, count:] = speeds
-            return at_rest[0], states[0], memory if np.any(still) or np.any(drive) else None
+            if memory is None or not (np.any(still) or np.any(drive)):
+                return at_rest[0], states[0], None
+            return at_rest[0], states[0], laws.filled(memory, acts)
         q, v = np.zeros((2, self.shapes.shape[1]))
         if acting.begins is Start.UNKNOWN:
             given = np.zeros(self.state_count)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Start
-from discrepancy.models.input_course import Course, Drive
+from discrepancy.models.input_course import Course, Drive, FormulaCourse
 
 FloatArray = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ class Acting:
     """
 
     time: FloatArray
-    loads: Sequence[tuple[FloatArray, Course]]
+    loads: Sequence[tuple[FloatArray, Course | FormulaCourse]]
     constant: FloatArray
     drives: Sequence[Drive] = ()
     begins: Start = Start.SETTLED

@@ -216,7 +216,11 @@ class SecondOrderSystem:
         """
         times = (1.0 + clock[0]) * time + clock[1]
         at_release = np.zeros(len(laws))
-        q, v, memory, holding = self._released(release_row, release, initial, laws)
+        acts = laws.act_at(0.0)
+        q, v, memory, holding = self._released(
+            release_row, release, initial, laws.only(acts) if laws.spans else laws
+        )
+        memory = laws.filled(memory, acts) if memory is not None and laws.spans else memory
         held = 0
         if release.at_rest:
             held = int(np.searchsorted(times, 0.0))  # samples before the release
@@ -240,12 +244,15 @@ class SecondOrderSystem:
                 q, v = self._backwards(q, v, -lead)
                 start, lead, memory = lead, 0.0, None
             if lead > LEAST_LEAD * interval:
-                first = simulate(
+                first = simulate_at(
+                    self.modal, laws, q=q, v=v, time=np.array([0.0, lead]), force=np.zeros((2, len(q))),
+                    memory=memory, refinement=refinement,
+                ) if laws.spans else simulate(
                     self.modal, laws, q=q, v=v, memory=memory, force=np.zeros(2), interval=lead,
                     refinement=refinement, kernel=compiled_kernel(),
                 )  # fmt: skip
                 q, v, memory, start = first.q[-1], first.v[-1], first.memory, lead
-            if is_even(time):
+            if is_even(time) and not laws.spans:
                 moved = simulate(
                     self.modal, laws, q=q, v=v, memory=memory, force=nothing[held:], interval=interval or 1.0,
                     start=start, refinement=refinement, kernel=compiled_kernel(),

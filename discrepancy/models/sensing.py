@@ -79,7 +79,7 @@ def observe(
     outputs = tuple(
         (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
     )
-    patch = _by_channels(built_in_sensors(model), campaign) + patch
+    patch = (_by_channels(built_in_sensors(model), campaign) + patch).in_trial(trial.name)
     if not uses_sensors(patch):
         response = model.respond(trial, outputs, patch, conditions, refinement=refinement)
         return Observed(response.values, response.rates)

@@ -4,9 +4,11 @@ The linear step of each length is the exponential of one matrix (Van Loan 1978),
 squaring, all lengths at once. Lengths that differ by less than `ALIKE` of the usual one are one.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,7 @@ from fe.runtime.motion_arrays import Samples, State
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 ALIKE = 1e-9
 """Lengths of steps that differ by less than this share of the usual one are taken as one."""
@@ -203,7 +206,7 @@ def simulate_at(
     ModalMotion
         At the stamps, the first included.
     """
-    boundaries = substeps(system, laws, time, refinement)
+    boundaries = substeps(system, laws, time, refinement, edges=laws.edges)
     fed = np.zeros((len(time), len(laws))) if feed is None else feed
     load, led = boundaries.between(force), boundaries.between(fed)
     found = exact_steps(system, boundaries.lengths)
@@ -242,9 +245,23 @@ class Boundaries:
 
 
 def substeps(
-    system: ModalSystem, laws: Laws, time: FloatArray, refinement: int = 1, least: int = 1
+    system: ModalSystem,
+    laws: Laws,
+    time: FloatArray,
+    refinement: int = 1,
+    least: int = 1,
+    edges: Sequence[float] = (),
 ) -> Boundaries:
-    """Return the steps between stamps (N,) that the laws ask for, at least `least` in each interval."""
+    """Return the steps between stamps (N,) that the laws ask for, at least `least` in each interval.
+
+    At `edges` something begins or ends, so that a step does.
+    """
+    inside = [moment for moment in edges if time[0] < moment < time[-1]]
+    if inside:
+        moments = np.union1d(time, inside)
+        found = substeps(system, laws, moments, refinement, least)
+        at = np.interp(found.time, time, np.arange(len(time)))
+        return replace(found, at=at, sample=found.sample[np.searchsorted(moments, time)])
     parts = np.maximum(_substeps(system, laws, np.diff(time)), least) * refinement
     sample = np.concatenate(([0], np.cumsum(parts))).astype(np.int64)
     lengths = np.repeat(np.diff(time) / parts, parts)
@@ -269,26 +286,85 @@ def advance(
     feed: FloatArray,
     memory: FloatArray | None,
 ) -> ModalMotion:
-    """Return the motion at the stamps of known steps; for arguments see `simulate_at` and `Steps`."""
+    """Return the motion at the stamps of known steps; for arguments see `simulate_at` and `Steps`.
+
+    Where laws begin or end, a new section does: modes and the laws that go on keep their state, a law that
+    begins has been loaded from zero to where its port is.
+    """
     modes, count = len(q), len(boundaries.sample)
     result = ModalMotion(
         np.empty((count, modes)), np.empty((count, modes)), np.empty((count, len(laws))),
         laws.memory() if memory is None else memory.copy(), np.empty((count, len(laws))),
     )  # fmt: skip
-    arrays = (steps.transition, steps.length, steps.which, push, begin, end, feed, boundaries.time)
-    given = (*(np.ascontiguousarray(item) for item in arrays), boundaries.sample)  # fields of `Steps`
-    structure = Structure(
-        system.coupled, system.stiffness, np.ascontiguousarray(system.damping), laws.rate, memory is not None
-    )
     state = State(np.array(q, dtype=float), np.array(v, dtype=float), result.memory, np.zeros(len(laws)))
-    ports = laws.at(
-        laws.rows(system.ports, modes), port_flexibility(system, laws), system.relaxation,
-        np.zeros((2, len(laws))), laws.rows(system.actions, modes) if isinstance(system, CoupledModes) and
-        system.actions else None,
-    )  # fmt: skip
-    out = Samples(result.q, result.v, result.port_forces, result.lagged)
-    compiled_steps()(given, tuple(structure), tuple(ports), tuple(state), tuple(out))
+    rows = laws.rows(system.ports, modes)
+    acts = rows
+    if isinstance(system, CoupledModes) and system.actions:
+        acts = laws.rows(system.actions, modes)
+    flexibility = port_flexibility(system, laws)
+    before = np.ones(len(laws), dtype=bool)
+    for section in _sections(laws, boundaries):
+        first, last = section.first, section.last
+        now = section.acts[:, None]
+        ports = laws.at(rows * now, flexibility, system.relaxation, np.zeros((2, len(laws))), acts * now)
+        started = section.acts & ~before
+        state.memory[started] = 0.0
+        moving = started & (laws.of_speed == 1)
+        state.memory[moving, 1] = rows[moving] @ state.q
+        state.current[:] = 0.0
+        between = slice(first, last)
+        arrays = (
+            steps.transition, steps.length, steps.which[between], push[between], begin[between], end[between],
+            feed[first : last + 1], boundaries.time[first : last + 1],
+        )  # fmt: skip
+        given = (*(np.ascontiguousarray(item) for item in arrays), section.record)  # fields of `Steps`
+        structure = Structure(
+            system.coupled, system.stiffness, np.ascontiguousarray(system.damping), laws.rate,
+            memory is not None or first > 0,
+        )  # fmt: skip
+        out = Samples(*(np.empty((len(section.record), item.shape[1])) for item in _samples(result)))
+        compiled_steps()(given, tuple(structure), tuple(ports), tuple(state), tuple(out))
+        for whole, part in zip(_samples(result), out, strict=True):
+            whole[section.samples] = part[section.kept]
+        before = section.acts
     return result
+
+
+def _samples(motion: ModalMotion) -> Samples:
+    return Samples(motion.q, motion.v, motion.port_forces, motion.lagged)
+
+
+class _Section(NamedTuple):
+    """Steps during which the same laws act: boundaries `first` to `last`, `acts` (J,).
+
+    The loop records at `record`, counted from `first`; of these `kept` are the `samples` of the motion.
+    """
+
+    first: int
+    last: int
+    acts: BoolArray
+    record: IntArray
+    kept: IntArray
+    samples: IntArray
+
+
+def _sections(laws: Laws, boundaries: Boundaries) -> Iterator[_Section]:
+    """Yield the sections; one where all laws always act. A stamp at an edge belongs to what begins there."""
+    time, count = boundaries.time, len(boundaries.lengths)
+    every = np.arange(len(boundaries.sample))
+    if not laws.spans:
+        yield _Section(0, count, np.ones(len(laws), dtype=bool), boundaries.sample, every, every)
+        return
+    inside = np.array([moment for moment in laws.edges if time[0] < moment < time[-1]])
+    cuts = np.unique(np.concatenate(([0, count], np.searchsorted(time, inside)))).tolist()
+    for first, last in pairwise(cuts):
+        own = (boundaries.sample >= first) & (
+            (boundaries.sample < last) | ((boundaries.sample == last) & (last == count))
+        )
+        sample = boundaries.sample[own] - first
+        record = np.unique(np.concatenate(([0], sample, [last - first]))).astype(np.int64)
+        acts = laws.act_at(0.5 * float(time[first] + time[first + 1]))
+        yield _Section(first, last, acts, record, np.searchsorted(record, sample), np.flatnonzero(own))
 
 
 def _substeps(system: ModalSystem, laws: Laws, lengths: FloatArray) -> IntArray:

@@ -36,6 +36,7 @@ from fe.runtime.patch import (
     ModelPatch,
     ModulusTemperature,
     PointMass,
+    PortLoad,
     Primitive,
 )
 from fe.runtime.patch_arrays import PatchArrays
@@ -147,8 +148,8 @@ class WingModel:
         return self._structure.output_quantity(output)
 
     def supports(self, primitive: type[Primitive]) -> bool:
-        """Whether the model can carry a primitive; it can carry all."""
-        return primitive in PRIMITIVES.values()
+        """Whether the model can carry a primitive; it can carry all but forces by a formula in time."""
+        return primitive in PRIMITIVES.values() and primitive is not PortLoad
 
     def ports(self) -> tuple[str, ...]:
         """Names of the ports where internal forces can act."""
@@ -237,6 +238,8 @@ class WingModel:
         dynamic trial the structure is that at its first temperature.
         """
         check_plain(trial, self.name)
+        if len(patch.of(PortLoad)):
+            raise ModelError(f"{self.name} cannot carry the primitive {PortLoad.kind!r}.")
         if len(conditions.parameters) != len(self._parameters):
             raise ModelError(
                 f"The wing has {len(self._parameters)} parameters, but {len(conditions.parameters)} came."

@@ -8,6 +8,7 @@ functions compiled, to be given as `kernel`.
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from .static_path import static_path
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 
 class Kernel(NamedTuple):
@@ -56,6 +58,8 @@ class Laws:
         Parameters of hysteretic elements.
     rate : float
         Stiffness drift of the whole structure [1/s].
+    spans : tuple of tuple of (float, float)
+        Begins and ends of when each law acts [s], none for one that always acts; empty where all do.
     """
 
     ports: tuple[str, ...]
@@ -63,6 +67,7 @@ class Laws:
     values: FloatArray
     elements: FloatArray
     rate: float = 0.0
+    spans: tuple[tuple[tuple[float, float], ...], ...] = ()
 
     def __len__(self) -> int:
         return len(self.ports)
@@ -75,6 +80,29 @@ class Laws:
     def rows(self, ports: Mapping[str, FloatArray], width: int) -> FloatArray:
         """Return the port row of each law, (J, width)."""
         return np.array([ports[name] for name in self.ports], dtype=np.float64).reshape(len(self), width)
+
+    @property
+    def edges(self) -> tuple[float, ...]:
+        """Moments at which a law begins or ends [s]."""
+        return tuple(moment for spans in self.spans for span in spans for moment in span if isfinite(moment))
+
+    def act_at(self, time: float) -> BoolArray:
+        """Return which of the laws (J,) act at a time."""
+        spans = self.spans or ((),) * len(self)
+        return np.array(
+            [not own or any(begin <= time < end for begin, end in own) for own in spans], dtype=bool
+        )
+
+    def only(self, chosen: BoolArray) -> "Laws":
+        """Return some of the laws, as they are while they act."""
+        names = tuple(name for name, taken in zip(self.ports, chosen, strict=True) if taken)
+        return Laws(names, self.numbers[chosen], self.values[chosen], self.elements[chosen], self.rate)
+
+    def filled(self, memory: FloatArray, chosen: BoolArray) -> FloatArray:
+        """Return the memory of all laws from that of `only` some of them; the others were never loaded."""
+        whole = self.memory()
+        whole[chosen] = memory
+        return whole
 
     @cached_property
     def of_speed(self) -> IntArray:
@@ -111,7 +139,7 @@ NO_LAWS = Laws((), np.zeros(0, dtype=np.int64), np.zeros((0, PARAMETERS)), np.ze
 """The linear structure."""
 
 
-def laws_of(patch: ModelPatch, ports: Collection[str]) -> Laws:
+def laws_of(patch: ModelPatch, ports: Collection[str], *, in_windows: bool = False) -> Laws:
     """Return the internal forces of a patch; laws without magnitude and other primitives are left out.
 
     Parameters
@@ -120,14 +148,16 @@ def laws_of(patch: ModelPatch, ports: Collection[str]) -> Laws:
         Changes.
     ports : collection of str
         Ports that the model has.
+    in_windows : bool
+        Whether the model can follow laws that act in windows only; these are those of its trial.
 
     Raises
     ------
     InvalidPatchError
         If a law acts on a port that the model does not have, or a value cannot be (a scale that is not
-        positive).
+        positive), or in a window only where the model cannot follow it.
     """
-    names, numbers, values, elements = [], [], [], []
+    names, numbers, values, elements, spans = [], [], [], [], []
     for item in patch:
         if not isinstance(item, PortForce):
             continue
@@ -140,6 +170,11 @@ def laws_of(patch: ModelPatch, ports: Collection[str]) -> Laws:
         if item.magnitude == 0.0:
             continue
         item.check()
+        if item.windows and not in_windows:
+            raise InvalidPatchError(
+                f"The primitive {item.kind!r} acts in a window, which lumped models alone can follow."
+            )
+        spans.append(tuple(window.span for window in item.windows))
         names.append(item.port)
         numbers.append(LAWS.index(type(item)))
         values.append(np.pad(item.row, (0, PARAMETERS - len(item.row))))
@@ -154,6 +189,7 @@ def laws_of(patch: ModelPatch, ports: Collection[str]) -> Laws:
         np.array(values, dtype=np.float64),
         np.array([np.pad(item, (0, width - len(item))) for item in elements]),
         rate,
+        tuple(spans) if any(spans) else (),
     )
 
 

@@ -8,7 +8,7 @@ NumPy and relative imports only: this file is copied into the FMU.
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from .errors import InvalidPatchError
@@ -22,13 +22,22 @@ from .laws.power_damping import PowerDamping as PowerDamping
 from .laws.power_stiffness import PowerStiffness as PowerStiffness
 from .laws.sine_force import SineForce as SineForce
 from .primitive import Primitive as Primitive
-
-EVERY_CHANNEL = "*"
-"""Name that stands for every channel of the primitive's quantity."""
-CHANNEL_UNIT = "channel's unit"
-PER_RELEASE = f"{CHANNEL_UNIT} per release amplitude"
-"""Units of numbers that are shown by a channel."""
-
+from .primitive import Window as Window
+from .sensor_primitives import CHANNEL_UNIT as CHANNEL_UNIT
+from .sensor_primitives import EVERY_CHANNEL as EVERY_CHANNEL
+from .sensor_primitives import PER_RELEASE as PER_RELEASE
+from .sensor_primitives import ChannelOffset as ChannelOffset
+from .sensor_primitives import Clock as Clock
+from .sensor_primitives import DecayingLine as DecayingLine
+from .sensor_primitives import HighPass as HighPass
+from .sensor_primitives import Line as Line
+from .sensor_primitives import LoggerClock as LoggerClock
+from .sensor_primitives import RunOffset as RunOffset
+from .sensor_primitives import SensorDrift as SensorDrift
+from .sensor_primitives import SensorGain as SensorGain
+from .sensor_primitives import SensorRotation as SensorRotation
+from .sensor_primitives import ThermalStrain as ThermalStrain
+from .sensor_primitives import course_of as course_of
 
 # ---------------------------------------------------------------- mass and stiffness
 
@@ -132,145 +141,26 @@ class InertiaRelief(Primitive):
     fraction: float
 
 
-# ---------------------------------------------------------------- sensors and clock
-#
-# `channel` is a channel's name, or `EVERY_CHANNEL` for all of `quantity` ("" for all quantities).
-
-
 @dataclass(frozen=True, slots=True)
-class SensorGain(Primitive):
-    """A channel shows (1 + `gain`) times what it should."""
+class PortLoad(Primitive):
+    """A force [N or N m] that pushes a port along its motion, a formula in `time` [s] of the trial."""
 
-    kind: ClassVar[str] = "sensor_gain"
-    units: ClassVar[dict[str, str]] = {"gain": "1"}
-    channel: str
-    gain: float
-    quantity: str = ""
+    kind: ClassVar[str] = "port_load"
+    in_windows: ClassVar[bool] = True
+    courses: ClassVar[tuple[str, ...]] = ("force",)
+    port: str
+    force: str
 
-
-@dataclass(frozen=True, slots=True)
-class SensorDrift(Primitive):
-    """A channel's zero moves by `amplitude` (t / `time`)^`exponent`, t since the campaign's start [s]."""
-
-    kind: ClassVar[str] = "sensor_drift"
-    units: ClassVar[dict[str, str]] = {"amplitude": CHANNEL_UNIT, "time": "s", "exponent": "1"}
-    channel: str
-    amplitude: float
-    time: float
-    exponent: float = 1.0
-    quantity: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class SensorRotation(Primitive):
-    """A strain gauge is turned by `angle` [rad] in the skin, from spanwise towards the tip's rear."""
-
-    kind: ClassVar[str] = "sensor_rotation"
-    units: ClassVar[dict[str, str]] = {"angle": "rad"}
-    channel: str
-    angle: float
-
-
-@dataclass(frozen=True, slots=True)
-class ThermalStrain(Primitive):
-    """Strain channels show `coefficient` [1/K] times (T - T_ref) more."""
-
-    kind: ClassVar[str] = "thermal_strain"
-    units: ClassVar[dict[str, str]] = {"coefficient": "1/K"}
-    channel: str
-    coefficient: float
-
-
-@dataclass(frozen=True, slots=True)
-class HighPass(Primitive):
-    """Channels pass through `order` equal first-order high-pass filters s tau / (1 + s tau), tau [s].
-
-    They had settled at the value before the record's first sample.
-    """
-
-    kind: ClassVar[str] = "high_pass"
-    units: ClassVar[dict[str, str]] = {"time_constant": "s", "order": "1"}
-    channel: str
-    time_constant: float
-    order: float = 1.0
-    quantity: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Clock(Primitive):
-    """A sample that is stamped t was taken at (1 + `rate`) t + `zero` [s]."""
-
-    kind: ClassVar[str] = "clock"
-    units: ClassVar[dict[str, str]] = {"rate": "1", "zero": "s"}
-    rate: float
-    zero: float
-
-
-@dataclass(frozen=True, slots=True)
-class LoggerClock(Primitive):
-    """The clock of a logger: what it stamps t, readings and recorded inputs alike, was at (1 + `rate`) t.
-
-    `logger` is the name of a logger of the campaign, or `EVERY_CHANNEL` where one logger records everything.
-    """
-
-    kind: ClassVar[str] = "logger_clock"
-    units: ClassVar[dict[str, str]] = {"rate": "1"}
-    logger: str
-    rate: float
-
-
-@dataclass(frozen=True, slots=True)
-class Line(Primitive):
-    """A line at `frequency` [Hz] is added: cosine cos + sine sin (2 pi f t), t since the trial's start.
-
-    Amplitudes in the channel's unit. It is in the noise record too.
-    """
-
-    kind: ClassVar[str] = "line"
-    units: ClassVar[dict[str, str]] = {"frequency": "Hz", "cosine": CHANNEL_UNIT, "sine": CHANNEL_UNIT}
-    channel: str
-    frequency: float
-    cosine: float
-    sine: float
-    quantity: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class DecayingLine(Primitive):
-    """A mode that the model does not have, e^(-zeta w t) (cosine cos w_d t + sine sin w_d t), in ring-downs.
-
-    t since the trial's start; amplitudes in the channel's unit per unit of the trial's release amplitude.
-    """
-
-    kind: ClassVar[str] = "decaying_line"
-    units: ClassVar[dict[str, str]] = {
-        "frequency": "Hz", "damping_ratio": "1", "cosine": PER_RELEASE, "sine": PER_RELEASE
-    }  # fmt: skip
-    channel: str
-    frequency: float
-    damping_ratio: float
-    cosine: float
-    sine: float
-    quantity: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class RunOffset(Primitive):
-    """Static readings of the trials labelled `run` have this `offset` (channel's unit): seating of a run."""
-
-    kind: ClassVar[str] = "run_offset"
-    units: ClassVar[dict[str, str]] = {"offset": CHANNEL_UNIT}
-    run: str
-    offset: float
-    channel: str = EVERY_CHANNEL
-    quantity: str = "displacement"
+    def __post_init__(self) -> None:
+        super(PortLoad, self).__post_init__()
+        course_of(self.force, self.kind)
 
 
 _EVERY: tuple[type[Primitive], ...] = (
     PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature, StiffnessDrift,
     *LAWS,
-    LoadPlace, LoadGain, Washout, InertiaRelief,
-    SensorGain, SensorDrift, SensorRotation, ThermalStrain, HighPass, Clock, LoggerClock, Line,
+    LoadPlace, LoadGain, Washout, InertiaRelief, PortLoad,
+    SensorGain, SensorDrift, ChannelOffset, SensorRotation, ThermalStrain, HighPass, Clock, LoggerClock, Line,
     DecayingLine,
     RunOffset,
 )  # fmt: skip
@@ -282,10 +172,11 @@ STRUCTURE = (PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature)
 INTERNAL_FORCES = (*LAWS, StiffnessDrift)
 """Primitives that act as forces inside the structure while it moves."""
 LOADS = (LoadPlace, LoadGain, Washout, InertiaRelief)
-"""Primitives that change what acts on the structure."""
+"""Primitives that change the loads that are known."""
 SENSORS = (
     SensorGain,
     SensorDrift,
+    ChannelOffset,
     SensorRotation,
     ThermalStrain,
     HighPass,
@@ -318,6 +209,26 @@ class ModelPatch:
 
     def __add__(self, other: "ModelPatch") -> "ModelPatch":
         return ModelPatch(self.primitives + other.primitives)
+
+    def in_trial(self, trial: str) -> "ModelPatch":
+        """Return what acts in a trial: without the primitives whose windows are in other trials only.
+
+        A primitive that acts throughout the trial has no window in it.
+        """
+        if not self.has_windows:
+            return self
+        found = []
+        for item in self.primitives:
+            own = tuple(window for window in item.windows if window.trial == trial)
+            if own or not item.windows:
+                open_ended = any(window.begin is None and window.end is None for window in own)
+                found.append(replace(item, windows=() if open_ended else own))
+        return ModelPatch(tuple(found))
+
+    @property
+    def has_windows(self) -> bool:
+        """Whether a primitive acts in windows only."""
+        return any(item.windows for item in self.primitives)
 
     def of(self, *kinds: type[Primitive]) -> "ModelPatch":
         """Return the part whose primitives are of the given classes."""
@@ -366,8 +277,8 @@ def _primitive(row: object, where: str) -> Primitive:
     if not isinstance(row, Mapping) or not isinstance(kind, str) or kind not in PRIMITIVES:
         raise InvalidPatchError(f"{where} has the kind {kind!r}, but known are {', '.join(PRIMITIVES)}.")
     primitive = PRIMITIVES[kind]
-    types = {item.name: item.type for item in fields(primitive)}
-    values = {str(name): value for name, value in row.items() if name != "kind"}
+    types = primitive.values()
+    values = {str(name): value for name, value in row.items() if name not in ("kind", "windows")}
     for name, value in values.items():
         wanted = types.get(name)
         if wanted is None:
@@ -385,8 +296,28 @@ def _primitive(row: object, where: str) -> Primitive:
             )
         if wanted is float:
             values[name] = float(value)
+    windows = _windows(row.get("windows", ()), where)
     try:
-        return primitive(**values)
+        return primitive(**values, windows=windows)
     except TypeError as cause:
-        missing = [item.name for item in fields(primitive) if item.name not in values]
+        missing = [name for name in types if name not in values]
         raise InvalidPatchError(f"{where} lacks {', '.join(missing)}.") from cause
+
+
+def _windows(rows: object, where: str) -> tuple[Window, ...]:
+    """Return the windows of a primitive as a file has them."""
+    if not isinstance(rows, list | tuple):
+        raise InvalidPatchError(f"{where}: windows must be a list, but is {rows!r}.")
+    found = []
+    for row in rows:
+        times = [row.get(key) for key in ("begin", "end")] if isinstance(row, Mapping) else []
+        sound = all(
+            value is None or (isinstance(value, float | int) and not isinstance(value, bool))
+            for value in times
+        )
+        if not times or not sound or not isinstance(row.get("trial"), str) or len(row) > 3:
+            raise InvalidPatchError(
+                f"{where}: a window has trial, begin and end (seconds or null), but is {row!r}."
+            )
+        found.append(Window(row["trial"], *(None if value is None else float(value) for value in times)))
+    return tuple(found)

@@ -3,22 +3,54 @@
 Standard library and relative imports only: this file is copied into the FMU.
 """
 
-from dataclasses import asdict, dataclass, fields
-from math import isfinite
-from typing import Any, ClassVar
+from dataclasses import asdict, dataclass, field, fields
+from math import inf, isfinite
+from typing import Any, ClassVar, NamedTuple
 
 from .errors import InvalidPatchError
 
 
+class Window(NamedTuple):
+    """A stretch of one trial, in its time [s]: from `begin` (None: from the first sample on) to `end`."""
+
+    trial: str
+    begin: float | None = None
+    end: float | None = None
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Begin and end, infinite where it is open."""
+        return -inf if self.begin is None else self.begin, inf if self.end is None else self.end
+
+
 @dataclass(frozen=True, slots=True)
 class Primitive:
-    """One primitive change; `kind` names its class in a file. All values SI; zero magnitude is no change."""
+    """One primitive change; `kind` names its class in a file. All values SI; zero magnitude is no change.
+
+    With `windows` it acts within these only, and in no trial that they do not name; without, always.
+    """
 
     kind: ClassVar[str] = ""
     units: ClassVar[dict[str, str]] = {}
     """Unit of each real number; at a port, "of one that is displaced or one that turns"."""
+    in_windows: ClassVar[bool] = False
+    """Whether it can act in windows only."""
+    courses: ClassVar[tuple[str, ...]] = ()
+    """Which of its texts are formulas in `time`."""
+
+    windows: tuple[Window, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
+        if self.windows and not self.in_windows:
+            raise InvalidPatchError(f"The primitive {self.kind!r} cannot act in a window only.")
+        for window in self.windows:
+            if not window.span[0] < window.span[1] or not all(
+                value is None or isfinite(value) for value in window[1:]
+            ):
+                raise InvalidPatchError(
+                    f"A window of the primitive {self.kind!r} must begin before it ends, but that in "
+                    f"{window.trial!r} goes from {window.begin} s to {window.end} s."
+                )
         for item in fields(self):
             value = getattr(self, item.name)
             if isinstance(value, float | int) and not isinstance(value, bool) and not isfinite(value):
@@ -28,4 +60,11 @@ class Primitive:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return kind and values as plain data."""
-        return {"kind": self.kind, **asdict(self)}
+        values = asdict(self)
+        windows = [window._asdict() for window in values.pop("windows")]
+        return {"kind": self.kind, **values, **({"windows": windows} if windows else {})}
+
+    @classmethod
+    def values(cls) -> dict[str, Any]:
+        """Return the types of its values by name, all but `windows`."""
+        return {item.name: item.type for item in fields(cls) if item.name != "windows"}

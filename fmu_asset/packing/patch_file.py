@@ -187,6 +187,11 @@ def _effects(rows: list[dict[str, Any]], where: str) -> tuple[Effect, ...]:
         try:
             patch = ModelPatch.from_list(row.get("primitives", row.get("patch")), f"{where}, effect {name}")
             for item in patch:
+                if item.windows or item.courses:
+                    raise PatchFileError(
+                        f"{where}: the effect {name!r} is bound to the time of trials "
+                        f"({item.kind}), which means nothing in an FMU: leave it out."
+                    )
                 if isinstance(item, PortForce) and item.magnitude:
                     item.check()
         except InvalidPatchError as cause:

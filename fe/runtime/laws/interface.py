@@ -47,6 +47,7 @@ HEAD = 5
 class PortForce(Primitive):
     """A primitive that acts at a port."""
 
+    in_windows: ClassVar[bool] = True
     of_speed: ClassVar[bool] = False
     """Whether the force is one of speed, which is zero at rest."""
     hysteretic: ClassVar[bool] = False

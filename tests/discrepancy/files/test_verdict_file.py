@@ -32,7 +32,7 @@ from discrepancy.verdict import (
     Verdict,
     VerdictKind,
 )
-from fe.runtime.patch import PRIMITIVES, Line, ModelPatch, PointMass, PowerDamping, PowerStiffness
+from fe.runtime.patch import PRIMITIVES, Line, ModelPatch, PointMass, PowerDamping, PowerStiffness, Window
 from reporting.errors import FileNotWrittenError
 from reporting.provenance import collect_provenance
 
@@ -122,15 +122,20 @@ def test_every_primitive_with_any_numbers_survives_the_file(
     primitives = []
     for kind in data.draw(st.lists(st.sampled_from(sorted(PRIMITIVES)), min_size=1, max_size=4)):
         values = {}
-        for item in fields(PRIMITIVES[kind]):
-            values[item.name] = data.draw(
+        for name, wanted in PRIMITIVES[kind].values().items():
+            values[name] = data.draw(
                 number
-                if item.type is float
+                if wanted is float
                 else st.integers(-5, 50)
-                if item.type is int
+                if wanted is int
+                else st.sampled_from(["3 * time", "step(time - 1.5)"])
+                if name in PRIMITIVES[kind].courses
                 else st.text(max_size=5)
             )
-        primitives.append(PRIMITIVES[kind](**values))
+        moments = st.none() | st.floats(0.0, 1.0)
+        window = st.builds(Window, st.text(max_size=3), moments, st.none() | st.floats(2.0, 3.0))
+        windows = data.draw(st.lists(window, max_size=2)) if PRIMITIVES[kind].in_windows else []
+        primitives.append(PRIMITIVES[kind](**values, windows=tuple(windows)))
     effect = replace(MASS, patch=ModelPatch(tuple(primitives)))
     path = tmp_path_factory.mktemp("patch") / "patch.json"
     back = read_patch(write_patch(path, (effect,), ORIGIN)).patch

@@ -103,7 +103,7 @@ def test_it_is_a_model(model: WingModel) -> None:
     assert as_model.output_quantity("strain[3]") is Quantity.STRAIN
     assert as_model.output_quantity("displacement[0.5, 0.3]") is Quantity.DISPLACEMENT
     assert as_model.output_quantity("strain[77]") is None
-    assert all(as_model.supports(kind) for kind in PRIMITIVES.values())
+    assert [kind for kind in PRIMITIVES if not as_model.supports(PRIMITIVES[kind])] == ["port_load"]
 
 
 # ---------------------------------------------------------------- at rest

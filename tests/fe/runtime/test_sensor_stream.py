@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fe.runtime.errors import InvalidPatchError
+from fe.runtime.high_pass import high_pass
 from fe.runtime.patch import (
     DecayingLine,
     HighPass,
@@ -19,7 +20,7 @@ from fe.runtime.patch import (
     ThermalStrain,
 )
 from fe.runtime.sensor_stream import Sample, SensorStream, high_pass_step
-from fe.runtime.sensors import SensorRecord, apply_sensors, high_pass
+from fe.runtime.sensors import SensorRecord, apply_sensors
 
 CHANNELS = (("strain[1]", "strain"), ("strain[2]", "strain"), ("tip_displacement", "displacement"))
 PATCH = ModelPatch(

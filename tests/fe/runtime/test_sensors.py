@@ -14,6 +14,7 @@ from scipy.signal import freqs, lfilter
 from scipy.special import hyp1f1
 
 from fe.runtime.errors import InvalidPatchError
+from fe.runtime.high_pass import high_pass
 from fe.runtime.patch import (
     Clock,
     DecayingLine,
@@ -32,7 +33,6 @@ from fe.runtime.sensors import (
     apply_sensors,
     check_channels,
     clock_of,
-    high_pass,
     needs_components,
     uses_sensors,
 )
