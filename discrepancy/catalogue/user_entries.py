@@ -136,13 +136,8 @@ def _effect(table: Table) -> Effect:
     parameters = tuple(_parameter(row) for row in table.tables("parameters"))
     shape = tuple(_shape(row) for row in table.tables("shape"))
     names = frozenset([*(item.name for item in parameters), *(item.name for item in shape)])
-    for name in names:
-        if not name.isidentifier() or name in {*SCALES, *PORT_SCALES, "pi", "place", "time"}:
-            raise CatalogueError(f"{table.where}: a parameter must not be called {name!r}.")
     events = table.texts("events")
-    for name in events:
-        if not name.isidentifier() or name in {*names, *SCALES, *PORT_SCALES, "pi", "place", "time"}:
-            raise CatalogueError(f"{table.where}: an event must not be called {name!r}.")
+    _check_names(table, names, events)
     rows = table.tables("primitives")
     if not rows:
         raise CatalogueError(f"{table.where} has no [[primitives]].")
@@ -174,6 +169,17 @@ def _effect(table: Table) -> Effect:
         ),
         confusable=table.texts("confusable"),
     )
+
+
+def _check_names(table: Table, names: frozenset[str], events: tuple[str, ...]) -> None:
+    """Refuse names of parameters and events that mean something else in an expression."""
+    taken = {*SCALES, *PORT_SCALES, "pi", "place", "time"}
+    for name in names:
+        if not name.isidentifier() or name in taken:
+            raise CatalogueError(f"{table.where}: a parameter must not be called {name!r}.")
+    for name in events:
+        if not name.isidentifier() or name in taken | names:
+            raise CatalogueError(f"{table.where}: an event must not be called {name!r}.")
 
 
 def _parameter(table: Table) -> EffectParameter:

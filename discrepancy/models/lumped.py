@@ -11,13 +11,12 @@ from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
 from discrepancy.models.lumped_file import LumpedDescription, load_lumped, matrix_of
-from discrepancy.models.lumped_patch import sorted_lumped
+from discrepancy.models.lumped_patch import laws_at, sorted_lumped
 from discrepancy.models.lumped_rig import LumpedRig
 from discrepancy.models.lumped_scales import rig_scales, state_sizes
 from discrepancy.models.lumped_sections import Damping
 from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
-from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS
 from fe.runtime.motion import NO_LAWS, laws_of
 from fe.runtime.patch import (
@@ -200,21 +199,17 @@ class LumpedModel:
             )
         self._check_outputs(outputs)
         quantities = [quantity for _, quantity in outputs]
-        sorted_out = sorted_lumped(patch.in_trial(trial.name), self)
-        structure, forces, gain, tare, along_span, along_chord, loads = sorted_out
-        try:
-            laws = laws_of(forces, self._ports, in_windows=True) if len(forces) else NO_LAWS
-        except InvalidPatchError as cause:
-            raise ModelError(str(cause)) from cause
+        own = patch.in_trial(trial.name)
+        structure, forces, gain, tare, along_span, along_chord, loads = sorted_lumped(own, self)
+        laws = laws_at(forces, self._ports)
         acting = trial.force * (1.0 + gain) + tare * (trial.force != 0.0) if gain or tare else trial.force
         switched = bool(laws.spans) and trial.kind is not TrialKind.RINGDOWN
         if self._as_rig(trial) or loads or switched:
             lumped = self._rig(conditions.parameters, structure, float(trial.temperature[0]))
             if len(lumped.own_laws):
-                laws = laws_of(lumped.own_laws + forces, self._ports, in_windows=True)
+                laws = laws_at(lumped.own_laws + forces, self._ports)
             place = self._moved_place(lumped, trial, along_span, along_chord)
-            load = (gain, tare, place, loads)
-            return lumped.response(trial, outputs, laws, conditions, load, refinement)
+            return lumped.response(trial, outputs, laws, conditions, (gain, tare, place, loads), refinement)
         rows = np.array([self._outputs[output] for output, _ in outputs]).reshape(-1, self.description.size)
         row = self._input_row(trial.load_place)
         if trial.kind is TrialKind.STATIC:

@@ -1,9 +1,12 @@
 """A patch for a lumped model, sorted by what its primitives change."""
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Model
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, LoadPlace, ModelPatch, PortLoad, Primitive
 
 
@@ -47,3 +50,13 @@ def sorted_lumped(patch: ModelPatch, model: Model) -> SortedLumped:
     return SortedLumped(
         tuple(structure), ModelPatch(tuple(forces)), gain, tare, along_span, along_chord, tuple(loads)
     )
+
+
+def laws_at(forces: ModelPatch, ports: Collection[str]) -> Laws:
+    """Return the laws of internal forces at ports; raises `ModelError` where one cannot be."""
+    if not len(forces):
+        return NO_LAWS
+    try:
+        return laws_of(forces, ports, in_windows=True)
+    except InvalidPatchError as cause:
+        raise ModelError(str(cause)) from cause

@@ -261,10 +261,9 @@ class LumpedRig:
         """
         gain, tare, place, at_ports = load
         name = self.description.name
-        if at_ports and not trial.is_dynamic:
+        if (at_ports or laws.spans) and not trial.is_dynamic:
             raise ModelError(
-                f"The trial {trial.name!r} has no time, but the force at {at_ports[0].port!r} is a "
-                "formula in it."
+                f"The trial {trial.name!r} has no time, which a law or a force in time asks for."
             )
         if trial.kind is TrialKind.RINGDOWN and self.description.is_plain:
             raise ModelError(

@@ -23,7 +23,7 @@ from discrepancy.models.second_order_motion import Motion
 from discrepancy.models.stepwise import simulate_at
 from fe.runtime.errors import SolutionError
 from fe.runtime.modal_system import ModalSystem, linear_step
-from fe.runtime.motion import Laws, StaticSolution, simulate, static_solution
+from fe.runtime.motion import Laws, ModalMotion, StaticSolution, simulate, static_solution
 
 FloatArray = NDArray[np.float64]
 
@@ -244,25 +244,11 @@ class SecondOrderSystem:
                 q, v = self._backwards(q, v, -lead)
                 start, lead, memory = lead, 0.0, None
             if lead > LEAST_LEAD * interval:
-                first = simulate_at(
-                    self.modal, laws, q=q, v=v, time=np.array([0.0, lead]), force=np.zeros((2, len(q))),
-                    memory=memory, refinement=refinement,
-                ) if laws.spans else simulate(
-                    self.modal, laws, q=q, v=v, memory=memory, force=np.zeros(2), interval=lead,
-                    refinement=refinement, kernel=compiled_kernel(),
-                )  # fmt: skip
+                first = self._released_from(q, v, memory, laws, np.array([0.0, lead]), lead, refinement)
                 q, v, memory, start = first.q[-1], first.v[-1], first.memory, lead
-            if is_even(time) and not laws.spans:
-                moved = simulate(
-                    self.modal, laws, q=q, v=v, memory=memory, force=nothing[held:], interval=interval or 1.0,
-                    start=start, refinement=refinement, kernel=compiled_kernel(),
-                )  # fmt: skip
-            else:
-                none = np.zeros((count - held, len(q)))
-                moved = simulate_at(
-                    self.modal, laws, q=q, v=v, time=times[held:] - times[held] + start, force=none,
-                    memory=memory, refinement=refinement,
-                )  # fmt: skip
+            apart = (interval or 1.0) if is_even(time) else 0.0
+            stamps = times[held:] - times[held] + start
+            moved = self._released_from(q, v, memory, laws, stamps, apart, refinement)
             all_q[held:], all_v[held:], forces[held:] = moved.q, moved.v, moved.port_forces
             lagged[held:] = moved.lagged
         if held and memory is not None:
@@ -359,6 +345,27 @@ class SecondOrderSystem:
         deviation = given[:, 0] * size / safe
         deviation[0] = 0.0
         return acts / self.angular_frequency**2 + deviation, np.zeros(modes), memory, holding
+
+    def _released_from(
+        self,
+        q: FloatArray,
+        v: FloatArray,
+        memory: FloatArray | None,
+        laws: Laws,
+        time: FloatArray,
+        interval: float,
+        refinement: int,
+    ) -> ModalMotion:
+        """Return the motion without loads at stamps (N,) that are `interval` apart, 0 where uneven."""
+        if interval and not laws.spans:
+            return simulate(
+                self.modal, laws, q=q, v=v, memory=memory, force=np.zeros(len(time)), interval=interval,
+                start=float(time[0]), refinement=refinement, kernel=compiled_kernel(),
+            )  # fmt: skip
+        return simulate_at(
+            self.modal, laws, q=q, v=v, time=time, force=np.zeros((len(time), len(q))), memory=memory,
+            refinement=refinement,
+        )  # fmt: skip
 
     def _backwards(self, q: FloatArray, v: FloatArray, duration: float) -> tuple[FloatArray, FloatArray]:
         """Return the state a duration [s] earlier, without internal forces."""
