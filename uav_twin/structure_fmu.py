@@ -1,5 +1,6 @@
 """`uav-twin structure fmu`."""
 
+from os.path import relpath
 from pathlib import Path
 from typing import Annotated
 
@@ -18,22 +19,35 @@ def fmu(
     binding: Annotated[
         Path | None, typer.Option(help="Write the binding of the FMU to this file, too.")
     ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(help="Write the file by which `discrepancy` takes the FMU as a model, too."),
+    ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the files if they exist.")] = False,
     memory_limit: MemoryLimit = None,
 ) -> None:
     """Pack the reduced model of a structure as an FMI 2.0 FMU; equal input gives equal bytes."""
+    from fe.structure.design import load_structure
     from fmu_asset.packing.contents import checked_target
     from fmu_asset.structures.binding import names_of_model, structure_binding_text
     from fmu_asset.structures.build import build_structure_fmu
+    from fmu_asset.structures.rig import rig_text
     from reporting.errors import FileNotWrittenError
     from reporting.files import atomic_write_text
 
     target = checked_target(file.with_suffix(".fmu") if out is None else out, replace=replace)
-    if binding is not None and binding.exists() and not replace:
-        raise FileNotWrittenError(f"{binding} exists: choose another --binding or give --replace.")
+    for name, path in (("binding", binding), ("rig", rig)):
+        if path is not None and path.exists() and not replace:
+            raise FileNotWrittenError(f"{path} exists: choose another --{name} or give --replace.")
+    text = None
+    if rig is not None:
+        text = rig_text(load_structure(file), relpath(target, rig.parent))
     model = reduced(file, memory_limit)
     info = build_structure_fmu(model, target, replace=replace)
     terminal.say(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
     if binding is not None:
         atomic_write_text(binding, structure_binding_text(names_of_model(model)))
         terminal.say(f"{binding}: its binding")
+    if rig is not None and text is not None:
+        atomic_write_text(rig, text)
+        terminal.say(f"{rig}: the model of a search, `uav-twin discrepancy run CAMPAIGN --model {rig}`")

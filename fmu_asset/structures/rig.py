@@ -1,0 +1,80 @@
+"""The file by which a structure's FMU is a model of the search for a missing effect: `docs/fmu_models.md`."""
+
+import json
+
+import numpy as np
+
+from fe.structure.design import Load, PointOutput, StructureDesign
+from fmu_asset.errors import FmuBuildError
+
+
+def rig_text(design: StructureDesign, fmu: str) -> str:
+    """Return the model file of a structure's FMU: forces, outputs, ports and parameters as its file has them.
+
+    A control in N is a force. Where a load of 1 N at a point meets a displacement output along it, there is a
+    port.
+
+    Parameters
+    ----------
+    design : StructureDesign
+        The structure.
+    fmu : str
+        Path of its FMU, seen from the folder of the file.
+
+    Raises
+    ------
+    FmuBuildError
+        If no control is a force.
+    """
+    forces = [part.name for part in design.control if part.unit == "N"]
+    if not forces:
+        raise FmuBuildError(
+            f"The structure {design.name} has no control in N, and a search needs a force that is recorded: "
+            'give a [[control]] with unit = "N" and a [[load]] of 1 N tied to it.'
+        )
+    several = ", ".join(f'{name} = "{name}"' for name in forces)
+    place = json.dumps(forces[0]) if len(forces) == 1 else f"{{ {several} }}"
+    tables = [
+        f'format = 1\nkind = "fmu"\nname = {json.dumps(design.name)}\nfmu = {json.dumps(fmu)}\n',
+        "[inputs]\nforce = " + place + "\n",
+        "[static]\nparameters = { response = 1.0 }\n",
+        "[motion]\nparameters = { response = 2.0 }\n",
+    ]
+    if any(part.name == "load_factor" for part in design.control):
+        tables[1] += 'load_factor = "load_factor"\n'
+    ports = [
+        (load.control, output.name)
+        for load in design.load
+        for output in design.displacement
+        if load.control in forces and _meet(load, output)
+    ]
+    if ports:
+        force, output = ports[0]
+        tables.append(f'[release]\nhold = "{force}"\noutput = "displacement.{output}"\n')
+    for key, quantity in (("gauge", "strain"), ("displacement",) * 2, ("acceleration",) * 2):
+        for part in getattr(design, key):
+            tables.append(
+                f'[[output]]\nname = "{part.name}"\nvariable = "{quantity}.{part.name}"\n'
+                f'quantity = "{quantity}"\n'
+            )
+    for force, output in ports:
+        tables.append(
+            f'[[port]]\nname = "{output}"\nforce = "{force}"\ndisplacement = "displacement.{output}"\n'
+        )
+    masses = [(part, f"mass.{part.name}", "kg") for part in design.mass if part.free]
+    for part, variable, unit in [*((part, part.name, "1") for part in design.parameter), *masses]:
+        low, high = part.range
+        tables.append(
+            f'[[parameter]]\nname = "{part.name}"\nvariable = "{variable}"\nmean = {part.middle!r}\n'
+            f"deviation = {0.25 * (high - low):.6g} # a quarter of the range: say better what is known\n"
+            f'low = {low!r}\nhigh = {high!r}\nunit = "{unit}"\n'
+        )
+    return "\n".join(tables)
+
+
+def _meet(load: Load, output: PointOutput) -> bool:
+    """Return whether a load is 1 N at the point of an output and along it."""
+    if load.point is None or load.force is None or load.point != output.point:
+        return False
+    direction = np.asarray(output.direction) / np.linalg.norm(output.direction)
+    return bool(np.abs(np.asarray(load.force) - direction).max() < 1e-9)

@@ -1,0 +1,86 @@
+"""A structure's FMU as a model of the search, by the file that is written beside it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
+from discrepancy.models.fmu import FmuModel
+from discrepancy.models.interface import Conditions
+from fe.reduction.structure_basis import reduce_structure
+from fe.runtime.patch import ModelPatch
+from fe.runtime.structure_model import StructureModel
+from fe.runtime.structure_motion import StructureMotion
+from fe.structure.design import load_structure
+from fe.structure.operators import load_and_assemble
+from fmu_asset.errors import FmuBuildError
+from fmu_asset.structures.build import build_structure_fmu
+from fmu_asset.structures.rig import rig_text
+
+OUTPUTS = (("tip", Quantity.DISPLACEMENT), ("g1", Quantity.STRAIN), ("shake", Quantity.ACCELERATION))
+TRIAL = Trial(
+    name="a trial", kind=TrialKind.STATIC, channels=(), values=np.zeros((40, 0)), used=np.ones((40, 0), bool),
+    time=1e-4 * np.arange(40), force=np.linspace(-100.0, 200.0, 40), load_factor=np.zeros(40),
+    load_place="tip_load", temperature=np.zeros(40), start=0.0, run="A", health=np.zeros((1, 2)),
+    health_deviation=np.zeros((1, 2)),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def pair(
+    write_beam: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[FmuModel, StructureModel]]:
+    """The model of the search, and the reduced structure inside it."""
+    folder = tmp_path_factory.mktemp("rig")
+    file = write_beam(folder, {'set = "end", force': "point = [100, 10, 5], force"}, cells=2)
+    reduced = reduce_structure(load_and_assemble(file), "beam").model
+    fmu = build_structure_fmu(reduced, folder / "beam.fmu").path
+    path = folder / "rig.toml"
+    path.write_text(rig_text(load_structure(file), os.path.relpath(fmu, folder)), encoding="utf-8")
+    model = FmuModel.load(path)
+    yield model, reduced
+    model.close()
+
+
+def test_it_is_the_structure_at_rest(pair: tuple[FmuModel, StructureModel]) -> None:
+    """Static trials at other parameters and masses; without a recorded load factor there is no weight."""
+    model, reduced = pair
+    assert [parameter.name for parameter in model.parameters] == ["e", "pump"]
+    assert model.ports() == ("tip",)
+    seen = model.respond(TRIAL, OUTPUTS[:2], ModelPatch(), Conditions(np.array([1.04, 0.06]))).values
+    for force, values in zip(TRIAL.force, seen, strict=True):
+        chosen = {"e": 1.04, "pump": 0.06, "load_factor": 0.0, "push": float(force)}
+        found = reduced.static_response(chosen)
+        np.testing.assert_allclose(values, [found.displacement[0], found.strain[0]], rtol=1e-10, atol=1e-15)
+
+
+def test_it_is_the_structure_in_motion(pair: tuple[FmuModel, StructureModel]) -> None:
+    """A tip that is held aside and let go, with its acceleration."""
+    model, reduced = pair
+    trial = replace(TRIAL, kind=TrialKind.RINGDOWN, force=np.zeros(40), release=Release(1e-4))
+    seen = model.respond(trial, OUTPUTS, ModelPatch(), Conditions(np.array([1.0, 0.05]))).values
+    unit = reduced.static_response({"load_factor": 0.0, "push": 1.0}).displacement[0]
+    held, free = (reduced.vector({"load_factor": 0.0, "push": force}) for force in (1e-4 / unit, 0.0))
+    motion = StructureMotion(reduced, held, *reduced.damping)
+    start = motion.at_rest(reduced.load_coefficients(held))
+    load = reduced.load_coefficients(free)
+    wanted = np.array(
+        [
+            motion.outputs(motion.advance(start, float(time), load))[[len(reduced.gauges), 0, -1]]
+            for time in trial.time[1:]
+        ]
+    )
+    largest = np.abs(wanted).max(axis=0)
+    np.testing.assert_allclose(seen[1:] / largest, wanted / largest, atol=1e-3)
+
+
+def test_a_structure_without_a_force_is_refused(write_beam: Callable[..., Path], tmp_path: Path) -> None:
+    design = load_structure(write_beam(tmp_path, {'unit = "N", ': ""}, cells=1))
+    with pytest.raises(FmuBuildError, match="no control in N"):
+        rig_text(design, "beam.fmu")
