@@ -124,7 +124,10 @@ class Teller:
         scales = np.array([factor.scale for factor in scene.factors])
         return self._printed(believed, observed) | {
             "control": [turn.control_index for turn in flight.seen(first, end)],
-            "notices": [[notice.sentence for notice in turn.notices] for turn in flight.seen(first, end)],
+            "notices": [
+                [notice.sentence.replace(" DIR", f" {flight.folder}") for notice in turn.notices]
+                for turn in flight.seen(first, end)
+            ],
             "learnt": [
                 {name: asdict(learnt) for name, learnt in turn.learnt.items()}
                 for turn in flight.seen(first, end)

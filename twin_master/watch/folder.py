@@ -4,7 +4,7 @@ import base64
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -31,6 +31,7 @@ from twin_master.mission.journal import (
 from twin_master.mission.kept_knowledge import keep_knowledge
 from twin_master.mission.loop import operate
 from twin_master.mission.preparation import prepare_knowledge
+from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.run_folder import (
     CONFIG_NAME,
@@ -272,6 +273,7 @@ class Watch:
         first = max(0, turns - last)
         found = self._replayed(first, lag=False)
         flight = found.beliefs.flight(found.twin, None, first_turn=found.first_turn)
+        flight = replace(flight, notices=self._told(first))
         knowledge, mission = self.models[-1].knowledge, self.scenario.mission
         result = MissionResult(
             scenario=self.scenario, model=knowledge.model, sensor_model=knowledge.sensor_model,
@@ -319,6 +321,16 @@ class Watch:
 
             with self._progress.stage("Writing the report"):
                 write_report(self.folder)
+
+    def _told(self, first: int) -> tuple[tuple[int, Notice], ...]:
+        """Return what the operator was told in the turns from `first` on, each sentence once."""
+        told: dict[str, tuple[int, Notice]] = {}
+        for record, _ in read_records(self._path, self._hash):
+            if record["turn"] >= first:
+                for notice in record.get("notices", ()):
+                    found = {**notice, "sensors": tuple(notice["sensors"])}
+                    told.setdefault(notice["sentence"], (record["turn"], Notice(**found)))
+        return tuple(told.values())
 
     def _figures(self, counts: Counts, turns: int) -> tuple[Figure, ...]:
         steps = f"{self.scenario.mission.step_name}s"

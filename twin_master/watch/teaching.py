@@ -239,7 +239,7 @@ def verdict_of(
 def trial_sentence(trial: Mapping[str, Any], gained: float, step: str) -> str:
     """Return what the operator is told at the end of a trial."""
     first = trial["from_turn"]
-    compared = f"beside the model for {TRIAL_TURNS} {step}s the patch gained {gained:.3g} nats of evidence"
+    compared = f"Beside the model for {TRIAL_TURNS} {step}s the patch gained {gained:.3g} nats of evidence"
     if gained > 0.0:
         return f"{compared}: it is believed from {step} {first} on, and these {step}s were filtered anew."
     return f"{compared}, and is not adopted."
@@ -326,7 +326,7 @@ class Tutor:
         try:
             gained = self._pupil.gained(file, trial["from_turn"], trial["turn"] + 1)
         except (TwinMasterError, FmuError, FiniteElementError) as error:
-            sentence = f"the patch cannot be believed by this twin: {error}"
+            sentence = f"The patch cannot be believed by this twin: {error}"
             self._pupil.write({"verdict": {**trial, "tried": False, "notice": notice_of("trial", sentence)}})
             return False
         notice = notice_of("trial", trial_sentence(trial, gained, self._step))

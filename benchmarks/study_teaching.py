@@ -1,0 +1,143 @@
+"""What teaching in flight is worth: missions with an effect that only the wing has, watched with `--teach`.
+
+`python -m benchmarks.study_teaching` flies level_turns with each of several hidden effects in the FMU, and
+watches the recorded strains three times: by a twin that is never taught, by one that is (`uav-twin watch
+--teach`: alarm, search, trial, adoption), and by one that knew the effect. Printed: alarm, verdicts,
+adoption, and the rms error of z1 and z2 in points behind the adoption (without one, from turn 30 on).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import uav_twin
+from benchmarks.study_hidden_effects import fly_mission, patch_text
+from fe.runtime.patch import LocalStiffnessLoss, PointMass, Primitive, RootCompliance, SensorGain
+from reporting.files import atomic_write_text
+from reporting.progress import SilentProgress
+from scenarios import scenario_files
+from twin_master.assets.resolution import Overrides
+from twin_master.mission.journal import JOURNAL_NAME, read_records
+from twin_master.scenario.reading import load_scenario
+from twin_master.watch import teaching
+from twin_master.watch.feeds import file_feed
+from twin_master.watch.folder import begin_watch
+
+HIDDEN: dict[str, tuple[Primitive, ...]] = {
+    "nothing": (),
+    "skin from 0.45 to 0.85 m has lost 15 %": (LocalStiffnessLoss(0.15, 0.45, 0.4),),
+    "skin from 0.45 to 0.85 m has lost 30 %": (LocalStiffnessLoss(0.3, 0.45, 0.4),),
+    "gauge 17 shows 12 % too little": (SensorGain("strain[17]", -0.12),),
+    "point mass of 0.2 kg at 1.6 m": (PointMass(0.2, 1.6),),
+    "root compliance of 3e-5 rad/(N m)": (RootCompliance(3e-5),),
+}
+TURNS = 50
+WITHOUT = 30
+"""First turn that is compared where nothing was adopted."""
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A watch of a mission; `mean` (T, 2) is what it believed of z1 and z2."""
+
+    mean: NDArray[np.float64]
+    records: list[dict[str, Any]]
+
+
+def scenario_of(place: Path, known: tuple[Primitive, ...]) -> Path:
+    """Write the scenario of a watch whose twin knows some effects."""
+    kept, skipping = [], False
+    for line in scenario_files()["level_turns"].read_text(encoding="utf-8").splitlines():
+        if line.startswith("["):
+            skipping = line.strip("[]").split(".")[0] in ("asset", "truth", "reference")
+        if not skipping:
+            kept.append(
+                line.replace("standard_deviation_microstrain = 125", "standard_deviation_microstrain = 150")
+            )
+    text = "\n".join([*kept, "", "[notice]", ""])
+    if known:
+        file = atomic_write_text(place / "known.json", patch_text(known))
+        text = text.replace("[belief]\n", f'[belief]\npatch = "{file.name}"\n')
+    return atomic_write_text(place / f"watched_{len(known)}.toml", text)
+
+
+def watched(run: Path, folder: Path, scenario: Path, *, teach: bool) -> Watched:
+    """Watch the strains of a run."""
+    watch, lock = begin_watch(
+        load_scenario(scenario), folder, Overrides(), SilentProgress(), replace_run=False
+    )
+    try:
+        search = teaching.Search(folder, watch.scenario.mission.seed) if teach else None
+        watch.run(file_feed(run / "run.nc", watch.scenario), lambda _decision: None, search=search)
+    finally:
+        os.close(lock)
+    records = [record for record, _ in read_records(folder / JOURNAL_NAME)]
+    filtered = np.array([record["filtered"] for record in records if "filtered" in record])
+    return Watched(filtered @ watch.models[0].knowledge.model.states.coordinates, records)
+
+
+def said(records: list[dict[str, Any]]) -> tuple[str, int]:
+    """Return what happened, and the first turn behind the adoption."""
+    words, first = [], WITHOUT
+    for record in records:
+        if "verdict" in record:
+            verdict = record["verdict"]
+            words.append(f"{verdict['from_turn']} to {verdict['to_turn']}: {verdict['kind']}")
+        elif "model" in record:
+            first = record["turn"] + 1
+            words.append(f"believed from {record['model']['from_turn']} on at {record['turn']}")
+        else:
+            alarm = any(notice["kind"] == "alarm" for notice in record.get("notices", ()))
+            words += [f"alarm at {record['turn']}"] if alarm else []
+    return "; ".join(words) or "no alarm", first
+
+
+def study(name: str, seed: int, work: Path) -> None:
+    """Fly a mission, watch it three times, and print how well its health was known."""
+    hidden = HIDDEN[name]
+    place = work / f"{len(name)}_{seed}"
+    place.mkdir()
+    fly_mission(place / "run", seed, hidden, scenario="level_turns", turns=TURNS)
+    truth = uav_twin.open_run(place / "run")["truth"]["state"].values
+    plain = scenario_of(place, ())
+    taught = watched(place / "run", place / "taught", plain, teach=True)
+    known = hidden
+    ways = {
+        "never taught": watched(place / "run", place / "never", plain, teach=False),
+        "taught": taught,
+        "knew": watched(place / "run", place / "knew", scenario_of(place, known), teach=False),
+    }
+    what, first = said(taught.records)
+    errors = {
+        way: 100.0 * np.sqrt(np.mean((watch.mean[first:] - truth[first:]) ** 2, axis=0))
+        for way, watch in ways.items()
+    }
+    figures = ", ".join(f"{way} {z1:.2f} {z2:.2f}" for way, (z1, z2) in errors.items())
+    print(f"{name}, seed {seed}: {what}. rms of z1, z2 from turn {first} on: {figures}", flush=True)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first-seed", type=int, default=2021)
+    parser.add_argument("--only", help="numbers of hidden effects from 0, with commas")
+    given = parser.parse_args()
+    names = [*HIDDEN] if given.only is None else [[*HIDDEN][int(number)] for number in given.only.split(",")]
+    teaching._COURTESY = 0  # nothing else is to be served first
+    with tempfile.TemporaryDirectory() as work:
+        for seed in range(given.first_seed, given.first_seed + given.seeds):
+            for name in names:
+                study(name, seed, Path(work))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
