@@ -4,6 +4,8 @@ The flight itself computes nothing for its viewers. Beliefs and decisions stand 
 from them is computed here, as the run does it, so that every number is that of the run.
 """
 
+from array import array
+from collections import OrderedDict
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,6 +25,12 @@ Float = NDArray[np.float64]
 
 TURNS_AT_ONCE = 200
 """Turns that are read before the viewers are answered again."""
+TURNS_KEPT = 512
+"""Turns in memory, those read last: more than two pages show at once."""
+
+
+class BegunAnewError(LookupError):
+    """Another flight has taken the place of the one that is looked at."""
 
 
 @dataclass(frozen=True)
@@ -74,15 +82,18 @@ class Flight:
         self.folder = folder
         config = read_config(folder)
         self.scenario: Scenario = parse_scenario(config["scenario"], str(folder))
+        self._knowledge_of = self._kept_at()
         self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
         self._journal = GrowingJournal(folder)
-        self._turns: list[SeenTurn] = []
+        # Where in the journal stand belief and observation of each turn; in memory are those last read.
+        self._believed, self._observed = array("q"), array("q")
+        self._kept: OrderedDict[int, SeenTurn] = OrderedDict()
         self.number = 0
 
     @property
     def turns(self) -> int:
         """Number of turns seen so far."""
-        return len(self._turns)
+        return len(self._believed)
 
     def update(self) -> bool:
         """Take in what is new in the journal, at most `TURNS_AT_ONCE`; return whether there was any.
@@ -92,48 +103,86 @@ class Flight:
         RunFolderError
             The journal was changed.
         """
-        begun_anew = self._journal.begun_anew()
-        if begun_anew:
-            self._turns.clear()
+        changed = self._journal.begun_anew()
+        if changed:
+            self._believed, self._observed = array("q"), array("q")
+            self._kept.clear()
             self.number += 1
+        if (kept := self._kept_at()) != self._knowledge_of:  # a patched model was adopted
+            self._knowledge_of, self.knowledge = kept, kept_knowledge(self.folder, self.scenario)
+            self.number += 1
+            changed = True
         news = self._journal.news(TURNS_AT_ONCE)
-        for seen in news:
-            if seen.turn == self.turns:
-                self._turns.append(seen)
+        for line in news:
+            if line.seen is None:
+                continue
+            if line.seen.turn == self.turns:
+                self._believed.append(line.place)
+                self._observed.append(line.place)
+                self._keep(line.seen.turn, line.seen)
             else:
-                self._revise(seen)
-        return begun_anew or bool(news)
+                self._revise(line.seen, line.place)
+        return changed or bool(news)
 
-    def _revise(self, seen: SeenTurn) -> None:
+    def _kept_at(self) -> tuple[int, int] | None:
+        """Return what tells the file of what the twin knows from another that took its place."""
+        try:
+            found = (self.folder / KNOWLEDGE_NAME).stat()
+        except FileNotFoundError:
+            return None
+        return found.st_ino, found.st_mtime_ns
+
+    def _revise(self, seen: SeenTurn, place: int) -> None:
         """Take in an observation that came late: it stands in its turn, and the last belief has changed."""
         if not 0 <= seen.observation_turn <= seen.turn == self.turns - 1:
             raise RunFolderError(
                 f"the journal in {self.folder} tells {self.scenario.mission.step_name} {seen.turn} where "
                 f"{self.turns} was expected: it is of another version."
             )
-        late, last = seen.observation_turn, self._turns[-1]
-        self._turns[-1] = replace(seen, observed=last.observed, control_index=last.control_index)
-        self._turns[late] = replace(
-            self._turns[late], observed=seen.observed, control_index=seen.control_index
-        )
+        self._believed[-1] = self._observed[seen.observation_turn] = place
+        self._kept.pop(seen.turn, None)
+        self._kept.pop(seen.observation_turn, None)
         self.number += 1
 
+    def _keep(self, turn: int, seen: SeenTurn) -> None:
+        self._kept[turn] = seen
+        if len(self._kept) > TURNS_KEPT:
+            self._kept.popitem(last=False)
+
     def seen(self, first: int, end: int) -> list[SeenTurn]:
-        """Return the turns first..end - 1."""
-        return self._turns[first:end]
+        """Return the turns first..end - 1.
+
+        Raises
+        ------
+        BegunAnewError
+            Another flight has taken the place of this one; `update` tells it.
+        """
+        missing = [turn for turn in range(first, end) if turn not in self._kept]
+        believed = self._journal.read([self._believed[turn] for turn in missing])
+        late = [n for n, turn in enumerate(missing) if self._observed[turn] != self._believed[turn]]
+        observed = self._journal.read([self._observed[missing[n]] for n in late])
+        if believed is None or observed is None:
+            raise BegunAnewError
+        for n, own in zip(late, observed, strict=True):
+            believed[n] = replace(believed[n], observed=own.observed, control_index=own.control_index)
+        found = {turn: self._kept[turn] for turn in range(first, end) if turn in self._kept}
+        for turn, seen in zip(missing, believed, strict=True):
+            found[turn] = seen
+            self._keep(turn, seen)
+        return [found[turn] for turn in range(first, end)]
 
     def observed(self, first: int, end: int) -> Float:
         """Return what the sensors said in turns first..end - 1: (n, G), SI; NaN where lost."""
-        return np.array([turn.observed for turn in self._turns[first:end]])
+        return np.array([turn.observed for turn in self.seen(first, end)])
 
     def truth(self, first: int, end: int) -> Float:
         """Return the true state of turns first..end - 1: (n, K), SI; NaN where nobody knows it."""
         unknown = np.full(len(self.scenario.state), np.nan)
-        return np.array([unknown if turn.truth is None else turn.truth for turn in self._turns[first:end]])
+        return np.array([unknown if turn.truth is None else turn.truth for turn in self.seen(first, end)])
 
     def believed(self, first: int, end: int) -> Belief:
         """Return what the twin believed of each of the turns first..end - 1 when it was flown."""
-        turns = self._turns[first:end]
+        turns = self.seen(first, end)
         joint = known_control(
             np.array([turn.filtered for turn in turns]),
             [turn.control_index for turn in turns],
@@ -145,10 +194,11 @@ class Flight:
     def predicted(self, turn: int) -> Belief:
         """Return what the twin expected after a turn of the H turns to come."""
         model, plan = self.knowledge.model, self.knowledge.plan
+        seen = self.seen(turn, turn + 1)[0]
         coming = predict(
             model,
-            self._turns[turn].filtered,
-            self._turns[turn].control_index,
+            seen.filtered,
+            seen.control_index,
             plan.policy,
             self.scenario.mission.prediction_steps,
         )

@@ -4,7 +4,7 @@ This is the one place that knows how a journal tells its turns: see `twin_master
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -56,6 +56,22 @@ class SeenTurn:
     notices: tuple[Notice, ...]
 
 
+@dataclass(frozen=True)
+class News:
+    """A line that was added to a journal.
+
+    Attributes
+    ----------
+    place : int
+        Where it begins, in bytes, see `GrowingJournal.read`.
+    seen : SeenTurn or None
+        The turn that it tells; None where it is of the watch itself, such as a model that was adopted.
+    """
+
+    place: int
+    seen: SeenTurn | None
+
+
 class GrowingJournal:
     """A journal that grows; each call of `news` gives the lines that were added since the last.
 
@@ -86,15 +102,15 @@ class GrowingJournal:
         self._begin()
         return True
 
-    def news(self, most: int) -> list[SeenTurn]:
-        """Return the turns of whole new lines, of at most so many.
+    def news(self, most: int) -> list[News]:
+        """Return what whole new lines tell, of at most so many.
 
         Raises
         ------
         NotResumableError
             A line was changed.
         """
-        found: list[SeenTurn] = []
+        found: list[News] = []
         try:
             if self._path.stat().st_size == self._end:
                 return []
@@ -104,20 +120,40 @@ class GrowingJournal:
                 for line in file:
                     if len(found) == most or not line.endswith(b"\n"):  # one that is being written
                         break
-                    record = self._record(line)
+                    record = self._record(line, self._lines)
+                    if self._end:  # not the heading
+                        found.append(News(self._end, _seen(record) if "filtered" in record else None))
                     self._end += len(line)
                     self._lines += 1
-                    if "filtered" in record:  # not the heading, nor what is said of the watch itself
-                        found.append(_seen(record))
         except FileNotFoundError:
             pass
         return found
 
-    def _record(self, line: bytes) -> dict[str, Any]:
+    def read(self, places: Sequence[int]) -> list[SeenTurn] | None:
+        """Return the turns told by lines that were news; None where the journal was begun anew since.
+
+        Raises
+        ------
+        NotResumableError
+            A line was changed.
+        """
+        try:
+            with self._path.open("rb") as file:
+                if os.fstat(file.fileno()).st_ino != self._file_number:
+                    return None
+                found = []
+                for place in places:
+                    file.seek(place)
+                    found.append(_seen(self._record(file.readline(), None)))
+                return found
+        except FileNotFoundError:
+            return None
+
+    def _record(self, line: bytes, number: int | None) -> dict[str, Any]:
         digest, _, text = line.rstrip(b"\n").partition(b" ")
         if sha256(text).hexdigest().encode("ascii") != digest:
-            raise damaged(self._path, self._lines, "it does not have the hash that stands before it")
-        return record_of(self._path, self._lines, text)
+            raise damaged(self._path, number or 0, "it does not have the hash that stands before it")
+        return record_of(self._path, number or 0, text)
 
 
 def _seen(record: Mapping[str, Any]) -> SeenTurn:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.viewer.flight import Belief, Flight
+from twin_master.viewer.flight import BegunAnewError, Belief, Flight
 from twin_master.viewer.scene import NORMAL_95, Scene
 
 Float = NDArray[np.float64]
@@ -104,8 +104,11 @@ class Teller:
             "turn": turn,
             "first": first,
         }
-        past = self._text("past", first, end) if first < end else "null"
-        ahead = "null" if same and request.shown == turn else self._text("ahead", turn, turn + 1)
+        try:
+            past = self._text("past", first, end) if first < end else "null"
+            ahead = "null" if same and request.shown == turn else self._text("ahead", turn, turn + 1)
+        except BegunAnewError:
+            return None
         return f'{json.dumps(heading)[:-1]}, "past": {past}, "ahead": {ahead}}}'
 
     def _text(self, what: str, first: int, end: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -21,6 +22,7 @@ import pytest
 
 from benchmarks.browser import CHROMIUM, open_browser
 from fe.wing.design import SHIPPED_DESIGN, load_design
+from reporting.files import atomic_write_bytes
 from reporting.progress import SilentProgress
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.assets.resolution import Overrides
@@ -170,6 +172,48 @@ def test_an_observation_that_came_late_stands_in_its_turn(begun: Path, lines: li
     add(begun, line_of(turns[30]))
     with pytest.raises(RunFolderError, match="tells turn 30 where 10 was expected"):
         flight.update()
+
+
+def test_turns_beyond_those_kept_are_read_again_and_are_the_same(
+    begun: Path, lines: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    turns = [json.loads(line[65:]) for line in lines[1:]]
+    missed = turns[6] | {"observed": [None] * 24}
+    late = turns[9] | {"observation_turn": 6, "observed": turns[6]["observed"]}
+    told = [*turns[:6], missed, *turns[7:10], late, {"model": {}}, *turns[10:20]]
+    add(begun, lines[0], *map(line_of, told))
+    flight, parts = whole(begun), ((0, 20), (5, 8), (0, 2), (18, 20))
+    expected, seen = [flight.believed(*part) for part in parts], flight.seen(0, 20)
+    monkeypatch.setattr("twin_master.viewer.flight.TURNS_KEPT", 3)
+    few = whole(begun)
+    assert few.turns == flight.turns == 20
+    for part, belief in zip(parts, expected, strict=True):
+        for name, values in vars(few.believed(*part)).items():
+            np.testing.assert_array_equal(values, getattr(belief, name))
+    assert [turn.notices for turn in few.seen(0, 20)] == [turn.notices for turn in seen]
+    assert len(few._kept) == 3
+    journal = begun / JOURNAL_NAME
+    journal.rename(begun / "before")
+    journal.write_bytes(b"".join(lines[:4]))  # another flight
+    assert teller_of(few).answer(asked()) is None  # until it is seen
+    assert few.update()
+    assert few.turns == 3
+
+
+def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown(
+    begun: Path, lines: list[bytes]
+) -> None:
+    add(begun, *lines)
+    flight = whole(begun)
+    before, number = flight.believed(0, 5).sensor_mean, flight.number
+    with np.load(begun / KNOWLEDGE_NAME) as kept:
+        arrays = dict(kept)
+    content = io.BytesIO()
+    np.savez(content, **(arrays | {"predicted": 1.1 * arrays["predicted"]}))
+    atomic_write_bytes(begun / KNOWLEDGE_NAME, content.getvalue())
+    assert flight.update()
+    assert flight.number > number
+    np.testing.assert_allclose(flight.believed(0, 5).sensor_mean, 1.1 * before)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"PK\x05\x06" + bytes(18), b"no archive"])
