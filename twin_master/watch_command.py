@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from twin_master.watch.folder import Patched, Watch
     from twin_master.watch.intake import Counts, Feed
 
-    Decide = Callable[[Mapping[str, Any]], None]
+    Decide = Callable[[Mapping[str, Any]], bool]
 
 Observations = Annotated[
     str | None,
@@ -117,9 +118,10 @@ def _recording(scenario: "Scenario") -> str | None:
 def _paced(decide: "Decide", seconds: float) -> "Decide":
     """Return what waits after each decision."""
 
-    def waiting(decision: Mapping[str, Any]) -> None:
-        decide(decision)
+    def waiting(decision: Mapping[str, Any]) -> bool:
+        heard = decide(decision)
         time.sleep(seconds)
+        return heard
 
     return waiting if seconds else decide
 
@@ -132,15 +134,41 @@ def _watched(
     patched: "Patched | None",
     teach: bool,
 ) -> "Counts":
-    """Watch until the end, and end what the observations come from."""
+    """Watch until the end, or until nobody reads the decisions, and end what the observations come from."""
     from twin_master.watch.teaching import Search
 
     feed, decide, close = fed
+    decide = _paced(decide, pace)
     search = Search(watched.folder, watched.scenario.mission.seed) if teach else None
+
+    def tell(decision: Mapping[str, Any]) -> None:
+        if not decide(decision):
+            signal.raise_signal(signal.SIGINT)  # which ends a watch in order
+
     try:
-        return watched.run(feed, _paced(decide, pace), turns=turns, patched=patched, search=search)
+        untold = _untold(watched)
+        if untold is not None:
+            decide(untold)
+        return watched.run(feed, tell, turns=turns, patched=patched, search=search)
     finally:
         close()
+
+
+def _untold(watched: "Watch") -> dict[str, Any] | None:
+    """Return the last decision, to be told again, where a kill may have left it untold."""
+    from reporting.errors import DamagedFileError
+    from reporting.json_file import read_json
+    from twin_master.mission.journal import JOURNAL_NAME
+    from twin_master.store.writing import SUMMARY_NAME
+    from twin_master.watch.decision import last_decision
+
+    model = watched.models[-1].knowledge.model
+    last = last_decision(watched.folder / JOURNAL_NAME, watched.scenario, model)
+    try:
+        ended = read_json(watched.folder / SUMMARY_NAME, DamagedFileError)["steps"]
+    except (DamagedFileError, KeyError, TypeError):
+        return last
+    return None if last is None or ended == last["turn"] + 1 else last
 
 
 def _opened(
@@ -218,26 +246,44 @@ def _feed(
         broker = broker_of(observations, ca_file)
         mqtt = MqttFeed(broker, scenario, watched.folder, lambda text: typer.echo(text, err=True))
 
-        def publish(decision: Mapping[str, Any]) -> None:
+        def publish(decision: Mapping[str, Any]) -> bool:
             _say(watched, decision, flush=True)
             mqtt.decide(decision)
+            return True
 
         return mqtt, publish, mqtt.close
     if observations == "-":
         return JsonLinesFeed(scenario), lambda decision: _say(watched, decision, flush=True), lambda: None
     feed = file_feed(Path(observations), scenario, follow=follow)
-    return feed, lambda decision: _say(watched, decision, flush=follow), sys.stdout.flush
+    return feed, lambda decision: _say(watched, decision, flush=follow), _flush
 
 
-def _say(watched: "Watch", decision: Mapping[str, Any], *, flush: bool) -> None:
-    for notice in decision["alarms"]:  # also where the decisions go to a program
+def _say(watched: "Watch", decision: Mapping[str, Any], *, flush: bool) -> bool:
+    """Print a decision; return whether anybody reads it."""
+    for notice in decision["notices"]:  # also where the decisions go to a program
         sentence = notice["sentence"].replace(" DIR", f" {shlex.quote(str(watched.folder))}")
         typer.secho(sentence, fg="yellow", err=True)
-    if not terminal.loudness.quiet:
-        people = sys.stdout.isatty()
-        sys.stdout.write((_line(watched.scenario, decision) if people else json.dumps(decision)) + "\n")
-        if flush or people:
+    if terminal.loudness.quiet:
+        return True
+    people = sys.stdout.isatty()
+    line = _line(watched.scenario, decision) if people else json.dumps(decision)
+    return _write(line + "\n", flush=flush or people)
+
+
+def _write(text: str, *, flush: bool) -> bool:
+    """Write to standard output; return whether it still leads anywhere."""
+    try:
+        sys.stdout.write(text)
+        if flush:
             sys.stdout.flush()
+    except BrokenPipeError:  # `watch | head`: what is left in the buffer goes nowhere, without a word
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return False
+    return True
+
+
+def _flush() -> None:
+    _write("", flush=True)
 
 
 def _line(scenario: "Scenario", decision: Mapping[str, Any]) -> str:

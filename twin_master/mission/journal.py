@@ -25,6 +25,7 @@ Float = NDArray[np.float64]
 
 JOURNAL_NAME = "journal.jsonl"
 _DIGEST = 64
+_PIECE = 1_000_000
 _ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(", ", ": "))
 
 
@@ -186,8 +187,9 @@ def read_lines(path: Path, config_hash: str | None) -> Iterator[tuple[bytes, int
                 return  # cut off by a kill
             end += len(line)
             text = line[_DIGEST + 1 :].rstrip(b"\n")
-            if sha256(text).hexdigest().encode("ascii") != line[:_DIGEST]:
-                raise damaged(path, number, "it does not have the hash that stands before it")
+            if not _is_whole(line):
+                behind = sum(_is_whole(other) for other in file)
+                raise damaged(path, number, "it does not have the hash that stands before it", behind)
             if not number and header is not None and line != header:
                 raise NotResumableError(
                     f"the journal {path} belongs to another configuration than the config.json beside it: "
@@ -209,6 +211,48 @@ def read_records(path: Path, config_hash: str | None = None) -> Iterator[tuple[d
             yield record_of(path, number, text), end
 
 
+def whole_records(path: Path) -> Iterator[tuple[int, dict[str, Any] | None]]:
+    """Return number, from 1, and record of each line of a journal, None in the place of a damaged one.
+
+    Every line has a hash of its own, so that one that was damaged says nothing about those behind it. The
+    last line is left out where it was cut off by a kill.
+    """
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            if not line.endswith(b"\n"):
+                return
+            record = json.loads(line[_DIGEST + 1 :]) if _is_whole(line) else None
+            yield number, record if isinstance(record, dict) else None
+
+
+def records_backwards(path: Path) -> Iterator[dict[str, Any]]:
+    """Return the records of the whole lines of a journal, the last one first; none where there is no journal.
+
+    It is read no further than it is asked.
+    """
+    if not path.exists():
+        return
+    with path.open("rb") as file:
+        begin, rest = file.seek(0, os.SEEK_END), b""
+        while begin:
+            size = min(begin, _PIECE)
+            begin -= size
+            file.seek(begin)
+            first, *lines = (file.read(size) + rest).splitlines(keepends=True)
+            if begin:
+                rest = first
+            else:
+                lines.insert(0, first)
+            for line in reversed(lines):
+                if line.endswith(b"\n") and _is_whole(line):
+                    yield json.loads(line[_DIGEST + 1 :])
+
+
+def _is_whole(line: bytes) -> bool:
+    text = line[_DIGEST + 1 :].rstrip(b"\n")
+    return sha256(text).hexdigest().encode("ascii") == line[:_DIGEST]
+
+
 def record_of(path: Path, number: int, text: bytes) -> dict[str, Any]:
     """Return the record of a line."""
     record = json.loads(text)
@@ -217,10 +261,14 @@ def record_of(path: Path, number: int, text: bytes) -> dict[str, Any]:
     return record
 
 
-def damaged(path: Path, number: int, why: str) -> NotResumableError:
-    """Return the exception for a line that cannot be believed."""
+def damaged(path: Path, number: int, why: str, behind: int | None = None) -> NotResumableError:
+    """Return the exception for a line, counted from 0, that cannot be believed.
+
+    `behind` is how many whole lines follow it, where that was looked at.
+    """
+    rest = "" if behind is None else f"; the {number} before it are whole, and {behind} behind it"
     return NotResumableError(
-        f"line {number + 1} of the journal {path} was changed or is damaged ({why}): begin again with "
+        f"line {number + 1} of the journal {path} was changed or is damaged ({why}){rest}: begin again with "
         "--replace."
     )
 

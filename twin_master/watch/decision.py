@@ -1,9 +1,12 @@
 """What the operator is told of a turn, and how well the twin's model has explained turns."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from twin_master.mission.journal import array_of, records_backwards
 from twin_master.mission.loop import Beliefs, Reading
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import known_control
@@ -11,25 +14,20 @@ from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import Twin, TwinTurn
 from twin_master.scenario.schema import Scenario
 
+Float = NDArray[np.float64]
+
 
 def decision_of(
     scenario: Scenario, model: GraphicalModel, twin: Twin, reading: Reading, turn: TwinTurn
 ) -> dict[str, Any]:
     """Return what the operator is told of a turn: never a control without its certainty."""
-    controls = scenario.control_names
-    mean, deviation = model.states.mean(turn.filtered), model.states.standard_deviation(turn.filtered)
-    record: dict[str, Any] = {
-        "turn": turn.turn,
-        "control": controls[turn.control_index],
-        "health": {
-            factor.name: {"mean": mean[index], "standard_deviation": deviation[index], "unit": factor.unit}
-            for index, factor in enumerate(scenario.state)
-        },
-        "next_control": controls[turn.next_control],
-        "probability": min(float(turn.decision_probability[turn.next_control]), 1.0),
+    record = {"turn": turn.turn} | _decided(
+        scenario, model, turn.filtered, turn.control_index, turn.next_control, turn.decision_probability
+    )
+    record |= {
         "lost_sensors": int(np.isnan(reading.observed).sum()),
         "log_evidence": turn.log_evidence,
-        "alarms": [vars(notice) for notice in turn.notices],
+        "notices": [vars(notice) for notice in turn.notices],
     }
     if turn.suspicion is not None:
         record["none_of_these"] = turn.suspicion.none_of_these
@@ -38,6 +36,53 @@ def decision_of(
     if turn.learnt:
         record["learnt"] = {name: vars(learnt) for name, learnt in turn.learnt.items()}
     return record
+
+
+def last_decision(path: Path, scenario: Scenario, model: GraphicalModel) -> dict[str, Any] | None:
+    """Return the last decision in a journal; None without any.
+
+    A kill may have left it untold, and nobody knows: it has `told_again`.
+    """
+    last: dict[str, Any] | None = None
+    for line in records_backwards(path):
+        if last is None and "filtered" in line:
+            last = line
+        if last is None or line.get("observation_turn") != last["turn"] or "observed" not in line:
+            continue
+        # The line of the turn itself: one behind it may tell of an earlier turn that was revised.
+        record = {"turn": last["turn"]} | _decided(
+            scenario, model, array_of(last["filtered"]), line["control_index"], last["next_control"],
+            array_of(last["decision_probability"]),
+        )  # fmt: skip
+        record |= {
+            "lost_sensors": last["observed"].count(None),
+            "log_evidence": last["log_evidence"],
+            "notices": last.get("notices", []),
+        }
+        if "suspicion" in last:
+            record["none_of_these"] = last["suspicion"]["none_of_these"]
+        if last is not line:
+            record["revised_by_turn"] = last["observation_turn"]
+        if "learnt" in last:
+            record["learnt"] = last["learnt"]
+        return record | {"told_again": True}
+    return None
+
+
+def _decided(
+    scenario: Scenario, model: GraphicalModel, filtered: Float, control: int, coming: int, probability: Float
+) -> dict[str, Any]:
+    controls = scenario.control_names
+    mean, deviation = model.states.mean(filtered), model.states.standard_deviation(filtered)
+    return {
+        "control": controls[control],
+        "health": {
+            factor.name: {"mean": mean[index], "standard_deviation": deviation[index], "unit": factor.unit}
+            for index, factor in enumerate(scenario.state)
+        },
+        "next_control": controls[coming],
+        "probability": min(float(probability[coming]), 1.0),
+    }
 
 
 def gap_of(beliefs: Beliefs, skipped: int, sensors: GaussianSensorModel) -> dict[str, Any]:

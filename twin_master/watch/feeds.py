@@ -17,7 +17,7 @@ import xarray as xr
 from reporting.errors import DamagedFileError
 from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME, array_of, read_records
+from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_records
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.intake import MISSING
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
@@ -174,6 +174,8 @@ class RunFeed:
 class FolderFeed:
     """The journal of another run or watch, of whatever version: its observations as they came.
 
+    A line that was damaged is refused, and those behind it are read on.
+
     Raises
     ------
     MissionInputError
@@ -194,9 +196,13 @@ class FolderFeed:
 
     def messages(self, after: int) -> Iterator[Fed]:
         """Return the observations behind the first `after` of them."""
-        records = (record for record, _ in read_records(self._path) if _came(record))
-        for number, record in enumerate(records, start=1):
-            if number > after:
+        lines = (line for line in whole_records(self._path) if line[1] is None or _came(line[1]))
+        for count, (number, record) in enumerate(lines, start=1):
+            if count <= after:
+                continue
+            if record is None:
+                yield Refused(f"line {number} of {self._path.name} was changed or is damaged"), ""
+            else:
                 yield self._message(record), f"line {number}"
 
     def _message(self, record: Mapping[str, Any]) -> Message | Refused:

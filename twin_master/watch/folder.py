@@ -176,7 +176,7 @@ class Watch:
                 keep.twin = twin = self._replayed(None).twin
             for reading, turn, _ in operate(twin, source, keep):
                 decision = decision_of(self.scenario, self.models[-1].knowledge.model, twin, reading, turn)
-                decide(decision | {"alarms": [*decision["alarms"], *keep.told]})
+                decide(decision | {"notices": [*decision["notices"], *keep.told]})
                 if keep.tutor is not None and keep.tutor.due:
                     break
             else:

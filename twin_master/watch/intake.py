@@ -134,6 +134,7 @@ class Intake:
         self._pending: deque[tuple[int, Reading, int]] = deque()
         self._given: deque[int] = deque(maxlen=scenario.watch.lag + 1)
         self._origin: float | None = None
+        self._first: int | None = None  # the only turn that was told a time so far, if there is but one
         self._text = ""
         self._before: Float = np.empty(0)
         self.counts = Counts()
@@ -152,7 +153,7 @@ class Intake:
             "given": "".join(map(str, self._given)),
             "origin": self._origin,
             "source": {"beginning": self._beginning[1], "read": read},
-        }
+        } | ({} if self._first is None else {"first_timed": self._first})
 
     def restore(self, state: Mapping[str, Any] | None) -> None:
         """Go on from a state; None is the begin.
@@ -162,7 +163,7 @@ class Intake:
         again = self._feed.replayable
         if state is not None:
             self.counts = Counts(**state["counts"])
-            self._origin = state["origin"]
+            self._origin, self._first = state["origin"], state.get("first_timed")
             self._given.extend(map(int, state["given"]))
             read = int(state["source"]["read"])
             again &= state["source"]["beginning"] == self._feed.beginning(min(read, RECOGNISED_BY))
@@ -215,15 +216,31 @@ class Intake:
             return twin.turns
         if self._section.seconds_per_turn is None:
             raise Refused("it has a time and no turn, and the scenario has no `watch.seconds_per_turn`")
-        if self._origin is None:
-            self._origin = message.time - self._section.seconds_per_turn * twin.turns
-        try:
-            turn = round((message.time - self._origin) / self._section.seconds_per_turn)
-        except OverflowError:
-            raise Refused("its time lies too far from the first") from None
+        turn = self._turn_at(twin, message.time)
+        gap = self._section.longest_gap
+        wrong = turn is None or not -gap <= turn <= twin.turns + gap
+        if self._first is not None and wrong:
+            # Two times that do not go together, and none that bears either out: a clock that was set in
+            # between. The turns seen so far stay, and time is counted from this message on.
+            self._origin = None
+            turn = self._turn_at(twin, message.time)
+        elif self._first is not None and turn != self._first:
+            self._first = None  # two turns agree about the time
+        if turn is None:
+            raise Refused("its time lies too far from the first")
         if turn < 0:
             raise Refused(f"its time lies {-turn} turns before the first")
         return turn
+
+    def _turn_at(self, twin: Twin, time: float) -> int | None:
+        """Return the turn of a time; None if it is too far from the first to be counted."""
+        assert self._section.seconds_per_turn is not None
+        if self._origin is None:
+            self._origin, self._first = time - self._section.seconds_per_turn * twin.turns, twin.turns
+        try:
+            return round((time - self._origin) / self._section.seconds_per_turn)
+        except OverflowError:
+            return None
 
     def _sort(self, twin: Twin, message: Message) -> None:
         turn = self._turn_of(twin, message)

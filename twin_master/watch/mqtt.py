@@ -77,10 +77,10 @@ def broker_of(address: str, authority: Path | None = None) -> Broker:
         )
     if "#" in address or "+" in topic:
         raise MissionInputError(f"{address}: a topic of one asset is expected, without `#` and `+`.")
-    tls = parts.scheme == "mqtts"
+    tls, user = parts.scheme == "mqtts", None if parts.username is None else unquote(parts.username)
     if authority is not None and not (tls and authority.is_file()):
         raise MissionInputError(f"the certificate {authority} is a file, and belongs to mqtts://.")
-    return Broker(parts.hostname, port or (8883 if tls else 1883), topic, parts.username, tls, authority)
+    return Broker(parts.hostname, port or (8883 if tls else 1883), topic, user, tls, authority)
 
 
 class MqttFeed:

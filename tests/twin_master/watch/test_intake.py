@@ -191,6 +191,56 @@ def test_an_observation_that_no_state_allows_is_refused_and_its_turn_predicted_t
     assert intake.counts.received == 3
 
 
+@pytest.mark.parametrize(
+    "times",
+    [
+        [0.0, *(1.7e9 + 0.5 * turn for turn in range(1, 8))],  # its clock was not yet set
+        [1.7e308, *(1.7e9 + 0.5 * turn for turn in range(1, 8))],
+        [1.7e9, 4e9, *(1.7e9 + 0.5 * turn for turn in range(2, 8))],
+    ],
+)
+def test_a_clock_that_is_set_after_the_first_turn_spoils_none(
+    knowledge: Knowledge, strains: np.ndarray, times: list[float]
+) -> None:
+    section = WatchSection(lag=20, longest_gap=30, seconds_per_turn=0.5)
+    timed = replace(knowledge, scenario=knowledge.scenario.model_copy(update={"watch": section}))
+    lines = [
+        json.dumps({"time": time, "control": "3g", "strain": row.tolist()}).encode() + b"\n"
+        for time, row in zip(times, strains, strict=False)
+    ]
+    twin, intake = watched(timed, lines)
+    assert (twin.turns, intake.counts.rejected, intake.counts.missing) == (8, 0, 0)
+    clean = watched(timed, [message(turn, row) for turn, row in enumerate(strains[:8])])[0]
+    assert twin.save_state() == clean.save_state()
+    # Two turns have agreed about the time: another such clock is refused, also by a watch that is taken up.
+    wrong = json.dumps({"time": 9e9, "strain_1": 1e-4}).encode() + b"\n"
+    feed = feeds.JsonLinesFeed(timed.scenario, io.BytesIO(wrong))
+    again = Intake(timed.scenario, feed, RejectedFile(None))
+    again.restore(json.loads(json.dumps(intake.state())))
+    assert again.read(twin) is None
+    assert again.counts.rejected == 1
+
+
+def test_a_watch_taken_up_after_its_first_turn_may_set_its_clock(
+    knowledge: Knowledge, strains: np.ndarray
+) -> None:
+    section = WatchSection(lag=20, longest_gap=30, seconds_per_turn=0.5)
+    timed = replace(knowledge, scenario=knowledge.scenario.model_copy(update={"watch": section}))
+    lines = [
+        json.dumps({"time": time, "strain": row.tolist()}).encode() + b"\n"
+        for time, row in zip((0.0, 1.7e9), strains, strict=False)
+    ]
+    twin, intake = watched(timed, lines[:1])
+    again = Intake(
+        timed.scenario, feeds.JsonLinesFeed(timed.scenario, io.BytesIO(lines[1])), RejectedFile(None)
+    )
+    again.restore(json.loads(json.dumps(intake.state())))
+    reading = again.read(twin)
+    assert reading is not None
+    assert reading.revises is None
+    np.testing.assert_array_equal(reading.observed, strains[1])
+
+
 def test_times_stand_for_turns(knowledge: Knowledge, strains: np.ndarray) -> None:
     section = WatchSection(lag=20, longest_gap=30, seconds_per_turn=0.5)
     timed = replace(knowledge, scenario=knowledge.scenario.model_copy(update={"watch": section}))

@@ -29,14 +29,16 @@ from fe.runtime.patch import ModelPatch, SensorGain
 from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
 from twin_master.assets.resolution import Overrides
-from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME, read_records
+from twin_master.errors import MissionInputError, NotResumableError
+from twin_master.mission.journal import JOURNAL_NAME, line_of, read_records
 from twin_master.mission.loop import Flight, fly
 from twin_master.network.estimator import ExactFilter
 from twin_master.scenario.notice import Noticing
 from twin_master.scenario.reading import LoadedScenario, load_scenario
-from twin_master.watch.feeds import CsvFeed, file_feed
+from twin_master.watch.decision import last_decision
+from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed
 from twin_master.watch.folder import Patched, Watch, begin_watch, resume_watch
+from twin_master.watch.message import Message
 from twin_master.watch.mqtt import PASSWORD_VARIABLE, MqttFeed, broker_of
 from twin_master.watch.replay import BelievedModel
 from twin_master.watch.snapshot import flown
@@ -292,14 +294,74 @@ def counting(seen: list[int], inner: Callable[..., object]) -> Callable[..., obj
     return turn
 
 
+def test_the_last_decision_is_read_from_the_journal(base: Watch, whole: Path, tmp_path: Path) -> None:
+    decisions = json.loads((whole / "decisions.json").read_text())
+    model, journal = base.models[0].knowledge.model, tmp_path / JOURNAL_NAME
+    lines = (whole / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
+    again = {"told_again": True}
+    for cut in (lines, [*lines, lines[-1][:90]], [*lines, line_of({"turn": 49, "model": {}})]):
+        journal.write_bytes(b"".join(cut))
+        assert last_decision(journal, base.scenario, model) == decisions[-1] | again
+    # What came late is told with the control of the last turn, not with that of its own.
+    late = json.loads(lines[-1][65:]) | {"observation_turn": 40, "control_index": 0, "observed": [None] * 24}
+    before = json.loads(lines[-1][65:]) | {"control_index": 1}
+    journal.write_bytes(b"".join([*lines[:-1], line_of(before), line_of(late)]))
+    told = last_decision(journal, base.scenario, model)
+    changed = {"control": "3g", "lost_sensors": 24, "revised_by_turn": 40}
+    assert told == decisions[-1] | changed | again
+    journal.write_bytes(lines[0])
+    assert last_decision(journal, base.scenario, model) is None
+    assert last_decision(tmp_path / "none", base.scenario, model) is None
+
+
+def test_a_reader_that_leaves_ends_the_watch_in_order(
+    scenario: LoadedScenario, mission: Flight, tmp_path: Path
+) -> None:
+    shown = mission.observed[:4].tolist()
+    lines = [json.dumps({"turn": turn, "strain": row}) + "\n" for turn, row in enumerate(shown)]
+    command = [sys.executable, "-m", "uav_twin", "watch", str(scenario.path), "--no-report"]
+    out, pipe = ["--out", str(tmp_path / "watch")], subprocess.PIPE
+    with subprocess.Popen([*command, *out], stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdin.write("".join(lines[:2]))
+        process.stdin.flush()
+        assert json.loads(process.stdout.readline())["turn"] == 0
+        process.stdout.close()  # as head does
+        process.stdin.write("".join(lines[2:]))
+        process.stdin.flush()
+        assert process.wait(60) == 0
+        said = process.stderr.read()
+    assert "Traceback" not in said
+    assert "Broken" not in said
+    # It has ended; only after a kill, before the summary is written, nobody knows what was told.
+    for again in (0, 1):
+        result = CliRunner().invoke(app(), ["watch", "--resume", *out, "--no-report"], input="")
+        assert result.exit_code == 0, result.output
+        told = [json.loads(line) for line in result.stdout.splitlines()]
+        assert [(decision["told_again"], decision["turn"] > 0) for decision in told] == [(True, True)] * again
+        (tmp_path / "watch" / "summary.json").unlink()
+
+
 def test_a_changed_journal_and_other_folders_are_refused(
     scenario: LoadedScenario, recorded: Path, whole: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(whole, tmp_path / "copy")
     journal = tmp_path / "copy" / JOURNAL_NAME
     journal.write_bytes(journal.read_bytes().replace(b'"turn": 9}', b'"turn": 8}', 1))
-    with pytest.raises(Exception, match=r"line 11 of the journal .*changed or is damaged"):
+    sentence = r"line 11 .*damaged.*the 10 before it are whole, and 40 behind it"
+    with pytest.raises(NotResumableError, match=sentence) as caught:
         resume_watch(tmp_path / "copy", None, SilentProgress())
+    # Another watch takes in all but what the line said, and refuses that by name.
+    assert f"--observations {tmp_path / 'copy'}" in caught.value.__notes__[-1]
+    fed = [list(FolderFeed(folder, scenario.scenario).messages(0)) for folder in (whole, tmp_path / "copy")]
+    assert "line 11 of journal.jsonl was changed or is damaged" in str(fed[1][9][0])
+    for (said, _), (kept, _) in zip(fed[0][:9] + fed[0][10:], fed[1][:9] + fed[1][10:], strict=True):
+        assert isinstance(said, Message)
+        assert isinstance(kept, Message)
+        np.testing.assert_array_equal(said.observed, kept.observed)
+        assert said.turn == kept.turn
     result = CliRunner().invoke(app(), ["watch", str(scenario.path), "--out", str(whole)])
     assert "holds a run already" in str(result.exception)
     with pytest.raises(Exception, match=r"this scenario has no `\[asset\]`"):
@@ -316,7 +378,7 @@ def test_the_shipped_recording_is_noticed(tmp_path: Path, monkeypatch: pytest.Mo
     assert result.exit_code == 0, result.output
     decisions = [json.loads(line) for line in result.stdout.splitlines()]
     assert [decision["turn"] for decision in decisions] == list(range(60))
-    alarms = [(d["turn"], notice) for d in decisions for notice in d["alarms"]]
+    alarms = [(d["turn"], notice) for d in decisions for notice in d["notices"]]
     (first, gauge), (second, none) = alarms
     assert 10 < first < 25 < second < 40
     assert gauge["sensors"] == [4]
@@ -325,7 +387,10 @@ def test_the_shipped_recording_is_noticed(tmp_path: Path, monkeypatch: pytest.Mo
     assert decisions[-1]["none_of_these"] > 0.999
     assert f"--from-run '{folder}'" in result.stderr
     again = CliRunner().invoke(app(), ["watch", "--resume", "--out", str(folder)])
-    assert again.stdout == ""
+    told = [json.loads(line) for line in again.stdout.splitlines()]
+    assert [(decision["turn"], decision["told_again"]) for decision in told] == [
+        (59, True)
+    ]  # nothing is read
     assert "60 messages." in again.stderr
 
 
@@ -434,12 +499,12 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
     records = lines(watch)
     (verdict,) = [record["verdict"] for record in records if "verdict" in record]
     (model,) = [record["model"] for record in records if "model" in record]
-    alarm = next(d for d in decisions for n in d["alarms"] if n["kind"] == "alarm")
+    alarm = next(d for d in decisions for n in d["notices"] if n["kind"] == "alarm")
     assert verdict["to_turn"] == alarm["turn"] + 10
     assert 12 <= verdict["from_turn"] <= 18
     assert model["from_turn"] == verdict["from_turn"]
     assert model["before"]["rms_residual"] > 1.4 > 1.3 > model["after"]["rms_residual"]
-    said = [notice["sentence"] for d in decisions for notice in d["alarms"]]
+    said = [notice["sentence"] for d in decisions for notice in d["notices"]]
     assert "named. It is so. The patch is tried" in said[1]
     assert "is believed from turn" in said[2]
     assert len(said) == 3
@@ -675,6 +740,7 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(
 def test_addresses_of_brokers(base: Watch, tmp_path: Path) -> None:
     assert broker_of("mqtt://host/a/b").port == 1883
     assert broker_of("mqtts://me@host:1/a").user == "me"
+    assert broker_of("mqtts://me%40work@host:1/a").user == "me@work"
     for wrong, match in (
         ("mqtt://me:secret@host/a", "every user of this machine"),
         ("mqtt://host/a/#", "one asset"),
