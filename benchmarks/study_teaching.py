@@ -103,7 +103,7 @@ def said(records: list[dict[str, Any]]) -> tuple[str, int]:
 def study(name: str, seed: int, work: Path) -> None:
     """Fly a mission, watch it three times, and print how well its health was known."""
     hidden = HIDDEN[name]
-    place = work / f"{len(name)}_{seed}"
+    place = work / f"{[*HIDDEN].index(name)}_{seed}"
     place.mkdir()
     fly_mission(place / "run", seed, hidden, scenario="level_turns", turns=TURNS)
     truth = uav_twin.open_run(place / "run")["truth"]["state"].values
