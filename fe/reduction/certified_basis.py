@@ -105,6 +105,8 @@ class StaticReduction:
         Largest distance of each coefficient from its reference.
     advance : callable
         Told one more part, and of what.
+    least : (groups, L) ndarray, optional
+        Outputs of a group under a load that are smaller are judged by this; zero by default.
     """
 
     def __init__(
@@ -115,7 +117,9 @@ class StaticReduction:
         anchors: list[FloatArray],
         farthest: FloatArray,
         advance: Callable[[int, str], object],
+        least: FloatArray | None = None,
     ) -> None:
+        self.least = np.zeros((len(problem.groups), problem.loads.shape[1])) if least is None else least
         self.problem, self.norm, self.reference, self.advance = problem, norm, reference, advance
         self.farthest = farthest
         n = len(problem.loads)
@@ -194,8 +198,10 @@ class StaticReduction:
         difference = np.abs(self.problem.outputs.T @ (basis @ coordinates) - wanted)
         return max(
             float(np.divide(largest, size, out=np.zeros_like(size), where=size > 0.0).max())
-            for rows in self.problem.groups
-            for largest, size in ((difference[rows].max(axis=0), np.abs(wanted[rows]).max(axis=0)),)
+            for rows, least in zip(self.problem.groups, self.least, strict=True)
+            for largest, size in (
+                (difference[rows].max(axis=0), np.maximum(np.abs(wanted[rows]).max(axis=0), least)),
+            )
         )
 
     def arrays(self) -> dict[str, Any]:

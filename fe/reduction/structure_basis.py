@@ -4,6 +4,7 @@ The certified search and the modes are those of the wing; see `docs/reduced_mode
 """
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,7 +26,7 @@ from .stages import Progress, stage_of
 
 FloatArray = npt.NDArray[np.float64]
 
-LEAST_COSINE = 1e-4
+LEAST_COSINE = 1e-3
 """A load whose outputs are smaller than this part of what its energy could do to them is judged by that part:
 nothing of the structure sees it there."""
 SAMPLED_INSIDE = 10
@@ -223,15 +224,7 @@ def reduce_structure(
     with stage_of(progress, "Factorising the structure"):
         norm = Norm(affine_sum(terms.reference, terms.problem.stiffness_terms))
     with stage_of(progress, "Reducing the modes") as stage:
-        modes = modal_basis(
-            terms.problem,
-            norm,
-            terms.middle_mass,
-            terms.sampled_modes(),
-            terms.compressed_modes(),
-            settings.modal,
-            stage.advance,
-        )
+        modes = _modes(terms, norm, name, settings.modal, stage.advance)
     with stage_of(progress, "Reducing the statics") as stage:
         static = StaticReduction(
             terms.problem,
@@ -240,8 +233,9 @@ def reduce_structure(
             terms.anchors(),
             terms.farthest()[:-1],
             stage.advance,
+            least := _least(terms.problem, norm),
         )
-        judgement, states = _judgement(terms, norm), terms.training()
+        judgement, states = _judgement(terms, least), terms.training()
         history = greedy(
             static,
             lambda: _model(static, terms, name, modes, settings.modal.mode_count),
@@ -265,6 +259,20 @@ def reduce_structure(
         tuple(static.snapshots),
         tuple(history),
     )
+
+
+def _modes(
+    terms: _Terms, norm: Norm, name: str, settings: ModalSettings, advance: Callable[[], object]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the modal basis with the terms in it; raises `ReductionError`."""
+    sampled, compression = terms.sampled_modes(), terms.compressed_modes()
+    try:
+        return modal_basis(terms.problem, norm, terms.middle_mass, sampled, compression, settings, advance)
+    except np.linalg.LinAlgError:
+        raise ReductionError(
+            f"The masses of {name} move in fewer ways than the {settings.mode_count + 2} modes that are "
+            "looked for; give its materials a density."
+        ) from None
 
 
 def _check(terms: _Terms, name: str) -> None:
@@ -324,20 +332,20 @@ def _model(
     )
 
 
-def _judgement(terms: _Terms, norm: Norm) -> Judgement[StructureModel]:
-    """Return how the model is judged: each load alone, gauges and displacements each by their largest."""
-    problem = terms.problem
+def _least(problem: AffineProblem, norm: Norm) -> FloatArray:
+    """Return the outputs (groups, L) below which a load is not seen; see `LEAST_COSINE`."""
 
     def length(functionals: FloatArray) -> FloatArray:
         squares = np.einsum("ik,ik->k", functionals, norm.riesz(functionals))
         return np.asarray(np.sqrt(np.maximum(squares, 0.0)), dtype=np.float64)
 
     loads, outputs = length(problem.loads), length(problem.outputs)
-    gauges = len(terms.structure.gauges)
-    least = LEAST_COSINE * np.array(
-        [loads * outputs[part].max(initial=0.0) for part in (slice(0, gauges), slice(gauges, None))]
-    )
-    unit = np.eye(len(loads))
+    return LEAST_COSINE * np.array([loads * outputs[part].max() for part in problem.groups])
+
+
+def _judgement(terms: _Terms, least: FloatArray) -> Judgement[StructureModel]:
+    """Return how the model is judged: each load alone, gauges and displacements each by their largest."""
+    unit = np.eye(len(terms.load_factors))
 
     def vector(model: StructureModel, state: State) -> FloatArray:
         found = model.nominal.copy()
@@ -348,12 +356,13 @@ def _judgement(terms: _Terms, norm: Norm) -> Judgement[StructureModel]:
         chosen, worst = vector(model, state), 0.0
         for number, load in enumerate(unit):
             found = model.static_response(chosen, load)
-            for values, error, floor in (
-                (found.strain, found.strain_error_bound, least[0, number]),
-                (found.displacement, found.displacement_error_bound, least[1, number]),
-            ):
-                if values.size:
-                    worst = max(worst, error / max(float(np.abs(values).max()), floor))
+            kinds = (
+                (found.strain, found.strain_error_bound),
+                (found.displacement, found.displacement_error_bound),
+            )
+            present = [(values, error) for values, error in kinds if values.size]
+            for (values, error), floor in zip(present, least[:, number], strict=True):
+                worst = max(worst, error / max(float(np.abs(values).max()), floor))
         return worst
 
     def solutions(model: StructureModel, state: State) -> list[FloatArray]:
