@@ -29,7 +29,7 @@ from discrepancy.judgement.look_alikes import look_alike_remark, with_untested
 from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
-from discrepancy.judgement.when import begins_inside, when_sentence
+from discrepancy.judgement.when import acting_sentence, begins_inside, when_sentence
 from discrepancy.location.change_points import GapWindow, gap_windows
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
@@ -219,6 +219,9 @@ def investigate(
 
 def _dated(verdict: Verdict, windows: tuple[GapWindow, ...]) -> str:
     """Return the sentence of a verdict, with when the gap is there where that tells something."""
+    acting = acting_sentence(verdict.effects)
+    if acting:
+        return f"{verdict.sentence} {acting}"
     known = verdict.kind is VerdictKind.NOTHING_MISSING or verdict.kind is VerdictKind.BELOW_LIMIT
     if known or not (begins_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED):
         return verdict.sentence

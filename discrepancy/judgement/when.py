@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from math import floor, log10
 
 from discrepancy.location.change_points import GapWindow, Moment
+from discrepancy.verdict import NamedEffect
 
 TOLD = 3
 """Windows told in a sentence; the others are in the file."""
@@ -48,3 +49,19 @@ def when_sentence(windows: Sequence[GapWindow]) -> str:
 def begins_inside(windows: Sequence[GapWindow]) -> bool:
     """Whether the gap of the model as it was has a begin in a record: something happened there."""
     return any(window.begin is not None for window in windows if not window.with_effect)
+
+
+def acting_sentence(effects: Sequence[NamedEffect]) -> str:
+    """Return when effects in windows act, in one sentence each; empty for those that always act."""
+    sentences = []
+    for effect in effects:
+        windows = effect.patch.primitives[0].windows if len(effect.patch) else ()
+        parts = []
+        for trial, begin, end in windows:
+            since = "from the first sample" if begin is None else f"from {begin:.6g} s"
+            until = "on" if end is None else f"until {end:.6g} s"
+            parts.append(f"{since} {until} in {trial!r}")
+        more = f"; and in {len(parts) - TOLD} more" if len(parts) > TOLD else ""
+        if parts:
+            sentences.append(f"{effect.name} acts {'; '.join(parts[:TOLD])}{more}.")
+    return " ".join(sentences)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,6 +114,8 @@ class LumpedModel:
         if primitive is LoadPlace:
             return any(item.station_derivative is not None for item in self.description.input)
         return primitive in INTERNAL_FORCES and bool(self._ports)
+
+    follows_windows: ClassVar[bool] = True
 
     def ports(self) -> tuple[str, ...]:
         """Names of the ports."""

@@ -76,6 +76,13 @@ def oscillates(model: Model) -> bool:
     return bool(getattr(model, "oscillates", True))
 
 
+def follows_windows(model: Model) -> bool:
+    """Whether a model can follow laws that act in windows only; models that do not say it cannot."""
+    while isinstance(model, WrappedModel):
+        model = model.inner
+    return bool(getattr(model, "follows_windows", False))
+
+
 def built_in_sensors(model: Model) -> ModelPatch:
     """Return the sensor primitives that a model has built in, their channels named by its outputs.
 

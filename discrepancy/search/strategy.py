@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.catalogue.entry import Effect
+from discrepancy.catalogue.windowed import in_events
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, attempt, fit
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate
@@ -374,7 +375,8 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
     problem : Problem
         Campaign and model.
     effects : sequence of Effect
-        The catalogue; what is unavailable here is left out.
+        The catalogue; what is unavailable here is left out, and what an event of the campaign may have begun
+        or ended is tried so too.
     tell : callable
         Takes a few words on what is fitted, and how much is left.
 
@@ -386,6 +388,7 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
     tell("fitting the model as it is")
     none = fit(problem, Candidate(), problem.start(Candidate()))
     usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
+    usable = (*usable, *in_events(usable, problem.setting))
     found = Search(problem, usable, none, tell=tell)
     found.run()
     return found
