@@ -230,7 +230,8 @@ def scored(verdict: Verdict, true: list[str]) -> dict[str, Any]:
     families = {item.identifier: item.family for item in library()}
     kind = verdict.kind.value
     if kind == "group":
-        outcome = "group" if true and true[0] in verdict.group else "wrong"
+        members = {name for item in verdict.group for name in item.split(" + ")}
+        outcome = "group" if true and true[0] in members else "wrong"
     elif kind in ("named", "named in part", "family"):
         right = named == true or (
             verdict.family != "" and bool(true) and families[true[0]] in verdict.family.split(", ")

@@ -145,6 +145,9 @@ class SearchSettings:
     """Explained share within which it does, if held-out data do not tell the two apart."""
     least_share: float = 0.5
     """Lower end of the explained share that a name in part needs."""
+    widened: float = 2.0
+    """How many times wider the priors of calibrated parameters and gains count for a name in part: they take
+    up what is left, and are those of the model with its remainder."""
     told_by_data: float = 0.8
     """Prior deviations below which a shape is known from the data, so that a verdict tells it."""
     sliver: float = 0.004

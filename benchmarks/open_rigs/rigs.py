@@ -313,7 +313,7 @@ HEATED = "capacity = 400.0\nconductance = 2.0\n" + (
     + port("surface")
 )
 RIGS = {
-    "cart": Rig(CART, "force N linear", 2.0, 0.025, (("x", "displacement", "m", 5e-4),),
+    "cart": Rig(CART, "force N smooth", 2.0, 0.025, (("x", "displacement", "m", 5e-4),),
                 {"mass": ("mass", 0.03), "bearing": ("damping", 0.2)}, cart),
     "damper": Rig(DAMPER, "displacement m smooth", 0.006, 0.025, (("force", "force", "N", 0.1),),
                   {"mass": ("mass", 0.03), "oil": ("damping", 0.1), "spring": ("stiffness", 0.03)}, damper),

@@ -8,8 +8,8 @@ losses give the equivalent viscous ratio zeta_eq = F_0 B / (pi k A):
 - structural, p = 0, a = 1, B = 1: zeta_eq = g / pi with F = g k |x| sgn v;
 - quadratic, p = 2, a = 0, B = 4/3: zeta_eq = 4 F_0 / (3 pi k A) = 4 c A w^2 / (3 pi k) with F = c |v| v.
 
-At a stiff port k is far above the stiffness at rest k_0, and a force of k_0 A holds it still: no more than
-0.9 of it is built.
+At a stiff port k is far above the stiffness at rest k_0, and a force of k_0 A that does not fall with the
+speed (p < 1) holds it still: no more than 0.9 of it is built, unless drives alone move the port.
 
 Spread over a wing, F acts at each place by its share w of the area, on the place's motion r x, x the mean's:
 the loss is sum w r^(p + a + 1) times as large.
@@ -53,7 +53,7 @@ def _damping(setting: Setting, values: Mapping[str, float], port: str, equivalen
     a = 0.0 if scale.free else a  # a port that nothing holds has no zero
     loss = loss_integral(p, a) * scale.mean_power(p + a + 1.0)
     force = pi * equivalent_ratio * scale.stiffness * scale.displacement / loss
-    if scale.static_stiffness is not None:  # a stronger one holds a stiff port still
+    if scale.static_stiffness is not None and p < 1.0 and not scale.driven:  # more holds a port still
         force = min(force, LARGEST_SHARE * scale.static_stiffness * scale.displacement)
     speed = scale.displacement * scale.angular_frequency
     return ModelPatch((PowerDamping(port, force, p, a, speed, scale.displacement),))

@@ -164,13 +164,9 @@ def _in_part(
     """Return the verdict named in part, or a group with shares; unexplained where neither may be said."""
     problem = told.problem
     explained = weighed.shares(best).summary()
-    following = [item.sentence() for item in sizes_by_trial(problem, best) if item.follows]
-    if following:
-        return _unexplained(told, weighed, best, first, why=" ".join(following))
-    tests = prior_tests(problem, best)
-    beside = any(p * len(tests) < ABSOLUTE_LEVEL for _, p in tests)
-    if explained.low < SEARCH.least_share or beside or weighed.is_mixed(best):
-        return _unexplained(told, weighed, best, first)
+    why = _no_name(problem, weighed, best)
+    if why:
+        return _unexplained(told, weighed, best, first, why=why)
     rivals = weighed.rivals(best)
     gates = (absolute_gate(problem, best),)
     more = {
@@ -196,8 +192,11 @@ def _in_part(
             effects=tuple(effect for item in members for effect in named_effects(problem, item)),
             group=tuple(" + ".join(sorted(plain(item))) for item in members), **more,
         )  # fmt: skip
-    if rivals or probability < SEARCH.sure or weighed.describes_better(best):
-        return _unexplained(told, weighed, best, first)
+    why = _no_winner(problem, weighed, best, len(rivals), probability)
+    if why:
+        return _unexplained(told, weighed, best, first, why=why)
+    beside = _beside(problem, best)
+    left += f", with {beside}" if beside else ""
     named = named_effects(problem, best)
     what = f"An effect of the family {family}, with a shape of its own," if family else _words(named)
     sentence = (
@@ -208,6 +207,40 @@ def _in_part(
     return told.verdict(
         VerdictKind.NAMED_IN_PART, sentence, probability, effects=named, family=family, **more
     )
+
+
+def _no_name(problem: Problem, weighed: Weighed, best: CandidateFit) -> str:
+    """Return why the best set is no name whatever its rivals; empty where nothing speaks against one."""
+    following = [item.sentence() for item in sizes_by_trial(problem, best) if item.follows]
+    if following:
+        return " ".join(following)
+    if weighed.is_mixed(best):
+        return "It is no name, as it takes an error of the readings beside a law."
+    if weighed.shares(best).summary().low < SEARCH.least_share:
+        return f"It is no name, as it may close less than {100.0 * SEARCH.least_share:.0f} %."
+    beside = _beside(problem, best, SEARCH.widened)
+    return f"It is no name, as it needs {beside}: are these priors what you would bet on?" if beside else ""
+
+
+def _no_winner(
+    problem: Problem, weighed: Weighed, best: CandidateFit, rivals: int, probability: float
+) -> str:
+    """Return why the best set is no name beside its rivals; empty where nothing speaks against one."""
+    if rivals:
+        return f"{rivals} other sets explain as much: that tells nothing."
+    if probability < SEARCH.sure:
+        return f"It is no name, as its probability is {probability:.2g}: a name needs {SEARCH.sure:g}."
+    describing = weighed.better_description(best)
+    if describing is None:
+        return ""
+    words = _words(named_effects(problem, describing))
+    return f"It is no name, as {words}, which describes readings and causes nothing, is more probable."
+
+
+def _beside(problem: Problem, best: CandidateFit, widened: float = 1.0) -> str:
+    """Return which unknowns have left their priors, in words."""
+    tests = prior_tests(problem, best, widened)
+    return " and ".join(name for name, p in tests if p * len(tests) < ABSOLUTE_LEVEL)
 
 
 def _exponents(problem: Problem, weighed: Weighed, best: CandidateFit) -> str:

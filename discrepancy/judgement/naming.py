@@ -63,7 +63,9 @@ def name(
     if stands and len(verdict.effects) > 1:
         verdict, _, fit = without_sliver(problem, found, verdict, fit)
         return verdict, found, fit
-    misfits = any(gate.name == "absolute fit" and gate.passed is False for gate in verdict.gates)
+    misfits = any(
+        gate.name in ("absolute fit", "held-out trials") and gate.passed is False for gate in verdict.gates
+    )
     open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
     if stands or not (misfits or verdict.kind in open_kinds):
         return verdict, found, fit

@@ -54,13 +54,15 @@ class Weighed:
             self._shares[key] = Shares.of(self._residuals[()], self.residuals(item), named)
         return self._shares[key]
 
-    def describes_better(self, best: CandidateFit) -> bool:
-        """Whether a stand-in that is as long as a set of laws was left out, and is more probable by far."""
-        return any(
-            len(item.candidate.terms) == len(best.candidate.terms)
-            and item.log_evidence > best.log_evidence + SEARCH.rival
+    def better_description(self, best: CandidateFit) -> CandidateFit | None:
+        """Return a stand-in as long as a set of laws that was left out, and is more probable by far."""
+        found = (
+            item
             for item in self.left_out
+            if len(item.candidate.terms) == len(best.candidate.terms)
+            and item.log_evidence > best.log_evidence + SEARCH.rival
         )
+        return next(found, None)
 
     def shown(self, best: CandidateFit) -> CandidateFit:
         """Return the best set if it closes a part of the gap, else the most probable one that does."""

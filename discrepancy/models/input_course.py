@@ -135,6 +135,20 @@ class Drive:
         upper = [base.derivative(number) for number in range(1, 4 - self.order)]
         return (*lower, base, *upper)
 
+    @cached_property
+    def first_speed(self) -> float:
+        """Speed at the first stamp; zero where the record does not tell it from that.
+
+        It does not where the slope of a parabola through the first three stamps is as far from the spline's.
+        """
+        first = self.time[:1]
+        speed = float(self.at(first, 1)[0])
+        if self.order == 0:
+            parabola = np.polynomial.Polynomial.fit(self.time[:3], self.values[:3], 2).deriv()
+            if abs(speed) <= abs(speed - float(parabola(first[0]))):
+                return 0.0
+        return speed
+
     def at(self, time: FloatArray, order: int) -> FloatArray:
         """Return the motion (N,), its first, second or third derivative at times."""
         return np.asarray(self._splines[order](time))

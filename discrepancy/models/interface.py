@@ -66,6 +66,8 @@ class PortScale:
     of_state : bool
         Whether it is a port of a state (a level, a temperature), at which laws are flows: `displacement`
         times `angular_frequency` is then its largest value, `displacement` times `stiffness` the flow scale.
+    driven : bool
+        Whether drives alone move it, so that no force holds it still.
     """
 
     displacement: float
@@ -77,6 +79,7 @@ class PortScale:
     free: bool = False
     turns: bool = True
     of_state: bool = False
+    driven: bool = False
 
     def mean_power(self, exponent: float) -> float:
         """Return the mean of |motion / A|^exponent over the places where a force at the port acts."""

@@ -51,7 +51,9 @@ class PortSizes:
 
     Where no stiffness of the structure holds a port (that of a controller is none), its force scale is
     `FORCES` times the rms of inertia, damping, own laws and loads there, its displacement and speed the
-    largest: effects are measured by what acts and moves. At a port of a state likewise, of flows.
+    largest: effects are measured by what acts and moves. At a port of a state likewise, of flows. Where
+    drives alone move a port, no frequency of the structure says how fast: its force scale is the largest
+    measured force.
 
     Parameters
     ----------
@@ -64,6 +66,7 @@ class PortSizes:
     def __init__(self, lumped: LumpedRig, *, driven_only: bool = False) -> None:
         self._rig, self._driven_only = lumped.open(), driven_only
         self._turns = dict.fromkeys(self._rig.ports, False)
+        self._follows = dict.fromkeys(self._rig.ports, True)
         self._sizes = {name: np.zeros(3) for name in self._rig.ports}
         self._forces: dict[str, list[FloatArray]] = {name: [] for name in self._rig.ports}
 
@@ -79,6 +82,7 @@ class PortSizes:
         for name, row in rig.ports.items():
             modal = row @ rig.shapes
             lent = float((row @ shapes) @ (row @ shapes))
+            self._follows[name] &= lent == 0.0
             if lent > 0.0:  # modal force along the port, over what a unit force there gives
                 along = shapes @ (shapes.T @ row) / lent
                 squares = [np.mean((item @ along) ** 2) for item in pushed if isinstance(item, np.ndarray)]
@@ -99,14 +103,18 @@ class PortSizes:
         frequency, weight = rig.angular_frequency[: rig.moving], along**2
         seen = weight > 1e-6 * float(weight.sum())
         amount = usual or largest or 1.0
+        table = np.array(self._forces[name]).reshape(-1, 2)
+        force = FORCES * float(np.sqrt(np.average(table[:, 1], weights=table[:, 0]))) if len(table) else 0.0
         if np.any(seen) and np.all(frequency[seen] > 0.0):
             first = int(np.flatnonzero(seen)[0])
             still = 1.0 / float(np.sum(weight[seen] / frequency[seen] ** 2))
+            if self._driven_only and self._follows[name] and force > 0.0 < speed:
+                return PortScale(
+                    amount, force / amount, speed / amount, still, largest or amount, driven=True
+                )
             w = float(frequency[first])
             return PortScale(amount, w**2 / float(weight[first]), w, still, largest or 1.0)
         free = not np.any(frequency[seen] > 0.0)
-        table = np.array(self._forces[name]).reshape(-1, 2)
-        force = FORCES * float(np.sqrt(np.average(table[:, 1], weights=table[:, 0]))) if len(table) else 0.0
         of_state = not np.any(rig.ports[name][: rig.displacements])
         return PortScale(
             amount, (force or 1.0) / amount, (speed or 1.0) / amount, None, largest or amount,

@@ -22,7 +22,7 @@ from discrepancy.models.interface import Response
 from discrepancy.models.rig_records import Acting, Effort, Shown
 from discrepancy.models.stepwise import Boundaries, CoupledModes, ExactSteps, advance, exact_steps, substeps
 from fe.runtime.errors import SolutionError
-from fe.runtime.motion import Laws, static_solution
+from fe.runtime.motion import Laws, ModalMotion, static_solution
 
 FloatArray = NDArray[np.float64]
 
@@ -239,6 +239,8 @@ class Rig:
             self.modal, laws, self._widened(steps), boundaries, q, v, push, begin, end,
             np.zeros((len(boundaries.time), len(laws))), memory,
         )  # fmt: skip
+        if acting.begins is not Start.UNKNOWN:
+            self._rest_on_drives(moved_at, v, laws)
         late = slice(1, None) if early else slice(None)
         return RigMotion(
             self, acting, times, moved_at.q[late], moved_at.v[late], moved_at.port_forces[late], laws
@@ -252,6 +254,8 @@ class Rig:
         drive = drive.reshape(1, len(acting.drives))
         root = np.sqrt(self._heavy)
         speeds = [root * float(item.at(first, 1)[0]) for item in acting.drives]
+        if acting.begins is not Start.UNKNOWN and acting.clock[1] == 0.0:
+            speeds = [root * item.first_speed for item in acting.drives]  # dry friction is zero at rest
         if acting.begins is Start.SETTLED:
             still = self._force_of(acting, first, moving=False)
             acts = laws.act_at(float(first[0]))
@@ -267,6 +271,17 @@ class Rig:
             q[:moving], v[:count] = given[:moving], given[moving:]
         q[count:], v[count:] = root * drive[0], speeds
         return q, v, None
+
+    def _rest_on_drives(self, found: ModalMotion, v: FloatArray, laws: Laws) -> None:
+        """Take laws of speed at ports that only drives move as nothing where they begin at rest.
+
+        The force by which a drive would be held there, were it a mass, is none that a reading shows.
+        """
+        if not len(laws):
+            return
+        rows = laws.rows(self.modal.ports, self.shapes.shape[1])
+        driven = ~np.any(rows[:, : len(self.angular_frequency)], axis=1)
+        found.port_forces[0, driven & (rows @ v == 0.0) & (laws.of_speed == 1)] = 0.0
 
     def _widened(self, steps: ExactSteps) -> ExactSteps:
         """Return the steps with the drives, which follow from nothing but what is prescribed."""

@@ -264,6 +264,15 @@ def test_other_scales(setting: Setting) -> None:
     assert isinstance(gap, FreePlay)
     assert gap.stiffness == pytest.approx(0.9 * (scales.ports["root"].static_stiffness or 0.0))
     assert gap.half_width == pytest.approx(0.1 * scales.ports["root"].displacement)
+    most = 0.9 * (scales.ports["root"].static_stiffness or 0.0) * scales.ports["root"].displacement
+    friction = only(setting, by_name("coulomb_friction"), {"friction_ratio": 50.0}, "root")
+    assert isinstance(friction, PowerDamping)
+    assert friction.coefficient == pytest.approx(most)  # more would hold it still, which no drag does
+    drag = only(
+        setting, by_name("coulomb_friction"), {"friction_ratio": 50.0, "velocity_exponent": 2.0}, "root"
+    )
+    assert isinstance(drag, PowerDamping)
+    assert drag.coefficient > 10.0 * most
     drift = only(setting, by_name("stiffness_drift"), {"stiffness_change": 0.05}, "")
     assert drift == StiffnessDrift(0.05 / scales.duration)
     cell = only(setting, by_name("load_cell"), {"gain_error": 0.02, "tare_ratio": 0.01}, "")

@@ -308,6 +308,40 @@ def test_a_driven_damper_shows_its_forces_and_those_of_laws() -> None:
     np.testing.assert_allclose(rest[moving], expected[moving], atol=1e-6)
 
 
+def test_friction_is_nothing_where_a_drive_begins_at_rest() -> None:
+    """The spline's slope there is not quite zero, and dry friction takes its sign."""
+    time = 0.025 * np.arange(100.0)
+    model = model_of(DAMPER)
+    laws = PowerDamping("piston", 3.0, 0.0, 0.0, 1.0, 1.0), PowerStiffness("piston", 5.0, 3.0, 0, 0.02)
+    for motion, begin in ((0.02 - 0.02 * np.cos(9.0 * time), 0.0), (0.02 * np.sin(9.0 * time), 3.0)):
+        drive = RecordedInput("actuator", Quantity.DISPLACEMENT, motion, Hold.SMOOTH)
+        what = trial(time, drive)
+        outputs = {"cell": Quantity.FORCE}
+        rest = (shown(model, what, outputs, *laws) - shown(model, what, outputs))[:, 0]
+        speed = np.gradient(motion, time)
+        expected = 3.0 * np.sign(speed) + 5.0 * (motion / 0.02) ** 3
+        moving = np.abs(speed) > 0.02
+        np.testing.assert_allclose(rest[moving][1:], expected[moving][1:], atol=1e-6)
+        assert rest[0] == pytest.approx(begin, abs=1e-6)
+
+
+def test_a_port_that_a_drive_moves_is_measured_by_its_motion_and_the_force() -> None:
+    """Not by the frequency that it would have if it were let go."""
+    time = 0.01 * np.arange(300.0)
+    motion = 0.02 * np.sin(2.0 * time)
+    drive = RecordedInput("actuator", Quantity.DISPLACEMENT, motion, Hold.SMOOTH)
+    readings = np.linspace(-50.0, 40.0, 300)[:, None]
+    what = trial(time, drive, channels=("cell",), values=readings, used=np.ones((300, 1), bool))
+    cell = Channel("cell", Quantity.FORCE, "cell", None)
+    model = model_of(DAMPER)
+    found = model.scales(Campaign("Damper", {"cell": cell}, (what,), None, {}, "")).ports["piston"]
+    assert found.displacement * found.angular_frequency == pytest.approx(0.04, rel=1e-3)
+    assert found.displacement * found.stiffness == pytest.approx(50.0)
+    assert found.static_stiffness == pytest.approx(300.0)
+    assert found.driven
+    assert not found.free
+
+
 def test_a_shaken_base_and_a_hand_on_the_mass() -> None:
     time = uneven(300, 0.01)
     shake = 3.0 * np.sin(12.0 * time) + np.cos(5.0 * time)
