@@ -27,6 +27,7 @@ from twin_master.mission.journal import (
     JournalFile,
     open_journal,
     read_records,
+    records_backwards,
 )
 from twin_master.mission.kept_knowledge import keep_knowledge
 from twin_master.mission.loop import operate
@@ -100,7 +101,7 @@ class Watch:
         self._patches: list[Path | None] = [Path(own) if own else None]  # of these models
         self._path = folder / JOURNAL_NAME
         self._hash = hash_record(self._config)
-        self._adopted: dict[str, Any] | None = None
+        self._adopted: tuple[dict[str, Any], ...] = ()
         self._take_up()
         keep_knowledge(folder, self.models[-1].knowledge)
 
@@ -108,10 +109,11 @@ class Watch:
         """Believe the patches that were adopted, as the journal says."""
         for record, _ in read_records(self._path, self._hash):
             if "model" in record:
-                self._adopted = record["model"]
-                file = self.folder / self._adopted["patch"]
+                model = record["model"]
+                self._adopted = (*self._adopted, model)
+                file = self.folder / model["patch"]
                 self._patches.append(file)
-                self.models.append(self._with_patch(file, self._adopted["from_turn"]))
+                self.models.append(self._with_patch(file, model["from_turn"]))
 
     def _with_patch(self, file: Path, from_turn: int) -> BelievedModel:
         belief = self.scenario.belief
@@ -251,7 +253,7 @@ class Watch:
             "twin_state": base64.b64encode(after.twin.save_state()).decode("ascii"),
         }
         journal.append(line)
-        self._adopted = model
+        self._adopted = (*self._adopted, model)
         keep_knowledge(self.folder, candidate.knowledge)
         self._progress.note(
             f"The patched model is believed from {self.scenario.mission.step_name} {patched.from_turn} on: "
@@ -266,7 +268,8 @@ class Watch:
 
     def store(self, counts: Counts, *, last: int = STORED_TURNS, report: bool = True) -> None:
         """Write `run.nc`, tables, summary and report of the last turns."""
-        turns = self._replayed(None).twin.turns
+        lines = records_backwards(self._path)
+        turns = next((int(line["turn"]) + 1 for line in lines if {"filtered", "model"} & {*line}), 0)
         if not turns:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
@@ -295,10 +298,10 @@ class Watch:
             "asset": WATCHED,
             "twin_model": origin.model,
         }
-        if self._adopted is not None:
+        if self._adopted:
             attributes |= {
-                "model_patch": self._adopted["patch"],
-                "model_patch_from_step": self._adopted["from_turn"],
+                "model_patch": self._adopted[-1]["patch"],
+                "model_patch_from_step": self._adopted[-1]["from_turn"],
             }
         if knowledge.draws.record is not None:
             text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
@@ -341,18 +344,16 @@ class Watch:
             Figure("duplicates", "messages that said nothing new", counts.duplicates),
             Figure("rejected", f"messages refused ({REJECTED_NAME})", counts.rejected),
         ]
-        for record, _ in read_records(self._path, self._hash):
-            if "model" in record:
-                model = record["model"]
-                for when in ("before", "after"):
-                    figures.append(
-                        Figure(
-                            f"gap_{when}_patch_{model['from_turn']}",
-                            f"rms residual {when} the patch of {self.scenario.mission.step_name} "
-                            f"{model['from_turn']}",
-                            model[when]["rms_residual"],
-                        )
+        for model in self._adopted:
+            for when in ("before", "after"):
+                figures.append(
+                    Figure(
+                        f"gap_{when}_patch_{model['from_turn']}",
+                        f"rms residual {when} the patch of {self.scenario.mission.step_name} "
+                        f"{model['from_turn']}",
+                        model[when]["rms_residual"],
                     )
+                )
         return tuple(figures)
 
 
