@@ -88,7 +88,7 @@ def watch(
 
     if (model_patch is None) != (from_turn is None) or (model_patch is not None and not resume):
         raise typer.BadParameter("--model-patch and --from-turn go together, with --resume.")
-    loaded, observations = _asked(scenario, observations, follow, ca_file)
+    loaded, observations = _asked(scenario, observations, follow, ca_file, teach)
     overrides = Overrides(seed=seed, calibration=calibration, library=library)
     with shown(view) as begun:
         watched, lock = _opened(loaded, observations, out, overrides, resume=resume, replace=replace)
@@ -203,12 +203,16 @@ def _opened(
 
 
 def _asked(
-    scenario: str | None, observations: str | None, follow: bool, ca_file: Path | None
+    scenario: str | None, observations: str | None, follow: bool, ca_file: Path | None, teach: bool
 ) -> "tuple[LoadedScenario | None, str | None]":
     """Return the scenario, and where its observations come from, as far as either is said."""
+    from twin_master.errors import MissionInputError
     from twin_master.scenario.reading import load_scenario
+    from twin_master.watch.teaching import NO_ALARMS
 
     loaded = None if scenario is None else load_scenario(scenario)
+    if teach and loaded is not None and loaded.scenario.notice is None:
+        raise MissionInputError(NO_ALARMS)
     if observations is None and loaded is not None:
         observations = _recording(loaded.scenario.moved(loaded.path.parent))
     if observations is not None:

@@ -81,6 +81,8 @@ def run(
         raise CampaignFileError("Give either the folder of a campaign or --from-run with that of a mission.")
     if from_run is None and (from_turn is not None or to_turn is not None):
         raise CampaignFileError("--from-turn and --to-turn belong to --from-run.")
+    if from_turn is not None and to_turn is not None and to_turn < from_turn:
+        raise CampaignFileError(f"--to-turn {to_turn} lies before --from-turn {from_turn}: no turn is left.")
     if from_run is not None and model is not None:
         raise CampaignFileError("--from-run takes the model that the twin believed; leave --model out.")
     source = campaign if from_run is None else from_run

@@ -32,6 +32,15 @@ def field(
     structure = assembled(file, memory_limit)
     known = (*structure.parameters, *structure.regions, *structure.masses, *structure.controls)
     values = dict(_named(text, known) for text in at or ())
+    for name, value in values.items():
+        lost, stiffness = name in structure.regions, name in structure.parameters
+        if (
+            (lost and not 0.0 <= value < 1.0)
+            or (stiffness and value <= 0.0)
+            or (name in structure.masses and value < 0.0)
+        ):
+            wanted = "at least 0 and below 1" if lost else "above 0" if stiffness else "at least 0"
+            raise typer.BadParameter(f"{name} must be {wanted}, but is {value:g}.", param_hint="--at")
     try:
         with terminal.progress().stage("Solving and writing the field"):
             write_structure_vtu(out, structure, values)

@@ -36,8 +36,14 @@ def fmu(
     from reporting.files import atomic_write_text
 
     target = checked_target(file.with_suffix(".fmu") if out is None else out, replace=replace)
+    taken = {file.resolve(): "the structure file", target.resolve(): "the FMU"}
     for name, path in (("binding", binding), ("rig", rig)):
-        if path is not None and path.exists() and not replace:
+        if path is None:
+            continue
+        if path.resolve() in taken:
+            raise FileNotWrittenError(f"{path} is {taken[path.resolve()]}: choose another --{name}.")
+        taken[path.resolve()] = f"the file of --{name}"
+        if path.exists() and not replace:
             raise FileNotWrittenError(f"{path} exists: choose another --{name} or give --replace.")
     text = None
     if rig is not None:

@@ -217,7 +217,7 @@ class EventSection(Section):
     name: Name
     time: NotNegative
     trial: Name | None = None
-    trials: tuple[Name, ...] | None = None
+    trials: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None
     until: Number | None = None
 
     @field_validator("trials", mode="before")
@@ -356,11 +356,14 @@ class CampaignSection(Section):
                         f"the event {event.name!r} is in the trial {trial!r}, which is {kinds[trial].value} "
                         "and has no course in time"
                     )
-                if (event.name, trial) in seen:
-                    raise ValueError(
-                        f"there is more than one event {event.name!r} in the trial {trial!r}: rename one"
-                    )
-                seen.add((event.name, trial))
+                # Its end has a name, too, by which expressions know it.
+                for word in (event.name, f"{event.name}_until")[: 1 if event.until is None else 2]:
+                    if (word, trial) in seen:
+                        raise ValueError(
+                            f"there is more than one moment {word!r} in the trial {trial!r}: rename one, or "
+                            "name the trial once"
+                        )
+                    seen.add((word, trial))
 
 
 def parse_campaign(table: Mapping[str, Any], source: str) -> CampaignSection:

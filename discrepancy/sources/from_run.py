@@ -128,9 +128,9 @@ def _campaign(folder: Path, plan: RunPlan, scenario: dict[str, Any]) -> Campaign
     since = slice(first, plan.last_turn)
     observed, smoothed = (run[name].to_dataset().sel(step=since) for name in ("observed", "smoothed"))
     if not observed.sizes["step"]:
-        raise CampaignDataError(
-            f"{folder} has turns {_ends(run)}, and none from {plan.first_turn} to {plan.last_turn}."
-        )
+        wanted = [f"from {plan.first_turn} on"] if plan.first_turn is not None else []
+        wanted += [f"up to {plan.last_turn}"] if plan.last_turn is not None else []
+        raise CampaignDataError(f"{folder.name} has the turns {_ends(run)}, and none {', '.join(wanted)}.")
     strain = np.asarray(observed[STRAIN].values, dtype=np.float64)
     used = np.isfinite(strain)
     if not used.any():

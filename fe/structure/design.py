@@ -119,6 +119,14 @@ class Control(Ranged):
         """Nominal value."""
         return self.nominal
 
+    @model_validator(mode="after")
+    def _is_not_always_zero(self) -> "Control":
+        if not any(self.range):
+            raise ValueError(
+                "with its nominal value 0 it would be 0 always; give the `minimum` and `maximum` it takes"
+            )
+        return self
+
 
 class Material(Part):
     """Material of the cells of a set: isotropic, or orthotropic in axes given by two vectors.

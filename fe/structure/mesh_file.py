@@ -136,9 +136,14 @@ def _from_meshio(path: Path) -> FileMesh:
 
     if not path.is_file():
         raise MeshError(f"The mesh file {path} is not there.")
+    said = io.StringIO()
     try:
         # meshio writes what it thinks of a file to the terminal, and ends the program where it fails.
-        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            contextlib.redirect_stderr(said),
+            warnings.catch_warnings(),
+        ):
             warnings.simplefilter("ignore")
             found = meshio.read(path)
     except meshio.ReadError as error:
@@ -147,7 +152,10 @@ def _from_meshio(path: Path) -> FileMesh:
         ) from None
     except OSError as error:
         raise MeshError(f"The mesh file {path} cannot be read: {error.strerror}.") from None
-    except (Exception, SystemExit) as error:  # noqa: BLE001 - the readers of formats fail in any way
+    except SystemExit:
+        why = " ".join(said.getvalue().split()).removeprefix("Error: ").rstrip(".")
+        raise MeshError(f"The mesh file {path} cannot be read as {path.suffix}: {why}.") from None
+    except Exception as error:  # noqa: BLE001 - the readers of formats fail in any way
         raise MeshError(f"The mesh file {path} cannot be read as {path.suffix}: {error!r}.") from None
     kind = _one_kind(path, found)
     numbers = np.cumsum([0, *(len(block.data) for block in found.cells)])

@@ -106,6 +106,7 @@ def test_the_catalogue(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
         (("run", "{campaign}", "--model", "wing.fmu"), "FMU"),
         (("run", "{campaign}", *RIG, "--effects", "none.toml"), "none.toml"),
         (("run", "{campaign}", *RIG, "--out", "{campaign}"), "not touched"),
+        (("run", "--from-run", "a_run", "--from-turn", "9", "--to-turn", "8"), "--to-turn 8 lies before"),
         (("check", "nowhere", *RIG), "nowhere"),
         (("example", "dance", "{new}", *RIG), "the kinds are"),
         (("example", "static", "{campaign}", *RIG), "not empty"),

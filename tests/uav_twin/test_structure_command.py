@@ -170,5 +170,20 @@ def test_the_field_is_written_for_paraview(
     assert field.point_data["displacement"][:, 0].max() == pytest.approx(2e-5, rel=1e-9)
     assert call(monkeypatch, "field", str(file), "--out", str(out)) != 0
     assert "exists" in capsys.readouterr().err
-    for words in ("e=stiff", "e", "z9=0.1", "e=nan"):
+    before = out.read_bytes()
+    for words in ("e=stiff", "e", "z9=0.1", "e=nan", "e=-1"):
         assert call(monkeypatch, "field", str(file), "--out", str(out), "--replace", "--at", words) == 2
+    assert "e must be above 0, but is -1" in " ".join(capsys.readouterr().err.split())
+    assert out.read_bytes() == before
+
+
+def test_a_file_beside_an_fmu_is_neither_the_fmu_nor_the_structure(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Refused before anything is built, with --replace, too."""
+    out = file.with_suffix(".fmu")
+    for path, words in ((out, "is the FMU: choose another --binding"), (file, "is the structure file")):
+        assert call(monkeypatch, "fmu", str(file), "--binding", str(path), "--replace") == 1
+        assert words in " ".join(capsys.readouterr().err.split())
+    assert not out.exists()
+    assert file.read_text() == STRUCTURE

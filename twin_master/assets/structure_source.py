@@ -129,6 +129,52 @@ def _check_parameter(scenario: Scenario, design: "StructureDesign") -> None:
         )
 
 
+def _check_ranges(scenario: Scenario, design: "StructureDesign", parameters: Mapping[str, float]) -> None:
+    """Refuse levels, controls and `parameters` outside the ranges of a structure; raises `MissionInputError`.
+
+    A name that the structure does not have is passed over.
+    """
+    ranges = {part.name: part.range for part in (*design.parameter, *design.mass, *design.control)}
+    ranges |= {part.name: (0.0, part.largest_loss) for part in design.damage}
+    given = [(f"parameter {name}", name, value) for name, value in parameters.items()]
+    given += [
+        (f"level of {state.name}", state.name, level) for state in scenario.state for level in state.levels
+    ]
+    given += [
+        (f"{name} of the control {control.name}", name, value)
+        for control in scenario.control
+        for name, value in control.values.items()
+    ]
+    for what, name, value in given:
+        low, high = ranges.get(name, (value, value))
+        if not low <= value <= high:
+            raise MissionInputError(
+                f"the {what} is {value:g}, but the structure {design.name} gives {name} the range {low:g} to "
+                f"{high:g}; give a value inside, or widen the range in the structure file."
+            )
+
+
+def _check_history(scenario: Scenario, design: "StructureDesign") -> None:
+    """Refuse a scripted truth that leaves the ranges of the damage regions; raises `MissionInputError`."""
+    last_step = scenario.mission.steps - 1
+    largest = {part.name: part.largest_loss for part in design.damage}
+    for state in scenario.state:  # each is a region: names were checked
+        gains = np.zeros(last_step + 1)
+        gains[0] = state.levels[int(np.argmax(state.prior))]
+        for entry in scenario.truth.gains:
+            if entry.state == state.name:
+                end = entry.first_step if entry.last_step is None else entry.last_step
+                gains[entry.first_step : end + 1] += entry.gain
+        loss = np.cumsum(gains)
+        outside = np.flatnonzero((loss < -1e-9) | (loss > largest[state.name] + 1e-9))
+        if outside.size:
+            raise MissionInputError(
+                f"`truth.gains` bring {state.name} to {loss[outside[0]]:.6g} in {scenario.mission.step_name} "
+                f"{outside[0]}, but the structure {design.name} gives it the range 0 to "
+                f"{largest[state.name]:g}; give smaller gains, or another `largest_loss` in its file."
+            )
+
+
 def _frequencies(scenario: Scenario) -> int:
     """Return how many natural frequencies a scenario observes; raises `MissionInputError` for too many."""
     from fe.reduction.modal_basis import ModalSettings
@@ -180,6 +226,9 @@ class StructureFmuSource(FmuSource):
         self._check_names(binding)
         self._observed(binding)
         self._inner_roles(binding)
+        if not own:  # under a binding of one's own the names may be others
+            _check_ranges(self._scenario, design, self._section.parameters)
+            _check_history(self._scenario, design)
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the structure and pack the FMU."""
@@ -267,6 +316,7 @@ class StructureSource:
                 f"the structure {design.name} has {observed[role]} sensors of `{role}`, and the scenario "
                 f"expects {scenario.observation.count}."
             )
+        _check_ranges(scenario, design, {})
 
     def files(self) -> dict[str, bytes]:
         """Return structure file and mesh as they are given.

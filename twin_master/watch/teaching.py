@@ -30,6 +30,7 @@ TRIAL_TURNS = 10
 TRIED = ("named", "named in part")
 """Verdicts whose patch is tried; of a group it would be one of several that fit alike."""
 FOLDER = "teaching"
+NO_ALARMS = "--teach begins with an alarm: the scenario needs the table `[notice]`."
 _COURTESY = 10
 """Niceness of the search: the watch comes first."""
 _LOOK_AGAIN = 0.05

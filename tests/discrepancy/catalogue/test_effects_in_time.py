@@ -133,7 +133,9 @@ def test_events_survive_the_files(campaign: Campaign, tmp_path: Path) -> None:
         ("time = 2.5", "time = 25.0\n#", "record of the trial 'pumping' goes from 0 to 10 s"),
         ('"pump_on"', '"pump on"', "must be of letters, digits and underscores"),
         ('trial = "pumping"\ntime', 'trial = "quiet"\ntrials = ["quiet"]\ntime', "give one of the two"),
-        ("until = 8.0", 'until = 8.0\n[[event]]\nname = "pump_on"\ntime = 1.0', "more than one event"),
+        ("until = 8.0", 'until = 8.0\n[[event]]\nname = "pump_on"\ntime = 1.0', "moment 'pump_on' in"),
+        ("until = 8.0", 'until = 8.0\n[[event]]\nname = "pump_on_until"\ntime = 1.0', "'pump_on_until' in"),
+        ('trial = "pumping"\ntime', "trials = []\ntime", "trials` must have at least one entry"),
     ],
 )  # fmt: skip
 def test_wrong_events_are_refused_in_one_sentence(tmp_path: Path, old: str, new: str, words: str) -> None:

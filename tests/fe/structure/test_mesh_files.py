@@ -161,7 +161,9 @@ def test_a_fault_of_a_deck_is_said_with_its_line(old: str, new: str, sentence: s
         read_mesh(tmp_path / "m.inp", 1.0, "m")
 
 
-def test_other_files_that_cannot_be_read_are_refused(box: Callable[..., Any], tmp_path: Path) -> None:
+def test_other_files_that_cannot_be_read_are_refused(
+    box: Callable[..., Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     def sentence(name: str) -> str:
         with pytest.raises(MeshError) as caught:
             read_mesh(tmp_path / name, 1.0, "m")
@@ -172,6 +174,9 @@ def test_other_files_that_cannot_be_read_are_refused(box: Callable[..., Any], tm
     assert "cannot be read" in sentence("m.msh")
     (tmp_path / "m.xyz").write_text("nonsense")
     assert "cannot be read" in sentence("m.xyz")
+    (tmp_path / "m.vtu").write_text("<nonsense/>")
+    assert "m.vtu cannot be read as .vtu: Couldn't read file" in sentence("m.vtu")
+    assert capsys.readouterr() == ("", "")
     points, cells = box("hexahedron", (1, 1, 1))
     meshio.write(tmp_path / "p.vtu", meshio.Mesh(points, [("hexahedron", cells), ("wedge", cells[:, :6])]))
     assert "one kind of elements is expected, but 1 8-node hexahedra, 1 6-node wedges" in sentence("p.vtu")

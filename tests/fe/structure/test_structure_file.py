@@ -120,6 +120,11 @@ def test_the_file_without_a_fault_is_taken(make: Callable[[str], Path]) -> None:
         ('scaled_by = "e"\n', "", "the parameter 'e' scales no material"),
         ('control = "g"', 'control = "h"', r"load\[1\] is tied to the control 'h', but no \[\[control\]\]"),
         ('control = "g"\n', "", "the control 'g' commands no load"),
+        (
+            'name = "g"',
+            'name = "g"\nnominal = 0',
+            r"control\[1\]: with its nominal value 0 it would be 0 always",
+        ),
         ('name = "z1"', 'name = "e"', r"parameter\[1\] and damage\[1\] are both named 'e'"),
         ('name = "w"', 'name = "a"', r"gauge\[1\] and displacement\[1\] are both named 'a'"),
         ('hold = ["x", "y", "z"]', 'hold = ["u"]', r"support\[1\]\.hold\[1\]: .* but 'u' came"),

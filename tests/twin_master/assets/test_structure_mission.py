@@ -25,6 +25,15 @@ from twin_master.workflow import new_run, resume_run
 PATH = scenario_files()["bracket"]
 
 
+TABLE = tomllib.loads(PATH.read_text(encoding="utf-8"))
+BEYOND = {"state": "z_heel", "first_step": 2, "last_step": 6, "gain_percent": 30}
+
+
+def high(table: str, key: str, value: Any) -> dict[str, Any]:
+    """The list of states or controls, one key of the first changed."""
+    return {"": [TABLE[table][0] | {key: value}, *TABLE[table][1:]]}
+
+
 def short(**changes: dict[str, Any]) -> LoadedScenario:
     """The shipped mission of the bracket in ten shifts; `changes` by table, None for a key that goes."""
     table = tomllib.loads(PATH.read_text(encoding="utf-8"))
@@ -32,6 +41,9 @@ def short(**changes: dict[str, Any]) -> LoadedScenario:
     table["asset"] |= {"isolated": False}
     table["truth"]["gains"] = [{"state": "z_heel", "first_step": 2, "last_step": 3, "gain_percent": 20}]
     for name, values in changes.items():
+        if "" in values:
+            table[name] = values[""]
+            continue
         table[name] |= values
         table[name] = {key: value for key, value in table[name].items() if value is not None}
     return LoadedScenario(parse_scenario(table, "short"), PATH, "0" * 64)
@@ -132,6 +144,13 @@ def test_the_field_of_the_last_estimate_is_written(flown: Path) -> None:
         ({"observation": {"role": "displacement"}}, "expects 4"),
         ({"observation": {"count": 3, "titles": ["a", "b", "c"]}}, "expects 3"),
         ({"asset": {"parameters": {"e": 1.0, "f": 2.0}}}, "parameter f"),
+        ({"asset": {"parameters": {"e": 1.2}}}, r"parameter e is 1\.2, .* range 0\.9 to 1\.1; give"),
+        ({"control": high("control", "values", {"load_factor": 30.0})}, "control smooth is 30, .* 0 to 4;"),
+        (
+            {"state": high("state", "levels_percent", [0, 20, 40, 60, 90])},
+            r"level of z_heel is 0\.9, .* 0\.8;",
+        ),
+        ({"truth": {"gains": [BEYOND]}}, r"bring z_heel to 0\.9 in shift 4, .* range 0 to 0\.8"),
     ],
 )
 def test_what_does_not_fit_is_refused_before_a_folder_is_made(
