@@ -14,7 +14,7 @@ demo: $(VENV)/.runtime ## Set up, fly the paper's mission and say where the repo
 	$(BIN)/uav-twin run level_turns --out $(OUT) --replace
 
 .PHONY: test
-test: $(VENV)/.dev ## Set up and run all tests
+test: $(VENV)/.dev ## Set up and run all tests (with UAV_TWIN_LONG_TESTS=1 those that take minutes, too)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
 .PHONY: setup
