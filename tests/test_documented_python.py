@@ -160,7 +160,7 @@ length = 1.8
 
 def bracket(folder: Path) -> None:
     """Write the structure of the page, and a mesh with its sets."""
-    (text,) = blocks(ROOT / "docs" / "structures.md", "toml")
+    text, *_ = blocks(ROOT / "docs" / "structures.md", "toml")  # the others are of scenarios
     (folder / "bracket.toml").write_text(text, encoding="utf-8")
     nodes = {
         (x, y, z): number

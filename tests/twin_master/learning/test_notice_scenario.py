@@ -88,8 +88,7 @@ def folder(scenario: Path) -> Path:
 
 def test_the_console_names_turn_gauge_and_the_command(folder: Path) -> None:
     said = (folder.parent / "said.txt").read_text()
-    alarm = next(line for line in said.splitlines() if "gauge 5" in line)
-    assert alarm.startswith("Turn ")
+    alarm = next(line for line in said.splitlines() if line.startswith("Turn ") and "gauge 5" in line)
     assert alarm.endswith(f"to find the cause: uav-twin discrepancy run --from-run {folder}")
     assert "Turn 3: gauge 12 shows 1e+14 microstrain, and no state can show less than" in said
 
