@@ -1,4 +1,6 @@
-"""Numbers beside their nouns, and reasons, for sentences."""
+"""Numbers beside their nouns, names of parameters, and reasons, for sentences."""
+
+import re
 
 
 def counted(count: int, noun: str, plural: str | None = None) -> str:
@@ -24,3 +26,8 @@ def be(count: int) -> str:
 def one_line(reason: object) -> str:
     """Return what a foreign error says as one line without its full stop, to stand in a sentence."""
     return " ".join(str(reason).split()).removesuffix(".")
+
+
+def parameter_title(name: str) -> str:
+    """Return the name of a parameter in words, "young_modulus_factor" as "Young modulus factor"."""
+    return re.sub(r"\byoung\b", "Young", name.replace("_", " "))

@@ -20,7 +20,7 @@ def test_what_is_shipped() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "states", "noise"), [("bracket", 25, (40, 4)), ("stiffened_panel", 64, (40, 6))]
+    ("name", "states", "noise"), [("bracket", 81, (40, 4)), ("stiffened_panel", 64, (40, 6))]
 )
 def test_a_shipped_structure_is_flown_and_believed(name: str, states: int, noise: tuple[int, int]) -> None:
     scenario = load_scenario(name).scenario

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibration.wing.result import QUANTITIES, STATE
 from reporting import figures as style
+from reporting.words import parameter_title
 from twin_master.report.data import RunRecord
 from twin_master.report.text import number
 
@@ -203,7 +204,7 @@ def _density_panel(axes: Axes, view: CalibrationView, label: str) -> None:
         )
     axes.set_xlim(low, high)
     axes.set_ylim(bottom=0.0)
-    axes.set_xlabel(view.parameter.replace("_", " ") + ("" if view.unit == "1" else f" ({view.unit})"))
+    axes.set_xlabel(parameter_title(view.parameter) + ("" if view.unit == "1" else f" ({view.unit})"))
     axes.set_ylabel("density")
     axes.legend(loc="upper right", handlelength=1.5)
     style.panel_label(axes, label, "The uncertain parameter")
@@ -211,7 +212,7 @@ def _density_panel(axes: Axes, view: CalibrationView, label: str) -> None:
 
 def calibration_caption(view: CalibrationView) -> str:
     """Return the caption of the calibration."""
-    name = view.parameter.replace("_", " ")
+    name = parameter_title(view.parameter)
     sentences = []
     if view.pairs is not None and view.stiffness is not None:
         mean, deviation = view.stiffness

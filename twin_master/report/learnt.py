@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from reporting import figures as style
 from reporting.page import Column, Table
+from reporting.words import parameter_title
 from twin_master.report.data import LearntCourse, RunRecord
 from twin_master.report.text import number
 from twin_master.report.view import capital, sensor_title, sensor_word
@@ -49,7 +50,7 @@ class _Printed:
 
 def _printed(learnt: LearntCourse) -> _Printed:
     scale, unit = printed_learnt(learnt.name, learnt.unit)
-    title = _TITLES.get(learnt.name, capital(learnt.name.replace("_", " ")))
+    title = _TITLES.get(learnt.name, capital(parameter_title(learnt.name)))
     truth = None if learnt.truth is None else scale * learnt.truth
     return _Printed(
         title, "µε" if unit == "microstrain" else unit, scale * learnt.course, scale * learnt.prior, truth

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from reporting.figures import to_png, to_svg
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.page import Column, Page, Table
+from reporting.words import parameter_title
 from twin_master.errors import RunFolderError
 from twin_master.report.belief import belief_figure, policy_figure
 from twin_master.report.calibration import (
@@ -283,7 +284,7 @@ def _highlights(record: RunRecord) -> list[tuple[str, str]]:
         if learnt.name == record.parameter_name:
             mean, deviation = learnt.course[-1, :2]
             truth = "" if learnt.truth is None else f" (truth {float(learnt.truth):.4g})"
-            label = learnt.name.replace("_", " ")
+            label = parameter_title(learnt.name)
             items.append((f"{mean:.3f}\u00a0±\u00a0{deviation:.3f}", f"{label} learnt{truth}"))
     check = predictive_check(record)
     if check is not None and np.isfinite(check.overall_coverage):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reporting.words import parameter_title
 from twin_master.network.estimator import Learnt
 from twin_master.scenario.schema import Scenario
 
@@ -102,7 +103,7 @@ def learnt_quantities(
             whole[:, sensors], first[sensors] = course, before
             course, before = whole, first
         truth = _truth(scenario, name) if simulated else None
-        title = _TITLES.get(name, name.replace("_", " "))
+        title = _TITLES.get(name, parameter_title(name))
         found.append(LearntQuantity(name, title, units.get(name, "1"), course, before, truth))
     return tuple(found)
 

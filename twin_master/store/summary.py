@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reporting.words import parameter_title
 from twin_master.assets.mismatch import Misfit
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.mission.loop import Flight
@@ -179,16 +180,15 @@ def summarise(
 
 def _parameter_figures(result: MissionResult, draws: ParameterDraws) -> list[Figure]:
     """Return what is known of the calibrated parameter before the flight, and after it where it is learnt."""
-    name, label = draws.name, draws.name.replace("_", " ")
+    name, label = draws.name, parameter_title(draws.name)
     own = next((quantity for quantity in result.learnt if quantity.name == name), None)
     if own is None:
+        measured = result.scenario.calibration.source in ("static_test", "file")
+        whose, of = "posterior " if measured else "", label if " " not in label else f"the {label}"
+        mean, deviation = f"{whose}mean of {of}", f"{whose}standard deviation of {of}"
         return [
-            Figure(f"{name}_mean", f"posterior mean of the {label}", draws.mean),
-            Figure(
-                f"{name}_standard_deviation",
-                f"posterior standard deviation of the {label}",
-                draws.standard_deviation,
-            ),
+            Figure(f"{name}_mean", mean, draws.mean),
+            Figure(f"{name}_standard_deviation", deviation, draws.standard_deviation),
         ]
     mean, deviation = own.course[-1, :2].tolist()
     figures = [

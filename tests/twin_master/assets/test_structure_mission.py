@@ -147,7 +147,7 @@ def test_the_field_of_the_last_estimate_is_written(flown: Path) -> None:
         ({"asset": {"parameters": {"e": 1.2}}}, r"parameter e is 1\.2, .* range 0\.9 to 1\.1; give"),
         ({"control": high("control", "values", {"load_factor": 30.0})}, "control smooth is 30, .* 0 to 4;"),
         (
-            {"state": high("state", "levels_percent", [0, 20, 40, 60, 90])},
+            {"state": high("state", "levels_percent", [*range(0, 80, 10), 90])},
             r"level of z_heel is 0\.9, .* 0\.8;",
         ),
         ({"truth": {"gains": [BEYOND]}}, r"bring z_heel to 0\.9 in shift 4, .* range 0 to 0\.8"),

@@ -115,7 +115,7 @@ def test_the_summary_says_what_was_learnt_and_what_was_believed_before(
     figures = {figure["key"]: figure for figure in summary["figures"]}
     assert tuple(figures) == load_scenario(scenario).scenario.figure_names
     assert figures["young_modulus_factor_mean"]["value"] == learnt["young_modulus_factor_mean"].values[-1]
-    assert figures["young_modulus_factor_mean"]["title"] == "young modulus factor learnt, mean"
+    assert figures["young_modulus_factor_mean"]["title"] == "Young modulus factor learnt, mean"
     assert figures["young_modulus_factor_prior_mean"]["value"] == pytest.approx(1.0)
     assert figures["young_modulus_factor_true"]["value"] == 0.95
     assert figures["noise_scale_mean"]["value"] == learnt["noise_scale_mean"].values[-1].mean()
@@ -145,8 +145,8 @@ def test_the_report_draws_and_lists_what_was_learnt(folder: Path, learnt: xr.Dat
     assert len(sensors.rows) == 24
     assert sensors.rows[23][[column.name for column in sensors.columns].index("Offset")] == "—"
     text = render_page(record, [])
-    assert "young modulus factor learnt (truth 0.95)" in text
-    assert "posterior mean of the young" not in text
+    assert "Young modulus factor learnt (truth 0.95)" in text
+    assert "posterior mean of the Young" not in text
 
 
 def test_what_the_gauges_are_expected_to_show_is_what_was_learnt(
