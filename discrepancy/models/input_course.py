@@ -1,6 +1,6 @@
 """What a recorded input does between its samples, and prescribed motions with their derivatives."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import isfinite, pi
 from typing import ClassVar
@@ -10,9 +10,14 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PPoly
 
 from discrepancy.campaign.records import Hold
+from discrepancy.models.memory import Memory
 from fe.runtime.expression import Expression
 
 FloatArray = NDArray[np.float64]
+
+KEPT_COURSES, KEPT_TIMES = 64, 24
+"""Records whose courses are kept, and times at which each of them is: a search asks for the same ones."""
+_courses = Memory(KEPT_COURSES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +35,13 @@ class Course:
     time: FloatArray
     values: FloatArray
     hold: Hold
+    _known: Memory = field(default_factory=lambda: Memory(KEPT_TIMES), init=False, repr=False)
+
+    @staticmethod
+    def of(time: FloatArray, values: FloatArray, hold: Hold) -> "Course":
+        """Return the course of a record, the same one for the same record."""
+        key = (hold, time.tobytes(), values.tobytes())
+        return _courses.get(key, lambda: Course(time, values, hold))
 
     @property
     def edges(self) -> tuple[float, ...]:
@@ -50,6 +62,9 @@ class Course:
 
     def at(self, time: FloatArray) -> FloatArray:
         """Return the values (N,) at times; of a held one that of just before."""
+        return self._known.get(time.tobytes(), lambda: self._at(time))
+
+    def _at(self, time: FloatArray) -> FloatArray:
         if self.hold is Hold.ZERO_ORDER:
             row = np.searchsorted(self.time, time - 1e-9 * (self.time[-1] - self.time[0]) / len(self.time))
             return np.asarray(self.values[np.maximum(row - 1, 0)])
@@ -62,6 +77,9 @@ class Course:
 
         Of a spline those of straight lines that have its mean effect, to fourth order in the step.
         """
+        return self._known.get(("ends", time.tobytes()), lambda: self._ends(time))
+
+    def _ends(self, time: FloatArray) -> tuple[FloatArray, FloatArray]:
         if self.hold is Hold.ZERO_ORDER:
             held = self.at(0.5 * (time[1:] + time[:-1]))
             return held, held
@@ -127,6 +145,13 @@ class Drive:
     time: FloatArray
     values: FloatArray
     order: int = 0
+    _known: Memory = field(default_factory=lambda: Memory(4 * KEPT_TIMES), init=False, repr=False)
+
+    @staticmethod
+    def of(time: FloatArray, values: FloatArray, order: int = 0) -> "Drive":
+        """Return the drive by a record, the same one for the same record."""
+        key = (order, time.tobytes(), values.tobytes())
+        return _courses.get(key, lambda: Drive(time, values, order))
 
     @cached_property
     def _splines(self) -> tuple[PPoly, ...]:
@@ -151,4 +176,4 @@ class Drive:
 
     def at(self, time: FloatArray, order: int) -> FloatArray:
         """Return the motion (N,), its first, second or third derivative at times."""
-        return np.asarray(self._splines[order](time))
+        return self._known.get((order, time.tobytes()), lambda: np.asarray(self._splines[order](time)))

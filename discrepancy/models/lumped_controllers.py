@@ -75,7 +75,7 @@ class Loop:
                 f"The controller {section.name!r} follows {section.quantity.value}, but the trial "
                 f"{trial.name!r} records its reference {item.name!r} as {item.quantity.value}."
             )
-        course = Course(trial.time, item.values + offset, item.hold)
+        course = Course.of(trial.time, item.values + offset, item.hold)
         found = [(self.gains[0] * self.acts, course)]
         if self._follows_slopes:
             found.append((self.gains[1] * self.acts, _slope(course, trial, section)))

@@ -70,7 +70,9 @@ class LumpedRig:
 
     def _padded(self, row: Sequence[float] | FloatArray) -> FloatArray:
         """Return a row of the file with the integrals of controllers after it."""
-        return np.pad(np.array(row, dtype=np.float64), (0, self.width - len(row)))
+        found = np.zeros(self.width)
+        found[: len(row)] = row
+        return found
 
     def _damping(self, mass: FloatArray, stiffness: FloatArray) -> FloatArray:
         given, factor = self.description.damping, self.factors.get("damping", 1.0)
@@ -188,15 +190,15 @@ class LumpedRig:
                     )
                 names.append(item.name)
                 order = order_of(item.quantity)
-                drives.append(Drive(trial.time, self.factors.get(item.name, 1.0) * values, order))
+                drives.append(Drive.of(trial.time, self.factors.get(item.name, 1.0) * values, order))
                 continue
             if (gain or tare) and item.quantity in (Quantity.FORCE, Quantity.TORQUE):
                 values = (1.0 + gain) * values + tare * (item.values != 0.0)
             vector = np.array(section.vector) if place is None else place
             loads.append(
-                (self._vector(vector, section.through, item.name), Course(trial.time, values, item.hold))
+                (self._vector(vector, section.through, item.name), Course.of(trial.time, values, item.hold))
             )
-        drives += [Drive(trial.time, np.zeros(len(trial.time))) for _ in held]
+        drives += [Drive.of(trial.time, np.zeros(len(trial.time))) for _ in held]
         prescribed = (*names, *held)
         acts = Acting(
             trial.time,

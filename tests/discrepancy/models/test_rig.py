@@ -26,6 +26,7 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.hysteresis import BOUC_WEN_HYSTERESIS, JOINT_MICRO_SLIP
 from discrepancy.catalogue.stiffness import BREATHING_CRACK, CUBIC_STIFFNESS, FREE_PLAY
 from discrepancy.errors import ModelError
+from discrepancy.models.input_course import Course, Drive
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import parse_lumped
@@ -507,3 +508,23 @@ def test_a_port_whose_motion_goes_one_way_shows_no_memory() -> None:
     assert QUADRATIC_DAMPING.unavailable(setting) is None
     still = replace(given, trials=(falls, replace(falls, name="load", kind=TrialKind.STATIC)))
     assert model.scales(still).ports["air"].turns
+
+
+def test_the_same_record_is_one_course_to_the_last_bit():
+    time = np.sort(np.random.default_rng(5).uniform(0.0, 3.0, 40))
+    between = np.linspace(time[0], time[-1], 91)
+    sine, cosine = np.sin(time), np.cos(time)
+    drive, load = Drive.of(time, sine, 1), Course.of(time, sine, Hold.SMOOTH)
+    assert Drive.of(time.copy(), sine.copy(), 1) is drive
+    assert Course.of(time.copy(), sine.copy(), Hold.SMOOTH) is load
+    assert Course.of(time, sine, Hold.LINEAR) is not load
+    for _ in range(2):  # computed, then kept
+        for values in (sine, cosine):
+            for order in range(3):
+                assert np.array_equal(
+                    Drive.of(time, values, 1).at(between, order), Drive(time, values, 1).at(between, order)
+                )
+            one, other = Course.of(time, values, Hold.SMOOTH), Course(time, values, Hold.SMOOTH)
+            assert np.array_equal(one.at(between), other.at(between))
+            assert np.array_equal(one.ends(between), other.ends(between))
+    assert not np.array_equal(drive.at(between, 0), Drive.of(time, cosine, 1).at(between, 0))
