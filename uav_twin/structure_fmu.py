@@ -2,7 +2,7 @@
 
 from os.path import relpath
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -16,6 +16,10 @@ def fmu(
         Path | None,
         typer.Option(help="The FMU to write; by default beside the structure file, with its name."),
     ] = None,
+    kind: Annotated[
+        Literal["python", "compiled", "source"],
+        typer.Option(help="Run by Python, compiled C, or C sources to be compiled elsewhere."),
+    ] = "python",
     binding: Annotated[
         Path | None, typer.Option(help="Write the binding of the FMU to this file, too.")
     ] = None,
@@ -28,6 +32,7 @@ def fmu(
 ) -> None:
     """Pack the reduced model of a structure as an FMI 2.0 FMU; equal input gives equal bytes."""
     from fe.structure.design import load_structure
+    from fmu_asset.compiled.compiler import find_compiler
     from fmu_asset.packing.contents import checked_target
     from fmu_asset.structures.binding import names_of_model, structure_binding_text
     from fmu_asset.structures.build import build_structure_fmu
@@ -48,8 +53,10 @@ def fmu(
     text = None
     if rig is not None:
         text = rig_text(load_structure(file), relpath(target, rig.parent))
+    if kind == "compiled":
+        find_compiler()  # before the structure is reduced, which can take minutes
     model = reduced(file, memory_limit)
-    info = build_structure_fmu(model, target, replace=replace)
+    info = build_structure_fmu(model, target, kind=kind, replace=replace)
     terminal.say(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
     if binding is not None:
         atomic_write_text(binding, structure_binding_text(names_of_model(model)))

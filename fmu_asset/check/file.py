@@ -49,7 +49,7 @@ def _content(description: FmuDescription) -> Iterator[Finding]:
     with zipfile.ZipFile(description.path) as archive:
         names = set(archive.namelist())
     ours = {"resources/start.json", "resources/reduced_model.npz"}
-    ours_compiled = {"resources/reduced_model.bin", "sources/wing_variables.h"}
+    ours_compiled = {"resources/reduced_model.bin", "sources/structure_variables.h"}
     ours_structure = {"resources/start.json", "resources/structure.npz"}
     if not any(parts <= names for parts in (ours, ours_compiled, ours_structure)):
         return

@@ -1,1 +1,1 @@
-"""The wing as a compiled FMU: the reduced model evaluated in C, with its sources inside the FMU."""
+"""A wing or structure as a compiled FMU: the reduced model evaluated in C, its sources inside the FMU."""

@@ -7,13 +7,14 @@ from importlib.resources import files
 from pathlib import Path
 
 from fe.runtime.reduced_arrays import ReducedArrays
+from fe.runtime.structure_arrays import StructureArrays
 from fmu_asset.description import documentation_page, model_description
 from fmu_asset.errors import FmuBuildError
-from fmu_asset.slaves.variables import FmuVariable
+from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
 from .compiler import PLATFORM, compile_library
 from .data_file import data_file_bytes
-from .variable_header import variable_sources
+from .variable_header import Roles, variable_sources
 
 DATA_FILE = "resources/reduced_model.bin"
 
@@ -24,9 +25,12 @@ HOST = "It is compiled C and needs nothing but the C library; its sources are in
 
 
 def compiled_members(
-    model: ReducedArrays,
+    model: ReducedArrays | StructureArrays,
     table: Sequence[FmuVariable],
+    roles: Roles,
     *,
+    units: Sequence[Unit] = UNITS,
+    model_name: str,
     identifier: str,
     guid: str,
     content_tag: str,
@@ -36,12 +40,16 @@ def compiled_members(
 
     Parameters
     ----------
-    model : ReducedArrays
-        The reduced wing.
+    model : ReducedArrays or StructureArrays
+        The reduced wing or structure.
     table : sequence of FmuVariable
         The variables, in order of their value reference.
-    identifier : str
-        Model identifier.
+    roles : Roles
+        Which of them is what.
+    units : sequence of Unit
+        Units of the table.
+    model_name, identifier : str
+        Model name and model identifier.
     guid, content_tag : str
         GUID, and the mark of saved states; placeholders, as long as the content is not known.
     description : str
@@ -62,13 +70,15 @@ def compiled_members(
         for entry in (files("fmu_asset.compiled") / "sources").iterdir()
         if entry.name.endswith((".c", ".h"))
     }
-    made = variable_sources(table, guid=guid, content_tag=content_tag)
+    made = variable_sources(table, roles, guid=guid, content_tag=content_tag)
     sources |= {name: text.encode() for name, text in made.items()}
     return {
         "modelDescription.xml": model_description(
+            model_name=model_name,
             identifier=identifier,
             guid=guid,
             table=table,
+            units=units,
             description=description,
             version=version("uav-twin"),
             generation_tool="uav-twin",

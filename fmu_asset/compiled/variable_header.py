@@ -1,8 +1,8 @@
-"""The variables of the wing as C: value references, ranges and start values, from the one table."""
+"""The variables of a structure as C: value references, ranges and start values, from the one table."""
 
 import math
-import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 from fmu_asset.description import LOG_CATEGORIES
 from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable
@@ -10,13 +10,43 @@ from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable
 _NOTE = "/* Made by the build of the FMU from its table of variables; a change here is lost. */\n"
 
 
-def variable_sources(table: Sequence[FmuVariable], *, guid: str, content_tag: str) -> dict[str, str]:
+@dataclass(frozen=True)
+class Roles:
+    """Which variables of a table are what; the outputs of the model come first among the outputs.
+
+    Attributes
+    ----------
+    chosen : tuple of str
+        Names of all that can be chosen, in the order of the model: parameters, losses, masses, controls.
+    outputs : int
+        Number of strains, displacements and accelerations.
+    displacement_bound : str or None
+        The bound of the displacements, where it is an output.
+    point_load : int
+        Index of the load that holds the structure aside before a release, and whose point may be an output.
+    release, load_point : str or None
+        The parameter that says how far it is held aside, and the displacement of that point.
+    """
+
+    chosen: tuple[str, ...]
+    outputs: int
+    displacement_bound: str | None = None
+    point_load: int = 0
+    release: str | None = None
+    load_point: str | None = None
+
+
+def variable_sources(
+    table: Sequence[FmuVariable], roles: Roles, *, guid: str, content_tag: str
+) -> dict[str, str]:
     """Return the C sources that say what the variables are.
 
     Parameters
     ----------
     table : sequence of FmuVariable
         The variables, in order of their value reference.
+    roles : Roles
+        Which of them is what.
     guid : str
         The GUID that `fmi2Instantiate` asks for.
     content_tag : str
@@ -25,45 +55,56 @@ def variable_sources(table: Sequence[FmuVariable], *, guid: str, content_tag: st
     Returns
     -------
     dict of str to str
-        File name to content: `wing_variables.h` and `wing_variables.c`.
+        File name to content: `structure_variables.h` and `structure_variables.c`.
     """
     return {
-        "wing_variables.h": _header(table, guid, content_tag),
-        "wing_variables.c": _source(table),
+        "structure_variables.h": _header(table, roles, guid, content_tag),
+        "structure_variables.c": _source(table, roles),
     }
 
 
-def _header(table: Sequence[FmuVariable], guid: str, content_tag: str) -> str:
-    """Return `wing_variables.h`: every constant, and the type of a row of the table."""
+def _header(table: Sequence[FmuVariable], roles: Roles, guid: str, content_tag: str) -> str:
+    """Return `structure_variables.h`: every constant, and the type of a row of the table."""
     outputs = [row for row in table if row.causality == "output"]
+    place = _places(table)
     counts = {
         "VARIABLE_COUNT": len(table),
         "INPUT_COUNT": sum(row.causality == "input" for row in table),
         "FIRST_OUTPUT": outputs[0].reference,
-        "GAUGE_COUNT": sum(row.name.startswith("strain[") for row in outputs),
+        "OUTPUT_COUNT": roles.outputs,
         "OUTPUT_MODES": sum(row.name.startswith("frequency[") for row in outputs),
+        "CHOSEN_COUNT": len(roles.chosen),
+        "POINT_LOAD": roles.point_load,
         "LOG_CATEGORIES": len(LOG_CATEGORIES),
     }
     defines = _defines(counts.items())
-    references = _defines((_identifier(row.name), row.reference) for row in table)
+    references = _defines(
+        (
+            ("DAMPING_ALPHA", place["damping.alpha"]),
+            ("DAMPING_BETA", place["damping.beta"]),
+            ("RESPONSE", place["response"]),
+            ("STRAIN_BOUND", place["strain_error_bound"]),
+            ("FIRST_FREQUENCY", place["frequency[1]"]),
+            ("STATUS", place["status"]),
+        )
+    )
     values = "".join(
-        _defines((f"{_identifier(e.name)}_{_identifier(name)}", value) for name, value, _ in e.items)
-        for e in ENUMERATIONS
+        _defines((f"{e.name}_{name}".upper(), value) for name, value, _ in e.items) for e in ENUMERATIONS
     )
     categories = _defines(
         (f"LOG_{name.removeprefix('log').removeprefix('Status').upper()}", index)
         for index, name in enumerate(LOG_CATEGORIES)
     )
-    return f"""{_NOTE}#ifndef WING_VARIABLES_H
-#define WING_VARIABLES_H
+    return f"""{_NOTE}#ifndef STRUCTURE_VARIABLES_H
+#define STRUCTURE_VARIABLES_H
 
 #include <stdbool.h>
 
-#define WING_GUID "{guid}"
-#define WING_CONTENT_TAG "{content_tag}"
+#define STRUCTURE_GUID "{guid}"
+#define STRUCTURE_CONTENT_TAG "{content_tag}"
 
 {defines}
-/* Value references, which are also the indices of the table. */
+/* Value references of what every structure has; they are also the indices of the table. */
 {references}
 /* Values of the enumerations. */
 {values}
@@ -80,10 +121,18 @@ typedef struct {{
     double minimum;
     double maximum;
     double start;
-}} wing_variable;
+}} structure_variable;
 
-extern const wing_variable wing_variables[WING_VARIABLE_COUNT];
-extern const char *const wing_log_categories[WING_LOG_CATEGORIES];
+extern const structure_variable structure_variables[STRUCTURE_VARIABLE_COUNT];
+extern const char *const structure_log_categories[STRUCTURE_LOG_CATEGORIES];
+
+/* Value references of all that can be chosen, in the order of the model. */
+extern const unsigned int structure_chosen_places[STRUCTURE_CHOSEN_COUNT];
+
+/* Value references of what some structures have; STRUCTURE_VARIABLE_COUNT where there is none. */
+extern const unsigned int structure_displacement_bound_place;
+extern const unsigned int structure_release_place;
+extern const unsigned int structure_load_point_place;
 
 #if defined(__GNUC__) && !defined(_WIN32)
 #pragma GCC visibility pop
@@ -93,20 +142,34 @@ extern const char *const wing_log_categories[WING_LOG_CATEGORIES];
 """
 
 
-def _source(table: Sequence[FmuVariable]) -> str:
-    """Return `wing_variables.c`: the table."""
+def _source(table: Sequence[FmuVariable], roles: Roles) -> str:
+    """Return `structure_variables.c`: the table, and which of it is what."""
+    place = _places(table)
+    chosen = "".join(f"    {place[name]},\n" for name in roles.chosen)
+    others = "".join(
+        f"const unsigned int structure_{what}_place = {len(table) if name is None else place[name]};\n"
+        for what, name in (
+            ("displacement_bound", roles.displacement_bound),
+            ("release", roles.release),
+            ("load_point", roles.load_point),
+        )
+    )
     rows = "".join(f"    {{{_row(row)}}},\n" for row in table)
     names = "".join(f'    "{name}",\n' for name in LOG_CATEGORIES)
-    return f"""{_NOTE}#include "wing_variables.h"
+    return f"""{_NOTE}#include "structure_variables.h"
 
 #include <math.h>
 
-const wing_variable wing_variables[WING_VARIABLE_COUNT] = {{
+const structure_variable structure_variables[STRUCTURE_VARIABLE_COUNT] = {{
 {rows}}};
 
-const char *const wing_log_categories[WING_LOG_CATEGORIES] = {{
+const char *const structure_log_categories[STRUCTURE_LOG_CATEGORIES] = {{
 {names}}};
-"""
+
+const unsigned int structure_chosen_places[STRUCTURE_CHOSEN_COUNT] = {{
+{chosen}}};
+
+{others}"""
 
 
 def _row(row: FmuVariable) -> str:
@@ -117,7 +180,16 @@ def _row(row: FmuVariable) -> str:
         row.start or 0.0,
     )
     enumeration = "true" if row.enumeration is not None else "false"
-    return ", ".join((f'"{row.name}"', f'"{unit}"', enumeration, *map(_number, numbers)))
+    return ", ".join((_text(row.name), _text(unit or ""), enumeration, *map(_number, numbers)))
+
+
+def _text(text: str) -> str:
+    """Return a text as a C string; units are anything that a user writes, and messages go through printf."""
+    plain = (
+        chr(byte) if 32 <= byte < 127 and chr(byte) not in '"\\?' else f"\\{byte:03o}"
+        for byte in text.encode()
+    )
+    return f'"{"".join(plain)}"'
 
 
 def _number(value: float) -> str:
@@ -127,9 +199,9 @@ def _number(value: float) -> str:
     return repr(float(value))
 
 
-def _identifier(name: str) -> str:
-    return re.sub(r"\W+", "_", name).strip("_").upper()
+def _places(table: Sequence[FmuVariable]) -> dict[str, int]:
+    return {row.name: row.reference for row in table}
 
 
 def _defines(items: Iterable[tuple[str, int]]) -> str:
-    return "".join(f"#define WING_{name} {value}\n" for name, value in items)
+    return "".join(f"#define STRUCTURE_{name} {value}\n" for name, value in items)

@@ -28,7 +28,10 @@ PLACEHOLDER = "0_content_0_"
 _DATE = (1980, 1, 1, 0, 0, 0)
 _TEXT_SUFFIXES = (".py", ".xml", ".txt", ".html", ".json", ".c", ".h")
 # Where the GUID itself stands, between these two; elsewhere the placeholder stands for the tag.
-_GUID_PLACES = {"modelDescription.xml": 'guid="{}"', "sources/wing_variables.h": 'WING_GUID "{}"'}
+_GUID_PLACES = {
+    "modelDescription.xml": 'guid="{}"',
+    "sources/structure_variables.h": 'STRUCTURE_GUID "{}"',
+}
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
 from fmu_asset.compiled.package import DATA_FILE, binary_of, compiled_members
+from fmu_asset.compiled.variable_header import Roles
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.slaves.effect_variables import effect_rows, switch_of, units_of
 from fmu_asset.slaves.variables import UNITS, FmuVariable, variable_table
@@ -149,6 +150,8 @@ def fmu_bytes(
         template = compiled_members(
             model,
             table,
+            _roles_of(model),
+            model_name="uav_wing",
             identifier=f"uav_wing_{PLACEHOLDER}",
             guid=PLACEHOLDER,
             content_tag=PLACEHOLDER,
@@ -176,6 +179,18 @@ def _table_of(model: ReducedModel, mode_count: int, start: Mapping[str, float]) 
     )
     check_start(table)
     return table
+
+
+def _roles_of(model: ReducedModel) -> Roles:
+    """Return which variables of the wing are what; its second load, the tip force, holds the tip aside."""
+    losses = (f"health.{name}" for name in model.regions)
+    return Roles(
+        chosen=("young_modulus_factor", *losses, "mass.servo", "mass.pitot", "load_factor", "tip_force"),
+        outputs=model.gauge_count + 1,
+        point_load=1,
+        release="initial_tip_displacement",
+        load_point="load_point_displacement",
+    )
 
 
 def check_kind(kind: FmuKind) -> None:
@@ -217,7 +232,7 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
     root = members["modelDescription.xml"].decode("utf-8")
     if DATA_FILE in members:
         members = {name: data for name, data in members.items() if not name.startswith("binaries/")}
-        tag = root.split('modelIdentifier="uav_wing_', 1)[1].split('"', 1)[0]
+        tag = root.split('modelIdentifier="', 1)[1].split('"', 1)[0][-len(PLACEHOLDER) :]
     else:
         tag = members["resources/slavemodule.txt"].decode("ascii").strip()[-len(PLACEHOLDER) :]
     declared = root.split('guid="', 1)[1].split('"', 1)[0]

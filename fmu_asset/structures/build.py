@@ -7,17 +7,23 @@ from collections.abc import Mapping
 from importlib.resources import files
 
 from fe.runtime.structure_model import StructureModel
+from fmu_asset.compiled.package import binary_of, compiled_members
+from fmu_asset.compiled.variable_header import Roles
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.contents import (
     PLACEHOLDER,
     FmuInfo,
+    archive_bytes,
     check_start,
     checked_target,
+    content_hash_of,
+    filled,
     room_members,
-    sealed,
+    tag_of,
     write_fmu,
 )
 from fmu_asset.packing.python_fmu import python_members
+from fmu_asset.packing.wing_fmu import FmuKind
 from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
 from .table import structure_table
@@ -34,10 +40,11 @@ def build_structure_fmu(
     model: StructureModel,
     path: str | os.PathLike[str],
     *,
+    kind: FmuKind = "python",
     start: Mapping[str, float] | None = None,
     replace: bool = False,
 ) -> FmuInfo:
-    """Pack a reduced structure as an FMI 2.0 co-simulation FMU that runs in Python.
+    """Pack a reduced structure as an FMI 2.0 co-simulation FMU.
 
     Parameters
     ----------
@@ -45,6 +52,8 @@ def build_structure_fmu(
         The structure.
     path : path-like
         Where to write, with the suffix .fmu.
+    kind : {"python", "compiled", "source"}
+        What evaluates the model: Python in the host, C compiled now, or C to be compiled elsewhere.
     start : mapping of str to float, optional
         Start values by variable name that take the place of the nominal ones.
     replace : bool
@@ -54,10 +63,10 @@ def build_structure_fmu(
     ------
     FmuBuildError
         If a start value does not fit, a name is taken by a variable of the FMU, the file exists, the suffix
-        is wrong, or the wrong pythonfmu is installed.
+        is wrong, the wrong pythonfmu is installed, or there is no C compiler for a compiled one.
     """
     target = checked_target(path, replace=replace)
-    content, content_hash = structure_fmu_bytes(model, start)
+    content, content_hash = structure_fmu_bytes(model, start, kind)
     return write_fmu(target, content, content_hash, stem_of(model), model.design_hash)
 
 
@@ -67,7 +76,9 @@ def stem_of(model: StructureModel) -> str:
     return plain if plain[:1].isalpha() else f"structure_{plain}".rstrip("_")
 
 
-def structure_fmu_bytes(model: StructureModel, start: Mapping[str, float] | None = None) -> tuple[bytes, str]:
+def structure_fmu_bytes(
+    model: StructureModel, start: Mapping[str, float] | None = None, kind: FmuKind = "python"
+) -> tuple[bytes, str]:
     """Return the archive and its content hash; see `build_structure_fmu`."""
     given = {name: float(value) for name, value in (start or {}).items()}
     try:
@@ -76,19 +87,49 @@ def structure_fmu_bytes(model: StructureModel, start: Mapping[str, float] | None
         raise FmuBuildError(f"The FMU of the structure {model.name} cannot be built: {error}.") from error
     check_start(table)
     name = stem_of(model)
+    description = (
+        f"Structure {model.name}: strains, displacements, accelerations and modes from a reduced finite "
+        "element model under its loads, with regions that can lose stiffness."
+    )
+    if kind == "python":
+        template = _python_template(model, table, given, name, description)
+    else:
+        template = compiled_members(
+            model,
+            table,
+            _roles_of(model),
+            units=_units(table),
+            model_name=name,
+            identifier=f"{name}_{PLACEHOLDER}",
+            guid=PLACEHOLDER,
+            content_tag=PLACEHOLDER,
+            description=description,
+        )
+    content_hash = content_hash_of(template)
+    members = filled(template, content_hash)
+    if kind == "compiled":
+        members |= binary_of(members, f"{name}_{tag_of(content_hash)}")
+    return archive_bytes(members), content_hash
+
+
+def _python_template(
+    model: StructureModel,
+    table: tuple[FmuVariable, ...],
+    start: Mapping[str, float],
+    name: str,
+    description: str,
+) -> dict[str, bytes]:
+    """Return the files of the FMU that runs in Python, with the placeholder in them."""
     runtime = f"resources/{name}_{PLACEHOLDER}_runtime"
     members = python_members(
         name,
         "Structure_",
         imports=_IMPORTS,
         table=table,
-        description=(
-            f"Structure {model.name}: strains, displacements, accelerations and modes from a reduced finite "
-            "element model under its loads, with regions that can lose stiffness."
-        ),
+        description=description,
         resources={
             "structure.npz": model.to_bytes(),
-            "start.json": (json.dumps(given, sort_keys=True) + "\n").encode(),
+            "start.json": (json.dumps(start, sort_keys=True) + "\n").encode(),
         },
         units=_units(table),
     ) | room_members("fe.runtime", f"{runtime}/fe")
@@ -98,7 +139,21 @@ def structure_fmu_bytes(model: StructureModel, start: Mapping[str, float] | None
             source = (own / file).read_bytes().replace(b"from fe.runtime", b"from ..fe")
             members[f"{runtime}/{room}/{file}"] = source
     members[f"{runtime}/companions/__init__.py"] = b'"""What small slaves have in common."""\n'
-    return sealed(members)
+    return members
+
+
+def _roles_of(model: StructureModel) -> Roles:
+    """Return which variables of a structure are what."""
+    return Roles(
+        chosen=(
+            *model.parameters,
+            *(f"health.{name}" for name in model.regions),
+            *(f"mass.{name}" for name in model.masses),
+            *model.controls,
+        ),
+        outputs=model.static_count + len(model.accelerations),
+        displacement_bound="displacement_error_bound",
+    )
 
 
 def _units(table: tuple[FmuVariable, ...]) -> tuple[Unit, ...]:

@@ -1,4 +1,4 @@
-/* Drives the wing in C, to be compiled with its sources and with sanitizers: every FMI function, several instances,
+/* Drives a wing or a structure in C, to be compiled with its sources and with sanitizers: every FMI function, several instances,
    restored states, refused calls, damaged data files.
 
    driver RESOURCES [DAMAGED ...]: the URI of the resources, and of folders whose data file must be refused. */
@@ -9,7 +9,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "wing_instance.h"
+#include "structure_instance.h"
 
 static int failures = 0;
 
@@ -45,21 +45,22 @@ static double random_number(unsigned long *state) {
 }
 
 static void start(fmi2Component wing, int response, double alpha) {
-    const fmi2ValueReference parameters[] = {WING_DAMPING_ALPHA, WING_INITIAL_TIP_DISPLACEMENT};
+    const fmi2ValueReference parameters[] = {STRUCTURE_DAMPING_ALPHA, structure_release_place};
     const fmi2Real values[] = {alpha, 0.05};
-    const fmi2ValueReference mode[] = {WING_RESPONSE};
+    const size_t count = structure_release_place < STRUCTURE_VARIABLE_COUNT ? 2 : 1;
+    const fmi2ValueReference mode[] = {STRUCTURE_RESPONSE};
     const fmi2Integer wanted[] = {response};
     CHECK(fmi2Reset(wing) == fmi2OK);
     CHECK(fmi2SetupExperiment(wing, fmi2True, 1e-6, 0.0, fmi2True, 1e3) == fmi2OK);
     CHECK(fmi2EnterInitializationMode(wing) == fmi2OK);
-    CHECK(fmi2SetReal(wing, parameters, 2, values) == fmi2OK);
+    CHECK(fmi2SetReal(wing, parameters, count, values) == fmi2OK);
     CHECK(fmi2SetInteger(wing, mode, 1, wanted) == fmi2OK);
     CHECK(fmi2ExitInitializationMode(wing) == fmi2OK);
 }
 
-static void read_all(fmi2Component wing, fmi2Real values[WING_VARIABLE_COUNT]) {
-    for (fmi2ValueReference i = 0; i < WING_VARIABLE_COUNT; ++i) {
-        if (wing_variables[i].enumeration) {
+static void read_all(fmi2Component wing, fmi2Real values[STRUCTURE_VARIABLE_COUNT]) {
+    for (fmi2ValueReference i = 0; i < STRUCTURE_VARIABLE_COUNT; ++i) {
+        if (structure_variables[i].enumeration) {
             fmi2Integer value = -1;
             CHECK(fmi2GetInteger(wing, &i, 1, &value) == fmi2OK);
             values[i] = value;
@@ -70,28 +71,28 @@ static void read_all(fmi2Component wing, fmi2Real values[WING_VARIABLE_COUNT]) {
 }
 
 static void step(fmi2Component wing, unsigned long *seed, double *time, double size) {
-    fmi2ValueReference references[WING_INPUT_COUNT];
-    fmi2Real inputs[WING_INPUT_COUNT];
-    for (fmi2ValueReference i = 0; i < WING_INPUT_COUNT; ++i) {
+    fmi2ValueReference references[STRUCTURE_INPUT_COUNT];
+    fmi2Real inputs[STRUCTURE_INPUT_COUNT];
+    for (fmi2ValueReference i = 0; i < STRUCTURE_INPUT_COUNT; ++i) {
         references[i] = i;
-        inputs[i] = wing_variables[i].minimum +
-                    random_number(seed) * (wing_variables[i].maximum - wing_variables[i].minimum);
+        inputs[i] = structure_variables[i].minimum +
+                    random_number(seed) * (structure_variables[i].maximum - structure_variables[i].minimum);
     }
-    CHECK(fmi2SetReal(wing, references, WING_INPUT_COUNT, inputs) == fmi2OK);
+    CHECK(fmi2SetReal(wing, references, STRUCTURE_INPUT_COUNT, inputs) == fmi2OK);
     CHECK(fmi2DoStep(wing, *time, size, fmi2True) == fmi2OK);
     *time += size;
 }
 
 static void fly(const char *resources, int response, double alpha) {
-    fmi2Component wing = make(WING_GUID, resources, fmi2CoSimulation);
-    fmi2Component twin = make(WING_GUID, resources, fmi2CoSimulation);
+    fmi2Component wing = make(STRUCTURE_GUID, resources, fmi2CoSimulation);
+    fmi2Component twin = make(STRUCTURE_GUID, resources, fmi2CoSimulation);
     CHECK(wing != NULL && twin != NULL);
     if (wing == NULL || twin == NULL) {
         return;
     }
     start(wing, response, alpha);
     unsigned long seed = 7;
-    double time = 0.0, seen[WING_VARIABLE_COUNT], expected[WING_VARIABLE_COUNT];
+    double time = 0.0, seen[STRUCTURE_VARIABLE_COUNT], expected[STRUCTURE_VARIABLE_COUNT];
     for (int i = 0; i < 50; ++i) {
         if (i % 10 == 0) {
             step(wing, &seed, &time, 0.02);
@@ -133,8 +134,8 @@ static void fly(const char *resources, int response, double alpha) {
             step(twin, &same, &there, 0.01);
             read_all(wing, seen);
             read_all(twin, expected);
-            CHECK(memcmp(seen + WING_FIRST_OUTPUT, expected + WING_FIRST_OUTPUT,
-                         (WING_VARIABLE_COUNT - WING_FIRST_OUTPUT) * sizeof *seen) == 0);
+            CHECK(memcmp(seen + STRUCTURE_FIRST_OUTPUT, expected + STRUCTURE_FIRST_OUTPUT,
+                         (STRUCTURE_VARIABLE_COUNT - STRUCTURE_FIRST_OUTPUT) * sizeof *seen) == 0);
         }
     }
     CHECK(fmi2Terminate(wing) == fmi2OK);
@@ -146,15 +147,15 @@ static void refuse(const char *resources) {
     CHECK(make("{another}", resources, fmi2CoSimulation) == NULL);
     CHECK(strstr(last_message, "GUID") != NULL);
     CHECK(make(NULL, resources, fmi2CoSimulation) == NULL);
-    CHECK(make(WING_GUID, resources, fmi2ModelExchange) == NULL);
-    CHECK(make(WING_GUID, NULL, fmi2CoSimulation) == NULL);
-    CHECK(make(WING_GUID, "file:///there/is/no%20such%2/place", fmi2CoSimulation) == NULL);
+    CHECK(make(STRUCTURE_GUID, resources, fmi2ModelExchange) == NULL);
+    CHECK(make(STRUCTURE_GUID, NULL, fmi2CoSimulation) == NULL);
+    CHECK(make(STRUCTURE_GUID, "file:///there/is/no%20such%2/place", fmi2CoSimulation) == NULL);
     CHECK(strstr(last_message, "/there/is/no such%%2/place/reduced_model.bin") != NULL);
-    CHECK(fmi2Instantiate("", fmi2CoSimulation, WING_GUID, resources, &callbacks, 0, 0) == NULL);
-    CHECK(fmi2Instantiate("x", fmi2CoSimulation, WING_GUID, resources, NULL, 0, 0) == NULL);
+    CHECK(fmi2Instantiate("", fmi2CoSimulation, STRUCTURE_GUID, resources, &callbacks, 0, 0) == NULL);
+    CHECK(fmi2Instantiate("x", fmi2CoSimulation, STRUCTURE_GUID, resources, NULL, 0, 0) == NULL);
 
-    fmi2Component wing = make(WING_GUID, resources, fmi2CoSimulation);
-    const fmi2ValueReference references[] = {0, WING_VARIABLE_COUNT, 4000000000u};
+    fmi2Component wing = make(STRUCTURE_GUID, resources, fmi2CoSimulation);
+    const fmi2ValueReference references[] = {0, STRUCTURE_VARIABLE_COUNT, 4000000000u};
     fmi2Real reals[3] = {1.0, 2.0, 3.0};
     fmi2Integer integers[3] = {1, 2, 3};
     fmi2Boolean booleans[3] = {0, 0, 0};
@@ -204,34 +205,39 @@ static void refuse(const char *resources) {
    critical damping, and far above it. */
 static void hold(const char *folder) {
     char path[2048];
-    wing_model model;
-    wing_behaviour wing;
-    wing_problem problem;
+    structure_model model;
+    structure_behaviour wing;
+    structure_problem problem;
     (void)snprintf(path, sizeof path, "%s/reduced_model.bin", folder + strlen("file://"));
-    CHECK(wing_model_read(&model, path, &problem));
-    CHECK(wing_behaviour_make(&wing, &model, &problem));
+    CHECK(structure_model_read(&model, path, &problem));
+    CHECK(structure_behaviour_make(&wing, &model, &problem));
     const double alphas[] = {0.0, 2.0, 2.0, 900.0};
     for (size_t k = 0; k < 4; ++k) {
-        wing_integrator *integrator = &wing.integrators[0];
-        const double key[WING_MOST_KEYS] = {1.0, 0.2, 0.1, 0.17, 0.13};
+        structure_integrator *integrator = &wing.integrators[0];
+        double chosen[STRUCTURE_CHOSEN_COUNT];
+        for (size_t i = 0; i < STRUCTURE_CHOSEN_COUNT; ++i) {
+            const structure_variable *variable = &structure_variables[structure_chosen_places[i]];
+            chosen[i] = 0.7 * variable->minimum + 0.3 * variable->maximum;
+        }
         double alpha = alphas[k];
-        CHECK(wing_integrator_prepare(integrator, key, alpha, 1e-4, &problem));
+        CHECK(structure_integrator_prepare(integrator, chosen, alpha, 1e-4, &problem));
         if (k == 2) { /* the first mode is critically damped, to rounding */
             alpha = 2.0 * integrator->modes.angular_frequency[0];
-            CHECK(wing_integrator_prepare(integrator, key, alpha, 0.0, &problem));
+            CHECK(structure_integrator_prepare(integrator, chosen, alpha, 0.0, &problem));
             CHECK(fabs(integrator->damping_ratio[0] - 1.0) < 1e-12);
         }
         double once[2][64], often[2][64], other[2][64];
-        const double load[WING_LOADS] = {3.0, 7.0}, none[WING_LOADS] = {0.0, 0.0};
-        wing_motion whole = {once[0], once[1], {0.0, 0.0}}, parts = {often[0], often[1], {0.0, 0.0}},
-                    next = {other[0], other[1], {0.0, 0.0}};
-        CHECK(model.mode_count <= 64);
-        wing_integrator_release(integrator, 0.02, none, &next);
-        wing_integrator_advance(integrator, &next, 0.4, load, &whole);
+        const double load[8] = {3.0, 7.0}, none[8] = {0.0};
+        double loads[3][8];
+        structure_motion whole = {once[0], once[1], loads[0]}, parts = {often[0], often[1], loads[1]},
+                         next = {other[0], other[1], loads[2]};
+        CHECK(model.mode_count <= 64 && model.loads <= 8);
+        structure_integrator_release(integrator, STRUCTURE_POINT_LOAD, 0.02, none, &next);
+        structure_integrator_advance(integrator, &next, 0.4, load, &whole);
         for (int i = 0; i < 16; ++i) {
-            wing_integrator_advance(integrator, &next, 0.025, load, &parts);
+            structure_integrator_advance(integrator, &next, 0.025, load, &parts);
             memcpy(other, often, sizeof other);
-            memcpy(next.load, parts.load, sizeof next.load);
+            memcpy(loads[2], loads[1], sizeof *loads);
         }
         for (size_t i = 0; i < model.mode_count; ++i) {
             const double omega = integrator->modes.angular_frequency[i];
@@ -241,17 +247,19 @@ static void hold(const char *folder) {
         }
         /* Long after, the wing is at rest under its load. */
         if (k > 0) {
-            wing_integrator_advance(integrator, &next, 1e3, load, &parts);
+            structure_integrator_advance(integrator, &next, 1e3, load, &parts);
             for (size_t i = 0; i < model.mode_count; ++i) {
-                const double rest = 3.0 * integrator->modal_static[i] +
-                                    7.0 * integrator->modal_static[model.mode_count + i];
+                double rest = 0.0;
+                for (size_t l = 0; l < model.loads; ++l) {
+                    rest += load[l] * integrator->modal_static[l * model.mode_count + i];
+                }
                 CHECK(fabs(often[0][i] - rest) < 1e-9 * fabs(rest) + 1e-12);
                 CHECK(fabs(often[1][i]) < 1e-12);
             }
         }
     }
-    wing_behaviour_free(&wing);
-    wing_model_free(&model);
+    structure_behaviour_free(&wing);
+    structure_model_free(&model);
 }
 
 int main(int count, char **arguments) {
@@ -266,7 +274,7 @@ int main(int count, char **arguments) {
     hold(arguments[1]);
     for (int i = 2; i < count; ++i) {
         last_message[0] = '\0';
-        fmi2Component wing = make(WING_GUID, arguments[i], fmi2CoSimulation);
+        fmi2Component wing = make(STRUCTURE_GUID, arguments[i], fmi2CoSimulation);
         if (wing != NULL || last_message[0] == '\0') {
             ++failures;
             printf("%s was not refused\n", arguments[i]);

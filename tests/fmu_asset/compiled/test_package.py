@@ -112,7 +112,7 @@ def test_nothing_is_found_to_complain_of(compiled_fmu: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "part", ["sources/wing_static.c", "resources/reduced_model.bin", "sources/wing_variables.c"]
+    "part", ["sources/structure_static.c", "resources/reduced_model.bin", "sources/structure_variables.c"]
 )
 def test_a_changed_part_is_noticed(compiled_fmu: Path, tmp_path: Path, part: str) -> None:
     declared, actual = recorded_content_hash(compiled_fmu)

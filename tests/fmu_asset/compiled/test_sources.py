@@ -48,7 +48,7 @@ def arrays_of(content: bytes) -> dict[str, np.ndarray]:
     assert content[:8] == MAGIC
     assert struct.unpack("<I", content[-4:])[0] == zlib.crc32(content[:-4])
     version, count = struct.unpack_from("<II", content, 8)
-    assert version == 1
+    assert version == 2
     at, arrays = 16, {}
     for _ in range(count):
         name = content[at : at + NAME_BYTES].rstrip(b"\0").decode()
@@ -74,7 +74,6 @@ def test_the_data_file_holds_the_arrays_of_the_model(model: ReducedModel) -> Non
         "cross_mass",
         "dual_split",
         "dual_counts",
-        "validity_box",
     ):
         np.testing.assert_array_equal(arrays[name], getattr(model, name))
     assert arrays["mode_count"] == model.mode_count
@@ -100,7 +99,7 @@ def damaged(content: bytes) -> dict[str, bytes]:
         "short": content[:20],
         "flipped": content[:5000] + bytes([content[5000] ^ 1]) + content[5001:],
         "magic": sealed(b"X" + body[1:]),
-        "version": sealed(body[:8] + struct.pack("<I", 2) + body[12:]),
+        "version": sealed(body[:8] + struct.pack("<I", 1) + body[12:]),
         "longer": sealed(body + b"\0" * 8),
         "no_arrays": sealed(body[:12] + struct.pack("<I", 0) + body[16:]),
         "many_arrays": sealed(body[:12] + struct.pack("<I", 2**32 - 1) + body[16:]),
@@ -111,17 +110,20 @@ def damaged(content: bytes) -> dict[str, bytes]:
         "modes": with_array("mode_count", np.array(1e300)),
         "fewer_modes": with_array("mode_count", np.array(2.0)),
         "gauges": with_array("static_output", arrays["static_output"][:-1]),
-        "regions": with_array("dual_counts", np.ones(9)),
-        "no_regions": with_array("dual_counts", np.ones((1, 1))),
+        "regions": with_array("chosen_counts", np.array([1.0, 9.0, 2.0, 2.0])),
+        "no_regions": with_array("chosen_counts", np.array([3.0, 0.0, 2.0, 2.0])),
+        "counts": with_array("chosen_counts", np.array([1e300, 2.0, 2.0, 2.0])),
+        "other_counts": with_array("chosen_counts", np.array([2.0, 2.0, 1.0, 2.0])),
+        "dual_counts": with_array("dual_counts", np.ones((1, 1))),
+        "stiffness_factors": with_array("stiffness_factors", np.full((4, 2), 3.0)),
+        "half_a_factor": with_array("load_factors", np.full((2, 2), 0.5)),
+        "last_term": with_array("stiffness_factors", np.ones((4, 2))),
+        "more_gauges": with_array("gauge_count", np.array(26.0)),
         "anchors": with_array("dual_counts", np.array([2.0, 1e300])),
         "splits": with_array("dual_split", np.zeros(1)),
         "overflow": with_array("dual_residual", np.zeros((1, 25, 4, 4))),
     }
-    files |= {
-        f"without_{name}": without(name)
-        for name in arrays
-        if name not in ("validity_box", "flapwise_reference")
-    }
+    files |= {f"without_{name}": without(name) for name in arrays}
     files |= {f"cut_{length}": sealed(body[:length]) for length in range(16, len(body), len(body) // 40)}
     return files
 

@@ -1,9 +1,9 @@
-#include "wing_common.h"
+#include "structure_common.h"
 
 #include <stdarg.h>
 #include <stdio.h>
 
-bool wing_fail(wing_problem *problem, const char *format, ...) {
+bool structure_fail(structure_problem *problem, const char *format, ...) {
     va_list arguments;
     va_start(arguments, format);
     (void)vsnprintf(problem->text, sizeof problem->text, format, arguments);
@@ -11,7 +11,7 @@ bool wing_fail(wing_problem *problem, const char *format, ...) {
     return false;
 }
 
-double *wing_take(wing_arena *arena, size_t count) {
+double *structure_take(structure_arena *arena, size_t count) {
     double *room = arena->base == NULL ? NULL : arena->base + arena->used;
     arena->used += count;
     return room;

@@ -1,9 +1,9 @@
-/* What every file of the wing shares: problems as sentences, memory in one piece.
+/* What every file shares: problems as sentences, memory in one piece.
 
    No globals but constants anywhere, so that any number of instances live side by side in a process and in
    its threads; one instance is used by one thread at a time, as FMI 2.0 demands. */
-#ifndef WING_COMMON_H
-#define WING_COMMON_H
+#ifndef STRUCTURE_COMMON_H
+#define STRUCTURE_COMMON_H
 
 #include <stdbool.h>
 #include <stddef.h>
@@ -16,20 +16,20 @@
 /* Why something could not be done, as a sentence for the log. */
 typedef struct {
     char text[400];
-} wing_problem;
+} structure_problem;
 
-/* Write the sentence and return false, so that a function can end with `return wing_fail(...)`. */
-bool wing_fail(wing_problem *problem, const char *format, ...);
+/* Write the sentence and return false, so that a function can end with `return structure_fail(...)`. */
+bool structure_fail(structure_problem *problem, const char *format, ...);
 
 /* Doubles handed out from one block. With `base` NULL it only counts, so that laying out twice, first to count
    and then for real, finds the size. */
 typedef struct {
     double *base;
     size_t used;
-} wing_arena;
+} structure_arena;
 
 /* Return room for `count` doubles (NULL while counting). */
-double *wing_take(wing_arena *arena, size_t count);
+double *structure_take(structure_arena *arena, size_t count);
 
 #if defined(__GNUC__) && !defined(_WIN32)
 #pragma GCC visibility pop

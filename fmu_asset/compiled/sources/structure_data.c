@@ -1,7 +1,7 @@
 #if defined(_MSC_VER) && !defined(_CRT_SECURE_NO_WARNINGS)
 #define _CRT_SECURE_NO_WARNINGS /* fopen is what every platform has */
 #endif
-#include "wing_data.h"
+#include "structure_data.h"
 
 #include <math.h>
 #include <stdint.h>
@@ -12,7 +12,7 @@
 #define CHECKSUM_BYTES 4u
 #define LARGEST_FILE ((size_t)1 << 30)
 
-static const unsigned char MAGIC[8] = {'U', 'A', 'V', 'W', 'I', 'N', 'G', 0};
+static const unsigned char MAGIC[8] = {'U', 'A', 'V', 'T', 'W', 'I', 'N', 0};
 
 /* What is left to read. */
 typedef struct {
@@ -57,15 +57,15 @@ static uint32_t crc32_of(const unsigned char *content, size_t size) {
 
 /* Take name and shape of one array; return the number of its values, or 0 if it is not sound. An array always
    has at least one value. */
-static size_t take_head(reader *from, wing_array *array) {
-    if (from->size - from->at < WING_DATA_NAME) {
+static size_t take_head(reader *from, structure_array *array) {
+    if (from->size - from->at < STRUCTURE_DATA_NAME) {
         return 0;
     }
-    memcpy(array->name, from->content + from->at, WING_DATA_NAME);
-    from->at += WING_DATA_NAME;
+    memcpy(array->name, from->content + from->at, STRUCTURE_DATA_NAME);
+    from->at += STRUCTURE_DATA_NAME;
     uint64_t dimensions, zero;
-    if (array->name[WING_DATA_NAME - 1] != '\0' || !take_number(from, 4, &dimensions) ||
-        !take_number(from, 4, &zero) || dimensions > WING_DATA_DIMENSIONS || zero != 0) {
+    if (array->name[STRUCTURE_DATA_NAME - 1] != '\0' || !take_number(from, 4, &dimensions) ||
+        !take_number(from, 4, &zero) || dimensions > STRUCTURE_DATA_DIMENSIONS || zero != 0) {
         return 0;
     }
     array->dimensions = (size_t)dimensions;
@@ -81,37 +81,37 @@ static size_t take_head(reader *from, wing_array *array) {
     return values <= (from->size - from->at) / 8 ? values : 0;
 }
 
-bool wing_data_parse(wing_data *data, const unsigned char *content, size_t size, const char *where,
-                     wing_problem *problem) {
+bool structure_data_parse(structure_data *data, const unsigned char *content, size_t size, const char *where,
+                     structure_problem *problem) {
     memset(data, 0, sizeof *data);
     uint64_t version, count;
     reader from = {content, size, sizeof MAGIC};
     if (size < sizeof MAGIC + 8 + CHECKSUM_BYTES || memcmp(content, MAGIC, sizeof MAGIC) != 0) {
-        return wing_fail(problem, "%s is not the data file of a wing", where);
+        return structure_fail(problem, "%s is not the data file of a reduced model", where);
     }
     from.size -= CHECKSUM_BYTES;
     if (crc32_of(content, from.size) != little_endian(content + from.size, CHECKSUM_BYTES)) {
-        return wing_fail(problem, "%s is damaged (its checksum is wrong); extract the FMU again", where);
+        return structure_fail(problem, "%s is damaged (its checksum is wrong); extract the FMU again", where);
     }
     (void)take_number(&from, 4, &version);
     (void)take_number(&from, 4, &count);
-    if (version != WING_DATA_VERSION) {
-        return wing_fail(problem, "%s has version %lu, but this binary reads %u", where,
-                         (unsigned long)version, WING_DATA_VERSION);
+    if (version != STRUCTURE_DATA_VERSION) {
+        return structure_fail(problem, "%s has version %lu, but this binary reads %u", where,
+                         (unsigned long)version, STRUCTURE_DATA_VERSION);
     }
     /* Each array takes at least its name in the file, so that these sizes are sane. */
-    if (count == 0 || count > size / WING_DATA_NAME) {
-        return wing_fail(problem, "%s does not hold the arrays that it announces", where);
+    if (count == 0 || count > size / STRUCTURE_DATA_NAME) {
+        return structure_fail(problem, "%s does not hold the arrays that it announces", where);
     }
     data->arrays = calloc((size_t)count, sizeof *data->arrays);
     data->values = malloc(size);
     if (data->arrays == NULL || data->values == NULL) {
-        wing_data_free(data);
-        return wing_fail(problem, "there is no memory for %s", where);
+        structure_data_free(data);
+        return structure_fail(problem, "there is no memory for %s", where);
     }
     double *next = data->values;
     for (data->count = 0; data->count < count; ++data->count) {
-        wing_array *array = &data->arrays[data->count];
+        structure_array *array = &data->arrays[data->count];
         const size_t values = take_head(&from, array);
         array->values = next;
         for (size_t i = 0; i < values; ++i) {
@@ -120,28 +120,28 @@ bool wing_data_parse(wing_data *data, const unsigned char *content, size_t size,
             (void)take_number(&from, 8, &bits);
             memcpy(&value, &bits, sizeof value);
             if (!isfinite(value)) {
-                wing_data_free(data);
-                return wing_fail(problem, "%s holds a number that is not finite", where);
+                structure_data_free(data);
+                return structure_fail(problem, "%s holds a number that is not finite", where);
             }
             *next++ = value;
         }
         if (values == 0) {
-            wing_data_free(data);
-            return wing_fail(problem, "%s does not hold the arrays that it announces", where);
+            structure_data_free(data);
+            return structure_fail(problem, "%s does not hold the arrays that it announces", where);
         }
     }
     if (from.at != from.size) {
-        wing_data_free(data);
-        return wing_fail(problem, "%s holds more than the arrays that it announces", where);
+        structure_data_free(data);
+        return structure_fail(problem, "%s holds more than the arrays that it announces", where);
     }
     return true;
 }
 
-bool wing_data_read(wing_data *data, const char *path, wing_problem *problem) {
+bool structure_data_read(structure_data *data, const char *path, structure_problem *problem) {
     memset(data, 0, sizeof *data);
     FILE *file = fopen(path, "rb");
     if (file == NULL) {
-        return wing_fail(problem, "the data file %s cannot be opened; extract the FMU again", path);
+        return structure_fail(problem, "the data file %s cannot be opened; extract the FMU again", path);
     }
     unsigned char *content = NULL;
     long size = -1;
@@ -155,21 +155,21 @@ bool wing_data_read(wing_data *data, const char *path, wing_problem *problem) {
     }
     (void)fclose(file);
     if (sound) {
-        sound = wing_data_parse(data, content, (size_t)size, path, problem);
+        sound = structure_data_parse(data, content, (size_t)size, path, problem);
     } else {
-        (void)wing_fail(problem, "the data file %s cannot be read; extract the FMU again", path);
+        (void)structure_fail(problem, "the data file %s cannot be read; extract the FMU again", path);
     }
     free(content);
     return sound;
 }
 
-void wing_data_free(wing_data *data) {
+void structure_data_free(structure_data *data) {
     free(data->arrays);
     free(data->values);
     memset(data, 0, sizeof *data);
 }
 
-const wing_array *wing_data_find(const wing_data *data, const char *name) {
+const structure_array *structure_data_find(const structure_data *data, const char *name) {
     for (size_t i = 0; i < data->count; ++i) {
         if (strcmp(data->arrays[i].name, name) == 0) {
             return &data->arrays[i];

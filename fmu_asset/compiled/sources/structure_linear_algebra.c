@@ -1,4 +1,4 @@
-#include "wing_linear_algebra.h"
+#include "structure_linear_algebra.h"
 
 #include <float.h>
 #include <math.h>
@@ -10,20 +10,20 @@
    last bit, because each element is computed by the same operations in the same order. */
 #if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GLIBC__) && defined(__has_attribute)
 #if __has_attribute(target_clones)
-#define WING_WIDE __attribute__((target_clones("avx2", "default")))
+#define STRUCTURE_WIDE __attribute__((target_clones("avx2", "default")))
 #endif
 #endif
-#ifndef WING_WIDE
-#define WING_WIDE
+#ifndef STRUCTURE_WIDE
+#define STRUCTURE_WIDE
 #endif
 
-void wing_add(double *restrict sum, size_t size, double factor, const double *restrict vector) {
+void structure_add(double *restrict sum, size_t size, double factor, const double *restrict vector) {
     for (size_t i = 0; i < size; ++i) {
         sum[i] += factor * vector[i];
     }
 }
 
-WING_WIDE
+STRUCTURE_WIDE
 static void add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
                         size_t count, const double *restrict coefficients) {
     size_t c = 0;
@@ -44,16 +44,16 @@ static void add_columns(double *restrict sum, size_t size, const double *restric
         c += 2;
     }
     if (c < count) {
-        wing_add(sum, size, coefficients[c], columns + c * stride);
+        structure_add(sum, size, coefficients[c], columns + c * stride);
     }
 }
 
-void wing_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
+void structure_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
                       size_t count, const double *restrict coefficients) {
     add_columns(sum, size, columns, stride, count, coefficients); /* the clones themselves would be exported */
 }
 
-double wing_dot(const double *first, const double *second, size_t size) {
+double structure_dot(const double *first, const double *second, size_t size) {
     /* Four sums that do not wait for each other. */
     double a = 0.0, b = 0.0, c = 0.0, d = 0.0;
     size_t i = 0;
@@ -69,29 +69,29 @@ double wing_dot(const double *first, const double *second, size_t size) {
     return (a + b) + (c + d);
 }
 
-double wing_norm(const double *vector, size_t size) { return sqrt(wing_dot(vector, vector, size)); }
+double structure_norm(const double *vector, size_t size) { return sqrt(structure_dot(vector, vector, size)); }
 
-void wing_multiply(double *restrict result, const double *restrict matrix, size_t rows, size_t size,
+void structure_multiply(double *restrict result, const double *restrict matrix, size_t rows, size_t size,
                    const double *restrict vector) {
     for (size_t i = 0; i < rows; ++i) {
-        result[i] = wing_dot(matrix + i * size, vector, size);
+        result[i] = structure_dot(matrix + i * size, vector, size);
     }
 }
 
-void wing_sum_terms(double *restrict result, size_t size, const double *restrict terms, size_t count,
+void structure_sum_terms(double *restrict result, size_t size, const double *restrict terms, size_t count,
                     const double *restrict theta) {
     memset(result, 0, size * size * sizeof *result);
-    wing_add_columns(result, size * size, terms, size * size, count, theta);
+    structure_add_columns(result, size * size, terms, size * size, count, theta);
 }
 
-bool wing_cholesky(double *matrix, size_t size) {
+bool structure_cholesky(double *matrix, size_t size) {
     for (size_t k = 0; k < size; ++k) {
         double *row = matrix + k * size;
         /* Column k of the factor, negative, moves to the lower triangle, where it lies in one piece. */
         for (size_t i = 0; i < k; ++i) {
             row[i] = -matrix[i * size + k];
         }
-        wing_add_columns(row + k, size - k, matrix + k, size, k, row);
+        structure_add_columns(row + k, size - k, matrix + k, size, k, row);
         if (!(row[k] > 0.0)) { /* also NaN */
             return false;
         }
@@ -104,22 +104,22 @@ bool wing_cholesky(double *matrix, size_t size) {
     return true;
 }
 
-void wing_solve_lower(const double *restrict factor, size_t size, double *restrict right) {
+void structure_solve_lower(const double *restrict factor, size_t size, double *restrict right) {
     for (size_t k = 0; k < size; ++k) {
         const double *row = factor + k * size;
         right[k] *= row[k];
-        wing_add(right + k + 1, size - k - 1, -right[k], row + k + 1);
+        structure_add(right + k + 1, size - k - 1, -right[k], row + k + 1);
     }
 }
 
-void wing_solve_upper(const double *restrict factor, size_t size, double *restrict right) {
+void structure_solve_upper(const double *restrict factor, size_t size, double *restrict right) {
     for (size_t k = size; k-- > 0;) {
         const double *row = factor + k * size;
-        right[k] = (right[k] - wing_dot(row + k + 1, right + k + 1, size - k - 1)) * row[k];
+        right[k] = (right[k] - structure_dot(row + k + 1, right + k + 1, size - k - 1)) * row[k];
     }
 }
 
-void wing_solve_lower_columns(const double *restrict factor, size_t size, double *restrict right) {
+void structure_solve_lower_columns(const double *restrict factor, size_t size, double *restrict right) {
     for (size_t k = 0; k < size; ++k) {
         const double *row = factor + k * size;
         const double scale = row[k];
@@ -128,7 +128,7 @@ void wing_solve_lower_columns(const double *restrict factor, size_t size, double
             solved[j] *= scale;
         }
         for (size_t i = k + 1; i < size; ++i) {
-            wing_add(right + i * size, size, -row[i], solved);
+            structure_add(right + i * size, size, -row[i], solved);
         }
     }
 }
@@ -140,7 +140,7 @@ static void tridiagonalise(double *restrict matrix, size_t size, double *restric
     for (size_t k = 0; k + 1 < size; ++k) {
         double *v = matrix + k * size + k + 1;
         const size_t length = size - k - 1;
-        const double norm = wing_norm(v, length);
+        const double norm = structure_norm(v, length);
         diagonal[k] = matrix[k * size + k];
         if (length == 1 || norm == 0.0) {
             off_diagonal[k] = v[0];
@@ -153,9 +153,9 @@ static void tridiagonalise(double *restrict matrix, size_t size, double *restric
         factors[k] = 1.0 / (norm * (norm + fabs(v[0])));
         v[0] -= reflected;
         for (size_t i = 0; i < length; ++i) {
-            work[i] = factors[k] * wing_dot(matrix + (k + 1 + i) * size + k + 1, v, length);
+            work[i] = factors[k] * structure_dot(matrix + (k + 1 + i) * size + k + 1, v, length);
         }
-        wing_add(work, length, -0.5 * factors[k] * wing_dot(work, v, length), v);
+        structure_add(work, length, -0.5 * factors[k] * structure_dot(work, v, length), v);
         for (size_t i = 0; i < length; ++i) {
             double *row = matrix + (k + 1 + i) * size + k + 1;
             const double vi = v[i], wi = work[i];
@@ -200,7 +200,7 @@ static void qr_step(double *restrict d, double *restrict e, size_t low, size_t h
     }
 }
 
-bool wing_symmetric_eigen(double *restrict matrix, size_t size, double *restrict values,
+bool structure_symmetric_eigen(double *restrict matrix, size_t size, double *restrict values,
                           double *restrict vectors, double *restrict work) {
     double *off_diagonal = work, *factors = work + size;
     tridiagonalise(matrix, size, values, off_diagonal, factors, work + 2 * size);
@@ -213,7 +213,7 @@ bool wing_symmetric_eigen(double *restrict matrix, size_t size, double *restrict
         const double *v = matrix + k * size + k + 1;
         for (size_t i = k + 1; i < size && factors[k] != 0.0; ++i) {
             double *row = vectors + i * size + k + 1;
-            wing_add(row, size - k - 1, -factors[k] * wing_dot(row, v, size - k - 1), v);
+            structure_add(row, size - k - 1, -factors[k] * structure_dot(row, v, size - k - 1), v);
         }
     }
     size_t high = size - 1, sweeps = 0;

@@ -1,4 +1,4 @@
-/* The functions of FMI 2.0 for co-simulation, on top of wing_instance. */
+/* The functions of FMI 2.0 for co-simulation, on top of structure_instance. */
 #include "fmi2Functions.h"
 
 #include <math.h>
@@ -7,17 +7,17 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "wing_instance.h"
+#include "structure_instance.h"
 
 #define DATA_FILE "reduced_model.bin"
 #define TAG_BYTES 16
 /* A serialised state: magic, tag of the content, number of doubles, the doubles; little endian. */
 #define STATE_HEADER (8 + TAG_BYTES + 4)
 
-static const char STATE_MAGIC[9] = "UAVWINGC";
+static const char STATE_MAGIC[9] = "UAVTWINC";
 
 /* The pointer that a host gives back is the instance that it was given. */
-static wing_instance *instance_of(fmi2Component component) { return (wing_instance *)component; }
+static structure_instance *instance_of(fmi2Component component) { return (structure_instance *)component; }
 
 static fmi2Status worse(fmi2Status first, fmi2Status second) { return first > second ? first : second; }
 
@@ -81,29 +81,29 @@ fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2Str
     if (functions == NULL) {
         return NULL;
     }
-    wing_problem problem;
-    wing_instance *instance = NULL;
+    structure_problem problem;
+    structure_instance *instance = NULL;
     const char *name = instanceName == NULL ? "" : instanceName;
     if (*name == '\0') {
-        (void)wing_fail(&problem, "an instance needs a name");
+        (void)structure_fail(&problem, "an instance needs a name");
     } else if (fmuType != fmi2CoSimulation) {
-        (void)wing_fail(&problem, "this FMU is for co-simulation only");
-    } else if (fmuGUID == NULL || strcmp(fmuGUID, WING_GUID) != 0) {
-        (void)wing_fail(&problem, "the GUID %.60s was given, but this is " WING_GUID,
+        (void)structure_fail(&problem, "this FMU is for co-simulation only");
+    } else if (fmuGUID == NULL || strcmp(fmuGUID, STRUCTURE_GUID) != 0) {
+        (void)structure_fail(&problem, "the GUID %.60s was given, but this is " STRUCTURE_GUID,
                         fmuGUID == NULL ? "(none)" : fmuGUID);
     } else if (fmuResourceLocation == NULL) {
-        (void)wing_fail(&problem, "the location of the resources was not given");
+        (void)structure_fail(&problem, "the location of the resources was not given");
     } else {
         char *path = data_file(fmuResourceLocation);
         if (path == NULL) {
-            (void)wing_fail(&problem, "there is no memory for an instance");
+            (void)structure_fail(&problem, "there is no memory for an instance");
         } else {
-            instance = wing_instance_make(name, path, &problem);
+            instance = structure_instance_make(name, path, &problem);
             free(path);
         }
     }
     if (instance == NULL) {
-        wing_log(functions->logger, functions->componentEnvironment, name, fmi2Error, problem.text);
+        structure_log(functions->logger, functions->componentEnvironment, name, fmi2Error, problem.text);
         return NULL;
     }
     instance->logger = functions->logger;
@@ -111,15 +111,15 @@ fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2Str
     return instance;
 }
 
-void fmi2FreeInstance(fmi2Component c) { wing_instance_free(instance_of(c)); }
+void fmi2FreeInstance(fmi2Component c) { structure_instance_free(instance_of(c)); }
 
 fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean loggingOn, size_t nCategories,
                                const fmi2String categories[]) {
-    wing_instance *instance = instance_of(c);
-    for (size_t i = 0; i < WING_LOG_CATEGORIES; ++i) {
+    structure_instance *instance = instance_of(c);
+    for (size_t i = 0; i < STRUCTURE_LOG_CATEGORIES; ++i) {
         bool named = nCategories == 0;
         for (size_t k = 0; k < nCategories; ++k) {
-            named = named || strcmp(categories[k], wing_log_categories[i]) == 0;
+            named = named || strcmp(categories[k], structure_log_categories[i]) == 0;
         }
         if (named) {
             instance->logged[i] = loggingOn != fmi2False;
@@ -134,27 +134,27 @@ fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean toleranceDefined, fm
     (void)tolerance;
     (void)stopTimeDefined;
     (void)stopTime;
-    return wing_setup(instance_of(c), startTime);
+    return structure_setup(instance_of(c), startTime);
 }
 
-fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return wing_enter_initialisation(instance_of(c)); }
+fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return structure_enter_initialisation(instance_of(c)); }
 
-fmi2Status fmi2ExitInitializationMode(fmi2Component c) { return wing_exit_initialisation(instance_of(c)); }
+fmi2Status fmi2ExitInitializationMode(fmi2Component c) { return structure_exit_initialisation(instance_of(c)); }
 
 fmi2Status fmi2Terminate(fmi2Component c) {
-    instance_of(c)->phase = WING_TERMINATED;
+    instance_of(c)->phase = STRUCTURE_TERMINATED;
     return fmi2OK;
 }
 
 fmi2Status fmi2Reset(fmi2Component c) {
-    wing_instance_reset(instance_of(c));
+    structure_instance_reset(instance_of(c));
     return fmi2OK;
 }
 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real currentCommunicationPoint, fmi2Real communicationStepSize,
                       fmi2Boolean noSetFMUStatePriorToCurrentPoint) {
     (void)noSetFMUStatePriorToCurrentPoint;
-    return wing_step(instance_of(c), currentCommunicationPoint, communicationStepSize);
+    return structure_step(instance_of(c), currentCommunicationPoint, communicationStepSize);
 }
 
 /* ---------------------------------------------------------------- values */
@@ -162,7 +162,7 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real currentCommunicationPoint, fmi2R
 fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, const fmi2Real value[]) {
     fmi2Status status = fmi2OK;
     for (size_t i = 0; i < nvr; ++i) {
-        status = worse(status, wing_set(instance_of(c), vr[i], value[i], false));
+        status = worse(status, structure_set(instance_of(c), vr[i], value[i], false));
     }
     return status;
 }
@@ -170,16 +170,16 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nv
 fmi2Status fmi2SetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, const fmi2Integer value[]) {
     fmi2Status status = fmi2OK;
     for (size_t i = 0; i < nvr; ++i) {
-        status = worse(status, wing_set(instance_of(c), vr[i], value[i], true));
+        status = worse(status, structure_set(instance_of(c), vr[i], value[i], true));
     }
     return status;
 }
 
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, fmi2Real value[]) {
-    wing_instance *instance = instance_of(c);
-    fmi2Status status = wing_update(instance, vr, nvr);
+    structure_instance *instance = instance_of(c);
+    fmi2Status status = structure_update(instance, vr, nvr);
     for (size_t i = 0; i < nvr; ++i) {
-        if (wing_readable(instance, vr[i], false) != NULL) {
+        if (structure_readable(instance, vr[i], false) != NULL) {
             value[i] = instance->values[vr[i]];
         } else {
             value[i] = NAN;
@@ -190,10 +190,10 @@ fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nv
 }
 
 fmi2Status fmi2GetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, fmi2Integer value[]) {
-    wing_instance *instance = instance_of(c);
+    structure_instance *instance = instance_of(c);
     fmi2Status status = fmi2OK;
     for (size_t i = 0; i < nvr; ++i) {
-        if (wing_readable(instance, vr[i], true) != NULL) {
+        if (structure_readable(instance, vr[i], true) != NULL) {
             value[i] = (fmi2Integer)instance->values[vr[i]];
         } else {
             value[i] = 0;
@@ -205,7 +205,7 @@ fmi2Status fmi2GetInteger(fmi2Component c, const fmi2ValueReference vr[], size_t
 
 static fmi2Status refuse_kind(fmi2Component c, size_t count, const char *kind) {
     return count == 0 ? fmi2OK
-                      : wing_refuse(instance_of(c), WING_STATUS_BAD_CALL, "the FMU has no %s variables", kind);
+                      : structure_refuse(instance_of(c), STRUCTURE_STATUS_BAD_CALL, "the FMU has no %s variables", kind);
 }
 
 fmi2Status fmi2SetBoolean(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, const fmi2Boolean value[]) {
@@ -238,9 +238,9 @@ fmi2Status fmi2GetString(fmi2Component c, const fmi2ValueReference vr[], size_t 
 
 /* ---------------------------------------------------------------- state */
 
-static wing_saved_state *state_of(fmi2FMUstate state) { return (wing_saved_state *)state; }
+static structure_saved_state *state_of(fmi2FMUstate state) { return (structure_saved_state *)state; }
 
-static void free_state(wing_saved_state *saved) {
+static void free_state(structure_saved_state *saved) {
     if (saved != NULL) {
         free(saved->body);
         free(saved);
@@ -248,10 +248,10 @@ static void free_state(wing_saved_state *saved) {
 }
 
 fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *FMUstate) {
-    wing_saved_state *saved = calloc(1, sizeof *saved);
-    if (saved == NULL || !wing_save(instance_of(c), saved)) {
+    structure_saved_state *saved = calloc(1, sizeof *saved);
+    if (saved == NULL || !structure_save(instance_of(c), saved)) {
         free(saved);
-        return wing_refuse(instance_of(c), WING_STATUS_INTERNAL, "there is no memory for the FMU state");
+        return structure_refuse(instance_of(c), STRUCTURE_STATUS_INTERNAL, "there is no memory for the FMU state");
     }
     free_state(state_of(*FMUstate)); /* what the host hands in again is used up */
     *FMUstate = saved;
@@ -260,9 +260,9 @@ fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *FMUstate) {
 
 fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate FMUstate) {
     if (FMUstate == NULL) {
-        return wing_refuse(instance_of(c), WING_STATUS_BAD_STATE, "the FMU state was not restored: it is empty");
+        return structure_refuse(instance_of(c), STRUCTURE_STATUS_BAD_STATE, "the FMU state was not restored: it is empty");
     }
-    return wing_restore(instance_of(c), state_of(FMUstate));
+    return structure_restore(instance_of(c), state_of(FMUstate));
 }
 
 fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *FMUstate) {
@@ -297,13 +297,13 @@ static uint64_t read_number(const fmi2Byte *bytes, size_t count) {
 
 static void write_tag(char tag[TAG_BYTES]) {
     memset(tag, 0, TAG_BYTES);
-    memcpy(tag, WING_CONTENT_TAG, sizeof WING_CONTENT_TAG - 1);
+    memcpy(tag, STRUCTURE_CONTENT_TAG, sizeof STRUCTURE_CONTENT_TAG - 1);
 }
 
 fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate FMUstate, fmi2Byte serializedState[], size_t size) {
-    const wing_saved_state *saved = state_of(FMUstate);
+    const structure_saved_state *saved = state_of(FMUstate);
     if (size < STATE_HEADER + 8 * saved->count) {
-        return wing_refuse(instance_of(c), WING_STATUS_BAD_STATE, "there is too little room for the FMU state");
+        return structure_refuse(instance_of(c), STRUCTURE_STATUS_BAD_STATE, "there is too little room for the FMU state");
     }
     char tag[TAG_BYTES];
     write_tag(tag);
@@ -321,27 +321,27 @@ fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate FMUstate, fmi2Byt
 fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte serializedState[], size_t size,
                                    fmi2FMUstate *FMUstate) {
     static const char sentence[] = "the FMU state was not restored: %s";
-    wing_instance *instance = instance_of(c);
+    structure_instance *instance = instance_of(c);
     if (size < STATE_HEADER || memcmp(serializedState, STATE_MAGIC, 8) != 0) {
-        return wing_refuse(instance, WING_STATUS_BAD_STATE, sentence, "it is not a state of this kind of FMU");
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_STATE, sentence, "it is not a state of this kind of FMU");
     }
     char tag[TAG_BYTES];
     write_tag(tag);
     if (memcmp(serializedState + 8, tag, TAG_BYTES) != 0) {
-        return wing_refuse(instance, WING_STATUS_BAD_STATE, sentence, "it was saved by an FMU with other content");
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_STATE, sentence, "it was saved by an FMU with other content");
     }
     const size_t count = (size_t)read_number(serializedState + 8 + TAG_BYTES, 4);
     if (count == 0 || size != STATE_HEADER + 8 * count) {
-        return wing_refuse(instance, WING_STATUS_BAD_STATE, sentence, "it is damaged");
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_STATE, sentence, "it is damaged");
     }
-    wing_saved_state *saved = calloc(1, sizeof *saved);
+    structure_saved_state *saved = calloc(1, sizeof *saved);
     if (saved != NULL) {
         saved->count = count;
         saved->body = calloc(count, sizeof *saved->body);
     }
     if (saved == NULL || saved->body == NULL) {
         free_state(saved);
-        return wing_refuse(instance, WING_STATUS_INTERNAL, sentence, "there is no memory for it");
+        return structure_refuse(instance, STRUCTURE_STATUS_INTERNAL, sentence, "there is no memory for it");
     }
     for (size_t i = 0; i < count; ++i) {
         const uint64_t bits = read_number(serializedState + STATE_HEADER + 8 * i, 8);
@@ -363,7 +363,7 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
     (void)nKnown;
     (void)dvKnown;
     (void)dvUnknown;
-    return wing_refuse(instance_of(c), WING_STATUS_BAD_CALL, "the FMU does not offer directional derivatives");
+    return structure_refuse(instance_of(c), STRUCTURE_STATUS_BAD_CALL, "the FMU does not offer directional derivatives");
 }
 
 fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t nvr,
@@ -372,7 +372,7 @@ fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference
     (void)nvr;
     (void)order;
     (void)value;
-    return wing_refuse(instance_of(c), WING_STATUS_BAD_CALL, "the FMU does not interpolate inputs");
+    return structure_refuse(instance_of(c), STRUCTURE_STATUS_BAD_CALL, "the FMU does not interpolate inputs");
 }
 
 fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t nvr,
@@ -381,11 +381,11 @@ fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReferenc
     (void)nvr;
     (void)order;
     (void)value;
-    return wing_refuse(instance_of(c), WING_STATUS_BAD_CALL, "the FMU does not offer derivatives of outputs");
+    return structure_refuse(instance_of(c), STRUCTURE_STATUS_BAD_CALL, "the FMU does not offer derivatives of outputs");
 }
 
 fmi2Status fmi2CancelStep(fmi2Component c) {
-    return wing_refuse(instance_of(c), WING_STATUS_BAD_CALL, "the FMU does not step asynchronously");
+    return structure_refuse(instance_of(c), STRUCTURE_STATUS_BAD_CALL, "the FMU does not step asynchronously");
 }
 
 fmi2Status fmi2GetStatus(fmi2Component c, const fmi2StatusKind s, fmi2Status *value) {

@@ -1,46 +1,46 @@
 /* Dense linear algebra of a few dozen unknowns. Matrices are row by row; what is written overlaps with nothing. */
-#ifndef WING_LINEAR_ALGEBRA_H
-#define WING_LINEAR_ALGEBRA_H
+#ifndef STRUCTURE_LINEAR_ALGEBRA_H
+#define STRUCTURE_LINEAR_ALGEBRA_H
 
-#include "wing_common.h"
+#include "structure_common.h"
 
 #if defined(__GNUC__) && !defined(_WIN32)
 #pragma GCC visibility push(hidden)
 #endif
 
 /* sum += factor * vector */
-void wing_add(double *restrict sum, size_t size, double factor, const double *restrict vector);
+void structure_add(double *restrict sum, size_t size, double factor, const double *restrict vector);
 
 /* sum += sum over c of coefficient[c] * column[c]; a column of `size` numbers begins `stride` after the last one */
-void wing_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
+void structure_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
                       size_t count, const double *restrict coefficients);
 
-double wing_dot(const double *first, const double *second, size_t size);
+double structure_dot(const double *first, const double *second, size_t size);
 
-double wing_norm(const double *vector, size_t size);
+double structure_norm(const double *vector, size_t size);
 
 /* result = matrix (rows, size) times vector */
-void wing_multiply(double *restrict result, const double *restrict matrix, size_t rows, size_t size,
+void structure_multiply(double *restrict result, const double *restrict matrix, size_t rows, size_t size,
                    const double *restrict vector);
 
 /* result = sum over the terms of theta[k] * terms[k], of matrices (size, size) one after another */
-void wing_sum_terms(double *restrict result, size_t size, const double *restrict terms, size_t count,
+void structure_sum_terms(double *restrict result, size_t size, const double *restrict terms, size_t count,
                     const double *restrict theta);
 
 /* Replace the upper triangle of a symmetric positive definite matrix A by the upper factor U, A = U' U, with one
    over its diagonal, by which is only divided; false if A is not positive definite. The lower triangle is not read, and is used for intermediate numbers. */
-bool wing_cholesky(double *matrix, size_t size);
+bool structure_cholesky(double *matrix, size_t size);
 
 /* Replace `right` (size) by the solution of U' y = right, then of U x = y, then of both. */
-void wing_solve_lower(const double *restrict factor, size_t size, double *restrict right);
-void wing_solve_upper(const double *restrict factor, size_t size, double *restrict right);
+void structure_solve_lower(const double *restrict factor, size_t size, double *restrict right);
+void structure_solve_upper(const double *restrict factor, size_t size, double *restrict right);
 
 /* Replace each column of `right` (size, size) by the solution of U' y = column. */
-void wing_solve_lower_columns(const double *restrict factor, size_t size, double *restrict right);
+void structure_solve_lower_columns(const double *restrict factor, size_t size, double *restrict right);
 
 /* Eigenvalues, and unit eigenvectors as rows, of a symmetric matrix, in no order. The matrix is destroyed;
    `work` has room for 3 size doubles. False if the iteration does not end, which finite numbers do not cause. */
-bool wing_symmetric_eigen(double *restrict matrix, size_t size, double *restrict values,
+bool structure_symmetric_eigen(double *restrict matrix, size_t size, double *restrict values,
                           double *restrict vectors, double *restrict work);
 
 #if defined(__GNUC__) && !defined(_WIN32)

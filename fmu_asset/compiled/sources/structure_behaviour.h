@@ -1,0 +1,78 @@
+/* What a structure does in one communication step: equilibrium, or its modes integrated in time.
+
+   A function either completes or returns false and leaves everything as it was. */
+#ifndef STRUCTURE_BEHAVIOUR_H
+#define STRUCTURE_BEHAVIOUR_H
+
+#include "structure_transient.h"
+
+#if defined(__GNUC__) && !defined(_WIN32)
+#pragma GCC visibility push(hidden)
+#endif
+
+typedef struct {
+    double damping_alpha; /* 1/s */
+    double damping_beta;  /* s */
+    bool transient;
+    /* Of a release: how far the last output is held aside by the load of index `point` [m]. */
+    double displacement;
+    size_t point;
+} structure_parameters;
+
+typedef struct {
+    const structure_model *model;
+    bool started;
+    bool moving; /* transient */
+    structure_parameters parameters;
+    double *chosen; /* (V) all that can be chosen, of the last step */
+    double *load;   /* (L) coefficients of the loads, of the call at hand */
+    /* The integrator in use, and the one that takes over when health changes; motions alike. */
+    structure_integrator integrators[2];
+    structure_motion motions[2];
+    size_t integrator;
+    size_t motion;
+    double *memory;
+} structure_behaviour;
+
+/* Make a structure that is not started. On success the caller frees it with `structure_behaviour_free`. */
+bool structure_behaviour_make(structure_behaviour *behaviour, const structure_model *model,
+                              structure_problem *problem);
+
+void structure_behaviour_free(structure_behaviour *behaviour);
+
+/* Forget the simulation; what is derived from parameters is kept, since it does not depend on the past. */
+void structure_behaviour_reset(structure_behaviour *behaviour);
+
+/* Find the initial state and its outputs: strains, displacements, accelerations. */
+bool structure_behaviour_start(structure_behaviour *behaviour, const structure_parameters *parameters,
+                               const double *chosen, double *output, structure_problem *problem);
+
+/* Advance by a duration with what is chosen held, and write the outputs. */
+bool structure_behaviour_advance(structure_behaviour *behaviour, const double *chosen, double duration,
+                                 double *output, structure_problem *problem);
+
+/* Certified bounds of the static response under the last inputs. */
+bool structure_behaviour_error_bounds(structure_behaviour *behaviour, structure_bounds *bounds,
+                                      structure_problem *problem);
+
+/* Displacement along the load of index `point` at its point [m]. */
+bool structure_behaviour_load_point(structure_behaviour *behaviour, size_t point, double *displacement,
+                                    structure_problem *problem);
+
+/* Natural frequencies [Hz] and damping ratios [1] of the first `count` modes under the last inputs. */
+bool structure_behaviour_modal_data(structure_behaviour *behaviour, size_t count, double *frequency,
+                                    double *damping_ratio, structure_problem *problem);
+
+/* The state as plain numbers: at most `structure_behaviour_state_size` of them; returns how many were written. */
+size_t structure_behaviour_state_size(const structure_behaviour *behaviour);
+size_t structure_behaviour_save(const structure_behaviour *behaviour, double *state);
+
+/* Take back what was saved, with the parameters of that moment. */
+bool structure_behaviour_restore(structure_behaviour *behaviour, const structure_parameters *parameters,
+                                 const double *state, size_t count, structure_problem *problem);
+
+#if defined(__GNUC__) && !defined(_WIN32)
+#pragma GCC visibility pop
+#endif
+
+#endif

@@ -1,0 +1,362 @@
+#include "structure_instance.h"
+
+#include <math.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+/* phase, time and three flags, then the values, then the behaviour */
+#define SAVED_HEAD 5
+
+static const char *category_of(fmi2Status status) {
+    return structure_log_categories[status == fmi2Discard ? STRUCTURE_LOG_DISCARD : STRUCTURE_LOG_ERROR];
+}
+
+void structure_log(fmi2CallbackLogger logger, fmi2ComponentEnvironment environment, const char *name,
+              fmi2Status status, const char *sentence) {
+    /* Some hosts take the message for the text, others for a format: with every % doubled it is both, but for
+       paths that hold one. */
+    char format[2 * sizeof(((structure_problem *)0)->text)];
+    size_t at = 0;
+    for (; *sentence != '\0' && at + 3 < sizeof format; ++sentence) {
+        if (*sentence == '%') {
+            format[at++] = '%';
+        }
+        format[at++] = *sentence;
+    }
+    format[at] = '\0';
+    if (logger != NULL) {
+        logger(environment, name, status, category_of(status), format);
+    }
+}
+
+structure_instance *structure_instance_make(const char *name, const char *data_file, structure_problem *problem) {
+    structure_instance *instance = calloc(1, sizeof *instance);
+    char *kept_name = malloc(strlen(name) + 1);
+    if (instance == NULL || kept_name == NULL) {
+        free(instance);
+        free(kept_name);
+        (void)structure_fail(problem, "there is no memory for an instance");
+        return NULL;
+    }
+    instance->name = strcpy(kept_name, name);
+    for (size_t i = 0; i < STRUCTURE_LOG_CATEGORIES; ++i) {
+        instance->logged[i] = true;
+    }
+    bool made = structure_model_read(&instance->model, data_file, problem);
+    if (made && (instance->model.modal_outputs != STRUCTURE_OUTPUT_COUNT ||
+                 instance->model.mode_count < STRUCTURE_OUTPUT_MODES ||
+                 instance->model.chosen != STRUCTURE_CHOSEN_COUNT)) {
+        made = structure_fail(problem,
+                              "%s belongs to another FMU: %lu outputs, %lu modes, %lu quantities that can be chosen",
+                              data_file, (unsigned long)instance->model.modal_outputs,
+                              (unsigned long)instance->model.mode_count, (unsigned long)instance->model.chosen);
+    }
+    if (!made || !structure_behaviour_make(&instance->behaviour, &instance->model, problem)) {
+        structure_instance_free(instance);
+        return NULL;
+    }
+    structure_instance_reset(instance);
+    return instance;
+}
+
+void structure_instance_free(structure_instance *instance) {
+    if (instance != NULL) {
+        structure_behaviour_free(&instance->behaviour);
+        structure_model_free(&instance->model);
+        free(instance->name);
+        free(instance);
+    }
+}
+
+void structure_instance_reset(structure_instance *instance) {
+    structure_behaviour_reset(&instance->behaviour);
+    instance->phase = STRUCTURE_INSTANTIATED;
+    instance->time = 0.0;
+    instance->discarded = false;
+    for (size_t i = 0; i < STRUCTURE_VARIABLE_COUNT; ++i) {
+        instance->values[i] = structure_variables[i].start;
+    }
+    instance->stale_response = instance->stale_bound = instance->stale_modal = true;
+}
+
+fmi2Status structure_refuse(structure_instance *instance, int status, const char *format, ...) {
+    structure_problem problem;
+    va_list arguments;
+    va_start(arguments, format);
+    (void)vsnprintf(problem.text, sizeof problem.text, format, arguments);
+    va_end(arguments);
+    instance->values[STRUCTURE_STATUS] = status;
+    const bool discard = instance->phase == STRUCTURE_READY && status != STRUCTURE_STATUS_BAD_STATE;
+    const fmi2Status level = discard ? fmi2Discard : fmi2Error;
+    if (instance->logged[discard ? STRUCTURE_LOG_DISCARD : STRUCTURE_LOG_ERROR] || instance->logged[STRUCTURE_LOG_ALL]) {
+        structure_log(instance->logger, instance->environment, instance->name, level, problem.text);
+    }
+    return level;
+}
+
+/* ---------------------------------------------------------------- ranges and parameters */
+
+static fmi2Status check_range(structure_instance *instance, size_t first, size_t last, const char *consequence) {
+    for (size_t i = first; i < last; ++i) {
+        const structure_variable *variable = &structure_variables[i];
+        const double value = instance->values[i];
+        if (!isfinite(value)) {
+            return structure_refuse(instance, STRUCTURE_STATUS_NOT_FINITE, "%s is %g, which is not finite; %s",
+                               variable->name, value, consequence);
+        }
+        if (value < variable->minimum || value > variable->maximum) {
+            return structure_refuse(instance, STRUCTURE_STATUS_OUTSIDE_RANGE,
+                               "%s = %.17g lies outside its range %g to %g%s%s; %s", variable->name, value,
+                               variable->minimum, variable->maximum, *variable->unit == '\0' ? "" : " ",
+                               variable->unit, consequence);
+        }
+    }
+    return fmi2OK;
+}
+
+static structure_parameters parameters_of(const double *values) {
+    const structure_parameters parameters = {
+        .damping_alpha = values[STRUCTURE_DAMPING_ALPHA],
+        .damping_beta = values[STRUCTURE_DAMPING_BETA],
+        .transient = values[STRUCTURE_RESPONSE] == STRUCTURE_RESPONSE_TRANSIENT,
+        .displacement = structure_release_place < STRUCTURE_VARIABLE_COUNT ? values[structure_release_place] : 0.0,
+        .point = STRUCTURE_POINT_LOAD,
+    };
+    return parameters;
+}
+
+/* All that can be chosen, in the order of the model. */
+static const double *chosen_of(structure_instance *instance) {
+    for (size_t i = 0; i < STRUCTURE_CHOSEN_COUNT; ++i) {
+        instance->chosen[i] = instance->values[structure_chosen_places[i]];
+    }
+    return instance->chosen;
+}
+
+static void accept_outputs(structure_instance *instance) {
+    memcpy(instance->values + STRUCTURE_FIRST_OUTPUT, instance->outputs, sizeof instance->outputs);
+    instance->values[STRUCTURE_STATUS] = STRUCTURE_STATUS_OK;
+    instance->stale_response = false;
+    instance->stale_bound = instance->stale_modal = true;
+}
+
+/* ---------------------------------------------------------------- life of an instance */
+
+fmi2Status structure_setup(structure_instance *instance, double start_time) {
+    if (!isfinite(start_time)) {
+        return structure_refuse(instance, STRUCTURE_STATUS_NOT_FINITE, "the start time is %g; it must be finite",
+                           start_time);
+    }
+    instance->time = start_time;
+    return fmi2OK;
+}
+
+fmi2Status structure_enter_initialisation(structure_instance *instance) {
+    if (instance->phase != STRUCTURE_INSTANTIATED && instance->phase != STRUCTURE_REFUSED) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL,
+                           "initialisation was entered a second time; reset the FMU first");
+    }
+    instance->phase = STRUCTURE_INITIALISING;
+    return fmi2OK;
+}
+
+static fmi2Status initialise(structure_instance *instance) {
+    const fmi2Status range = check_range(instance, 0, STRUCTURE_FIRST_OUTPUT, "the initialisation was refused");
+    if (range != fmi2OK) {
+        return range;
+    }
+    const structure_parameters parameters = parameters_of(instance->values);
+    structure_problem problem;
+    if (!structure_behaviour_start(&instance->behaviour, &parameters, chosen_of(instance), instance->outputs,
+                                   &problem)) {
+        return structure_refuse(instance, STRUCTURE_STATUS_INTERNAL, "the initialisation failed: %s", problem.text);
+    }
+    accept_outputs(instance);
+    return fmi2OK;
+}
+
+fmi2Status structure_exit_initialisation(structure_instance *instance) {
+    if (instance->phase != STRUCTURE_INITIALISING) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL,
+                           "initialisation was left without having been entered");
+    }
+    const fmi2Status status = initialise(instance);
+    instance->phase = status == fmi2OK ? STRUCTURE_READY : STRUCTURE_REFUSED;
+    return status;
+}
+
+static const char *phase_name(structure_phase phase) {
+    switch (phase) {
+    case STRUCTURE_INSTANTIATED:
+        return "before initialisation";
+    case STRUCTURE_INITIALISING:
+        return "during initialisation";
+    case STRUCTURE_REFUSED:
+        return "after an initialisation that was refused";
+    case STRUCTURE_TERMINATED:
+        return "after termination";
+    case STRUCTURE_READY:
+        break;
+    }
+    return "";
+}
+
+fmi2Status structure_step(structure_instance *instance, double time, double step_size) {
+    instance->discarded = true; /* until it is done */
+    if (instance->phase != STRUCTURE_READY) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL, "a step was asked for %s", phase_name(instance->phase));
+    }
+    if (!(step_size > 0.0) || !isfinite(step_size) || !isfinite(time)) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_STEP,
+                           "the step from t = %.17g s over %.17g s was refused: the communication point must be "
+                           "finite, the step size finite and positive",
+                           time, step_size);
+    }
+    if (fabs(time - instance->time) > 1e-6 * step_size + 1e-9 * fabs(instance->time)) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_STEP,
+                           "the step from t = %.17g s was refused: the FMU stands at t = %.17g s", time,
+                           instance->time);
+    }
+    const fmi2Status range =
+        check_range(instance, 0, STRUCTURE_INPUT_COUNT, "the step was refused and the state is as it was");
+    if (range != fmi2OK) {
+        return range;
+    }
+    structure_problem problem;
+    if (!structure_behaviour_advance(&instance->behaviour, chosen_of(instance), step_size, instance->outputs,
+                                     &problem)) {
+        return structure_refuse(instance, STRUCTURE_STATUS_INTERNAL, "the step from t = %g s failed: %s", time,
+                           problem.text);
+    }
+    instance->time = time + step_size;
+    instance->discarded = false;
+    accept_outputs(instance);
+    return fmi2OK;
+}
+
+/* ---------------------------------------------------------------- values */
+
+fmi2Status structure_set(structure_instance *instance, unsigned int reference, double value, bool enumeration) {
+    if (reference >= STRUCTURE_VARIABLE_COUNT || reference >= STRUCTURE_FIRST_OUTPUT ||
+        structure_variables[reference].enumeration != enumeration) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL, "%s (value reference %u) cannot be set%s",
+                           reference < STRUCTURE_VARIABLE_COUNT ? structure_variables[reference].name
+                                                           : "an unknown variable",
+                           reference, enumeration ? " as an integer" : "");
+    }
+    if (reference >= STRUCTURE_INPUT_COUNT && (instance->phase == STRUCTURE_READY || instance->phase == STRUCTURE_TERMINATED)) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL,
+                           "%s is a fixed parameter and can be set only before the first step",
+                           structure_variables[reference].name);
+    }
+    instance->values[reference] = value;
+    instance->stale_response = true;
+    return fmi2OK;
+}
+
+const structure_variable *structure_readable(structure_instance *instance, unsigned int reference, bool enumeration) {
+    if (reference < STRUCTURE_VARIABLE_COUNT && structure_variables[reference].enumeration == enumeration) {
+        return &structure_variables[reference];
+    }
+    (void)structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL, "there is no %s variable with value reference %u",
+                      enumeration ? "enumeration" : "real", reference);
+    return NULL;
+}
+
+fmi2Status structure_update(structure_instance *instance, const unsigned int *references, size_t count) {
+    unsigned int highest = 0;
+    bool bound = false, load_point = false, modal = false;
+    for (size_t i = 0; i < count; ++i) {
+        const unsigned int reference = references[i];
+        if (reference >= STRUCTURE_VARIABLE_COUNT) {
+            continue;
+        }
+        highest = reference > highest ? reference : highest;
+        bound = bound || reference == STRUCTURE_STRAIN_BOUND || reference == structure_displacement_bound_place;
+        load_point = load_point || reference == structure_load_point_place;
+        modal = modal || (reference >= STRUCTURE_FIRST_FREQUENCY &&
+                          reference < STRUCTURE_FIRST_FREQUENCY + 2 * STRUCTURE_OUTPUT_MODES);
+    }
+    if (highest < STRUCTURE_FIRST_OUTPUT) {
+        return fmi2OK;
+    }
+    if (instance->stale_response && instance->phase == STRUCTURE_INITIALISING) {
+        const fmi2Status status = initialise(instance);
+        if (status != fmi2OK) {
+            return status;
+        }
+    }
+    if (instance->phase == STRUCTURE_INSTANTIATED || instance->phase == STRUCTURE_REFUSED) {
+        return fmi2OK;
+    }
+    structure_problem problem;
+    if (bound && instance->stale_bound) {
+        structure_bounds bounds;
+        if (!structure_behaviour_error_bounds(&instance->behaviour, &bounds, &problem)) {
+            return structure_refuse(instance, STRUCTURE_STATUS_INTERNAL, "values could not be read: %s", problem.text);
+        }
+        instance->values[STRUCTURE_STRAIN_BOUND] = bounds.strain;
+        if (structure_displacement_bound_place < STRUCTURE_VARIABLE_COUNT) {
+            instance->values[structure_displacement_bound_place] = bounds.displacement;
+        }
+        instance->stale_bound = false;
+    }
+    if (load_point && !structure_behaviour_load_point(&instance->behaviour, STRUCTURE_POINT_LOAD,
+                                                      &instance->values[structure_load_point_place], &problem)) {
+        return structure_refuse(instance, STRUCTURE_STATUS_INTERNAL, "values could not be read: %s", problem.text);
+    }
+    if (modal && instance->stale_modal) {
+        double *frequency = instance->values + STRUCTURE_FIRST_FREQUENCY;
+        if (!structure_behaviour_modal_data(&instance->behaviour, STRUCTURE_OUTPUT_MODES, frequency,
+                                       frequency + STRUCTURE_OUTPUT_MODES, &problem)) {
+            return structure_refuse(instance, STRUCTURE_STATUS_INTERNAL, "values could not be read: %s", problem.text);
+        }
+        instance->stale_modal = false;
+    }
+    return fmi2OK;
+}
+
+/* ---------------------------------------------------------------- state */
+
+bool structure_save(const structure_instance *instance, structure_saved_state *saved) {
+    const size_t most = SAVED_HEAD + STRUCTURE_VARIABLE_COUNT + structure_behaviour_state_size(&instance->behaviour);
+    double *body = calloc(most, sizeof *body);
+    if (body == NULL) {
+        return false;
+    }
+    body[0] = (double)instance->phase;
+    body[1] = instance->time;
+    body[2] = instance->stale_response ? 1.0 : 0.0;
+    body[3] = instance->stale_bound ? 1.0 : 0.0;
+    body[4] = instance->stale_modal ? 1.0 : 0.0;
+    memcpy(body + SAVED_HEAD, instance->values, sizeof instance->values);
+    saved->body = body;
+    saved->count = SAVED_HEAD + STRUCTURE_VARIABLE_COUNT +
+                   structure_behaviour_save(&instance->behaviour, body + SAVED_HEAD + STRUCTURE_VARIABLE_COUNT);
+    return true;
+}
+
+fmi2Status structure_restore(structure_instance *instance, const structure_saved_state *saved) {
+    const double *body = saved->body;
+    structure_problem problem;
+    if (saved->count <= SAVED_HEAD + STRUCTURE_VARIABLE_COUNT || !(body[0] >= 0.0 && body[0] <= STRUCTURE_TERMINATED) ||
+        !isfinite(body[1])) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_STATE, "the FMU state was not restored: it is damaged");
+    }
+    const double *values = body + SAVED_HEAD, *rest = values + STRUCTURE_VARIABLE_COUNT;
+    const structure_parameters parameters = parameters_of(values);
+    if (!structure_behaviour_restore(&instance->behaviour, &parameters, rest,
+                                saved->count - SAVED_HEAD - STRUCTURE_VARIABLE_COUNT, &problem)) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_STATE, "the FMU state was not restored: %s", problem.text);
+    }
+    instance->phase = (structure_phase)(int)body[0];
+    instance->time = body[1];
+    instance->discarded = false;
+    instance->stale_response = body[2] != 0.0;
+    instance->stale_bound = body[3] != 0.0;
+    instance->stale_modal = body[4] != 0.0;
+    memcpy(instance->values, values, sizeof instance->values);
+    return fmi2OK;
+}

@@ -1,0 +1,83 @@
+/* The reduced model: what fe/runtime/reduced_arrays.py describes, with a few arrays laid out anew for speed.
+
+   All that can be chosen stands in one vector, in this order: parameters (factors on the stiffness), losses of the
+   damage regions, masses [kg], controls of the loads. A term of the stiffness is times one parameter or none and
+   times (1 - loss) of one region or none; a load is times one control or none and times one mass or none. Every
+   size stands in the data file: a wing and a structure from a mesh are the same to these sources. */
+#ifndef STRUCTURE_MODEL_H
+#define STRUCTURE_MODEL_H
+
+#include "structure_data.h"
+
+#if defined(__GNUC__) && !defined(_WIN32)
+#pragma GCC visibility push(hidden)
+#endif
+
+#define STRUCTURE_MOST_REGIONS 8
+
+/* Two positions in the vector of what can be chosen, counted from one; zero for none. */
+typedef struct {
+    size_t first;
+    size_t second;
+} structure_factors;
+
+typedef struct {
+    size_t static_size;   /* N, static basis vectors */
+    size_t modal_size;    /* Nm, modal basis vectors */
+    size_t mode_count;    /* M, modes that are kept */
+    size_t gauges;        /* G, strains, the first outputs */
+    size_t output_count;  /* O: strains, then displacements */
+    size_t modal_outputs; /* O and the accelerations */
+    size_t residual_size; /* R, basis of the residuals */
+    size_t terms;         /* T, terms of the stiffness, of which the last is times one */
+    size_t loads;         /* L */
+    size_t masses;        /* P, masses that can be chosen; the terms of the mass are one more */
+    size_t parameters;
+    size_t regions;       /* K, damage regions */
+    size_t controls;
+    size_t chosen;        /* V, all that can be chosen */
+    size_t health;        /* parameters and losses, the first of what can be chosen: the stiffness */
+    size_t key;           /* these and the masses: the modes */
+    size_t anchors[STRUCTURE_MOST_REGIONS]; /* approximate dual solutions along each loss, A in all */
+    size_t lasting;                 /* terms whose coefficient no loss changes; the first of `order` */
+    size_t *order;                  /* (T) terms in the order of `stiffness_terms`: the last one, others, damage */
+    structure_factors *stiffness_factors; /* (T) parameter and loss of each term */
+    structure_factors *load_factors;      /* (L) control and mass of each load */
+    const double *static_load;      /* (L, N) */
+    const double *bound_reference;  /* (T - 1) */
+    const double *dual_split[STRUCTURE_MOST_REGIONS]; /* (anchors less one) of each region, ascending */
+    const double *dual_residual;    /* (A, O, T, T) */
+    const double *modal_stiffness;  /* (T, Nm, Nm) */
+    const double *modal_mass;       /* (1 + P, Nm, Nm) */
+    const double *modal_load;       /* (L, Nm) */
+    const double *modal_output;     /* (modal_outputs, Nm) */
+    const double *cross_mass;       /* (1 + P, Nm, N) */
+    double residual_allowance;
+    double rounding_allowance;
+    /* laid out anew: columns one after another */
+    double *stiffness_terms;    /* (T, N, N) in the order of `order` */
+    double *output_columns;     /* (N, O) */
+    double *load_residual;      /* (L, R) */
+    double *stiffness_residual; /* (T, N, R) in the order of `order` */
+    double *correction_columns; /* (A, R, O) */
+    structure_data data;        /* owns the arrays */
+    double *memory;             /* owns what was laid out anew */
+    size_t *places;             /* owns `order` */
+    structure_factors *factors; /* owns both tables of factors */
+} structure_model;
+
+/* Read and check a model. On success the caller frees it with `structure_model_free`. */
+bool structure_model_read(structure_model *model, const char *path, structure_problem *problem);
+
+void structure_model_free(structure_model *model);
+
+/* Write the coefficients of the stiffness terms (T), of the mass terms (1 + P) and of the loads (L). */
+void structure_stiffness_coefficients(const structure_model *model, const double *chosen, double *theta);
+void structure_mass_coefficients(const structure_model *model, const double *chosen, double *theta);
+void structure_load_coefficients(const structure_model *model, const double *chosen, double *load);
+
+#if defined(__GNUC__) && !defined(_WIN32)
+#pragma GCC visibility pop
+#endif
+
+#endif

@@ -1,0 +1,40 @@
+/* The first undamped eigenmodes at one state, Kapteyn et al. 2021, eq. (16). */
+#ifndef STRUCTURE_MODES_H
+#define STRUCTURE_MODES_H
+
+#include "structure_model.h"
+
+#if defined(__GNUC__) && !defined(_WIN32)
+#pragma GCC visibility push(hidden)
+#endif
+
+typedef struct {
+    const structure_model *model;
+    bool known;
+    double *key;               /* parameters, losses and masses of these modes */
+    double *theta;             /* (T) */
+    double *mass_theta;        /* (1 + P) */
+    double *angular_frequency; /* (M) rad/s, ascending */
+    double *shape;             /* (M, Nm), mass-normalised, the last output is not negative */
+    double *output;            /* (M, O and accelerations) per unit of modal coordinate */
+    double *participation;     /* (M, L) modal force per unit of load */
+    double *mass;              /* (Nm, Nm) */
+    double *factor, *matrix, *vectors; /* (Nm, Nm) */
+    double *values, *work;     /* (Nm), (3 Nm) */
+} structure_modes;
+
+void structure_modes_lay_out(structure_modes *modes, const structure_model *model, structure_arena *arena);
+
+/* Find the modes; does nothing if parameters, losses and masses are those of the last call. */
+bool structure_modes_find(structure_modes *modes, const double *chosen, structure_problem *problem);
+
+/* result (M) = shape' M u for displacements u = modal (Nm) in the modal plus static (N) in the static basis;
+   `work` has room for Nm doubles. */
+void structure_modes_project(const structure_modes *modes, const double *modal, const double *static_part, double *result,
+                        double *work);
+
+#if defined(__GNUC__) && !defined(_WIN32)
+#pragma GCC visibility pop
+#endif
+
+#endif

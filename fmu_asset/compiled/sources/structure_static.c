@@ -1,0 +1,234 @@
+#include "structure_static.h"
+
+#include <math.h>
+#include <string.h>
+
+#include "structure_linear_algebra.h"
+
+static size_t larger(size_t first, size_t second) { return first > second ? first : second; }
+
+static double smaller(double first, double second) { return first < second ? first : second; }
+
+void structure_static_lay_out(structure_static *steady, const structure_model *model, structure_arena *arena) {
+    const size_t n = model->static_size, outputs = model->output_count, r = model->residual_size;
+    const size_t damaged = model->terms - model->lasting;
+    steady->model = model;
+    steady->health = structure_take(arena, model->health);
+    steady->theta = structure_take(arena, model->terms);
+    steady->theta_damaged = structure_take(arena, damaged);
+    steady->lasting_parameters = structure_take(arena, model->parameters);
+    steady->lasting_stiffness = structure_take(arena, n * n);
+    steady->lasting_residual = structure_take(arena, n * r);
+    steady->factor = structure_take(arena, n * n);
+    steady->dual_norm = structure_take(arena, outputs);
+    /* Flags in the room of doubles, of which every byte is zero at first. */
+    steady->solved = (bool *)(void *)structure_take(arena, model->loads);
+    steady->bounded = (bool *)(void *)structure_take(arena, model->loads);
+    steady->coordinates = structure_take(arena, model->loads * n);
+    steady->output = structure_take(arena, model->loads * outputs);
+    steady->residual = structure_take(arena, model->loads * r);
+    steady->correction = structure_take(arena, model->loads * outputs);
+    steady->work = structure_take(arena, larger((damaged + 1) * larger(n, larger(r, outputs)), model->terms));
+}
+
+/* sum = what losses do not change, of the terms of an array (T, size) in the order of the model */
+static void join_lasting(double *sum, const structure_static *steady, const double *terms, size_t size) {
+    const structure_model *model = steady->model;
+    memcpy(sum, terms, size * sizeof *sum);
+    for (size_t i = 1; i < model->lasting; ++i) {
+        structure_add(sum, size, steady->theta[model->order[i]], terms + i * size);
+    }
+}
+
+bool structure_static_prepare(structure_static *steady, const double *chosen, structure_problem *problem) {
+    const structure_model *model = steady->model;
+    const size_t parameters = model->parameters * sizeof *chosen;
+    if (steady->factorised && memcmp(steady->health, chosen, model->health * sizeof *chosen) == 0) {
+        return true;
+    }
+    memcpy(steady->health, chosen, model->health * sizeof *chosen);
+    structure_stiffness_coefficients(model, chosen, steady->theta);
+    steady->dual_known = false;
+    memset(steady->solved, 0, model->loads * sizeof *steady->solved);
+    memset(steady->bounded, 0, model->loads * sizeof *steady->bounded);
+    const size_t n = model->static_size, lasting = model->lasting, damaged = model->terms - lasting;
+    if (!steady->lasting_known || memcmp(steady->lasting_parameters, chosen, parameters) != 0) {
+        join_lasting(steady->lasting_stiffness, steady, model->stiffness_terms, n * n);
+        join_lasting(steady->lasting_residual, steady, model->stiffness_residual, n * model->residual_size);
+        memcpy(steady->lasting_parameters, chosen, parameters);
+        steady->lasting_known = true;
+    }
+    for (size_t i = 0; i < damaged; ++i) {
+        steady->theta_damaged[i] = steady->theta[model->order[lasting + i]];
+    }
+    memcpy(steady->factor, steady->lasting_stiffness, n * n * sizeof *steady->factor);
+    structure_add_columns(steady->factor, n * n, model->stiffness_terms + lasting * n * n, n * n, damaged,
+                          steady->theta_damaged);
+    steady->factorised = structure_cholesky(steady->factor, n);
+    return steady->factorised ||
+           structure_fail(problem, "the stiffness under these parameters and losses is not positive definite");
+}
+
+void structure_static_solve(structure_static *steady, size_t load) {
+    const structure_model *model = steady->model;
+    if (steady->solved[load]) {
+        return;
+    }
+    const size_t n = model->static_size, outputs = model->output_count;
+    double *coordinates = steady->coordinates + load * n, *output = steady->output + load * outputs;
+    memcpy(coordinates, model->static_load + load * n, n * sizeof *coordinates);
+    structure_solve_lower(steady->factor, n, coordinates);
+    structure_solve_upper(steady->factor, n, coordinates);
+    memset(output, 0, outputs * sizeof *output);
+    structure_add_columns(output, outputs, model->output_columns, outputs, n, coordinates);
+    steady->solved[load] = true;
+}
+
+double structure_static_load_point(structure_static *steady, size_t point, size_t load) {
+    const size_t n = steady->model->static_size;
+    structure_static_solve(steady, load);
+    const double *coordinates = steady->coordinates + load * n;
+    const double *output = steady->model->static_load + point * n; /* the load vector, by reciprocity */
+    double sum = 0.0;
+    for (size_t i = 0; i < n; ++i) {
+        sum += output[i] * coordinates[i];
+    }
+    return sum;
+}
+
+/* sum (size) = sum over the loads of their coefficients times what one unit of each gives, (L, size) */
+static void superpose(double *sum, size_t size, const structure_model *model, const double *load,
+                      const double *given) {
+    memset(sum, 0, size * sizeof *sum);
+    for (size_t k = 0; k < model->loads; ++k) {
+        if (load[k] != 0.0) {
+            structure_add(sum, size, load[k], given + k * size);
+        }
+    }
+}
+
+/* Solve for the loads that act. */
+static void solve_needed(structure_static *steady, const double *load) {
+    for (size_t k = 0; k < steady->model->loads; ++k) {
+        if (load[k] != 0.0) {
+            structure_static_solve(steady, k);
+        }
+    }
+}
+
+void structure_static_response(structure_static *steady, const double *load, double *output) {
+    solve_needed(steady, load);
+    superpose(output, steady->model->output_count, steady->model, load, steady->output);
+}
+
+/* Index of the approximate dual solution of one region: how many splits its loss has reached. */
+static size_t anchor_index(const structure_model *model, size_t region, double loss) {
+    size_t index = 0;
+    while (index + 1 < model->anchors[region] && model->dual_split[region][index] <= loss) {
+        ++index;
+    }
+    return index;
+}
+
+static size_t anchor_of(const structure_static *steady) {
+    const structure_model *model = steady->model;
+    size_t index = 0;
+    for (size_t k = 0; k < model->regions; ++k) {
+        index = index * model->anchors[k] + anchor_index(model, k, steady->health[model->parameters + k]);
+    }
+    return index;
+}
+
+/* The residual of one unit response, and its product with the approximate dual solutions. */
+static void bound_unit(structure_static *steady, size_t load) {
+    const structure_model *model = steady->model;
+    const size_t n = model->static_size, r = model->residual_size, outputs = model->output_count;
+    const size_t lasting = model->lasting, damaged = model->terms - lasting;
+    const double *coordinates = steady->coordinates + load * n;
+    double *residual = steady->residual + load * r, *correction = steady->correction + load * outputs;
+    memcpy(residual, model->load_residual + load * r, r * sizeof *residual);
+    structure_add_columns(residual, r, steady->lasting_residual, r, n, coordinates);
+    /* The damaged terms, whose columns lie one after another. */
+    for (size_t k = 0; k < damaged; ++k) {
+        for (size_t i = 0; i < n; ++i) {
+            steady->work[k * n + i] = steady->theta_damaged[k] * coordinates[i];
+        }
+    }
+    structure_add_columns(residual, r, model->stiffness_residual + lasting * n * r, r, damaged * n, steady->work);
+    memset(correction, 0, outputs * sizeof *correction);
+    structure_add_columns(correction, outputs, model->correction_columns + anchor_of(steady) * r * outputs, outputs,
+                          r, residual);
+    steady->bounded[load] = true;
+}
+
+/* Norms of the dual residuals: of the factors times (1, -theta_1, -theta_2, ...). */
+static void find_dual_norms(structure_static *steady) {
+    const structure_model *model = steady->model;
+    const size_t terms = model->terms;
+    const double *factor = model->dual_residual + anchor_of(steady) * model->output_count * terms * terms;
+    double *coefficients = steady->work;
+    coefficients[0] = 1.0;
+    for (size_t k = 1; k < terms; ++k) {
+        coefficients[k] = -steady->theta[k - 1];
+    }
+    for (size_t i = 0; i < model->output_count; ++i) {
+        double sum = 0.0;
+        for (size_t row = 0; row < terms; ++row, factor += terms) {
+            double value = 0.0;
+            size_t k = 0;
+            for (; k + 2 <= terms; k += 2) {
+                value += coefficients[k] * factor[k] + coefficients[k + 1] * factor[k + 1];
+            }
+            for (; k < terms; ++k) {
+                value += coefficients[k] * factor[k];
+            }
+            sum += value * value;
+        }
+        steady->dual_norm[i] = sqrt(sum);
+    }
+    steady->dual_known = true;
+}
+
+/* Largest of the bounds of some outputs, before rounding; `correction` belongs to all outputs. */
+static double largest_bound(const structure_static *steady, double remainder, const double *correction, size_t first,
+                            size_t last) {
+    double bound = 0.0;
+    for (size_t i = first; i < last; ++i) {
+        const double of_output = remainder * steady->dual_norm[i] + fabs(correction[i]);
+        bound = bound > of_output ? bound : of_output;
+    }
+    return bound;
+}
+
+structure_bounds structure_static_error_bounds(structure_static *steady, const double *load) {
+    const structure_model *model = steady->model;
+    const size_t outputs = model->output_count, gauges = model->gauges;
+    solve_needed(steady, load);
+    for (size_t k = 0; k < model->loads; ++k) {
+        if (load[k] != 0.0 && !steady->bounded[k]) {
+            bound_unit(steady, k);
+        }
+    }
+    if (!steady->dual_known) {
+        find_dual_norms(steady);
+    }
+    /* |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha */
+    superpose(steady->work, model->residual_size, model, load, steady->residual);
+    double remainder = structure_norm(steady->work, model->residual_size);
+    superpose(steady->work, model->static_size, model, load, steady->coordinates);
+    remainder += model->residual_allowance * structure_norm(steady->work, model->static_size);
+    double coercivity = 1.0;
+    for (size_t k = 0; k + 1 < model->terms; ++k) {
+        coercivity = smaller(coercivity, steady->theta[k] / model->bound_reference[k]);
+    }
+    remainder /= coercivity;
+    superpose(steady->work, outputs, model, load, steady->correction);
+    structure_bounds bounds = {
+        .strain = largest_bound(steady, remainder, steady->work, 0, gauges),
+        .displacement = largest_bound(steady, remainder, steady->work, gauges, outputs),
+    };
+    superpose(steady->work, outputs, model, load, steady->output);
+    bounds.strain += model->rounding_allowance * structure_norm(steady->work, gauges);
+    bounds.displacement += model->rounding_allowance * structure_norm(steady->work + gauges, outputs - gauges);
+    return bounds;
+}

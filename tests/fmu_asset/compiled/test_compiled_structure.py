@@ -1,0 +1,154 @@
+"""A structure from a mesh as a compiled FMU: the sources of the wing, and the outputs of the Python FMU."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fe.reduction.structure_basis import StructureReduction
+from fe.runtime.structure_model import StructureModel
+from fmu_asset.check import check_fmu
+from fmu_asset.packing.wing_fmu import recorded_content_hash
+from fmu_asset.structures.build import build_structure_fmu
+
+OK, DISCARD, ERROR = 0, 2, 3
+DRIVER = Path(__file__).with_name("driver.c")
+
+
+@pytest.fixture(scope="module")
+def beam_model(beam_reduction: StructureReduction) -> StructureModel:
+    return beam_reduction.model
+
+
+@pytest.fixture(scope="module")
+def pair(
+    compiler: list[str], beam_model: StructureModel, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path]:
+    """The beam as a compiled FMU, and as one that runs in Python."""
+    folder = tmp_path_factory.mktemp("pair")
+    compiled = build_structure_fmu(beam_model, folder / "compiled.fmu", kind="compiled").path
+    return compiled, build_structure_fmu(beam_model, folder / "python.fmu").path
+
+
+def _fly(slave: Any, model: StructureModel, seed: int, response: int) -> list[list[float]]:
+    """Parameters, inputs and steps at random: health mostly stays, a load is often none at all."""
+    rng = np.random.default_rng(seed)
+    inputs = [v for v in slave.description.variables if v.causality == "input"]
+    start = {name: float(rng.uniform(*model.validity[name])) for name in ("e", "push")}
+    overdamped = float(rng.choice([0.0, 5.0, 2e4]))
+    slave.fmu.reset()
+    status = slave.start(
+        response=response,
+        mass__pump=float(rng.uniform(*model.validity["pump"])),
+        damping__alpha=overdamped,
+        **start,
+    )
+    assert status == OK, slave.log
+    seen, time, values = [slave.everything()], 0.0, [0.0] * len(inputs)
+    for _ in range(20):
+        for number, variable in enumerate(inputs):
+            if rng.random() < 0.4:
+                values[number] = float(rng.uniform(variable.minimum, variable.maximum))
+        if rng.random() < 0.3:
+            values[0] = 0.0
+        size = float(rng.choice([1e-5, 1e-3, 0.1]))
+        slave.fmu.setReal([v.reference for v in inputs], values)
+        assert slave.status_of(slave.fmu.doStep, time, size) == OK, slave.log
+        time += size
+        seen.append(slave.everything())
+    return seen
+
+
+def test_outputs_equal_those_of_the_python_fmu(
+    pair: tuple[Path, Path], beam_model: StructureModel, open_slave: Callable[..., Any]
+) -> None:
+    """Strains, displacements, accelerations, both bounds, frequencies, damping ratios: to 1e-12."""
+    slaves = [open_slave(path) for path in pair]
+    names = [v.name for v in slaves[0].description.variables if v.kind == "Real"]
+    for seed in range(8):
+        for response in (1, 2):
+            ours, expected = (np.array(_fly(slave, beam_model, seed, response)) for slave in slaves)
+            scale = np.maximum(np.abs(expected).max(axis=0), 1e-300)
+            strain = max(size for name, size in zip(names, scale, strict=True) if name.startswith("strain."))
+            for number, name in enumerate(names):
+                # a bound is made of outputs that cancel: its digits end where theirs do
+                limit = {
+                    "strain_error_bound": strain,
+                    "displacement_error_bound": scale[names.index("displacement.tip")],
+                }.get(name, scale[number])
+                np.testing.assert_allclose(
+                    ours[:, number], expected[:, number], rtol=0.0, atol=1e-12 * limit, err_msg=name
+                )
+            assert (np.abs(ours[1:, names.index("acceleration.shake")]).max() > 0.0) == (response == 2)
+    for slave in slaves:
+        slave.close()
+
+
+def test_refusals_and_states_are_those_of_the_python_fmu(
+    pair: tuple[Path, Path], open_slave: Callable[..., Any]
+) -> None:
+    slaves = [open_slave(path) for path in pair]
+    after = []
+    for slave in slaves:
+        place = slave.reference
+        assert slave.start(response=2) == OK
+        assert slave.status_of(slave.fmu.doStep, 0.0, 0.01) == OK
+        kept = slave.saved()
+        before = slave.everything()
+        slave.fmu.setReal([place["health.z1"]], [0.95])
+        assert slave.status_of(slave.fmu.doStep, 0.01, 0.01) == DISCARD
+        assert slave.log[-1][1].startswith("health.z1 = 0.9")
+        slave.fmu.setReal([place["health.z1"]], [0.0])
+        assert slave.everything() == before
+        ahead = []
+        for _ in range(2):
+            assert slave.restore(kept) == OK
+            slave.fmu.setReal([place["push"], place["health.z2"]], [400.0, 0.3])
+            assert slave.status_of(slave.fmu.doStep, 0.01, 0.01) == OK
+            ahead.append(slave.everything())
+        assert ahead[0] == ahead[1]
+        after.append(ahead[0])
+        slave.close()
+    np.testing.assert_allclose(after[0], after[1], rtol=1e-9, atol=1e-15)
+
+
+def test_no_check_finds_anything(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    compiled = pair[0]
+    check = check_fmu(compiled)
+    assert check.passed, check.problems
+    assert not check.warnings
+    declared, actual = recorded_content_hash(compiled)
+    assert declared == actual
+    changed = tmp_path / "changed.fmu"
+    with zipfile.ZipFile(compiled) as archive, zipfile.ZipFile(changed, "w") as target:
+        for name in archive.namelist():
+            target.writestr(name, archive.read(name) + b" " * (name == "sources/structure_modes.c"))
+    assert any("GUID" in problem for problem in check_fmu(changed).problems)
+
+
+def test_driven_in_c_without_a_lost_byte(
+    compiler: list[str], pair: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """The driver of the wing drives the beam, too; valgrind watches, where it is installed."""
+    with zipfile.ZipFile(pair[0]) as archive:
+        archive.extractall(tmp_path)
+    sources = sorted((tmp_path / "sources").glob("*.c"))
+    driver = tmp_path / "driver"
+    subprocess.run(
+        [*compiler, "-std=c11", "-O2", "-g", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Wcast-qual",
+         "-Werror", f"-I{tmp_path / 'sources'}", *sources, DRIVER, "-o", driver, "-lm"],
+        check=True,
+    )  # fmt: skip
+    valgrind = shutil.which("valgrind")
+    watched = [] if valgrind is None else [valgrind, "--error-exitcode=9", "--leak-check=full", "--quiet"]
+    run = subprocess.run(
+        [*watched, driver, (tmp_path / "resources").as_uri()], capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
