@@ -9,6 +9,37 @@ from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable
 
 _NOTE = "/* Made by the build of the FMU from its table of variables; a change here is lost. */\n"
 
+_DECLARATIONS = """#if defined(__GNUC__) && !defined(_WIN32)
+#pragma GCC visibility push(hidden)
+#endif
+
+typedef struct {
+    const char *name;
+    const char *unit; /* for messages; empty where there is none */
+    bool enumeration;
+    double minimum;
+    double maximum;
+    double start;
+} structure_variable;
+
+extern const structure_variable structure_variables[STRUCTURE_VARIABLE_COUNT];
+extern const char *const structure_log_categories[STRUCTURE_LOG_CATEGORIES];
+
+/* Value references of all that can be chosen, in the order of the model. */
+extern const unsigned int structure_chosen_places[STRUCTURE_CHOSEN_COUNT];
+
+/* Value references of what some structures have; STRUCTURE_VARIABLE_COUNT where there is none. */
+extern const unsigned int structure_displacement_bound_place;
+extern const unsigned int structure_release_place;
+extern const unsigned int structure_load_point_place;
+
+#if defined(__GNUC__) && !defined(_WIN32)
+#pragma GCC visibility pop
+#endif
+
+#endif
+"""
+
 
 @dataclass(frozen=True)
 class Roles:
@@ -110,36 +141,7 @@ def _header(table: Sequence[FmuVariable], roles: Roles, guid: str, content_tag: 
 {values}
 /* Log categories. */
 {categories}
-#if defined(__GNUC__) && !defined(_WIN32)
-#pragma GCC visibility push(hidden)
-#endif
-
-typedef struct {{
-    const char *name;
-    const char *unit; /* for messages; empty where there is none */
-    bool enumeration;
-    double minimum;
-    double maximum;
-    double start;
-}} structure_variable;
-
-extern const structure_variable structure_variables[STRUCTURE_VARIABLE_COUNT];
-extern const char *const structure_log_categories[STRUCTURE_LOG_CATEGORIES];
-
-/* Value references of all that can be chosen, in the order of the model. */
-extern const unsigned int structure_chosen_places[STRUCTURE_CHOSEN_COUNT];
-
-/* Value references of what some structures have; STRUCTURE_VARIABLE_COUNT where there is none. */
-extern const unsigned int structure_displacement_bound_place;
-extern const unsigned int structure_release_place;
-extern const unsigned int structure_load_point_place;
-
-#if defined(__GNUC__) && !defined(_WIN32)
-#pragma GCC visibility pop
-#endif
-
-#endif
-"""
+{_DECLARATIONS}"""
 
 
 def _source(table: Sequence[FmuVariable], roles: Roles) -> str:
