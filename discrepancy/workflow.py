@@ -260,8 +260,12 @@ def _given(campaign: Campaign | str | Path, model: Model | str | Path | None) ->
     return campaign, model
 
 
-def checked(campaign: Campaign, model: Model) -> tuple[Campaign, tuple[DataFault, ...]]:
+def checked(
+    campaign: Campaign, model: Model, *, hold_out: bool = True
+) -> tuple[Campaign, tuple[DataFault, ...]]:
     """Return the campaign with outliers marked and trials held out, and what is wrong with it.
+
+    Without `hold_out` only those trials are held out that the campaign marks.
 
     Raises
     ------
@@ -278,7 +282,7 @@ def checked(campaign: Campaign, model: Model) -> tuple[Campaign, tuple[DataFault
     faults = check_data(campaign)
     campaign = mark_outliers(campaign)
     faults = (*faults, *check_against_model(campaign, model))
-    return choose_held_out(campaign), faults
+    return choose_held_out(campaign) if hold_out else campaign, faults
 
 
 def without_wrong_ends(problem: Problem) -> Campaign:

@@ -38,7 +38,7 @@ ROOMS = {
     ),
     "calibration": (
         "errors", "lab_folder", "static", "geometry", "dynamics", "published_strains", "joint",
-        "identification", "virtual_wing", "wing",
+        "identification", "virtual_wing", "samples", "wing", "parameters", "reading",
     ),
     "twin_master": (
         "errors", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library", "mission",
@@ -48,7 +48,7 @@ ROOMS = {
     "discrepancy": (
         "errors", "campaign", "models", "lumped_models", "location", "catalogue", "document_types", "verdict",
         "search_settings", "fits", "search", "judgement", "checks", "sources", "model_choice", "workflow",
-        "files", "self_calibration", "report", "verdict_folder",
+        "parameters", "files", "self_calibration", "report", "verdict_folder",
     ),
 }  # fmt: skip
 

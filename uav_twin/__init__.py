@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same when it runs
-    from calibration.wing.result_file import load_calibration
+    from calibration.reading import load_calibration
     from calibration.wing.three_steps import calibrate_wing as calibrate
     from discrepancy.campaign.reading import read_campaign
     from discrepancy.files.verdict import read_verdict_folder as read_verdict
@@ -83,7 +83,7 @@ _HOMES = {
     "filter_sequence": "twin_master.network.inference",
     "fly": "twin_master.workflow:new_run",
     "investigate": "discrepancy.workflow",
-    "load_calibration": "calibration.wing.result_file",
+    "load_calibration": "calibration.reading",
     "load_design": "fe.wing.design",
     "load_model": "discrepancy.model_choice",
     "load_scenario": "twin_master.scenario.reading",

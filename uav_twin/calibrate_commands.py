@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from reporting import terminal
-from uav_twin import calibrate_simulate, calibrate_steps
+from uav_twin import calibrate_campaign, calibrate_simulate, calibrate_steps
 from uav_twin.calibrate_wing import calibrate_wing
 
 calibrate_app = typer.Typer(no_args_is_help=False)
@@ -56,3 +56,4 @@ calibrate_app.command("geometry")(calibrate_steps.calibrate_geometry)
 calibrate_app.command("ringdown")(calibrate_steps.calibrate_ringdown)
 calibrate_app.command("dynamics")(calibrate_steps.calibrate_dynamics)
 calibrate_app.command("simulate")(calibrate_simulate.calibrate_simulate)
+calibrate_app.command("campaign")(calibrate_campaign.calibrate_campaign)

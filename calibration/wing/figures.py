@@ -18,22 +18,18 @@ from reporting.figures import (
     LEVELS,
     OBSERVED,
     PAST,
-    PRESENT,
     REFERENCE,
     new_figure,
     panel_label,
     publication_style,
 )
 
-from .result import STATE, CalibrationResult, measured_quantities
+from .result import CalibrationResult, measured_quantities
 from .table_1 import SHOWN
 
 Float = NDArray[np.float64]
 
-NOTICEABLE_CORRELATION = 0.3
-"""From which a correlation is printed in colour."""
-
-_AXIS_TITLES = {
+AXIS_TITLES = {
     "young_modulus_factor": "$e$",
     "servo_mass": "servo (g)",
     "pitot_mass": "pitot tube (g)",
@@ -46,94 +42,6 @@ _AXIS_TITLES = {
     "damping_ratio_2": r"$\zeta_2$ (%)",
 }
 _FACES = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
-
-
-def corner_figure(joint: Float, paper: Float) -> Figure:
-    """Draw the joint posterior pair by pair, with its correlations, and the paper's samples beside.
-
-    Parameters
-    ----------
-    joint, paper : (N, 5) array
-        Samples of `STATE`, SI.
-    """
-    names = [entry.name for entry in STATE]
-    scale = np.array([SHOWN[name].scale for name in names])
-    ours, authors = joint * scale, paper * scale
-    correlation: Float = np.asarray(np.corrcoef(joint, rowvar=False))
-    size = len(names)
-    with publication_style():
-        figure = new_figure(height=6.6)
-        grid = figure.add_gridspec(
-            size, size, wspace=0.10, hspace=0.10, left=0.085, right=0.985, bottom=0.075, top=0.985
-        )
-        limits = [_limits(ours[:, index], authors[:, index]) for index in range(size)]
-        for row in range(size):
-            for column in range(size):
-                axes = figure.add_subplot(grid[row, column])
-                if column > row:
-                    _draw_correlation(axes, float(correlation[row, column]))
-                    continue
-                if column == row:
-                    _draw_marginal(axes, ours[:, row], authors[:, row], limits[row])
-                else:
-                    axes.plot(
-                        ours[:, column], ours[:, row], ".", color=PAST, ms=1.6, alpha=0.35, mew=0.0,
-                        rasterized=True,
-                    )  # fmt: skip
-                    axes.plot(authors[:, column], authors[:, row], ".", color=PRESENT, ms=2.0, mew=0.0)
-                    axes.set_ylim(limits[row])
-                axes.set_xlim(limits[column])
-                _outer_labels(axes, names, row, column, size)
-        handles = [
-            Axes.plot(axes, [], [], "s", color=colour, ms=4.0, label=text)[0]
-            for colour, text in ((PAST, "joint posterior"), (PRESENT, "the paper's procedure"))
-        ]
-        figure.legend(handles=handles, loc="upper right", bbox_to_anchor=(0.985, 0.99))
-    return figure
-
-
-def _limits(ours: Float, authors: Float) -> tuple[float, float]:
-    low, high = np.quantile(ours, [0.002, 0.998])
-    low, high = min(low, authors.min()), max(high, authors.max())
-    margin = 0.06 * (high - low) or 1e-3 * abs(high)
-    return float(low - margin), float(high + margin)
-
-
-def _draw_marginal(axes: Axes, ours: Float, authors: Float, limits: tuple[float, float]) -> None:
-    edges = np.linspace(*limits, 31)
-    axes.hist(ours, bins=edges.tolist(), density=True, color=PAST, alpha=0.45, lw=0.0)
-    own, _ = np.histogram(authors, bins=edges, density=True)
-    top = float(np.histogram(ours, bins=edges, density=True)[0].max())
-    if own.max() > 0.0:  # its own scale: the paper's damping has next to no width
-        axes.stairs(own * top / own.max(), edges, color=PRESENT, lw=0.9)
-    axes.set_ylim(0.0, 1.12 * top)
-
-
-def _draw_correlation(axes: Axes, value: float) -> None:
-    axes.set_axis_off()
-    axes.text(
-        0.5, 0.5, f"{value:+.2f}".replace("-", "−"), ha="center", va="center",
-        transform=axes.transAxes, fontsize=6.5 + 5.0 * abs(value),
-        color=PAST if abs(value) > NOTICEABLE_CORRELATION else OBSERVED,
-    )  # fmt: skip
-
-
-def _outer_labels(axes: Axes, names: list[str], row: int, column: int, size: int) -> None:
-    axes.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
-    axes.yaxis.set_major_locator(MaxNLocator(3, prune="both"))
-    axes.ticklabel_format(useOffset=False)
-    axes.tick_params(labelsize=6.5)
-    if row == size - 1:
-        axes.set_xlabel(_AXIS_TITLES[names[column]], parse_math=True)
-    else:
-        axes.set_xticklabels([])
-    if column == 0 and row > 0:
-        axes.set_ylabel(_AXIS_TITLES[names[row]], parse_math=True)
-    elif column != row and column > 0:
-        axes.set_yticklabels([])
-    if column == row:
-        axes.set_yticks([])
-        axes.spines["left"].set_visible(False)
 
 
 def quantities_figure(result: CalibrationResult) -> Figure:
@@ -185,7 +93,7 @@ def _draw_quantity(axes: Axes, result: CalibrationResult, name: str, measured: t
     axes.set_yticks([])
     axes.spines["left"].set_visible(False)
     axes.xaxis.set_major_locator(MaxNLocator(4))
-    axes.set_xlabel(_AXIS_TITLES[name], parse_math=True)
+    axes.set_xlabel(AXIS_TITLES[name], parse_math=True)
 
 
 def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Figure:

@@ -1,19 +1,19 @@
 """The folder that a calibration leaves."""
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from calibration.errors import CalibrationRecordError
+from calibration.samples.file import FILE_NAME
+from calibration.samples.folder import check_folder as check_any_folder
+from calibration.samples.folder import replaced_at_once
 from fe.reduction.fields import WingFields, write_modes_vtu, write_wing_vtu
 from fe.reduction.model_cache import wing_fields
-from reporting.errors import FileNotWrittenError
 from reporting.figures import to_png, to_svg
-from reporting.files import atomic_write_bytes, atomic_write_text, write_error
+from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.progress import Progress
 
 from .report import render_page, report_figures
-from .result_file import FILE_NAME, load_calibration, result_bytes
+from .result_file import load_calibration, result_bytes
 from .table_1 import table_1, write_table_1
 from .three_steps import WingCalibration
 
@@ -42,19 +42,7 @@ def check_folder(folder: Path, asset: str | None = None) -> None:
     FileNotWrittenError
         If it is no folder, or holds the calibration of another wing.
     """
-    if folder.exists() and not folder.is_dir():
-        raise FileNotWrittenError(f"{folder} exists and is no folder: choose another --out.")
-    kept = folder / FILE_NAME
-    if not kept.exists():
-        return
-    try:
-        found = load_calibration(kept).asset
-    except CalibrationRecordError:
-        return  # what cannot be read is of no use to anyone
-    if asset is not None and found != asset:
-        raise FileNotWrittenError(
-            f"{kept} is the calibration of {found}, not of {asset}: choose another --out, one for each wing."
-        )
+    check_any_folder(folder, asset, load_calibration)
 
 
 def write_calibration_folder(
@@ -82,30 +70,16 @@ def write_calibration_folder(
             drawings = {name: to_svg(figure) for name, figure in figures.items()}
             pictures = {name: to_png(figure) for name, figure in figures.items()}
             page = render_page(calibration, drawings)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as scratch:
-            fresh = Path(scratch)
-            for name in drawings:
-                atomic_write_bytes(fresh / "figures" / f"{name}.svg", drawings[name])
-                atomic_write_bytes(fresh / "figures" / f"{name}.png", pictures[name])
-            write_table_1(table_1(calibration), fresh / paths.table.name)
-            if report:
-                _write_fields(calibration, fields, fresh)
-                atomic_write_text(fresh / paths.report.name, page)
-            atomic_write_bytes(fresh / paths.calibration.name, content)
-            _move(fresh, folder, last=paths.calibration.name)
-    except OSError as error:
-        raise write_error(error, folder) from error
+    with replaced_at_once(folder) as fresh:
+        for name in drawings:
+            atomic_write_bytes(fresh / "figures" / f"{name}.svg", drawings[name])
+            atomic_write_bytes(fresh / "figures" / f"{name}.png", pictures[name])
+        write_table_1(table_1(calibration), fresh / paths.table.name)
+        if report:
+            _write_fields(calibration, fields, fresh)
+            atomic_write_text(fresh / paths.report.name, page)
+        atomic_write_bytes(fresh / paths.calibration.name, content)
     return paths
-
-
-def _move(fresh: Path, folder: Path, last: str) -> None:
-    """Move all files into the folder, the calibration itself at the end."""
-    files = sorted(path.relative_to(fresh) for path in fresh.rglob("*") if path.is_file())
-    for name in sorted(files, key=lambda name: (name.name == last, name)):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (fresh / name).replace(folder / name)
 
 
 def _write_fields(calibration: WingCalibration, fields: WingFields, folder: Path) -> None:

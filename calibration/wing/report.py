@@ -6,13 +6,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.dynamics.figures import masses_figure, ring_down_figure
+from calibration.samples.figures import corner_figure
 from calibration.static.figures import calibration_figure, residual_figure
 from calibration.static.report import SOURCE
 from fe.reduction.fields import WingFields
 from reporting.page import Column, Page, Table
 
 from .disagreements import disagreements, misses
-from .figures import corner_figure, modes_figure, quantities_figure
+from .figures import AXIS_TITLES, modes_figure, quantities_figure
 from .result import STATE
 from .steps import CalibrationStep
 from .table_1 import SHOWN, TableRow, printed, signed, signed_number, table_1
@@ -26,6 +27,7 @@ _STEP_TITLES = {1: "Planform", 2: "Load test", 3: "Ring-down"}
 def report_figures(calibration: WingCalibration, fields: WingFields) -> dict[str, Figure]:
     """Draw every figure of the report, by the name of its file."""
     paper = np.column_stack([calibration.paper.young_modulus_factor, calibration.paper.samples])
+    scale = np.array([SHOWN[entry.name].scale for entry in STATE])
     state = calibration.result.mean_state()
     modes = calibration.model.modes(
         state.young_modulus_factor, state.stiffness_loss, state.servo_mass, state.pitot_mass
@@ -40,7 +42,13 @@ def report_figures(calibration: WingCalibration, fields: WingFields) -> dict[str
         "load_test": calibration_figure(calibration.static),
         "residuals": residual_figure(calibration.static),
         "masses": masses_figure(calibration.paper, calibration.lab.authors),
-        "posterior": corner_figure(calibration.joint.samples, paper),
+        "posterior": corner_figure(
+            [AXIS_TITLES[entry.name] for entry in STATE],
+            calibration.joint.samples * scale,
+            paper * scale,
+            ("joint posterior", "the paper's procedure"),
+            math=True,
+        ),
         "modes": modes_figure(fields, modes, titles),
     }
     if calibration.lab.trials is not None:

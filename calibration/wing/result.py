@@ -10,28 +10,22 @@ from numpy.typing import NDArray
 from calibration.errors import CalibrationRecordError
 from calibration.geometry import GeometryCalibration
 from calibration.joint import ModalMeasurement, WeighedMass
+from calibration.samples.record import (
+    CalibratedFigure,
+    SampledCalibration,
+    SampleTable,
+    check_name,
+    frozen_samples,
+)
 from calibration.static.experiments import LoadDisplacementData
-from calibration.static.posterior import Seed, check_count, child_seed
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 
-from .steps import CalibrationStep, deviation
+from .steps import CalibrationStep
 
 Float = NDArray[np.float64]
 Procedure = Literal["joint", "paper"]
 """Which posterior the samples of a calibration are drawn from."""
-
-LONGEST_NAME = 80
-
-
-@dataclass(frozen=True)
-class CalibratedFigure:
-    """Name, unit (SI) and meaning of a calibrated figure."""
-
-    name: str
-    unit: str
-    title: str
-
 
 STATE = (
     CalibratedFigure("young_modulus_factor", "1", "factor on Young's modulus of the skin, e"),
@@ -52,21 +46,6 @@ QUANTITIES = (
 """Quantities of interest, in the order of `CalibrationResult.quantity_samples`."""
 
 
-def check_name(asset: str) -> str:
-    """Return the name of an asset if it can be printed.
-
-    Raises
-    ------
-    CalibrationRecordError
-        If it is empty, too long or holds control characters.
-    """
-    if not (0 < len(asset) <= LONGEST_NAME and asset.isprintable() and asset.strip()):
-        raise CalibrationRecordError(
-            f"the name of the asset must be 1 to {LONGEST_NAME} printable characters, and {asset!r} came."
-        )
-    return asset
-
-
 def measured_quantities(modal: ModalMeasurement) -> dict[str, tuple[float, float]]:
     """Return name of a quantity of interest -> measured value and its standard deviation, SI."""
     return {
@@ -77,7 +56,7 @@ def measured_quantities(modal: ModalMeasurement) -> dict[str, tuple[float, float
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationResult:
+class CalibrationResult(SampledCalibration):
     """Everything that a twin of one wing is tailored with.
 
     Attributes
@@ -140,15 +119,8 @@ class CalibrationResult:
             )
         for name, partner in (("samples", "quantity_samples"), ("prior_samples", "prior_quantity_samples")):
             for which, columns in ((name, STATE), (partner, QUANTITIES)):
-                values = np.array(getattr(self, which), dtype=np.float64, order="C")
-                values.setflags(write=False)
+                values = frozen_samples(which, getattr(self, which), len(columns))
                 object.__setattr__(self, which, values)
-                if values.ndim != 2 or not len(values) or values.shape[1] != len(columns):
-                    raise CalibrationRecordError(
-                        f"{which} must have the shape (N, {len(columns)}), and {values.shape} came."
-                    )
-                if not np.all(np.isfinite(values)):
-                    raise CalibrationRecordError(f"{which} hold a value that is not finite.")
             if len(getattr(self, name)) != len(getattr(self, partner)):
                 raise CalibrationRecordError(f"{partner} must be as many as {name}.")
 
@@ -157,51 +129,15 @@ class CalibrationResult:
         """SHA-256 of the tailored design."""
         return self.design.hash
 
-    def mean(self, name: str) -> float:
-        """Return the posterior mean of a figure of `STATE` or `QUANTITIES`, SI."""
-        return float(np.mean(self.draws_of(name)))
+    @property
+    def calibrated(self) -> SampleTable:
+        """Samples of `STATE`."""
+        return SampleTable(STATE, self.samples, self.prior_samples)
 
-    def standard_deviation(self, name: str) -> float:
-        """Return the posterior standard deviation of a figure of `STATE` or `QUANTITIES`, SI."""
-        return deviation(self.draws_of(name))
-
-    def draws_of(self, name: str, *, prior: bool = False) -> Float:
-        """Return all samples of one figure; (N,), SI.
-
-        Raises
-        ------
-        CalibrationRecordError
-            If the calibration has no figure of this name.
-        """
-        for columns, values in (
-            (STATE, self.prior_samples if prior else self.samples),
-            (QUANTITIES, self.prior_quantity_samples if prior else self.quantity_samples),
-        ):
-            for index, quantity in enumerate(columns):
-                if quantity.name == name:
-                    return values[:, index]
-        known = ", ".join(quantity.name for quantity in (*STATE, *QUANTITIES))
-        raise CalibrationRecordError(
-            f"the calibration of {self.asset} has no samples of `{name}`; it has {known}."
-        )
-
-    def stratified_draws(self, name: str, count: int, seed: Seed) -> Float:
-        """Return `count` draws of one figure from its samples; (count,), SI.
-
-        One from each of `count` strata of equal probability, in shuffled order: means of functions of this
-        figure scatter far less than with independent draws.
-
-        Raises
-        ------
-        CalibrationRecordError
-            If the calibration has no figure of this name, or `count` is not 1 to `MOST_SAMPLES`.
-        """
-        values = np.sort(self.draws_of(name))
-        check_count(count, CalibrationRecordError)
-        generator = np.random.default_rng(child_seed(seed, 0))
-        probability = (np.arange(count) + generator.random(count)) / count
-        drawn = values[np.minimum((probability * len(values)).astype(np.int64), len(values) - 1)]
-        return generator.permutation(drawn)
+    @property
+    def derived(self) -> SampleTable:
+        """Samples of `QUANTITIES`."""
+        return SampleTable(QUANTITIES, self.quantity_samples, self.prior_quantity_samples)
 
     def mean_state(self) -> DigitalState:
         """Return the digital state at the posterior mean, healthy."""

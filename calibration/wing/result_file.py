@@ -4,7 +4,6 @@ Groups `prior`, `posterior`, `geometry`, `quantity_of_interest` and `measured` h
 units; the root's attributes hold the name of the wing, the tailored design, the steps and the provenance.
 """
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -13,29 +12,35 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError, CalibrationRecordError
 from calibration.geometry import LENGTH_NAMES, GeometryCalibration, MeasuredLength
 from calibration.joint import ModalMeasurement, WeighedMass
+from calibration.samples.file import (
+    PRIOR_SAMPLE,
+    SAMPLE,
+    check_content,
+    check_schema,
+    file_bytes,
+    json_text,
+    read_file,
+    samples_dataset,
+    samples_of,
+    variable,
+)
 from calibration.static.experiments import LoadDisplacementData
 from fe.runtime.errors import InvalidDesignError
 from fe.wing.design import parse_design
-from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
-from reporting.netcdf import read_groups
 from reporting.record_json import record_of
 
-from .result import QUANTITIES, STATE, CalibratedFigure, CalibrationResult
+from .result import QUANTITIES, STATE, CalibrationResult
 from .steps import CalibrationStep
 
 SCHEMA = "uav-twin wing calibration 1"
 """Value of the attribute `schema` of the root."""
 
-FILE_NAME = "calibration.nc"
-
 _MODES = ("first", "second")
-_SAMPLE, _PRIOR_SAMPLE = "sample", "prior_sample"
 
 
 def save_calibration(result: CalibrationResult, path: Path | str) -> Path:
@@ -51,8 +56,7 @@ def save_calibration(result: CalibrationResult, path: Path | str) -> Path:
 
 def result_bytes(result: CalibrationResult) -> bytes:
     """Return the content of the file of a calibration."""
-    tree = _tree(result)
-    return bytes(tree.to_netcdf(engine="h5netcdf"))
+    return file_bytes(*_content(result))
 
 
 def load_calibration(path: Path | str) -> CalibrationResult:
@@ -64,28 +68,10 @@ def load_calibration(path: Path | str) -> CalibrationResult:
         If the file is missing, damaged, cut off, of another kind or of another schema; one sentence.
     """
     path = Path(path)
-    if not path.is_file():
-        raise CalibrationRecordError(
-            f"{path} is {'no file' if path.exists() else 'not there'}; give the {FILE_NAME} that "
-            "`uav-twin calibrate --out DIR` leaves."
-        )
+    groups, root = read_file(path)
+    check_schema(path, root, SCHEMA)
     try:
-        tree = read_groups(path)
-    except DamagedFileError as error:
-        raise CalibrationRecordError(
-            f"{path} is damaged or no calibration file: it cannot be read as NetCDF; calibrate again."
-        ) from error
-    groups = {name: tree[name].to_dataset() for name in tree.children}
-    root = {str(name): value for name, value in tree.attrs.items()}
-    if root.get("schema") != SCHEMA:
-        came = root.get("schema")
-        raise CalibrationRecordError(
-            f"{path} is {'of the schema ' + repr(str(came)) if came else 'no calibration file'}, but "
-            f"{SCHEMA!r} is needed; calibrate again with this version."
-        )
-    try:
-        if root["content_sha256"] != _content_hash(groups, root):
-            raise CalibrationRecordError("its content does not match its hash")
+        check_content(groups, root)
         return _result(groups, root)
     except (CalibrationError, InvalidDesignError) as error:
         reason = str(error).rstrip(".")
@@ -94,18 +80,18 @@ def load_calibration(path: Path | str) -> CalibrationResult:
     raise CalibrationRecordError(f"{path} is damaged ({reason}); calibrate again.")
 
 
-def _tree(result: CalibrationResult) -> xr.DataTree:
+def _content(result: CalibrationResult) -> tuple[dict[str, xr.Dataset], dict[str, Any]]:
     groups = {
-        "prior": _samples(STATE, result.prior_samples, _PRIOR_SAMPLE, "prior sample of the "),
-        "posterior": _samples(STATE, result.samples, _SAMPLE, "posterior sample of the "),
+        "prior": samples_dataset(STATE, result.prior_samples, PRIOR_SAMPLE, "prior sample of the "),
+        "posterior": samples_dataset(STATE, result.samples, SAMPLE, "posterior sample of the "),
         "geometry": _geometry(result.geometry),
         "quantity_of_interest": xr.merge(
             [
-                _samples(QUANTITIES, result.quantity_samples, _SAMPLE, "at the posterior samples, "),
-                _samples(
+                samples_dataset(QUANTITIES, result.quantity_samples, SAMPLE, "at the posterior samples, "),
+                samples_dataset(
                     QUANTITIES,
                     result.prior_quantity_samples,
-                    _PRIOR_SAMPLE,
+                    PRIOR_SAMPLE,
                     "at the prior samples, ",
                     "prior_",
                 ),
@@ -120,61 +106,14 @@ def _tree(result: CalibrationResult) -> xr.DataTree:
         "procedure": result.procedure,
         "seed": result.seed,
         "design_hash": result.design_hash,
-        "design": _json(result.design.model_dump(mode="json")),
+        "design": json_text(result.design.model_dump(mode="json")),
         "geometry_source": result.geometry.source,
         "load_test_source": result.pairs.source,
         "ring_down_source": result.modal.source,
-        "steps": _json([asdict(step) for step in result.steps]),
-        "provenance": _json(dict(result.provenance)),
+        "steps": json_text([asdict(step) for step in result.steps]),
+        "provenance": json_text(dict(result.provenance)),
     }
-    root["content_sha256"] = _content_hash(groups, root)
-    return xr.DataTree.from_dict({"/": xr.Dataset(attrs=root), **groups})
-
-
-def _json(content: object) -> str:
-    return json.dumps(content, sort_keys=True, ensure_ascii=False)
-
-
-def _content_hash(groups: Mapping[str, xr.Dataset], root: Mapping[str, Any]) -> str:
-    """Return a hash of all values and attributes, so that a flipped bit does not pass as a calibration."""
-    digest = hashlib.sha256()
-    for name in sorted(set(root) - {"content_sha256"}):
-        digest.update(f"{name}\0{root[name]}\0".encode())
-    for group in sorted(groups):
-        dataset = groups[group]
-        for name in sorted(str(name) for name in dataset.variables):
-            values = dataset.variables[name].values
-            kind = "f" if values.dtype.kind == "f" else "i" if values.dtype.kind in "iu" else "s"
-            digest.update(f"{group}/{name}\0{values.shape}\0{kind}\0".encode())
-            if kind == "s":
-                digest.update("\0".join(str(value) for value in values.ravel()).encode())
-            else:
-                digest.update(np.ascontiguousarray(values, "<f8" if kind == "f" else "<i8").tobytes())
-            digest.update(_json({key: str(dataset[name].attrs[key]) for key in dataset[name].attrs}).encode())
-    return digest.hexdigest()
-
-
-def _variable(
-    dimension: str, values: object, unit: str, title: str
-) -> tuple[str, NDArray[Any], dict[str, str]]:
-    return dimension, np.asarray(values), {"units": unit, "long_name": title}
-
-
-def _samples(
-    columns: tuple[CalibratedFigure, ...],
-    values: NDArray[np.float64],
-    dimension: str,
-    before: str,
-    prefix: str = "",
-) -> xr.Dataset:
-    return xr.Dataset(
-        {
-            prefix + quantity.name: _variable(
-                dimension, values[:, index], quantity.unit, before + quantity.title
-            )
-            for index, quantity in enumerate(columns)
-        }
-    )
+    return groups, root
 
 
 _LENGTH_FIGURES = {
@@ -188,12 +127,12 @@ _LENGTH_FIGURES = {
 def _geometry(geometry: GeometryCalibration) -> xr.Dataset:
     lengths = geometry.lengths
     table = {
-        name: _variable("length", [getattr(length, name) for length in lengths], "m", title)
+        name: variable("length", [getattr(length, name) for length in lengths], "m", title)
         for name, title in _LENGTH_FIGURES.items()
     }
     posterior = [length.posterior for length in lengths]
-    table["mean"] = _variable("length", [item.mean for item in posterior], "m", "posterior mean")
-    table["standard_deviation"] = _variable(
+    table["mean"] = variable("length", [item.mean for item in posterior], "m", "posterior mean")
+    table["standard_deviation"] = variable(
         "length", [item.standard_deviation for item in posterior], "m", "posterior standard deviation"
     )
     return xr.Dataset(table, coords={"length": list(LENGTH_NAMES)})
@@ -202,13 +141,13 @@ def _geometry(geometry: GeometryCalibration) -> xr.Dataset:
 def _measured(result: CalibrationResult) -> xr.Dataset:
     pairs, modal = result.pairs, result.modal
     table: dict[str, tuple[Any, Any, dict[str, str]]] = {
-        "load": _variable("pair", pairs.load, "N", "tip load"),
-        "displacement": _variable("pair", pairs.displacement, "m", "tip displacement"),
-        "run": _variable("pair", pairs.run.astype(np.int64), "1", "loading run, from 0"),
-        "load_standard_deviation": _variable(
+        "load": variable("pair", pairs.load, "N", "tip load"),
+        "displacement": variable("pair", pairs.displacement, "m", "tip displacement"),
+        "run": variable("pair", pairs.run.astype(np.int64), "1", "loading run, from 0"),
+        "load_standard_deviation": variable(
             "pair", np.full(pairs.count, pairs.load_standard_deviation), "N", "of a reading"
         ),
-        "displacement_standard_deviation": _variable(
+        "displacement_standard_deviation": variable(
             "pair", np.full(pairs.count, pairs.displacement_standard_deviation), "m", "of a reading"
         ),
     }
@@ -225,9 +164,9 @@ def _measured(result: CalibrationResult) -> xr.Dataset:
     )
     for name, unit in (("frequency", "Hz"), ("damping_ratio", "1")):
         title = name.replace("_", " ")
-        table[name] = _variable("mode", getattr(modal, name), unit, f"{title} of a flapwise bending mode")
+        table[name] = variable("mode", getattr(modal, name), unit, f"{title} of a flapwise bending mode")
         deviation = getattr(modal, f"{name}_standard_deviation")
-        table[f"{name}_standard_deviation"] = _variable("mode", deviation, unit, f"of the measured {title}")
+        table[f"{name}_standard_deviation"] = variable("mode", deviation, unit, f"of the measured {title}")
     return xr.Dataset(table, coords={"mode": list(_MODES)})
 
 
@@ -246,10 +185,10 @@ def _result(groups: Mapping[str, xr.Dataset], root: Mapping[str, Any]) -> Calibr
         design=design,
         geometry=GeometryCalibration(span, root_chord, tip_chord, source=str(root["geometry_source"])),
         procedure=root["procedure"],
-        samples=_columns(groups["posterior"], STATE),
-        prior_samples=_columns(groups["prior"], STATE),
-        quantity_samples=_columns(quantities, QUANTITIES),
-        prior_quantity_samples=_columns(quantities, QUANTITIES, "prior_"),
+        samples=samples_of(groups["posterior"], STATE),
+        prior_samples=samples_of(groups["prior"], STATE),
+        quantity_samples=samples_of(quantities, QUANTITIES),
+        prior_quantity_samples=samples_of(quantities, QUANTITIES, "prior_"),
         pairs=LoadDisplacementData(
             load=measured["load"].values,
             displacement=measured["displacement"].values,
@@ -272,12 +211,6 @@ def _result(groups: Mapping[str, xr.Dataset], root: Mapping[str, Any]) -> Calibr
         seed=int(root["seed"]),
         provenance=json.loads(root["provenance"]),
     )
-
-
-def _columns(
-    dataset: xr.Dataset, columns: tuple[CalibratedFigure, ...], prefix: str = ""
-) -> NDArray[np.float64]:
-    return np.column_stack([dataset[prefix + quantity.name].values for quantity in columns])
 
 
 def _pair(variable: xr.DataArray) -> tuple[float, float]:

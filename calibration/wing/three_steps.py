@@ -18,6 +18,7 @@ from calibration.joint import (
     modal_measurement,
     published_modal_measurement,
 )
+from calibration.samples.record import check_name
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import child_seed
 from calibration.static.record import StaticCalibration
@@ -35,7 +36,6 @@ from .result import (
     STATE,
     CalibrationResult,
     Procedure,
-    check_name,
     measured_quantities,
 )
 from .result_file import save_calibration

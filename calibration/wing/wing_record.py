@@ -5,11 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy.stats import gaussian_kde
-
-from calibration.wing.result import QUANTITIES, STATE, CalibratedFigure, CalibrationResult
+from calibration.samples.moments import drawn_record, moments, sampled_record
+from calibration.wing.result import STATE, CalibrationResult
 from calibration.wing.result_file import result_bytes
 from fe.runtime.state import DigitalState
 from reporting.provenance import hash_bytes
@@ -18,8 +15,6 @@ RESOURCE_NAME = "calibration.json"
 """The file among the FMU's resources that says what the wing was calibrated with."""
 
 SCHEMA = "uav-twin calibrated wing 1"
-
-_GRID_POINTS = 401
 
 
 @dataclass(frozen=True)
@@ -70,12 +65,7 @@ def calibrated_wing(calibration: CalibrationResult) -> dict[str, Any]:
         "samples": len(calibration.samples),
         "design_hash": calibration.design_hash,
         "calibration_sha256": hash_bytes(result_bytes(calibration)),
-        "state": _figures(STATE, calibration.samples),
-        "quantities": _figures(QUANTITIES, calibration.quantity_samples),
-        "correlation": {
-            "names": [entry.name for entry in STATE],
-            "matrix": _correlation(calibration.samples).tolist(),
-        },
+        **sampled_record(calibration),
         "geometry_m": {
             length.name: {
                 "mean": length.posterior.mean,
@@ -94,54 +84,13 @@ def calibrated_wing(calibration: CalibrationResult) -> dict[str, Any]:
 def run_record(calibration: CalibrationResult, parameter: str) -> dict[str, Any]:
     """Return what `calibration.json` of a run folder holds: the wing, and the parameter drawn by the twin."""
     stiffness = calibration.draws_of("tip_stiffness")
-    prior = calibration.draws_of(parameter, prior=True)
     return {
         **calibrated_wing(calibration),
-        "parameter": parameter,
-        "prior": _moments(prior),
-        "posterior": _density(calibration.draws_of(parameter)),
-        "tip_stiffness": {"unit": "N/m", **_moments(stiffness)},
+        **drawn_record(calibration, parameter),
+        "tip_stiffness": {"unit": "N/m", **moments(stiffness)},
         "data": {
             "source": calibration.pairs.source,
             "load_N": calibration.pairs.load.tolist(),
             "displacement_m": calibration.pairs.displacement.tolist(),
         },
     }
-
-
-def _moments(values: NDArray[np.float64]) -> dict[str, float]:
-    deviation = float(values.std(ddof=1)) if values.size > 1 else 0.0
-    return {"mean": float(values.mean()), "standard_deviation": deviation}
-
-
-def _figures(
-    columns: tuple[CalibratedFigure, ...], values: NDArray[np.float64]
-) -> dict[str, Mapping[str, Any]]:
-    return {
-        entry.name: {
-            "title": entry.title,
-            "unit": entry.unit,
-            **_moments(values[:, index]),
-            "interval_95": np.quantile(values[:, index], [0.025, 0.975]).tolist(),
-        }
-        for index, entry in enumerate(columns)
-    }
-
-
-def _correlation(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the correlation matrix; a figure that does not vary is correlated with itself alone."""
-    centred = values - values.mean(axis=0)
-    norm = np.linalg.norm(centred, axis=0)
-    scaled = centred / np.where(norm > 0.0, norm, 1.0)
-    matrix = np.clip(scaled.T @ scaled, -1.0, 1.0)
-    np.fill_diagonal(matrix, 1.0)
-    return np.asarray(matrix)
-
-
-def _density(values: NDArray[np.float64]) -> dict[str, list[float]]:
-    """Return a Gaussian kernel density of samples; nothing if they do not vary."""
-    spread = float(values.std())
-    if spread <= 1e-12 * abs(float(values.mean())):
-        return {}
-    grid = np.linspace(values.min() - spread, values.max() + spread, _GRID_POINTS)
-    return {"grid": grid.tolist(), "density": gaussian_kde(values)(grid).tolist()}

@@ -1,0 +1,108 @@
+"""What has to be said beside the posterior of parameters, a sentence each."""
+
+import numpy as np
+
+from calibration.parameters.result import ParameterPrior
+from calibration.samples.moments import correlation
+from discrepancy.checks.fault import DataFault, FaultKind
+from discrepancy.checks.observability import LEFT
+from discrepancy.parameters.posterior import ParameterPosterior
+from discrepancy.verdict import Gate
+
+FAR = 3.0
+"""Prior deviations from which on a posterior mean is remarked on."""
+TIED = 0.95
+"""Correlation from which on two parameters are told together rather than one by one."""
+EDGE = 0.02
+"""Share of a posterior beyond the model's range from which on it is remarked on."""
+
+
+def findings(
+    priors: tuple[ParameterPrior, ...],
+    posterior: ParameterPosterior,
+    gate: Gate,
+    faults: tuple[DataFault, ...],
+    remarks: tuple[str, ...],
+) -> tuple[str, ...]:
+    """Return all sentences: what disagrees first, then what the campaign does not tell, then remarks."""
+    said: list[str] = []
+    if gate.passed is False:
+        said.append(
+            f"The campaign is not explained by these parameters: {gate.reason[0].lower()}{gate.reason[1:]} "
+            "The posterior is too narrow, and may be of the wrong thing; `uav-twin discrepancy run` on the "
+            "same campaign and model looks for what is missing."
+        )
+    elif gate.passed is None:
+        said.append(gate.reason)
+    said += _disagreements(priors, posterior)
+    said += _untold(priors, posterior)
+    said += [fault.sentence for fault in faults if fault.kind is not FaultKind.UNOBSERVABLE]
+    said += [text for text in remarks if text not in said]
+    return tuple(said)
+
+
+def _disagreements(priors: tuple[ParameterPrior, ...], posterior: ParameterPosterior) -> list[str]:
+    said = []
+    draws, marginal = posterior.draws, posterior.marginal
+    means = draws.mean(axis=0)
+    for at, prior in enumerate(priors):
+        if abs(means[at]) > FAR:
+            side = "above" if means[at] > 0.0 else "below"
+            said.append(
+                f"{prior.name} comes out {abs(means[at]):.1f} prior deviations {side} what {prior.stated_by} "
+                "states: the prior is wrong, or the parameter stands for something that the model lacks."
+            )
+    if posterior.cut > EDGE:
+        best = posterior.optima[0].point.shared[marginal.free]
+        deviation = np.sqrt(np.diag(posterior.optima[0].covariance)[marginal.free])
+        room = np.minimum(best - marginal.low, marginal.high - best) / np.maximum(deviation, 1e-12)
+        at = int(np.argmin(room))
+        said.append(
+            f"The posterior of {priors[at].name} reaches the end of its range, {priors[at].low:g} to "
+            f"{priors[at].high:g}, and is cut off there: widen the range if the model holds beyond it."
+        )
+    if len(posterior.optima) > 1:
+        evidence = np.array([item.log_evidence for item in posterior.optima])
+        weight = np.exp(evidence - evidence.max())
+        names = [prior.name for prior in priors]
+        places = " and ".join(
+            f"{', '.join(f'{name} = {value:.4g}' for name, value in zip(names, values, strict=True))} "
+            f"({share:.0%})"
+            for values, share in zip(
+                [marginal.values(item.point.shared[marginal.free]) for item in posterior.optima],
+                (weight / weight.sum()).tolist(),
+                strict=True,
+            )
+        )
+        said.append(
+            f"The posterior has {len(posterior.optima)} maxima: {places}; the campaign does not tell which, "
+            "and the mean lies between them."
+        )
+    if not posterior.optima[0].converged:
+        said.append(
+            "The fit had not settled when it ended: the samples may be off; state the priors narrower."
+        )
+    return said
+
+
+def _untold(priors: tuple[ParameterPrior, ...], posterior: ParameterPosterior) -> list[str]:
+    said = []
+    draws = posterior.draws
+    kept = draws.std(axis=0, ddof=1)
+    for prior, share in zip(priors, kept.tolist(), strict=True):
+        if share > LEFT:
+            said.append(
+                f"The campaign does not tell {prior.name}: {min(share, 1.0):.0%} of its prior deviation is "
+                "left, and what is believed of it is the prior."
+            )
+    if len(priors) > 1:
+        matrix = correlation(draws)
+        for first in range(len(priors)):
+            for second in range(first + 1, len(priors)):
+                if abs(matrix[first, second]) > TIED:
+                    said.append(
+                        f"{priors[first].name} and {priors[second].name} are told together and hardly apart "
+                        f"(correlation {matrix[first, second]:+.3f}): fly with samples of both, or measure "
+                        "where they act differently."
+                    )
+    return said

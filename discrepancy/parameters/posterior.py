@@ -1,0 +1,225 @@
+"""Samples of the posterior of a model's parameters: by quadrature, of a checked Gaussian, or drawn."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import Akima1DInterpolator
+
+from calibration.parameters.result import Procedure
+from discrepancy.errors import FitError, ModelError
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.problem import Problem
+from discrepancy.parameters.marginal import Marginal
+
+FloatArray = NDArray[np.float64]
+
+REACH, NEAR, WIDE, BETWEEN = 6.0, 9, 17, 40
+"""Quadrature: deviations of the prior to either side, nodes within three deviations of an optimum, nodes over
+the whole prior, and points of the density between two nodes."""
+LARGEST_MASS, MOST_NODES = 0.04, 90
+"""Nodes are added until no interval between two holds more of the posterior than this."""
+CHECKED = ((1.0, 0.12), (2.0, 0.5))
+"""The posterior is a Gaussian if its energy, so many deviations from the optimum along each principal
+direction, is that of one within so many nats."""
+CUT = 0.01
+"""Share of a Gaussian beyond the model's range from which on it is drawn otherwise."""
+EMPTY = 700.0
+"""Energy [nat] above the least where nothing is left of a density."""
+LEAST_SPREAD = 1e-9
+"""Nodes closer together than this share of the grid are one."""
+
+
+@dataclass(frozen=True)
+class ParameterPosterior:
+    """What the campaign says of the parameters.
+
+    Attributes
+    ----------
+    procedure : Procedure
+        How `draws` were made.
+    draws : (N, P) ndarray
+        Equally weighted scaled parameters.
+    optima : tuple of CandidateFit
+        Maxima that tell, the most probable first.
+    marginal : Marginal
+        The density.
+    cut : float
+        Share of the Gaussian at the best optimum that lies beyond the model's range [1].
+    """
+
+    procedure: Procedure
+    draws: FloatArray
+    optima: tuple[CandidateFit, ...]
+    marginal: Marginal
+    cut: float
+
+
+def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPosterior:
+    """Return `count` draws of the posterior of a problem's parameters.
+
+    One parameter is integrated by quadrature. Of several the Gaussian at the optimum is taken where the
+    energy along its principal axes is that of a Gaussian; else the parameter that is told least is
+    integrated by quadrature, the others being Gaussian given it (a nested Laplace approximation, Rue,
+    Martino and Chopin 2009, J. R. Statist. Soc. B 71 (2)). Where several optima tell, each has its Gaussian,
+    weighed by its Laplace evidence.
+
+    Raises
+    ------
+    FitError, ModelError
+        If the model fails at its prior mean.
+    """
+    marginal = Marginal(problem)
+    optima = tuple(marginal.optima(seed))
+    generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
+    free = marginal.free
+    centres = [item.point.shared[free] for item in optima]
+    spreads = [item.covariance[np.ix_(free, free)] for item in optima]
+    trial = generator.multivariate_normal(centres[0], spreads[0], 4000, method="cholesky")
+    cut = float(np.mean(~_inside(marginal, trial)))
+    procedure: Procedure
+    if len(free) > 1 and len(optima) > 1:
+        procedure = "several optima"
+        evidence = np.array([item.log_evidence for item in optima])
+        weight = np.exp(evidence - evidence.max())
+        chosen = generator.choice(len(optima), count, p=weight / weight.sum())
+        draws = np.concatenate(
+            [
+                _gaussian(marginal, centre, spread, int(np.sum(chosen == at)), generator)
+                for at, (centre, spread) in enumerate(zip(centres, spreads, strict=True))
+            ]
+        )
+        draws = generator.permutation(draws)
+    elif len(free) > 1 and cut < CUT and is_gaussian(marginal, centres[0], spreads[0]):
+        procedure = "Gaussian"
+        draws = _gaussian(marginal, centres[0], spreads[0], count, generator)
+    else:
+        procedure = "quadrature"
+        draws = _along_the_widest(marginal, optima, count, generator)
+    return ParameterPosterior(procedure, draws, optima, marginal, cut)
+
+
+def is_gaussian(marginal: Marginal, centre: FloatArray, covariance: FloatArray) -> bool:
+    """Return whether the energy rises along the principal axes as that of a Gaussian does."""
+    least = marginal(centre)
+    for axis in _axes(covariance).T:
+        for size, allowed in CHECKED:
+            for side in (-1.0, 1.0):
+                rise = marginal(centre + side * size * axis) - least
+                if not abs(rise - 0.5 * size**2) < allowed:
+                    return False
+    return True
+
+
+def _axes(covariance: FloatArray) -> FloatArray:
+    spread, directions = np.linalg.eigh(covariance)
+    return np.asarray(directions * np.sqrt(np.maximum(spread, 0.0)))
+
+
+def _inside(marginal: Marginal, u: FloatArray) -> NDArray[np.bool_]:
+    return np.asarray(np.all((u >= marginal.low) & (u <= marginal.high), axis=-1))
+
+
+def _gaussian(
+    marginal: Marginal, centre: FloatArray, covariance: FloatArray, count: int, generator: np.random.Generator
+) -> FloatArray:
+    """Return draws (count, P) of a Gaussian, cut off at the model's range."""
+    kept: list[FloatArray] = [np.empty((0, len(centre)))]
+    while sum(map(len, kept)) < count:
+        drawn = generator.multivariate_normal(centre, covariance, count, method="cholesky")
+        inside = drawn[_inside(marginal, drawn)]
+        kept.append(inside if len(inside) else np.clip(drawn[:1], marginal.low, marginal.high))
+    return np.concatenate(kept)[:count]
+
+
+def _along_the_widest(
+    marginal: Marginal, optima: tuple[CandidateFit, ...], count: int, generator: np.random.Generator
+) -> FloatArray:
+    """Return draws (count, P): the parameter that is told least by quadrature, the others given it."""
+    free = marginal.free
+    deviations = np.sqrt(np.diag(optima[0].covariance)[free])
+    widest = int(np.argmax(deviations))
+    low, high = max(float(marginal.low[widest]), -REACH), min(float(marginal.high[widest]), REACH)
+    places = [np.linspace(low, high, WIDE)]
+    for item in optima:
+        deviation = float(np.sqrt(np.diag(item.covariance)[free][widest]))
+        near = float(item.point.shared[free][widest]) + deviation * np.linspace(-3.0, 3.0, NEAR)
+        places.append(np.clip(near, marginal.low[widest], marginal.high[widest]))
+    nodes = np.unique(np.concatenate(places))
+    nodes = nodes[np.concatenate(([True], np.diff(nodes) > LEAST_SPREAD * (nodes[-1] - nodes[0])))]
+    slices = Slices(marginal, widest, optima[0])
+    slices.visit(nodes)
+    fine, mass = slices.mass()
+    while len(slices.nodes) < MOST_NODES:
+        shares = np.diff(mass[::BETWEEN])
+        largest = int(np.argmax(shares))
+        if shares[largest] <= LARGEST_MASS:
+            break
+        slices.visit(np.array([0.5 * (slices.nodes[largest] + slices.nodes[largest + 1])]))
+        fine, mass = slices.mass()
+    strata = (np.arange(count) + generator.random(count)) / count
+    return slices.others(generator.permutation(np.interp(strata, mass, fine)), generator)
+
+
+class Slices:
+    """The posterior at fixed values of one parameter, the others fitted and integrated with the nuisances."""
+
+    def __init__(self, marginal: Marginal, index: int, best: CandidateFit) -> None:
+        self._marginal, self._index, self._best = marginal, index, best
+        self._fits: dict[float, CandidateFit | None] = {}
+        self.nodes = np.empty(0)
+
+    def visit(self, nodes: FloatArray) -> None:
+        """Fit at further nodes, each from what was found beside it, the optimum first."""
+        marginal, index = self._marginal, self._index
+        free, best = marginal.free, self._best.point
+        fixed = np.arange(len(free)) == index
+        centre = float(best.shared[free][index])
+        known = {centre: best} | {u: item.point for u, item in self._fits.items() if item is not None}
+        for node in sorted(nodes.tolist(), key=lambda node: abs(node - centre)):
+            near = known[min(known, key=lambda place: abs(place - node))]
+            u = np.zeros(len(free))
+            u[index] = node
+            try:
+                found = marginal.fitted(u, fixed=fixed, near=near)
+            except (FitError, ModelError):
+                self._fits[node] = None
+                continue
+            self._fits[node] = found
+            known[node] = found.point
+        self.nodes = np.array(sorted(self._fits))
+
+    def mass(self) -> tuple[FloatArray, FloatArray]:
+        """Return points and the posterior's distribution function at them, `BETWEEN` to an interval."""
+        nodes = self.nodes
+        energy = np.full(len(nodes), np.inf)
+        for at, node in enumerate(nodes.tolist()):
+            if (found := self._fits[node]) is not None:
+                energy[at] = 0.5 * node**2 - found.log_evidence
+        energy = np.minimum(energy - energy.min(), EMPTY)
+        share = np.linspace(0.0, 1.0, BETWEEN, endpoint=False)
+        fine = np.append((nodes[:-1, None] + np.diff(nodes)[:, None] * share).ravel(), nodes[-1])
+        density = np.exp(-Akima1DInterpolator(nodes, energy)(fine))
+        mass = np.concatenate(([0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))))
+        return fine, mass / mass[-1]
+
+    def others(self, values: FloatArray, generator: np.random.Generator) -> FloatArray:
+        """Return draws (N, P) of all parameters given the one, cut off at the model's range."""
+        marginal, free = self._marginal, self._marginal.free
+        draws = np.zeros((len(values), len(free)))
+        rest = np.flatnonzero(np.arange(len(free)) != self._index)
+        draws[:, self._index] = values
+        if not len(rest):
+            return draws
+        found = {node: item for node, item in self._fits.items() if item is not None}
+        nodes = np.array(sorted(found))
+        centres = np.array([found[node].point.shared[free][rest] for node in nodes.tolist()])
+        drawn = Akima1DInterpolator(nodes, centres)(np.clip(values, nodes[0], nodes[-1]))
+        nearest = np.abs(values[:, None] - nodes).argmin(axis=1)
+        for at, node in enumerate(nodes.tolist()):
+            rows = np.flatnonzero(nearest == at)
+            block = found[node].covariance[np.ix_(free, free)][np.ix_(rest, rest)]
+            shift = generator.multivariate_normal(np.zeros(len(rest)), block, len(rows), method="cholesky")
+            drawn[rows] += shift
+        draws[:, rest] = np.clip(drawn, marginal.low[rest], marginal.high[rest])
+        return draws

@@ -1,0 +1,307 @@
+"""The posterior of a model's parameters beside closed forms, dense integration and known truths."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calibration.errors import CalibrationRecordError
+from calibration.parameters.result import ParameterCalibration
+from calibration.parameters.result_file import load_parameters, result_bytes
+from calibration.reading import load_calibration
+from calibration.samples.file import FILE_NAME
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.records import Campaign, Quantity, Trial
+from discrepancy.errors import CampaignDataError, ModelError
+from discrepancy.model_choice import ModelChoice, ModelKind
+from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
+from discrepancy.parameters.calibration import calibrate_parameters
+from fe.runtime.patch import ModelPatch, Primitive
+
+Float = NDArray[np.float64]
+
+FORCE = np.array([10.0, 20.0, 30.0, 40.0, 50.0, 60.0])
+NOISE = 0.02
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A model at rest whose only output is any function of force and parameters."""
+
+    law: Callable[[Float, Float], Float]
+    parameters: tuple[ModelParameter, ...]
+    name: str = "curve"
+
+    def output_quantity(self, output: str) -> Quantity | None:
+        return Quantity.DISPLACEMENT if output == "y" else None
+
+    def supports(self, primitive: type[Primitive]) -> bool:
+        return False
+
+    def ports(self) -> tuple[str, ...]:
+        return ()
+
+    def stations(self) -> tuple[float, float] | None:
+        return None
+
+    def scales(self, campaign: Campaign) -> Scales:
+        ports: Mapping[str, PortScale] = {}
+        return Scales(1.0, 1.0, 1.0, 1.0, 60.0, 0.0, 1.0, 1.0, ports)
+
+    def respond(
+        self,
+        trial: Trial,
+        outputs: tuple[tuple[str, Quantity], ...],
+        patch: ModelPatch,
+        conditions: Conditions,
+        *,
+        components: bool = False,
+        refinement: int = 1,
+    ) -> Response:
+        values = self.law(trial.force, conditions.parameters)
+        return Response(np.tile(values[:, np.newaxis], (1, len(outputs))))
+
+
+def choice_of(
+    law: Callable[[Float, Float], Float], *priors: tuple[float, float, float, float]
+) -> ModelChoice:
+    """Return a curve whose parameters p1, p2, ... have mean, deviation, low, high."""
+    parameters = tuple(
+        ModelParameter(f"p{number}", mean, deviation, "1", low, high)
+        for number, (mean, deviation, low, high) in enumerate(priors, start=1)
+    )
+    return ModelChoice(Curve(law, parameters), ModelKind.LUMPED, "curve.toml", "0" * 64)
+
+
+def campaign_of(folder: Path, values: Float, *, freedom: int | None = None, more: str = "") -> Campaign:
+    """Return static readings in metres at `FORCE`, one row of values for each trial."""
+    folder.mkdir(parents=True, exist_ok=True)
+    known = "" if freedom is None else f", degrees_of_freedom = {freedom}"
+    text = (
+        'format = 1\nname = "bench"\n[[channel]]\nname = "y"\nquantity = "displacement"\nunit = "m"\n'
+        f"noise = {{ standard_deviation = {NOISE}{known} }}\n{more}\n"
+    )
+    for number, row in enumerate(np.atleast_2d(values)):
+        rows = zip(FORCE.tolist(), row.tolist(), strict=True)
+        (folder / f"t{number}.csv").write_text(
+            "force,y\n" + "".join(f"{force!r},{value!r}\n" for force, value in rows)
+        )
+        text += f'[[trial]]\nname = "t{number}"\nkind = "static"\nfile = "t{number}.csv"\n'
+    (folder / "campaign.toml").write_text(text.replace('unit = "m"\n', 'unit = "m"\noutput = "y"\n'))
+    return read_campaign(folder)
+
+
+def line(force: Float, parameters: Float) -> Float:
+    return np.asarray(parameters[0] * force / 10.0 + parameters[1] * (force / 40.0) ** 2)
+
+
+def spring(force: Float, parameters: Float) -> Float:
+    return np.asarray(force / 10.0 / parameters[0])
+
+
+PRIORS = ((1.0, 0.2, -3.0, 5.0), (0.5, 0.3, -3.0, 4.0))
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[ParameterCalibration, Float]:
+    """A calibration whose posterior is Gaussian, and the readings."""
+    noise = NOISE * np.random.default_rng(3).standard_normal(len(FORCE))
+    values = line(FORCE, np.array([1.1, 0.7])) + noise
+    campaign = campaign_of(tmp_path_factory.mktemp("line"), values)
+    return calibrate_parameters(campaign, choice_of(line, *PRIORS), samples=20_000, seed=4), values
+
+
+def test_a_linear_model_has_the_posterior_of_the_closed_form(
+    told: tuple[ParameterCalibration, Float],
+) -> None:
+    found, values = told
+    design = np.column_stack([FORCE / 10.0, (FORCE / 40.0) ** 2])
+    mean, precision = np.array([1.0, 0.5]), np.diag([0.2**-2, 0.3**-2])
+    covariance = np.linalg.inv(precision + design.T @ design / NOISE**2)
+    expected = covariance @ (precision @ mean + design.T @ values / NOISE**2)
+    deviation = np.sqrt(np.diag(covariance))
+    assert found.procedure == "Gaussian"
+    np.testing.assert_allclose(found.samples.mean(axis=0), expected, atol=0.03 * deviation.min())
+    np.testing.assert_allclose(np.cov(found.samples, rowvar=False), covariance, rtol=0.04)
+    prior = 0.5 * (np.trace(precision @ covariance) - 2.0 - np.linalg.slogdet(precision @ covariance)[1])
+    shift = expected - mean
+    assert found.information == pytest.approx(prior + 0.5 * shift @ precision @ shift, rel=0.02)
+    assert found.explained is True
+    assert found.channels[0].before > 5.0 > 1.5 > found.channels[0].after
+
+
+def test_the_file_holds_all_of_it_and_refuses_damage(
+    told: tuple[ParameterCalibration, Float], tmp_path: Path
+) -> None:
+    found, _ = told
+    content = result_bytes(found)
+    assert content == result_bytes(found)
+    path = tmp_path / FILE_NAME
+    path.write_bytes(content)
+    again = load_calibration(path)
+    assert isinstance(again, ParameterCalibration)
+    np.testing.assert_array_equal(again.samples, found.samples)
+    assert result_bytes(again) == content
+    assert again.priors == found.priors
+    assert again.channels == found.channels
+    damaged = bytearray(content)
+    at = content.index(found.samples[:, 0].tobytes()[:8])
+    damaged[at] ^= 1
+    path.write_bytes(bytes(damaged))
+    with pytest.raises(CalibrationRecordError, match=r"damaged .*hash"):
+        load_parameters(path)
+
+
+def test_what_is_drawn_together_stays_together(told: tuple[ParameterCalibration, Float]) -> None:
+    found, _ = told
+    given = found.given("p1", found.mean("p1") + np.array([-0.01, 0.0, 0.01]))["p2"]
+    slope = np.cov(found.samples, rowvar=False)[0, 1] / found.samples[:, 0].var()
+    np.testing.assert_allclose(np.diff(given), 0.01 * slope, rtol=1e-3)
+    rows = found.stratified_rows("p1", 50, 1)
+    np.testing.assert_array_equal(found.draws_of("p1")[rows], found.stratified_draws("p1", 50, 1))
+
+
+def test_one_parameter_is_integrated_as_densely_as_one_likes(tmp_path: Path) -> None:
+    """Two readings with much noise, a prior that is cut off, noise known from few degrees of freedom."""
+    values = spring(FORCE, np.array([0.7])) + 60.0 * NOISE * np.sin(FORCE)
+    more = "[parameters.p1]\nmean = 1.0\ndeviation = 0.6"
+    campaign = campaign_of(tmp_path, values, freedom=4, more=more)
+    found = calibrate_parameters(campaign, choice_of(spring, (1.0, 0.1, 0.72, 3.0)), samples=20_000)
+    assert found.procedure == "quadrature"
+    grid = np.linspace(0.72, 3.0, 200_001)
+    residual = np.zeros_like(grid)
+    for force, value in zip(FORCE, values, strict=True):
+        residual += ((value - force / 10.0 / grid) / NOISE) ** 2
+    log = -0.5 * (4 + len(FORCE)) * np.log1p(residual / 4) - 0.5 * ((grid - 1.0) / 0.6) ** 2
+    mass = np.cumsum(np.exp(log - log.max()))
+    for share in (0.05, 0.25, 0.5, 0.75, 0.95):
+        expected = grid[np.searchsorted(mass, share * mass[-1])]
+        assert np.quantile(found.samples, share) == pytest.approx(expected, abs=2e-4)
+    assert found.priors[0].stated_by == "the campaign"
+    assert any("end of its range" in sentence for sentence in found.findings)
+    assert found.explained is False
+    assert any("not explained by these parameters" in sentence for sentence in found.findings)
+
+
+def test_intervals_cover_what_is_true(tmp_path: Path) -> None:
+    """Truths from the prior; the zero is free, and the noise known from twelve degrees of freedom."""
+    generator = np.random.default_rng(12)
+    choice = choice_of(line, *PRIORS)
+    template = campaign_of(tmp_path, np.stack([line(FORCE, np.array([1.0, 0.5]))] * 2), freedom=12)
+    channels = {"y": replace(template.channels["y"], offset_deviation=np.inf)}
+    inside = np.zeros(2)
+    total = 20
+    for seed in range(total):
+        truth = np.array([1.0, 0.5]) + generator.standard_normal(2) * [0.2, 0.3]
+        deviation = NOISE * np.sqrt(12 / generator.chisquare(12))
+        trials = tuple(
+            replace(
+                trial,
+                values=(line(FORCE, truth) + generator.normal(0.0, 3.0))[:, np.newaxis]
+                + deviation * generator.standard_normal((len(FORCE), 1)),
+            )
+            for trial in template.trials
+        )
+        campaign = replace(template, channels=channels, trials=trials)
+        found = calibrate_parameters(campaign, choice, samples=400, seed=seed)
+        ends = [found.interval(name) for name in ("p1", "p2")]
+        inside += [low < value < high for (low, high), value in zip(ends, truth, strict=True)]
+    assert 0.8 * 2 * total <= inside.sum() <= 0.98 * 2 * total
+
+
+def test_what_is_not_told_is_said(tmp_path: Path) -> None:
+    def tied(force: Float, parameters: Float) -> Float:
+        return np.asarray(force / 10.0 * (parameters[0] + parameters[1]) + 0.0 * parameters[2])
+
+    noise = NOISE * np.random.default_rng(5).standard_normal(len(FORCE))
+    campaign = campaign_of(tmp_path, 2.0 * FORCE / 10.0 + noise)
+    prior = (1.0, 0.1, 0.2, 2.0)
+    found = calibrate_parameters(campaign, choice_of(tied, prior, prior, prior), samples=2000)
+    assert found.kept_share("p3") == pytest.approx(1.0, abs=0.05)
+    assert any("does not tell p3: " in sentence for sentence in found.findings)
+    assert not any(
+        "does not tell p1" in sentence for sentence in found.findings
+    )  # half of its variance is gone
+    assert any("p1 and p2 are told together and hardly apart" in sentence for sentence in found.findings)
+
+
+def test_a_bent_ridge_is_followed(tmp_path: Path) -> None:
+    def product(force: Float, parameters: Float) -> Float:
+        return np.asarray(force / 10.0 * parameters[0] * parameters[1])
+
+    campaign = campaign_of(tmp_path, FORCE / 10.0)
+    prior = (1.0, 0.3, 0.2, 3.0)
+    found = calibrate_parameters(campaign, choice_of(product, prior, prior), samples=2000)
+    assert found.procedure == "quadrature"
+    np.testing.assert_allclose((found.samples[:, 0] * found.samples[:, 1]), 1.0, atol=0.02)
+    # along the ridge p2 = 1 / p1 the prior density and the width 1 / hypot(p1, p2) of the ridge count
+    grid = np.linspace(0.34, 2.9, 20_001)
+    log = -0.5 * ((grid - 1.0) / 0.3) ** 2 - 0.5 * ((1.0 / grid - 1.0) / 0.3) ** 2 - np.log(grid)
+    mass = np.cumsum(np.exp(log))
+    for share in (0.1, 0.5, 0.9):
+        expected = grid[np.searchsorted(mass, share * mass[-1])]
+        assert np.quantile(found.samples[:, 0], share) == pytest.approx(expected, abs=0.01)
+
+
+def test_several_maxima_are_told(tmp_path: Path) -> None:
+    def even(force: Float, parameters: Float) -> Float:
+        return np.asarray(force / 10.0 * parameters[0] ** 2 + 0.5 * parameters[1])
+
+    noise = NOISE * np.random.default_rng(6).standard_normal(len(FORCE))
+    campaign = campaign_of(tmp_path, even(FORCE, np.array([0.8, 0.0])) + noise)
+    priors = ((0.05, 1.0, -5.0, 5.0), (0.0, 0.1, -1.0, 1.0))
+    found = calibrate_parameters(campaign, choice_of(even, *priors), samples=4000)
+    assert found.procedure == "several optima"
+    assert any("has 2 maxima" in sentence for sentence in found.findings)
+    share = float(np.mean(found.samples[:, 0] > 0.0))  # equal likelihoods: the prior weighs them
+    ratio = np.exp(-0.5 * (0.75**2 - 0.85**2))
+    assert share == pytest.approx(ratio / (1.0 + ratio), abs=0.03)
+    np.testing.assert_allclose(np.abs(found.samples[:, 0]).mean(), 0.8, atol=0.01)
+
+
+def test_a_parameter_far_from_its_prior_is_said(tmp_path: Path) -> None:
+    campaign = campaign_of(tmp_path, spring(FORCE, np.array([0.8])))
+    found = calibrate_parameters(campaign, choice_of(spring, (1.0, 0.02, 0.5, 1.5)), samples=500)
+    assert found.mean("p1") == pytest.approx(0.8, abs=0.01)
+    assert any("prior deviations below what curve.toml states" in sentence for sentence in found.findings)
+
+
+@pytest.mark.parametrize(
+    ("more", "priors", "cause", "words"),
+    [
+        (
+            "[parameters.q]\nmean = 1.0\ndeviation = 0.1",
+            (1.0, 0.1, 0.5, 1.5),
+            CampaignDataError,
+            "does not have",
+        ),
+        (
+            "[parameters.p1]\nmean = 2.0\ndeviation = 0.1",
+            (1.0, 0.1, 0.5, 1.5),
+            CampaignDataError,
+            r"p1 = 2, outside the range 0.5 to 1.5",
+        ),
+        ("", (1.0, 0.0, 0.5, 1.5), ModelError, r"curve.toml has no parameter to calibrate"),
+    ],
+)
+def test_what_cannot_be_calibrated_is_one_sentence(
+    tmp_path: Path, more: str, priors: tuple[float, float, float, float], cause: type[Exception], words: str
+) -> None:
+    campaign = campaign_of(tmp_path, spring(FORCE, np.array([1.0])), more=more)
+    with pytest.raises(cause, match=words):
+        calibrate_parameters(campaign, choice_of(spring, priors))
+
+
+def test_held_out_trials_take_no_part(tmp_path: Path) -> None:
+    values = spring(FORCE, np.array([1.1]))
+    whole = campaign_of(tmp_path, np.stack([values, 1.2 * values]))
+    marked = replace(whole, trials=(whole.trials[0], replace(whole.trials[1], held_out=True)))
+    found = calibrate_parameters(marked, choice_of(spring, (1.0, 0.1, 0.5, 1.5)), samples=500)
+    assert found.mean("p1") == pytest.approx(1.1, abs=0.005)
+    assert [(item.trials, item.after > 10.0) for item in found.channels] == [
+        ("fitted", False),
+        ("held out", True),
+    ]

@@ -1,0 +1,138 @@
+"""`uav-twin calibrate campaign` as a user calls it."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from calibration.parameters.result import ParameterCalibration
+from calibration.reading import load_calibration
+from uav_twin import cli
+
+MODEL = """format = 1
+name = "spring"
+mass = 2.0
+stiffness = 1000.0
+[damping]
+ratios = [0.01]
+[[input]]
+name = "end"
+vector = 1.0
+[[output]]
+name = "sag"
+vector = 1.0
+[[parameter]]
+name = "factor"
+terms = "stiffness"
+mean = 1.0
+deviation = 0.2
+low = 0.5
+high = 1.5
+"""
+CAMPAIGN = """format = 1
+name = "spring test"
+[[channel]]
+name = "tip"
+quantity = "displacement"
+unit = "mm"
+output = "sag"
+noise = { standard_deviation = 0.5 }
+[[trial]]
+name = "up"
+kind = "static"
+file = "up.csv"
+"""
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    """A folder with a campaign of a spring of 0.88 times its stiffness, and the model beside."""
+    folder = tmp_path / "lab"
+    folder.mkdir()
+    forces = (10.0, 20.0, 30.0, 40.0)
+    noise = (0.3, -0.4, 0.1, 0.2)
+    rows = [f"{f},{f / 0.88 + n}" for f, n in zip(forces, noise, strict=True)]
+    (folder / "up.csv").write_text("force,tip\n" + "\n".join(rows))
+    (folder / "campaign.toml").write_text(CAMPAIGN)
+    (tmp_path / "model.toml").write_text(MODEL)
+    return folder
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
+    monkeypatch.setattr(sys, "argv", ["uav-twin", "calibrate", "campaign", *map(str, arguments)])
+    monkeypatch.setenv("COLUMNS", "120")
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    return int(caught.value.code or 0)
+
+
+def test_a_campaign_gives_a_file_a_report_and_a_table(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, out = lab.parent / "model.toml", lab.parent / "out"
+    assert call(monkeypatch, lab, "--model", model, "--out", out, "--asset", "spring 7") == 0
+    shown = capsys.readouterr().out
+    assert "factor" in shown
+    assert "1.00 ± 0.20" in shown
+    found = load_calibration(out / "calibration.nc")
+    assert isinstance(found, ParameterCalibration)
+    assert (found.asset, found.model, found.source) == ("spring 7", "spring", "spring test")
+    assert found.mean("factor") == pytest.approx(0.88, abs=0.02)
+    page = (out / "report.html").read_text()
+    assert "Calibration of spring 7" in page
+    assert page.count("<figure") == 2
+    first = (out / "calibration.nc").read_bytes()
+    assert call(monkeypatch, lab, "--model", model, "--out", out, "--asset", "spring 7", "--no-report") == 0
+    assert (out / "calibration.nc").read_bytes() == first
+    capsys.readouterr()
+    assert call(monkeypatch, lab, "--model", model, "--out", out, "--asset", "spring 8") != 0
+    assert "is the calibration of spring 7, not of spring 8" in capsys.readouterr().err
+
+
+def test_json_has_the_same_figures(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call(monkeypatch, lab, "--model", lab.parent / "model.toml", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    (parameter,) = record["parameters"]
+    assert parameter["name"] == "factor"
+    assert parameter["interval_90"][0] < 0.88 < parameter["interval_90"][1]
+    assert parameter["prior_left"] < 0.15
+    assert record["explained"] is True
+    assert record["procedure"] == "quadrature"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("[[parameter]]", "[[place]]"), ""),
+        (('unit = "mm"', 'unit = "m"'), "1000"),
+        (("mean = 1.0", "mean = 1.6"), "a factor needs 0 < low <= mean <= high"),
+        (('unit = "mm"', 'unit = "N"'), "unit"),
+    ],
+)
+def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
+    lab: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    change: tuple[str, str],
+    words: str,
+) -> None:
+    for file in (lab / "campaign.toml", lab.parent / "model.toml"):
+        file.write_text(file.read_text().replace(*change))
+    out = lab.parent / "out"
+    assert call(monkeypatch, lab, "--model", lab.parent / "model.toml", "--out", out) != 0
+    said = capsys.readouterr().err.strip()
+    assert words in said
+    assert "Traceback" not in said
+    assert not out.exists()
+
+
+def test_a_model_without_parameters_is_refused(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = lab.parent / "model.toml"
+    model.write_text(MODEL.split("[[parameter]]")[0])
+    assert call(monkeypatch, lab, "--model", model) != 0
+    assert "has no parameter to calibrate: it lists none" in capsys.readouterr().err

@@ -1,0 +1,115 @@
+"""`uav-twin calibrate campaign`: the parameters of any model from a campaign."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from reporting import terminal
+
+if TYPE_CHECKING:
+    from calibration.parameters.result import ParameterCalibration
+
+
+def calibrate_campaign(
+    campaign: Annotated[Path, typer.Argument(help="Folder with campaign.toml.", show_default=False)],
+    model: Annotated[
+        str | None,
+        typer.Option(
+            help="The model file of an FMU or a structure, a lumped model, a wing design: as of `discrepancy "
+            "run`.",
+            show_default="the shipped wing",
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for calibration.nc and report.")] = None,
+    asset: Annotated[
+        str | None, typer.Option(help="Name of what was measured.", show_default="that of the campaign")
+    ] = None,
+    samples: Annotated[int, typer.Option(min=100, max=100_000, help="Samples that are kept.")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all samples.")] = 0,
+    json: terminal.Json = False,
+    no_report: terminal.NoReport = False,
+) -> None:
+    """Posterior of the parameters of any model, an FMU or a structure too, from a campaign."""
+    from calibration.parameters.folder import (
+        REPORT_NAME,
+        check_parameters_folder,
+        write_parameters_folder,
+    )
+    from calibration.samples.record import check_name
+    from discrepancy.campaign.reading import read_campaign
+    from discrepancy.model_choice import choose_model
+    from discrepancy.parameters.calibration import calibrate_parameters
+    from uav_twin.discrepancy_run import one_thread
+
+    one_thread()
+    data = read_campaign(campaign)
+    name = check_name(data.name if asset is None else asset)
+    if out is not None:
+        check_parameters_folder(out, name)
+    progress = terminal.progress()
+    choice = choose_model(model, progress)
+    result = calibrate_parameters(data, choice, asset=name, samples=samples, seed=seed, progress=progress)
+    written = None if out is None else write_parameters_folder(result, out, progress, report=not no_report)
+    if json:
+        terminal.print_json({"calibration": None if written is None else str(written)} | _record(result))
+        return
+    _show(result)
+    if written is None:
+        terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
+        return
+    terminal.say(f"Calibration: {written}")
+    if not no_report:
+        terminal.say(f"Report: {written.with_name(REPORT_NAME)}")
+
+
+def _record(result: "ParameterCalibration") -> dict[str, Any]:
+    """Return the calibration as plain data."""
+    from dataclasses import asdict
+
+    from calibration.samples.moments import correlation
+    from reporting.record_json import plain
+
+    return {
+        "asset": result.asset,
+        "model": result.model,
+        "campaign": result.source,
+        "procedure": result.procedure,
+        "explained": result.explained,
+        "seed": result.seed,
+        "parameters": [
+            asdict(prior)
+            | {
+                "posterior_mean": result.mean(prior.name),
+                "posterior_deviation": result.standard_deviation(prior.name),
+                "interval_90": list(result.interval(prior.name)),
+                "prior_left": result.kept_share(prior.name),
+            }
+            for prior in result.priors
+        ],
+        "correlation": correlation(result.samples).tolist(),
+        "information_nat": result.information,
+        "channels": plain(list(result.channels)),
+        "findings": list(result.findings),
+    }
+
+
+def _show(result: "ParameterCalibration") -> None:
+    from calibration.parameters.text import (
+        CHANNEL_HEADINGS,
+        HEADINGS,
+        channel_rows,
+        correlation_lines,
+        headline,
+        parameter_rows,
+    )
+    from uav_twin.console_table import console_table
+
+    console = terminal.console()
+    console.print(headline(result), soft_wrap=True)
+    console.print(console_table(HEADINGS, parameter_rows(result), console.width))
+    for line in correlation_lines(result):
+        console.print(line, soft_wrap=True)
+    console.print(console_table(CHANNEL_HEADINGS, channel_rows(result), console.width))
+    for sentence in result.findings:
+        console.print(f"- {sentence}", soft_wrap=True)
