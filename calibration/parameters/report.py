@@ -44,6 +44,13 @@ def render_page(result: ParameterCalibration, drawings: Mapping[str, bytes]) -> 
         ),
     )
     page.add_section("Result")
+    _add_result(page, result, drawings)
+    page.add_section("What is left of the readings")
+    _add_residuals(page, result)
+    return page.render()
+
+
+def _add_result(page: Page, result: ParameterCalibration, drawings: Mapping[str, bytes]) -> None:
     page.add_highlights(
         [
             (
@@ -78,7 +85,9 @@ def render_page(result: ParameterCalibration, drawings: Mapping[str, bytes]) -> 
         "The same with samples of the prior; the histograms have scales of their own.",
         title="Prior and posterior",
     )
-    page.add_section("What is left of the readings")
+
+
+def _add_residuals(page: Page, result: ParameterCalibration) -> None:
     columns = (
         *(Column(name) for name in CHANNEL_HEADINGS[:2]),
         *(Column(name, numeric=True) for name in CHANNEL_HEADINGS[2:]),
@@ -106,4 +115,3 @@ def render_page(result: ParameterCalibration, drawings: Mapping[str, bytes]) -> 
         "calibration.nc has everything.",
         title="Where it comes from",
     )
-    return page.render()
