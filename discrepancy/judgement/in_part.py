@@ -21,7 +21,7 @@ from discrepancy.verdict import Gate, NamedEffect, RemainderEstimate, Verdict, V
 from .conclusion import Conclusion, named_effects
 from .consistency_gate import consistency_gate
 from .explained_share import Shares
-from .practical_size import small_terms
+from .practical_size import UNSTATED_GAIN, small_terms
 from .proof import held_out_gate
 from .trial_by_trial import sizes_by_trial
 from .weighed import Weighed, plain
@@ -61,7 +61,12 @@ def judged_with_remainder(problem: Problem, found: Search, first: Verdict) -> Ou
         leading = weighed.leading()
         return _unexplained(told, weighed, leading, first), found, leading
     if best.point.remainder is None:  # what is left is noise: another gate is why it has no name
-        return _unexplained(told, weighed, best, first), found, weighed.shown(best)
+        within, probability, family = weighed.nameable(best)
+        if len(within.candidate.terms) == len(best.candidate.terms):
+            return _unexplained(told, weighed, best, first), found, weighed.shown(best)
+        verdict = _in_part(told, weighed, within, probability, family, first)
+        named = verdict.kind is not VerdictKind.UNEXPLAINED
+        return verdict, found, within if named else weighed.shown(best)
     probability = weighed.probability(best)
     plain = not best.candidate.is_family and weighed.freed(best) is None
     if plain and probability >= SEARCH.sure and _is_coloured(best) and weighed.slimmer(best) is best:
@@ -91,7 +96,7 @@ def without_sliver(problem: Problem, found: Search, first: Verdict, fit: Candida
     """
     weighed = Weighed(problem, found)
     names, share = set(plain(fit)), weighed.shares(fit).value
-    small = small_terms(problem, fit)
+    small = small_terms(problem, fit, unstated=UNSTATED_GAIN)
     kept = {name for name, size in zip(plain(fit), small, strict=True) if size is None}
     singles = [item for item in found.exact.values() if item.candidate.terms and set(plain(item)) < names]
     closing = [item for item in singles if weighed.shares(item).value > share - SEARCH.sliver]

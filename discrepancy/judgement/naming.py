@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
@@ -17,7 +18,7 @@ from discrepancy.search.hypotheses import Tell, in_silence
 from discrepancy.search.strategy import Search, search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, NamedEffect, Verdict, VerdictKind
-from fe.runtime.patch import INTERNAL_FORCES
+from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, SensorGain
 
 from .conclusion import Conclusion, best_of, named_effects, plain_names
 from .consistency_gate import consistency_gate
@@ -58,8 +59,11 @@ def name(
         said = f" {gate.reason}" if gate.passed is False else ""
         verdict = replace(verdict, sentence=verdict.sentence + said, gates=(*verdict.gates, gate))
         stands = stands and gate.passed is not False
-    if verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP) and _all_small(problem, found, verdict, fit):
+    may_name = verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP)
+    if may_name and _all_small(problem, found, verdict, fit):
         return _nuisance(verdict), found, found.none
+    if may_name and _stands_for_parameters(problem, found, verdict):
+        return _strained(problem, found, verdict), found, found.none
     if stands and len(verdict.effects) > 1:
         verdict, _, fit = without_sliver(problem, found, verdict, fit)
         return verdict, found, fit
@@ -96,6 +100,40 @@ def _nuisance(verdict: Verdict) -> Verdict:
     )  # fmt: skip
 
 
+def _stands_for_parameters(problem: Problem, found: Search, verdict: Verdict) -> bool:
+    """Whether a verdict of errors of instruments only keeps calibrated parameters within their priors.
+
+    With one channel under a recorded drive a gain does what all parameters of a linear model do together.
+    Where the model as it is leaves no gap on held-out trials either, nothing but these priors speaks for it.
+    """
+    campaign = problem.campaign
+    driven = all(trial.kind in (TrialKind.DRIVEN, TrialKind.FORCED) for trial in campaign.trials)
+    if not driven or len(problem.channel_names) > 1 or not campaign.held_out:
+        return False
+    gains = [any(isinstance(part, LoadGain | SensorGain) for part in item.patch) for item in verdict.effects]
+    instruments = all(
+        isinstance(part, (LoadGain, *SENSORS)) for item in verdict.effects for part in item.patch
+    )
+    as_it_is = held_out_gate(residual_set(problem, found.none, sensitivities=False))
+    return any(gains) and instruments and as_it_is.passed is True
+
+
+def _strained(problem: Problem, found: Search, verdict: Verdict) -> Verdict:
+    """Return the verdict where errors of instruments and calibrated parameters cannot be told apart."""
+    moved = zip(problem.model.parameters, found.none.point.shared, strict=False)
+    far = [f"{item.name!r} {abs(u):.1f}" for item, u in moved if abs(u) > SEARCH.stand_in_range]
+    told = f" ({', '.join(far)} stated deviations off)" if far else ""
+    words = " or ".join(dict.fromkeys(effect.name for effect in verdict.effects))
+    return replace(
+        verdict, kind=VerdictKind.UNEXPLAINED,
+        sentence="The model predicts held-out trials as it is, but with calibrated parameters beside their "
+        f"priors{told}. An error of the instruments "
+        f"({words}) would do as well: with one channel these data cannot tell them apart.",
+        resembles=tuple(dict.fromkeys(effect.identifier for effect in verdict.effects)),
+        effects=(), group=(),
+    )  # fmt: skip
+
+
 def _as_recorded(problem: Problem, found: Search) -> tuple[Verdict, Search, CandidateFit]:
     """Return the verdict if what a right model leaves is noise as the records say, and no more."""
     probabilities = _settled_probabilities(found)
@@ -127,8 +165,31 @@ def _as_recorded(problem: Problem, found: Search) -> tuple[Verdict, Search, Cand
     if best.candidate.is_family:  # reached from several members or places, it is one family
         p_top = max(p_top, _family_probability(found, best.candidate.terms[0].effect.family))
     if p_top < SEARCH.sure or told.log_bayes_factor < SEARCH.bayes_factor:
-        return _open(problem, found, probabilities, told.verdict, best)
+        return _shared(problem, found, probabilities) or _open(
+            problem, found, probabilities, told.verdict, best
+        )
     return _judged(told, best, p_top)
+
+
+def _shared(
+    problem: Problem, found: Search, probabilities: dict[tuple[str, ...], float]
+) -> tuple[Verdict, Search, CandidateFit] | None:
+    """Return the verdict that names what all probable sets hold, if that fits alone: else a group is open.
+
+    Which further effect it has beside it stays open, and a name does not depend on that.
+    """
+    members = _members(probabilities)
+    common = set.intersection(*(set(plain_names(names)) for names in members))
+    alone = next((names for names in members if set(names) == common), None)
+    if not alone:
+        return None
+    best = best_of(found, alone)
+    told = Conclusion.of(problem, found, best, probabilities)
+    p_common = sum(p for names, p in probabilities.items() if common <= set(plain_names(names)))
+    if p_common < SEARCH.sure or told.log_bayes_factor < SEARCH.bayes_factor:
+        return None
+    outcome = _judged(told, best, min(p_common, 1.0))
+    return outcome if outcome[0].kind is VerdictKind.NAMED else None
 
 
 def _judged(told: Conclusion, best: CandidateFit, p_top: float) -> tuple[Verdict, Search, CandidateFit]:

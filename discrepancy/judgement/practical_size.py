@@ -7,18 +7,34 @@ from fe.runtime.patch import Clock, LoadGain, Primitive, SensorGain
 
 LEAST_SIZE = 1e-3
 """Size of a gain, tare or clock error over what it acts on, below which it is a nuisance and no name."""
+UNSTATED_GAIN = 1e-2
+"""The same of the gain of a channel of which no deviation is stated, beside a law that explains as much: a
+calibration that nobody stated is not exact."""
 
 
-def small_terms(problem: Problem, found: CandidateFit) -> tuple[float | None, ...]:
-    """Return for each effect of a fit its size over what it acts on where that is too small, else None."""
+def small_terms(
+    problem: Problem, found: CandidateFit, *, unstated: float = LEAST_SIZE
+) -> tuple[float | None, ...]:
+    """Return for each effect of a fit its size over what it acts on where that is too small, else None.
+
+    `unstated`: the least size of a gain of a channel of which no deviation is stated.
+    """
     sizes: list[float | None] = []
     for term, part in zip(found.candidate.terms, found.candidate.parts(found.point.effect), strict=True):
         patch = Candidate((term,)).patch(problem.setting, part)
         known = [_size(problem, item) for item in patch]
         largest = max((size for size in known if size is not None), default=None)
-        small = largest is not None and None not in known and largest < LEAST_SIZE
+        least = max((_least(problem, item, unstated) for item in patch), default=LEAST_SIZE)
+        small = largest is not None and None not in known and largest < least
         sizes.append(largest if small else None)
     return tuple(sizes)
+
+
+def _least(problem: Problem, item: Primitive, unstated: float) -> float:
+    """Return the size from which an error of an instrument may be a name."""
+    if not isinstance(item, SensorGain) or item.channel not in problem.campaign.channels:
+        return LEAST_SIZE
+    return unstated if problem.campaign.channels[item.channel].gain_deviation == 0.0 else LEAST_SIZE
 
 
 def _size(problem: Problem, item: Primitive) -> float | None:
