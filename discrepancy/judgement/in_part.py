@@ -221,9 +221,12 @@ def _no_name(problem: Problem, weighed: Weighed, best: CandidateFit) -> str:
         return " ".join(following)
     if weighed.is_mixed(best):
         return "It is no name, as it takes an error of the readings beside a law."
-    if weighed.shares(best).summary().low < SEARCH.least_share:
+    low = weighed.shares(best).summary().low
+    if low < SEARCH.least_share:
         return f"It is no name, as it may close less than {100.0 * SEARCH.least_share:.0f} %."
-    beside = _beside(problem, best, SEARCH.widened)
+    # the gap is what parameters and gains could not close by themselves: what is left of it moves them
+    nearly_all = low > 1.0 - SEARCH.rival_share
+    beside = _beside(problem, best, SEARCH.widened, own=nearly_all)
     return f"It is no name, as it needs {beside}: are these priors what you would bet on?" if beside else ""
 
 
@@ -242,9 +245,9 @@ def _no_winner(
     return f"It is no name, as {words}, which describes readings and causes nothing, is more probable."
 
 
-def _beside(problem: Problem, best: CandidateFit, widened: float = 1.0) -> str:
-    """Return which unknowns have left their priors, in words."""
-    tests = prior_tests(problem, best, widened)
+def _beside(problem: Problem, best: CandidateFit, widened: float = 1.0, *, own: bool = False) -> str:
+    """Return which unknowns have left their priors, in words; `own`: of the effects alone."""
+    tests = prior_tests(problem, best, widened, own=own)
     return " and ".join(name for name, p in tests if p * len(tests) < ABSOLUTE_LEVEL)
 
 

@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.open_rigs.__main__ import judge, outcome_of
 from benchmarks.open_rigs.campaigns import ALONE, GAPS, SHARES, Bench, drawn, simulate, write
 from benchmarks.open_rigs.rigs import RIGS, Truth
 from discrepancy.campaign.reading import read_campaign
+from discrepancy.catalogue.library import library
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import parse_lumped
@@ -97,3 +99,36 @@ def test_campaigns_repeat_and_variants_change_what_they_say(tmp_path: Path) -> N
     assert "offset_deviation = 0.0003" in changed
     np.testing.assert_array_equal(rows[:, :2], plain[:, :2])
     assert np.abs(rows[:, 2] - plain[:, 2]).max() > bench.noise[0]
+
+
+@pytest.mark.parametrize(
+    ("seed", "number", "kind", "named"),
+    [
+        (1, 25, "unexplained", []),  # a loose body on the cart: its position alone is measured
+        *(
+            pytest.param(*row, marks=pytest.mark.long)
+            for row in (
+                (1, 8, "named in part", ["quadratic_damping"]),  # not with what imitates a square and a sine
+                (1, 13, "named in part", ["cubic_stiffness"]),  # not with half a per cent of a sensor's gain
+                (11, 1, "named in part", ["coulomb_friction"]),  # though a loose body moves the mass
+            )
+        ),
+    ],
+)
+def test_what_is_left_takes_no_name(
+    seed: int, number: int, kind: str, named: list[str], tmp_path: Path
+) -> None:
+    row = judge(tmp_path, seed, number, "plain")
+    assert (row["kind"], row["named"]) == (kind, named), row["sentence"]
+    if not named:
+        assert "'mass' 12.8 stated deviations off" in row["sentence"]
+        assert "with one channel these data cannot tell them apart" in row["sentence"]
+
+
+@pytest.mark.parametrize(("left", "outcome"), [("law", "family"), ("push", "wrong")])
+def test_the_family_of_a_law_that_is_left_alone_is_right(left: str, outcome: str) -> None:
+    families = {item.identifier: item.family for item in library()}
+    row = {"outcome": "wrong", "family": families["cubic_stiffness"]}
+    assert outcome_of(row, {"rig": "damper", "identifiers": [], "left": left}) == outcome
+    assert outcome_of(row, {"rig": "stores", "identifiers": [], "left": left}) == "wrong"
+    assert outcome_of(row, {"rig": "damper", "identifiers": ["outflow"], "left": left}) == "wrong"

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import SHAPE_GAIN
-from discrepancy.judgement.naming import _open, name
+from discrepancy.judgement.naming import _open, _shared, name
 from discrepancy.search.hypotheses import key_of
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Verdict, VerdictKind
@@ -248,11 +248,17 @@ def test_without_a_noise_record_the_sentence_says_so(kit) -> None:  # type: igno
     assert "record" not in verdict.sentence
 
 
-def test_members_that_do_not_fit_are_no_part_of_a_group(small, few) -> None:  # type: ignore[no-untyped-def]
-    """Patch and proof are those of a member; the probability is that of the members together."""
+@pytest.fixture(scope="module")
+def searched(small, few):  # type: ignore[no-untyped-def]
+    """A campaign with friction, and what a search has found there."""
     values, place = TRUTHS["coulomb_friction"]
     problem = small.problem(small.measured(11, small.patch("coulomb_friction", values, place)))
-    _, found, _ = name(problem, few)
+    return problem, name(problem, few)[1]
+
+
+def test_members_that_do_not_fit_are_no_part_of_a_group(searched, few) -> None:  # type: ignore[no-untyped-def]
+    """Patch and proof are those of a member; the probability is that of the members together."""
+    problem, found = searched
     candidate = Candidate((Term(next(item for item in few if item.identifier == "load_cell")),))
     wrong = fit(problem, candidate, problem.start(candidate))
     found.keep(wrong, exact=True)
@@ -265,6 +271,26 @@ def test_members_that_do_not_fit_are_no_part_of_a_group(small, few) -> None:  # 
     assert verdict.probability == pytest.approx(0.38)
     assert nearest.candidate.identifiers == right
     assert verdict.gates[0].passed
+
+
+def test_what_all_probable_sets_hold_is_named_where_it_fits_alone(searched, few) -> None:  # type: ignore[no-untyped-def]
+    """Which further effect stands beside it stays open; what does not fit alone is no name so."""
+    problem, found = searched
+    place = TRUTHS["coulomb_friction"][1]
+    friction, cell, gain = (
+        Term(next(item for item in few if item.identifier == identifier), place)
+        for identifier, place in (("coulomb_friction", place), ("load_cell", ""), ("gauge_gain", "g1"))
+    )
+    for terms in ((cell,), (friction, gain), (cell, gain)):
+        found.keep(fit(problem, Candidate(terms), problem.start(Candidate(terms))), exact=True)
+    right, more = ("coulomb_friction",), Candidate((friction, gain)).identifiers
+    outcome = _shared(problem, found, {more: 0.7, right: 0.3})
+    assert outcome is not None
+    assert outcome[0].kind is VerdictKind.NAMED
+    assert [item.identifier for item in outcome[0].effects] == list(right)
+    assert outcome[0].probability == pytest.approx(1.0)
+    assert _shared(problem, found, {Candidate((cell, gain)).identifiers: 0.6, ("load_cell",): 0.4}) is None
+    assert _shared(problem, found, {right: 0.8, (): 0.2}) is None
 
 
 # ---------------------------------------------------------------- families
