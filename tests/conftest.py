@@ -149,7 +149,7 @@ def library_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def synthetic_calibration(
     count: int = 40, seed: int = 1, asset: str = "Wing 7 (é)", young_modulus_factor: float = 1.01
 ) -> CalibrationResult:
-    """A calibration drawn from Gaussians, for a design 2 mm longer than the shipped one."""
+    """A calibration drawn from Gaussians, for a design 2 mm longer than the shipped one, on a coarse mesh."""
     from calibration.geometry import published_lengths
     from calibration.joint import WeighedMass, published_modal_measurement
     from calibration.static.experiments import published_measurements
@@ -165,7 +165,7 @@ def synthetic_calibration(
     step = CalibrationStep(3, "Ring-down", "joint", "drawn", (), (update,), StepReward(-2.0, -0.7, 0.7, None))
     return CalibrationResult(
         asset=asset,
-        design=load_design().changed(planform={"semi_span": 1.83}),
+        design=load_design().changed(planform={"semi_span": 1.83}, mesh={"refinement": 0.25}),
         geometry=published_lengths(),
         procedure="joint",
         samples=mean + spread * generator.normal(size=(count, 5)),
