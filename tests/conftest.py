@@ -37,6 +37,9 @@ settings.load_profile("ci" if os.environ.get("CI") else "developer")
 SHARED = ("coarse_reduction", "coarse_patch_arrays", "virtual_model", "beam_reduction")
 """Fixtures of several files that take three to ten seconds each."""
 
+LARGEST, COMPILED = "wing", "discrepancy"
+"""The group of tests that takes longest, and the folder of those that need loops which a minute compiles."""
+
 LONG = "takes minutes of processor time; set UAV_TWIN_LONG_TESTS to run it"
 
 
@@ -45,8 +48,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Let one worker run all tests that share what is made once.
 
     That is all tests of a file, of all files that use a fixture of `SHARED`, and of all files in which a test
-    names the same group. Groups with slow tests come first: at the end a long one would keep one worker
-    alone. Tests marked `long` are skipped unless they are asked for.
+    names the same group. The largest group comes first, then those with slow tests: at the end a long one
+    would keep one worker alone. Tests marked `long` are skipped unless they are asked for.
     """
     if not os.environ.get("UAV_TWIN_LONG_TESTS"):
         for item in items:
@@ -64,7 +67,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if named:
             group[item.path] = named.args[0]
     slow = {group[item.path] for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: group[item.path] not in slow)
+    # The largest group ends with tests of `discrepancy`: by then the other worker has compiled the loops.
+    items.sort(
+        key=lambda item: (
+            group[item.path] != LARGEST,
+            group[item.path] not in slow,
+            group[item.path] == LARGEST and COMPILED in item.path.parts,
+        )
+    )
     for item in items:
         if not item.get_closest_marker("xdist_group"):
             item.add_marker(pytest.mark.xdist_group(group[item.path]))

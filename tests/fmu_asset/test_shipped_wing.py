@@ -23,8 +23,9 @@ from fmu_asset.packing.patch_file import SCHEMA, parse_patch
 from fmu_asset.packing.patched_runtime import output_channels
 from fmu_asset.packing.wing_fmu import build_fmu
 
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
 
-@pytest.mark.slow
+
 def test_the_shipped_wing_as_an_fmu(binding: Binding, tmp_path: Path) -> None:
     model = reduced_model()
     path = build_fmu(model, tmp_path / "wing.fmu").path
@@ -39,7 +40,6 @@ def test_the_shipped_wing_as_an_fmu(binding: Binding, tmp_path: Path) -> None:
             assert 0.0 < seen.extra["strain_error_bound"] < 1e-3 * seen.values.max()
 
 
-@pytest.mark.slow
 def test_the_shipped_wing_with_effects_is_that_of_the_naming_side(tmp_path: Path) -> None:
     model, arrays = reduced_model(), patch_arrays()
     joint = MicroSlip("root", 2.0, 300.0, -0.3, 8)

@@ -253,17 +253,17 @@ def test_a_worker_ends_when_the_twin_is_killed(
     assert not list(scratch.iterdir())
 
 
-def test_fifty_sessions_leak_nothing(fmu: Path, binding: Binding) -> None:
-    """Neither descriptors nor entries of sys.path, nor with fifty resets in each of several workers."""
+def test_sessions_leak_nothing(fmu: Path, binding: Binding) -> None:
+    """Neither descriptors nor entries of sys.path, nor with twenty resets in each of several workers."""
     path = list(sys.path)
-    for _ in range(50):
+    for _ in range(20):
         with FmiAsset(fmu, binding, isolated=False) as asset:
             asset.step({"load_factor": 2.0})
     assert sys.path == path
     before = len(list(Path("/proc/self/fd").iterdir()))
-    for _ in range(5):
+    for _ in range(3):
         with FmiAsset(fmu, binding) as asset:
-            for _ in range(50):
+            for _ in range(20):
                 asset.reset()
                 asset.step({"load_factor": 2.0})
     assert len(list(Path("/proc/self/fd").iterdir())) == before
