@@ -41,7 +41,7 @@ StrainLibrary = Annotated[
 ]
 Calibration = Annotated[
     Path | None,
-    typer.Option(help="Fly with this calibration of the wing, a calibration.nc of `uav-twin calibrate`."),
+    typer.Option(help="Fly with this calibration, a calibration.nc of `uav-twin calibrate`."),
 ]
 Library = Annotated[
     Path | None,

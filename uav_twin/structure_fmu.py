@@ -25,7 +25,9 @@ def fmu(
     ] = None,
     rig: Annotated[
         Path | None,
-        typer.Option(help="Write the file by which `discrepancy` takes the FMU as a model, too."),
+        typer.Option(
+            help="Write the file by which `calibrate campaign` and `discrepancy` take the FMU as a model."
+        ),
     ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the files if they exist.")] = False,
     memory_limit: MemoryLimit = None,
@@ -63,4 +65,6 @@ def fmu(
         terminal.say(f"{binding}: its binding")
     if rig is not None and text is not None:
         atomic_write_text(rig, text)
-        terminal.say(f"{rig}: the model of a search, `uav-twin discrepancy run CAMPAIGN --model {rig}`")
+        terminal.say(
+            f"{rig}: the model of `uav-twin calibrate campaign` and `discrepancy run CAMPAIGN --model {rig}`"
+        )

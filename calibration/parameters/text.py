@@ -46,7 +46,7 @@ def parameter_rows(result: ParameterCalibration) -> list[tuple[str, ...]]:
                 with_deviation(prior.mean, prior.deviation),
                 with_deviation(result.mean(prior.name), deviation),
                 f"{figures(low, deviation)} to {figures(high, deviation)}",
-                f"{100.0 * result.kept_share(prior.name):.2g} %",
+                _percent(result.kept_share(prior.name)),
             )
         )
     return rows
@@ -58,6 +58,10 @@ def channel_rows(result: ParameterCalibration) -> list[tuple[str, ...]]:
         (item.name, item.trials, str(item.readings), *(_size(value) for value in (item.before, item.after)))
         for item in result.channels
     ]
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f} %" if share > 0.095 else f"{100.0 * share:.1f} %"
 
 
 def _size(value: float) -> str:

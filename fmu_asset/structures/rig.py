@@ -11,8 +11,8 @@ from fmu_asset.errors import FmuBuildError
 def rig_text(design: StructureDesign, fmu: str) -> str:
     """Return the model file of a structure's FMU: forces, outputs, ports and parameters as its file has them.
 
-    A control in N is a force. Where a load of 1 N at a point meets a displacement output along it, there is a
-    port.
+    A control in N is a force, and one of the name load_factor the load factor of flights, which stand for any
+    rest under it. Where a load of 1 N at a point meets a displacement output along it, there is a port.
 
     Parameters
     ----------
@@ -24,23 +24,25 @@ def rig_text(design: StructureDesign, fmu: str) -> str:
     Raises
     ------
     FmuBuildError
-        If no control is a force.
+        If no control is a force or a load factor.
     """
     forces = [part.name for part in design.control if part.unit == "N"]
-    if not forces:
+    flies = any(part.name == "load_factor" for part in design.control)
+    if not forces and not flies:
         raise FmuBuildError(
-            f"The structure {design.name} has no control in N, and a search needs a force that is recorded: "
-            'give a [[control]] with unit = "N" and a [[load]] of 1 N tied to it.'
+            f"The structure {design.name} has no control in N and no load_factor, and a campaign needs a "
+            'load that is recorded: give a [[control]] with unit = "N" and a [[load]] of 1 N tied to it, or '
+            "a [[control]] load_factor."
         )
     several = ", ".join(f'{name} = "{name}"' for name in forces)
     place = json.dumps(forces[0]) if len(forces) == 1 else f"{{ {several} }}"
     tables = [
         f'format = 1\nkind = "fmu"\nname = {json.dumps(design.name)}\nfmu = {json.dumps(fmu)}\n',
-        "[inputs]\nforce = " + place + "\n",
+        "[inputs]\n" + (f"force = {place}\n" if forces else ""),
         "[static]\nparameters = { response = 1.0 }\n",
         "[motion]\nparameters = { response = 2.0 }\n",
     ]
-    if any(part.name == "load_factor" for part in design.control):
+    if flies:
         tables[1] += 'load_factor = "load_factor"\n'
     ports = [
         (load.control, output.name)

@@ -13,7 +13,12 @@ from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.assets.asset_source import AssetBelief, FlownAndBelieved, keep_files, named_files, read_files
 from twin_master.assets.interface import Asset
-from twin_master.assets.parameter import ParameterDraws, check_calibration, draw_parameter
+from twin_master.assets.parameter import (
+    ParameterDraws,
+    calibrated_means,
+    check_calibration,
+    draw_parameter,
+)
 from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import AssetSection
@@ -170,9 +175,9 @@ class FmuSource:
         """
         from fmu_asset.door.binding import load_binding
 
-        check_calibration(self._scenario.calibration)
         self.files()
         binding = load_binding(self._section.binding_path)
+        check_calibration(self._scenario.calibration, binding.parameter, f"the binding {binding.name}")
         self._check_names(binding)
         with TemporaryDirectory(prefix="uav_twin_") as folder:
             binding = self._fitted(binding, Path(folder))
@@ -248,7 +253,8 @@ class FmuSource:
         with self._session() as session:
             chosen = self._observed(session.binding)
             for row, value in enumerate(draws.values):
-                session.reset({**self.parameters(), draws.name: float(value)})
+                others = {name: float(values[row]) for name, values in draws.others.items()}
+                session.reset({**self.parameters(), **others, draws.name: float(value)})
                 for state, levels in enumerate(states):
                     health = dict(zip(scenario.state_names, levels.tolist(), strict=True))
                     for index, control in enumerate(controls):
@@ -301,12 +307,14 @@ class FmuSource:
         )
 
     def parameters(self) -> dict[str, float]:
-        """Return the parameters of the scenario, and the numbers drawn for its seeds."""
+        """Return the parameters of the scenario, and the numbers drawn for its seeds.
+
+        What was calibrated from a campaign and the scenario does not name is at its posterior mean.
+        """
         section, seed = self._section, self._scenario.mission.seed
         drawn = generator(seed, "asset").integers(LARGEST_SEED, size=len(section.seeds))
-        return section.parameters | {
-            name: float(value) for name, value in zip(section.seeds, drawn, strict=True)
-        }
+        seeds = {name: float(value) for name, value in zip(section.seeds, drawn, strict=True)}
+        return calibrated_means(self._scenario.calibration) | section.parameters | seeds
 
     def _session(self) -> "Session":
         from fmu_asset.door.session import FmiAsset

@@ -1,18 +1,19 @@
 """Draws of the uncertain parameter of the model, from a calibration."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.errors import MissingObservationModelError
+from twin_master.errors import MissingObservationModelError, MissionInputError
 from twin_master.scenario.schema import Calibration
 from twin_master.seeds import generator, seed_sequence
 
 if TYPE_CHECKING:
+    from calibration.parameters.result import ParameterCalibration
     from calibration.static.stiffness_curve import StiffnessCurve, TipStiffnessModel
 
 Float = NDArray[np.float64]
@@ -34,6 +35,8 @@ class ParameterDraws:
         Where the distribution comes from.
     record : mapping or None
         The whole calibration, ready for JSON.
+    others : mapping of str to (E,)
+        What the other calibrated parameters are expected to be at each draw, SI.
     """
 
     name: str
@@ -42,6 +45,7 @@ class ParameterDraws:
     standard_deviation: float
     source: str
     record: Mapping[str, Any] | None = None
+    others: Mapping[str, Float] = field(default_factory=dict)
 
 
 def draw_parameter(
@@ -118,30 +122,85 @@ def draw_parameter(
 
 
 def _draws_of_file(calibration: Calibration, seed: int) -> ParameterDraws:
-    from calibration.wing.result_file import load_calibration
-    from calibration.wing.wing_record import run_record
+    from calibration.reading import load_calibration, run_record
 
     name = calibration.parameter
     found = load_calibration(Path(calibration.file or ""))
+    values = found.stratified_draws(name, calibration.draws, seed_sequence(seed, "calibration"))
+    of_parameters = _parameters_in(calibration)
     return ParameterDraws(
         name=name,
-        values=found.stratified_draws(name, calibration.draws, seed_sequence(seed, "calibration")),
+        values=values,
         mean=found.mean(name),
         standard_deviation=found.standard_deviation(name),
-        source=f"calibration of {found.asset}, {found.procedure}, {len(found.samples)} samples",
+        source=f"calibration of {found.asset}, {found.procedure}, {len(found.calibrated.samples)} samples",
         record=run_record(found, name),
+        others={} if of_parameters is None else of_parameters.given(name, values),
     )
 
 
-def check_calibration(calibration: Calibration) -> None:
+def check_calibration(
+    calibration: Calibration, known: Collection[str] | None = None, where: str = ""
+) -> None:
     """Read the calibration file, if there is one.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Section of the scenario.
+    known : collection of str, optional
+        Parameters of what is believed or flown, each of which a calibration from a campaign must be of.
+    where : str
+        What has these, in the sentence.
 
     Raises
     ------
     CalibrationRecordError
         It is damaged or of another kind, or has no samples of the parameter.
+    MissionInputError
+        It has a parameter that is not known.
     """
-    if calibration.file is not None:
-        from calibration.wing.result_file import load_calibration
+    if calibration.file is None:
+        return
+    from calibration.reading import load_calibration
 
-        load_calibration(Path(calibration.file)).draws_of(calibration.parameter)
+    load_calibration(Path(calibration.file)).draws_of(calibration.parameter)
+    found = _parameters_in(calibration)
+    if found is None or known is None:
+        return
+    unknown = sorted({prior.name for prior in found.priors} - {*known})
+    if unknown:
+        raise MissionInputError(
+            f"the calibration of {found.asset} has the parameter {', '.join(unknown)}, which {where} "
+            f"does not know; it knows {', '.join(known) or 'none'}: give parameters the same names in the "
+            "model file of the calibration."
+        )
+
+
+def is_of_parameters(file: Path | str) -> bool:
+    """Return whether a file is the calibration of a model's parameters from a campaign; a wing's is not."""
+    from calibration.errors import CalibrationRecordError
+    from calibration.parameters.result import ParameterCalibration
+    from calibration.reading import load_calibration
+
+    try:
+        return isinstance(load_calibration(file), ParameterCalibration)
+    except CalibrationRecordError:  # said where the file is used
+        return False
+
+
+def calibrated_means(calibration: Calibration) -> dict[str, float]:
+    """Return the posterior means of the parameters of a model that were calibrated from a campaign, SI."""
+    found = _parameters_in(calibration)
+    return {} if found is None else {prior.name: found.mean(prior.name) for prior in found.priors}
+
+
+def _parameters_in(calibration: Calibration) -> "ParameterCalibration | None":
+    """Return the calibration from a campaign that a scenario names; None if it names none."""
+    from calibration.parameters.result import ParameterCalibration
+    from calibration.reading import load_calibration
+
+    if calibration.file is None:
+        return None
+    found = load_calibration(Path(calibration.file))
+    return found if isinstance(found, ParameterCalibration) else None

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from twin_master.assets.asset_source import AssetSource, PairedSource
+from twin_master.assets.parameter import is_of_parameters
 from twin_master.assets.strain_library import FILE_NAME
 from twin_master.errors import MissionInputError
 from twin_master.network.memory import check_scenario_fits
@@ -32,7 +33,7 @@ class Overrides:
     in_process : bool
         Fly the FMU in this process instead of a worker.
     calibration : Path or None
-        The calibration file of the wing, instead of what the scenario says of its calibration.
+        The calibration file, instead of what the scenario says of its calibration.
     ssp : Path or None
         SSP file to fly in the place of the scenario's asset.
     """
@@ -89,7 +90,8 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
         table["belief"] = {"kind": "library", "file": str(overrides.library.resolve()), "design": design}
     if overrides.calibration:
         table["calibration"] |= {"source": "file", "file": str(overrides.calibration.resolve())}
-    if table["calibration"]["file"]:
+    file = table["calibration"]["file"]
+    if file and not is_of_parameters(file):
         _tailor(table)
     elif any(part.get("design") == CALIBRATED_DESIGN_NAME for part in _wings(table)):
         raise MissionInputError(

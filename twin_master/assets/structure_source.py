@@ -20,7 +20,12 @@ from twin_master.assets.asset_source import (
 )
 from twin_master.assets.fmu_source import BINDING_COPY, FmuSection, FmuSource
 from twin_master.assets.interface import Asset, AssetReading, StatelessAsset
-from twin_master.assets.parameter import ParameterDraws, draw_parameter
+from twin_master.assets.parameter import (
+    ParameterDraws,
+    calibrated_means,
+    check_calibration,
+    draw_parameter,
+)
 from twin_master.errors import MissingObservationModelError, MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import BeliefSection, FileSection
@@ -115,13 +120,14 @@ class StructureBelief(StructureFiles, BeliefSection):
 def _check_parameter(scenario: Scenario, design: "StructureDesign") -> None:
     """Refuse a calibration that a structure cannot have; raises `MissionInputError`."""
     calibration = scenario.calibration
-    if calibration.source not in ("normal", "fixed"):
+    if calibration.source == "static_test":
         raise MissionInputError(
-            f"the calibration source `{calibration.source}` is for wings: of a structure give `normal` or "
-            "`fixed`, with `mean`."
+            "the calibration source `static_test` is for wings: of a structure give `file`, or `normal` or "
+            "`fixed` with `mean`."
         )
     known = [part.name for part in design.parameter]
     known += [part.name for part in design.mass if part.free]
+    check_calibration(calibration, known, f"the structure {design.name}")
     if calibration.parameter not in known:
         raise MissionInputError(
             f"the calibrated parameter {calibration.parameter} is none of the structure {design.name}, which "
@@ -250,7 +256,7 @@ class StructureFmuSource(FmuSource):
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write displacement and strain of the structure as VTU."""
-        return _write_field(path, self._path(FLOWN_COPY), {**self._section.parameters, **state, **control})
+        return _write_field(path, self._path(FLOWN_COPY), {**self.parameters(), **state, **control})
 
 
 class StructureSource:
@@ -346,7 +352,7 @@ class StructureSource:
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the parameter."""
         found = draw_parameter(self._scenario.calibration, seed)
-        self._mean = {found.name: found.mean}
+        self._mean = calibrated_means(self._scenario.calibration) | {found.name: found.mean}
         return found
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
@@ -366,7 +372,8 @@ class StructureSource:
         vectors = np.tile(reduced.nominal, (draw.size, 1))
         place = reduced.chosen.index
         count = scenario.observation.count
-        vectors[:, place(draws.name)] = draws.values[draw]
+        for name, values in {**draws.others, draws.name: draws.values}.items():
+            vectors[:, place(name)] = values[draw]
         for column, name in enumerate(scenario.state_names):
             vectors[:, place(name)] = states[state, column]
         for name in controls[0].values:
@@ -384,7 +391,8 @@ class StructureSource:
 
     def open(self) -> Asset:
         """Return the model as an asset, with the parameters of the scenario's true structure."""
-        model, observed, true = self._prepared, self._observed, dict(self._scenario.asset.true_parameters)
+        model, observed = self._prepared, self._observed
+        true = {**calibrated_means(self._scenario.calibration), **self._scenario.asset.true_parameters}
         role, count = self._scenario.observation.role, self._scenario.observation.count
         known = {name: value for name, value in true.items() if name in model.chosen}
 

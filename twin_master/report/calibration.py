@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from calibration.wing.result import QUANTITIES, STATE
+from calibration.wing.result import QUANTITIES
 from reporting import figures as style
 from reporting.words import parameter_title
 from twin_master.report.data import RunRecord
@@ -49,7 +49,11 @@ class CalibrationView:
     stiffness : (mean, standard deviation) N/m or None
         Posterior of the tip stiffness.
     wing : str
-        Name of the wing, from its calibration file.
+        Name of the wing, or of whatever else was calibrated, from its calibration file.
+    campaign : str
+        Name of the campaign that parameters of a model were calibrated from; empty for a wing.
+    findings : tuple of str
+        What that did not tell, or what disagreed.
     figures : tuple of CalibratedFigure
         All that its calibration file gives of it.
     """
@@ -64,6 +68,8 @@ class CalibrationView:
     stiffness: tuple[float, float] | None
     wing: str = ""
     figures: tuple[CalibratedFigure, ...] = ()
+    campaign: str = ""
+    findings: tuple[str, ...] = ()
 
 
 def calibration_view(record: RunRecord) -> CalibrationView | None:
@@ -76,8 +82,9 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
     asset = asset if isinstance(asset, Mapping) else {}
     parameters = asset.get("parameters")
     true_value = parameters.get(record.parameter_name) if isinstance(parameters, Mapping) else None
-    if true_value is None and asset.get("design") == "calibration" and not asset.get("file"):
-        # the FMU packed from the calibration starts at its mean
+    packed = asset.get("design") == "calibration" and not asset.get("file")
+    if true_value is None and asset.get("kind") and (packed or "campaign" in kept):
+        # what is flown starts at the mean of the calibration
         true_value = _table(_table(kept, "state"), record.parameter_name).get("mean")
     exact = _table(kept, "exact") or _table(kept, "posterior")
     data = _table(kept, "data")
@@ -91,13 +98,24 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
         pairs=_arrays(data, "load_N", "displacement_m"),
         stiffness=_moments(_table(kept, "tip_stiffness_exact") or _table(kept, "tip_stiffness")),
         wing=str(kept.get("asset") or ""),
+        campaign=str(kept.get("campaign") or ""),
+        findings=tuple(str(text) for text in kept.get("findings") or ()),
         figures=tuple(
             figure
-            for group, columns in (("state", STATE), ("quantities", QUANTITIES))
-            for column in columns
-            if (figure := _figure(_table(kept, group).get(column.name))) is not None
+            for group, names in _figure_names(kept)
+            for name in names
+            if (figure := _figure(_table(kept, group).get(name))) is not None
         ),
     )
+
+
+def _figure_names(kept: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
+    """Return the tables of calibrated figures with the names in them, in the order of the calibration."""
+    names = _table(kept, "correlation").get("names")
+    return [
+        ("state", [str(name) for name in names] if isinstance(names, list) else []),
+        ("quantities", [figure.name for figure in QUANTITIES]),
+    ]
 
 
 def _figure(entry: object) -> CalibratedFigure | None:

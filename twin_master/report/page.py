@@ -315,11 +315,17 @@ def _add_calibrated_wing(page: Page, view: CalibrationView | None) -> None:
         Column("95 % interval", numeric=True),
         Column("unit"),
     )
+    if not view.campaign:
+        source, what = "of the healthy wing", "wing"
+    else:
+        source, what = f"from the campaign {view.campaign}", "parameters"
     page.add_table(
         Table(columns, rows),
-        "From the samples of the calibration file, of the healthy wing.",
-        title=f"The calibrated wing: {view.wing}",
+        f"From the samples of the calibration file, {source}.",
+        title=f"The calibrated {what}: {view.wing}",
     )
+    for sentence in view.findings:
+        page.add_paragraph(sentence)
 
 
 def _notices(record: RunRecord) -> list[str]:
@@ -351,7 +357,7 @@ def _loss_notices(record: RunRecord) -> list[str]:
         notices.append(
             f"The asset flown has a {view.parameter.replace('_', ' ')} of {number(view.true_value)}, "
             f"{off:.1f} standard deviations from what the twin was calibrated with: it flies with the model "
-            "of another wing."
+            f"of another {'asset' if view.campaign else 'wing'}."
         )
     lost = np.isnan(record.observation)
     if not lost.any():

@@ -81,6 +81,6 @@ def test_it_is_the_structure_in_motion(pair: tuple[FmuModel, StructureModel]) ->
 
 
 def test_a_structure_without_a_force_is_refused(write_beam: Callable[..., Path], tmp_path: Path) -> None:
-    design = load_structure(write_beam(tmp_path, {'unit = "N", ': ""}, cells=1))
-    with pytest.raises(FmuBuildError, match="no control in N"):
+    design = load_structure(write_beam(tmp_path, {'unit = "N", ': "", "load_factor": "gee"}, cells=1))
+    with pytest.raises(FmuBuildError, match="no control in N and no load_factor"):
         rig_text(design, "beam.fmu")

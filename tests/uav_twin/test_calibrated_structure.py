@@ -1,0 +1,151 @@
+"""From a structure file to a twin with calibrated parameters: model file, campaign, calibration, mission."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from calibration.parameters.result import ParameterCalibration
+from calibration.reading import load_calibration
+from fe.full.statics import Factorisation
+from fe.structure.operators import load_and_assemble
+from scenarios import scenario_files, structure_files
+from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
+from twin_master.errors import MissionInputError
+from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.workflow import new_run
+from uav_twin import cli
+
+TRUTH = {"e": 0.96}
+BRACKET = scenario_files()["bracket"]
+CHANNEL = """
+[[channel]]
+name = "{name}"
+quantity = "{quantity}"
+unit = "{unit}"
+output = "{name}"
+noise = {{ standard_deviation = {noise} }}
+"""
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> None:
+    monkeypatch.setattr(sys, "argv", ["uav-twin", *map(str, arguments)])
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    assert not caught.value.code
+
+
+def write_campaign(folder: Path, structure: Path) -> None:
+    """Write what the full model shows at eight load factors, with noise."""
+    folder.mkdir()
+    full = load_and_assemble(structure)
+    solution = Factorisation(full.stiffness(TRUTH, {})).solve(full.load("weight", 1.0))
+    shown = np.append(1e6 * (full.gauge_output @ solution), 1e3 * (full.displacement_output @ solution))
+    factors, noise = np.linspace(0.5, 4.0, 8), np.array([4.0] * 4 + [0.005])
+    rows = np.outer(factors, shown) + noise * np.random.default_rng(4).standard_normal((8, 5))
+    names = ("heel", "arm", "tip", "back", "sag")
+    lines = [",".join(map(repr, [n, *row])) for n, row in zip(factors.tolist(), rows.tolist(), strict=True)]
+    (folder / "loads.csv").write_text(f"load_factor,{','.join(names)}\n" + "\n".join(lines))
+    text = 'format = 1\nname = "loads"\n[parameters.pump]\nmean = 2.5\ndeviation = 0.01\n'
+    for name in names:
+        sag = name == "sag"
+        text += CHANNEL.format(
+            name=name, quantity="displacement" if sag else "strain", unit="mm" if sag else "microstrain",
+            noise=0.005 if sag else 4.0,
+        )  # fmt: skip
+    (folder / "campaign.toml").write_text(
+        text + '[[trial]]\nname = "loads"\nkind = "flight"\nfile = "loads.csv"\n'
+    )
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The calibration file of a bracket whose modulus is 0.96 times the nominal one."""
+    folder = tmp_path_factory.mktemp("bracket")
+    source = structure_files()["bracket"]
+    for file in (source, source.with_suffix(".inp")):
+        shutil.copy(file, folder)
+    write_campaign(folder / "lab", folder / source.name)
+    with pytest.MonkeyPatch.context() as patch:
+        call(patch, "structure", "fmu", folder / source.name, "--rig", folder / "model.toml")
+        call(
+            patch, "calibrate", "campaign", folder / "lab", "--model", folder / "model.toml", "--asset",
+            "bracket 7", "--out", folder / "out", "--no-report",
+        )  # fmt: skip
+    return folder / "out" / "calibration.nc"
+
+
+def mission(**calibration: object) -> LoadedScenario:
+    """The shipped mission in six shifts, of an asset whose parameters are not named."""
+    table = tomllib.loads(BRACKET.read_text(encoding="utf-8"))
+    table["mission"] |= {"steps": 6, "prediction_steps": 2}
+    table["asset"] = {"kind": "structure", "structure": "bracket", "isolated": False}
+    table["truth"]["gains"] = []
+    table["calibration"] |= calibration
+    return LoadedScenario(parse_scenario(table, "mission"), BRACKET, "0" * 64)
+
+
+def test_the_campaign_tells_the_modulus_and_not_the_mass(calibrated: Path) -> None:
+    found = load_calibration(calibrated)
+    assert isinstance(found, ParameterCalibration)
+    assert abs(found.mean("e") - TRUTH["e"]) < 3.0 * found.standard_deviation("e") < 0.03
+    assert found.explained is True
+    assert any("does not tell pump" in sentence for sentence in found.findings)
+
+
+def test_the_twin_flies_with_it(calibrated: Path, tmp_path: Path) -> None:
+    """Its draws are those of the file; what flies stands at the means; the mass follows the modulus."""
+    found = load_calibration(calibrated)
+    assert isinstance(found, ParameterCalibration)
+    folder = new_run(mission(), tmp_path / "run", Overrides(calibration=calibrated), report=False).folder
+    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
+        tree.load()
+    draws = tree["calibration"]["draw_value"].values
+    assert set(draws) <= set(found.draws_of("e"))
+    np.testing.assert_allclose(draws.mean(), found.mean("e"), atol=0.1 * found.standard_deviation("e"))
+    assert (folder / "asset/calibration.nc").read_bytes() == calibrated.read_bytes()
+    full = load_and_assemble(structure_files()["bracket"])
+    solution = Factorisation(full.stiffness({"e": found.mean("e")}, {})).solve(full.load("weight", 1.0))
+    wanted = float(tree["observed"]["load_factor"][0]) * (full.gauge_output @ solution)
+    np.testing.assert_allclose(tree["truth"]["strain"].values[0], wanted, rtol=5e-4)
+
+    scenario = resolve_scenario(mission(draws=3), Overrides(calibration=calibrated))
+    source = asset_source(scenario)
+    source.prepare(tmp_path, _silent())
+    drawn = source.draws(scenario.mission.seed)
+    assert dict(drawn.others).keys() == {"pump"}
+    table = source.observation_table(drawn, build_graphical_model(scenario))
+    row = {"e": float(drawn.values[1])}
+    solution = Factorisation(full.stiffness(row, {})).solve(full.load("weight", 1.0))
+    ratio = table[1, 0, 0] / (1.5 * (full.gauge_output @ solution))
+    arm = (drawn.others["pump"][1] - 2.5) / 2.5  # the pump bends the bracket with nearly all of the load
+    np.testing.assert_allclose(ratio, 1.0 + arm, rtol=1e-3)
+
+
+def _silent() -> object:
+    from reporting.progress import SilentProgress
+
+    return SilentProgress()
+
+
+def test_what_the_calibration_does_not_fit_is_refused(calibrated: Path, tmp_path: Path) -> None:
+    with pytest.raises(Exception, match="has no samples of `pomp`; it has e, pump"):
+        new_run(mission(parameter="pomp"), tmp_path / "run", Overrides(calibration=calibrated), report=False)
+    source = structure_files()["bracket"]
+    shutil.copy(source.with_suffix(".inp"), tmp_path)
+    text = source.read_text(encoding="utf-8").replace("free = true", "")
+    (tmp_path / "fixed.toml").write_text(text, encoding="utf-8")
+    table = mission().scenario.to_dict()
+    for name in ("asset", "belief"):
+        table[name]["structure"] = str(tmp_path / "fixed.toml")
+    other = LoadedScenario(parse_scenario(table, "mission"), BRACKET, "0" * 64)
+    with pytest.raises(MissionInputError, match="parameter pump, which the structure bracket does not know"):
+        new_run(other, tmp_path / "run", Overrides(calibration=calibrated), report=False)
+    assert not (tmp_path / "run").exists()
