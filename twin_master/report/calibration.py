@@ -83,7 +83,7 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
     parameters = asset.get("parameters")
     true_value = parameters.get(record.parameter_name) if isinstance(parameters, Mapping) else None
     packed = asset.get("design") == "calibration" and not asset.get("file")
-    if true_value is None and asset.get("kind") and (packed or "campaign" in kept):
+    if true_value is None and (packed or ("campaign" in kept and not record.config.get("watched"))):
         # what is flown starts at the mean of the calibration
         true_value = _table(_table(kept, "state"), record.parameter_name).get("mean")
     exact = _table(kept, "exact") or _table(kept, "posterior")
