@@ -21,7 +21,7 @@ from discrepancy.verdict import Gate, NamedEffect, RemainderEstimate, Verdict, V
 from .conclusion import Conclusion, named_effects
 from .consistency_gate import consistency_gate
 from .explained_share import Shares
-from .practical_size import UNSTATED_GAIN, small_terms
+from .practical_size import UNSTATED_GAIN, is_one_driven_channel, small_terms
 from .proof import held_out_gate
 from .trial_by_trial import sizes_by_trial
 from .weighed import Weighed, plain
@@ -49,6 +49,7 @@ def judged_with_remainder(problem: Problem, found: Search, first: Verdict) -> Ou
     weigh_with_remainders(found)
     weighed = Weighed(problem, found)
     weighed.leave_out_stand_ins()
+    weighed.join_relatives()
     best = found.best()
     probabilities = found.set_probabilities()
     told = Conclusion.of(problem, found, best, probabilities)
@@ -97,7 +98,8 @@ def without_sliver(problem: Problem, found: Search, first: Verdict, fit: Candida
     weighed = Weighed(problem, found)
     names, share = set(plain(fit)), weighed.shares(fit).value
     small = small_terms(problem, fit, unstated=UNSTATED_GAIN)
-    kept = {name for name, size in zip(plain(fit), small, strict=True) if size is None}
+    alone = weighed.laws_of(fit) if is_one_driven_channel(problem) else plain(fit)
+    kept = {name for name, size in zip(plain(fit), small, strict=True) if size is None and name in alone}
     singles = [item for item in found.exact.values() if item.candidate.terms and set(plain(item)) < names]
     closing = [item for item in singles if weighed.shares(item).value > share - SEARCH.sliver]
     if not closing and kept == names:

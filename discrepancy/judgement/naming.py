@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
@@ -23,7 +22,7 @@ from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, SensorGain
 from .conclusion import Conclusion, best_of, named_effects, plain_names
 from .consistency_gate import consistency_gate
 from .in_part import judged_with_remainder, without_sliver
-from .practical_size import LEAST_SIZE, small_terms
+from .practical_size import LEAST_SIZE, is_one_driven_channel, small_terms
 from .proof import held_out_gate
 
 
@@ -106,9 +105,7 @@ def _stands_for_parameters(problem: Problem, found: Search, verdict: Verdict) ->
     With one channel under a recorded drive a gain does what all parameters of a linear model do together.
     Where the model as it is leaves no gap on held-out trials either, nothing but these priors speaks for it.
     """
-    campaign = problem.campaign
-    driven = all(trial.kind in (TrialKind.DRIVEN, TrialKind.FORCED) for trial in campaign.trials)
-    if not driven or len(problem.channel_names) > 1 or not campaign.held_out:
+    if not is_one_driven_channel(problem) or not problem.campaign.held_out:
         return False
     gains = [any(isinstance(part, LoadGain | SensorGain) for part in item.patch) for item in verdict.effects]
     instruments = all(

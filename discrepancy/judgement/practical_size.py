@@ -1,5 +1,6 @@
 """What is too small to be a name: a gain of half a thousandth is a nuisance of instruments, not a cause."""
 
+from discrepancy.campaign.records import TrialKind
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
@@ -10,6 +11,12 @@ LEAST_SIZE = 1e-3
 UNSTATED_GAIN = 1e-2
 """The same of the gain of a channel of which no deviation is stated, beside a law that explains as much: a
 calibration that nobody stated is not exact."""
+
+
+def is_one_driven_channel(problem: Problem) -> bool:
+    """Whether a campaign is of driven trials and one channel: no error of it has a pattern of its own."""
+    driven = all(trial.kind in (TrialKind.DRIVEN, TrialKind.FORCED) for trial in problem.campaign.trials)
+    return driven and len(problem.channel_names) == 1
 
 
 def small_terms(

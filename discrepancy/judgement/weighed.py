@@ -14,7 +14,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.fits.remainder_inference import RemainderPrior, with_remainder
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.search.hypotheses import Key, key_of
-from discrepancy.search.starting_points import acts_within
+from discrepancy.search.starting_points import acts_within, are_related
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import DecayingLine, Line
@@ -115,6 +115,40 @@ class Weighed:
                 del kept[key]
                 self.left_out.append(item)
         self.found.judge(kept)
+
+    def join_relatives(self) -> None:
+        """Compare the families of laws that are easily taken for the best one, where that leaves much.
+
+        A law of another family may explain the rest with a shape of its own where its usual one does not.
+        """
+        best = self.found.best()
+        if len(best.candidate.terms) != 1 or self._stands_in(best):
+            return
+        if self.shares(best).summary().low > 1.0 - SEARCH.rival_share:
+            return
+        (own,) = best.candidate.terms
+        singles: dict[tuple[str, str], CandidateFit] = {}
+        for item in (*self.found.rough.values(), *self.found.exact.values()):
+            terms = item.candidate.terms
+            if len(terms) != 1 or terms[0].effect.family == own.effect.family or not terms[0].effect.shape:
+                continue
+            key = (terms[0].effect.family, terms[0].place)
+            if are_related(terms[0].effect, own.effect) and not self._stands_in(item):
+                singles[key] = max(singles.get(key, item), item, key=self.found.score)
+        joined = dict(self.found.judged)
+        for item in singles.values():
+            free = self.free(item)
+            if free is not None:
+                joined[key_of(free.candidate)] = free
+        self.found.judge(joined)
+
+    def laws_of(self, item: CandidateFit) -> tuple[str, ...]:
+        """Return the identifiers of a set without its stand-ins."""
+        terms = item.candidate.terms
+        return tuple(
+            name for name, term in zip(plain(item), terms, strict=True)
+            if acts_within(term.effect, self.problem.setting)
+        )  # fmt: skip
 
     def _stands_in(self, item: CandidateFit) -> bool:
         return any(not acts_within(term.effect, self.problem.setting) for term in item.candidate.terms)

@@ -111,6 +111,8 @@ def test_campaigns_repeat_and_variants_change_what_they_say(tmp_path: Path) -> N
                 (1, 8, "named in part", ["quadratic_damping"]),  # not with what imitates a square and a sine
                 (1, 13, "named in part", ["cubic_stiffness"]),  # not with half a per cent of a sensor's gain
                 (11, 1, "named in part", ["coulomb_friction"]),  # though a loose body moves the mass
+                (11, 19, "named in part", ["outflow"]),  # by its exponent of 5/4, not an overflow
+                (11, 20, "named in part", ["quadratic_damping"]),  # not with a filter of the one channel
             )
         ),
     ],
