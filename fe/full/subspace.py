@@ -106,6 +106,92 @@ def conjugate_gradients(
     )
 
 
+class BlockDiagonal:
+    """Several matrices (n, n), each for as many columns of what it is multiplied with.
+
+    With it, `conjugate_gradients` solves with all of them in the time of one: applying the factors to twelve
+    columns takes hardly longer than to three.
+    """
+
+    def __init__(self, matrices: list[Any]) -> None:
+        self.matrices = matrices
+
+    def __matmul__(self, vectors: FloatArray) -> FloatArray:
+        parts = np.split(vectors, len(self.matrices), axis=1)
+        return np.concatenate(
+            [np.asarray(matrix @ part) for matrix, part in zip(self.matrices, parts, strict=True)], axis=1
+        )
+
+
+class FunctionalBasis:
+    """A growing basis of functionals, orthonormal in the norm dual to X, with their representatives.
+
+    As `OrthonormalBasis` with `functionals`, but a block at a time, so that the factors of X are applied to
+    many columns at once: the Gram matrix of a block gives its orthonormal combinations, and those that are
+    small get representatives of their own before they are judged.
+
+    Parameters
+    ----------
+    unknowns : int
+        Length n of the functionals.
+    norm : Norm
+        The norm of X.
+    drop : float
+        A direction is dropped if it is less than this fraction of every functional.
+
+    Attributes
+    ----------
+    vectors, products : (n, k) ndarray
+        The representatives, and the functionals.
+    dropped_square : float
+        Bound of the sum of squared norms of all that was dropped.
+    """
+
+    def __init__(self, unknowns: int, norm: Norm, *, drop: float) -> None:
+        self.vectors, self.products = np.empty((unknowns, 0)), np.empty((unknowns, 0))
+        self.dropped_square = 0.0
+        self._norm, self._drop = norm, drop
+
+    def extend(self, functionals: FloatArray) -> None:
+        """Add functionals (n, k)."""
+        rest = np.array(functionals)
+        inside = self._project(rest)
+        representatives = self._norm.riesz(rest)
+        outside = np.maximum(np.einsum("ik,ik->k", rest, representatives), 0.0)
+        scale = np.sqrt(inside + outside)
+        used = np.flatnonzero(scale > 0.0)
+        rest, representatives = rest[:, used] / scale[used], representatives[:, used] / scale[used]
+        mix = np.eye(len(used))  # the functionals, of unit length, in terms of what is left of them
+        while rest.shape[1]:
+            gram = representatives.T @ rest
+            square, rotation = np.linalg.eigh(0.5 * (gram + gram.T))
+            square = np.maximum(square, 0.0)
+            mix = mix @ rotation
+            part = np.sqrt(square) * np.abs(mix).max(axis=0, initial=0.0)
+            new = part > self._drop
+            strong = new & (square > NEARLY_DEPENDENT**2)
+            self.dropped_square += float(np.sum((mix[:, ~new] * scale[used, None]) ** 2 @ square[~new]))
+            length = np.sqrt(square)
+            if strong.any():
+                turned = rotation[:, strong] / length[strong]
+                self.vectors = np.concatenate((self.vectors, representatives @ turned), axis=1)
+                self.products = np.concatenate((self.products, rest @ turned), axis=1)
+            weak = new & ~strong
+            rest = rest @ (rotation[:, weak] / length[weak])
+            mix = mix[:, weak] * length[weak]
+            self._project(rest)
+            representatives = self._norm.riesz(rest) if weak.any() else rest
+
+    def _project(self, functionals: FloatArray) -> FloatArray:
+        """Take what the basis holds out of functionals, in place; return the squared norms of that."""
+        inside = np.zeros(functionals.shape[1])
+        for _ in range(2):
+            share = self.vectors.T @ functionals
+            functionals -= self.products @ share
+            inside += np.einsum("ik,ik->k", share, share)
+        return inside
+
+
 class OrthonormalBasis:
     """A growing basis, orthonormal in a norm, with its products kept.
 

@@ -5,6 +5,7 @@ The method and what it reaches are in `docs/reduced_model.md`.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -14,8 +15,10 @@ from pymor.core.exceptions import ExtensionError
 from pymor.core.logger import set_log_levels
 from scipy import sparse
 
-from fe.full.affine import affine_sum
+from fe.full.affine import AffineSum, affine_sum
 from fe.full.subspace import (
+    BlockDiagonal,
+    FunctionalBasis,
     Norm,
     OrthonormalBasis,
     conjugate_gradients,
@@ -33,6 +36,8 @@ DUAL_TOLERANCE = 0.05
 """Relative residual of the approximate dual solutions at their own anchors."""
 FIRST_TOLERANCE, SNAPSHOT_TOLERANCE = 1e-10, 1e-6
 """Relative residual of the first full solutions and of the others."""
+MOST_COLUMNS = 48
+"""Columns of approximate dual solutions that are iterated together."""
 ROUNDING_FACTOR, LEAST_ROUNDING = 8.0, 5e-6
 """Rounding allowance as a multiple of the difference seen at the first full solutions, and its least value:
 with condition numbers of 1e10, full solutions differ by 1e-6 among themselves."""
@@ -107,6 +112,9 @@ class StaticReduction:
         Told one more part, and of what.
     least : (groups, L) ndarray, optional
         Outputs of a group under a load that are smaller are judged by this; zero by default.
+    batch : int
+        How many full solutions the search takes at once. One repeats the shipped wing to the bit; several
+        take hardly longer than one, since the factors are applied to all of them together.
     """
 
     def __init__(
@@ -118,7 +126,11 @@ class StaticReduction:
         farthest: FloatArray,
         advance: Callable[[int, str], object],
         least: FloatArray | None = None,
+        batch: int = 1,
     ) -> None:
+        self.batch = batch
+        terms = problem.stiffness_terms
+        self.stiffness = partial(affine_sum, terms=terms) if batch == 1 else AffineSum(terms).matrix
         self.least = np.zeros((len(problem.groups), problem.loads.shape[1])) if least is None else least
         self.problem, self.norm, self.reference, self.advance = problem, norm, reference, advance
         self.farthest = farthest
@@ -128,8 +140,13 @@ class StaticReduction:
             np.empty((n, 0)) for _ in problem.stiffness_terms
         ]  # stiffness terms times basis vectors
         self.rounding = 0.0
-        self.residual_basis = OrthonormalBasis(n, norm, drop=1e-8, functionals=True)
-        self.residual_basis.extend(norm.riesz(problem.loads), problem.loads)
+        self.residual_basis: OrthonormalBasis | FunctionalBasis
+        if batch == 1:
+            self.residual_basis = OrthonormalBasis(n, norm, drop=1e-8, functionals=True)
+            self.residual_basis.extend(norm.riesz(problem.loads), problem.loads)
+        else:
+            self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
+            self.residual_basis.extend(problem.loads)
         self.dual = self._approximate_duals(anchors)
         self.snapshots: list[State] = []
 
@@ -140,40 +157,53 @@ class StaticReduction:
         products = np.empty((len(anchors), n, count))
         factors = np.empty((len(anchors), count, terms, terms))
         at_reference = self.norm.riesz(outputs)
-        for number, theta in enumerate(anchors):
+        together = 1 if self.batch == 1 else max(1, MOST_COLUMNS // count)
+        for first in range(0, len(anchors), together):
+            chosen = anchors[first : first + together]
             # a rough solution will do: the norm of what it leaves is computed, not assumed
-            dual = conjugate_gradients(
-                affine_sum(theta, stiffness_terms),
+            duals = conjugate_gradients(
+                self._matrices(chosen),
                 self.norm,
-                outputs,
-                at_reference,
+                _beside([outputs] * len(chosen)),
+                _beside([at_reference] * len(chosen)),
                 tolerance=DUAL_TOLERANCE,
             )
-            images = [np.asarray(term @ dual) for term in stiffness_terms]
-            lifted = [self.norm.riesz(image) for image in images[:-1]]
-            # X^-1 K_base dual, since X is the sum of all terms at the reference
-            base = dual - sum(t * part for t, part in zip(self.reference, lifted, strict=True))
-            factors[number] = triangular_factors(
-                np.stack((at_reference - base, *lifted), axis=2),
-                np.stack((outputs - images[-1], *images[:-1]), axis=2),
-            )
-            products[number] = self.norm.product(dual)
-            self.advance(1, "dual solutions")
+            for number, dual in enumerate(np.split(duals, len(chosen), axis=1), start=first):
+                images = [np.asarray(term @ dual) for term in stiffness_terms]
+                lifted = self._lifted(images[:-1])
+                # X^-1 K_base dual, since X is the sum of all terms at the reference
+                base = dual - sum(t * part for t, part in zip(self.reference, lifted, strict=True))
+                factors[number] = triangular_factors(
+                    np.stack((at_reference - base, *lifted), axis=2),
+                    np.stack((outputs - images[-1], *images[:-1]), axis=2),
+                )
+                products[number] = self.norm.product(dual)
+                self.advance(1, "dual solutions")
         return _DualData(products, factors)
 
-    def add_snapshot(self, state: State) -> None:
-        """Solve the full model for all loads and extend the bases."""
-        theta, loads = self.problem.theta(state), self.problem.loads
-        matrix = affine_sum(theta, self.problem.stiffness_terms)
-        start = np.zeros_like(loads)
-        if self.basis.size:
-            image = sum(t * k for t, k in zip(theta, self.images, strict=True))
-            start = self.basis.vectors @ np.linalg.solve(
-                self.basis.vectors.T @ image, self.basis.vectors.T @ loads
-            )
+    def _matrices(self, thetas: list[FloatArray]) -> Any:
+        """Return the stiffness at coefficients (T,), or those of several, each for its own columns."""
+        matrices = [self.stiffness(theta) for theta in thetas]
+        return matrices[0] if len(matrices) == 1 else BlockDiagonal(matrices)
+
+    def _lifted(self, images: list[FloatArray]) -> list[FloatArray]:
+        """Return the representatives of functionals, several (n, k) each."""
+        if self.batch == 1:
+            return [self.norm.riesz(image) for image in images]
+        return np.split(self.norm.riesz(np.concatenate(images, axis=1)), len(images), axis=1)
+
+    def add_snapshots(self, states: list[State]) -> None:
+        """Solve the full model for all loads at several states and extend the bases."""
+        thetas, loads = [self.problem.theta(state) for state in states], self.problem.loads
         # a basis vector may be rough, since errors are bounded by residuals; the first one measures rounding
         tolerance = SNAPSHOT_TOLERANCE if self.snapshots else FIRST_TOLERANCE
-        solution = conjugate_gradients(matrix, self.norm, loads, start, tolerance=tolerance)
+        solution = conjugate_gradients(
+            self._matrices(thetas),
+            self.norm,
+            _beside([loads] * len(states)),
+            _beside([self._galerkin(theta) for theta in thetas]),
+            tolerance=tolerance,
+        )
         before = self.basis.size
         self.basis.extend(solution, self.norm.product(solution))
         new = self.basis.vectors[:, before:]
@@ -182,13 +212,22 @@ class StaticReduction:
         images = [np.asarray(term @ new) for term in self.problem.stiffness_terms]
         self.images = [np.concatenate(pair, axis=1) for pair in zip(self.images, images, strict=True)]
         varying = np.concatenate(images[:-1], axis=1)
-        self.residual_basis.extend(
-            np.concatenate((new, self.norm.riesz(varying)), axis=1),
-            np.concatenate((self.basis.products[:, before:], varying), axis=1),
-        )
+        functionals = np.concatenate((self.basis.products[:, before:], varying), axis=1)
+        if isinstance(self.residual_basis, FunctionalBasis):
+            self.residual_basis.extend(functionals)
+        else:
+            self.residual_basis.extend(np.concatenate((new, self.norm.riesz(varying)), axis=1), functionals)
         if not self.snapshots:
-            self.rounding = self._rounding(theta, self.problem.outputs.T @ solution)
-        self.snapshots.append(state)
+            self.rounding = self._rounding(thetas[0], self.problem.outputs.T @ solution)
+        self.snapshots.extend(states)
+
+    def _galerkin(self, theta: FloatArray) -> FloatArray:
+        """Return the solutions (n, L) in the present basis."""
+        if not self.basis.size:
+            return np.zeros_like(self.problem.loads)
+        image = sum(t * k for t, k in zip(theta, self.images, strict=True))
+        basis = self.basis.vectors
+        return np.asarray(basis @ np.linalg.solve(basis.T @ image, basis.T @ self.problem.loads))
 
     def _rounding(self, theta: FloatArray, wanted: FloatArray) -> float:
         """Return the relative difference of outputs between full solutions and the basis that holds them."""
@@ -273,6 +312,8 @@ def greedy(
     class Surrogate(WeakGreedySurrogate):  # type: ignore[misc]
         """The reduced model's own bound, as pyMOR's search wants it."""
 
+        bounds, asked, rounds = np.empty(0), np.empty((0, 0)), 0
+
         def evaluate(self, mus: list[Any], return_all_values: bool = False) -> Any:
             """Return the largest bound and where it is, or all bounds."""
             if not static.basis.size:  # nothing to bound yet: begin in the middle
@@ -282,17 +323,43 @@ def greedy(
                 bounds = np.array([judgement.bound(present, mu) for mu in mus])
             if return_all_values:
                 return bounds
+            self.bounds, self.asked = bounds, np.array(mus)
             worst = int(bounds.argmax())
             return float(bounds[worst]), mus[worst]
 
         def extend(self, mu: State) -> None:
-            """Add the full solutions at the worst state."""
-            static.add_snapshot(mu)
-            static.advance(1, f"full solution {len(static.snapshots)}")
+            """Add the full solutions at the worst state, and at others of large bounds away from it."""
+            first = static.batch == 1 or not static.basis.size
+            chosen = (
+                [mu] if first else _spread(self.asked, self.bounds, static.batch, SEARCH_MARGIN * tolerance)
+            )
+            static.add_snapshots(chosen)
+            self.rounds += 1
+            static.advance(len(chosen), f"full solution {len(static.snapshots)}")
 
-    result = weak_greedy(Surrogate(), states, atol=SEARCH_MARGIN * tolerance, max_extensions=most_snapshots)
+    surrogate, most_rounds = Surrogate(), 1 + (most_snapshots - 1) // static.batch
+    result = weak_greedy(surrogate, states, atol=SEARCH_MARGIN * tolerance, max_extensions=most_rounds)
     bounds = [float(value) for value in result["max_errs"][1:]]
-    if len(bounds) < len(static.snapshots):  # stopped by the limit: the last bound was not evaluated
+    if len(bounds) < surrogate.rounds:  # stopped by the limit: the last bound was not evaluated
         present = model()
         bounds.append(max(judgement.bound(present, mu) for mu in states))
     return bounds
+
+
+def _beside(blocks: list[FloatArray]) -> FloatArray:
+    """Return blocks (n, k) beside each other; one alone as it is: its layout decides how sums round."""
+    return blocks[0] if len(blocks) == 1 else np.concatenate(blocks, axis=1)
+
+
+def _spread(states: FloatArray, bounds: FloatArray, count: int, least: float) -> list[State]:
+    """Return the worst state, then those above `least` by bound times distance from all that are chosen."""
+    places = states / np.maximum(np.ptp(states, axis=0), 1e-300)
+    chosen = [int(bounds.argmax())]
+    distance = np.full(len(states), np.inf)
+    while len(chosen) < count:
+        distance = np.minimum(distance, np.linalg.norm(places - places[chosen[-1]], axis=1))
+        score = np.where(bounds > least, bounds * distance, 0.0)
+        if not score.any():
+            break
+        chosen.append(int(score.argmax()))
+    return [tuple(states[number].tolist()) for number in chosen]

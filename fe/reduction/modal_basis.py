@@ -7,6 +7,7 @@ in it; then the modes of many states, computed in the working basis, are compres
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.linalg import eigh
 
-from fe.full.affine import AffineSystem, affine_sum
+from fe.full.affine import AffineSum, AffineSystem, affine_sum
 from fe.full.subspace import Norm, OrthonormalBasis
 from fe.runtime.errors import ReductionError
 
@@ -76,8 +77,12 @@ class MatrixTerms(Protocol):
 class _WorkingBasis:
     """Basis orthonormal in the reference norm, with the projected terms."""
 
-    def __init__(self, system: MatrixTerms, norm: Norm) -> None:
+    def __init__(self, system: MatrixTerms, norm: Norm, together: int) -> None:
         self.system, self.norm = system, norm
+        self.sums = tuple(
+            partial(affine_sum, terms=terms) if together == 1 else AffineSum(terms).matrix
+            for terms in (system.stiffness_terms, system.mass_terms)
+        )
         self.basis = OrthonormalBasis(system.stiffness_terms[0].shape[0], norm, drop=1e-6)
         self.stiffness = np.empty((len(system.stiffness_terms), 0, 0))
         self.mass = np.empty((len(system.mass_terms), 0, 0))
@@ -225,6 +230,7 @@ def modal_basis(
     compression: list[ModalState],
     settings: ModalSettings,
     advance: Callable[[], object],
+    together: int = 1,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Make a basis for the first modes of any structure.
 
@@ -240,6 +246,8 @@ def modal_basis(
         Where the working basis is refined, and whose modes are compressed together.
     settings, advance
         As of `reduce_modes`, as are the errors.
+    together : int
+        How many states are refined at once; one repeats the shipped wing to the bit.
 
     Returns
     -------
@@ -254,16 +262,15 @@ def modal_basis(
         raise ReductionError(
             f"{settings.mode_count} modes cannot be had from {unknowns} unknowns; ask for fewer or refine."
         )
-    working = _WorkingBasis(system, norm)
+    working = _WorkingBasis(system, norm, together)
     matrix = affine_sum(middle, system.mass_terms)
     # inverse iteration on a block; what it leaves is refined below
     vectors = np.random.default_rng(1).normal(size=(unknowns, count + 4))
     for _ in range(START_ITERATIONS):
         vectors = np.linalg.qr(norm.riesz(np.asarray(matrix @ vectors)))[0]
     working.extend(vectors)
-    for theta, mass_theta in sampled:
-        _refine(working, theta, mass_theta, count, settings)
-        advance()
+    for first in range(0, len(sampled), together):
+        _refine(working, sampled[first : first + together], count, settings, advance)
     basis = _compress(working, compression, count, settings)
     stiffness, mass = (
         # What rounding made of the symmetry of large entries is averaged out.
@@ -274,25 +281,40 @@ def modal_basis(
 
 
 def _refine(
-    working: _WorkingBasis, theta: FloatArray, mass_theta: FloatArray, count: int, settings: ModalSettings
+    working: _WorkingBasis,
+    states: list[ModalState],
+    count: int,
+    settings: ModalSettings,
+    advance: Callable[[], object],
 ) -> None:
-    """Add Davidson corrections X^-1 (K - omega^2 M) phi until the modes of one state have small residuals."""
-    stiffness = affine_sum(theta, working.system.stiffness_terms)
-    mass = affine_sum(mass_theta, working.system.mass_terms)
-    sizes = np.full(count, np.inf)
+    """Add Davidson corrections X^-1 (K - omega^2 M) phi until all modes of the states are found well."""
+    open_states = [
+        (*state, *(sums(values) for sums, values in zip(working.sums, state, strict=True)))
+        for state in states
+    ]
+    largest = np.inf
     for _ in range(settings.most_corrections):
-        square, coefficients = working.modes(theta, mass_theta, count)
-        shape = working.basis.vectors @ coefficients
-        residual = stiffness @ shape - (mass @ shape) * square
-        correction = working.norm.riesz(residual)
+        modes = [working.modes(theta, mass_theta, count) for theta, mass_theta, _, _ in open_states]
+        residual = []
+        for (_, _, stiffness, mass), (square, coefficients) in zip(open_states, modes, strict=True):
+            shape = working.basis.vectors @ coefficients
+            residual.append(stiffness @ shape - (mass @ shape) * square)
+        residuals = np.concatenate(residual, axis=1)
+        correction = working.norm.riesz(residuals)
         # (r, X^-1 r) / (phi, K phi); phi is mass-normalised
-        sizes = np.sqrt(np.einsum("ik,ik->k", residual, correction) / square)
-        open_modes = np.flatnonzero(sizes > settings.residual_tolerance)
-        if not open_modes.size:
+        squares = np.concatenate([square for square, _ in modes])
+        sizes = np.sqrt(np.einsum("ik,ik->k", residuals, correction) / squares)
+        too_large = sizes > settings.residual_tolerance
+        still = too_large.reshape(len(open_states), count).any(axis=1)
+        for _ in range(int(np.sum(~still))):
+            advance()
+        if not still.any():
             return
-        working.extend(correction[:, open_modes])
+        largest = float(sizes.max())
+        working.extend(correction[:, np.flatnonzero(too_large)])
+        open_states = [state for state, chosen in zip(open_states, still, strict=True) if chosen]
     raise ReductionError(
-        f"The modes of a sampled state reached a residual of {sizes.max():.2g} only, "
+        f"The modes of a sampled state reached a residual of {largest:.2g} only, "
         f"{settings.residual_tolerance:.2g} was asked for; allow more corrections."
     )
 

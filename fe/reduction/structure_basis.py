@@ -31,6 +31,8 @@ LEAST_COSINE = 1e-3
 nothing of the structure sees it there."""
 SAMPLED_INSIDE = 10
 """States inside the box at which the modes are refined."""
+TOGETHER = 4
+"""Full solutions of the search, and states whose modes are refined, at once."""
 CHOSEN_STATES = 128
 """States inside the box on the training set, beside corners."""
 
@@ -51,7 +53,7 @@ class StructureSettings:
     """
 
     bound_tolerance: float = 6e-4
-    most_snapshots: int = 40
+    most_snapshots: int = 61
     modal: ModalSettings = field(default_factory=ModalSettings)
 
 
@@ -234,6 +236,7 @@ def reduce_structure(
             terms.farthest()[:-1],
             stage.advance,
             least := _least(terms.problem, norm),
+            TOGETHER,
         )
         judgement, states = _judgement(terms, least), terms.training()
         history = greedy(
@@ -267,7 +270,9 @@ def _modes(
     """Return the modal basis with the terms in it; raises `ReductionError`."""
     sampled, compression = terms.sampled_modes(), terms.compressed_modes()
     try:
-        return modal_basis(terms.problem, norm, terms.middle_mass, sampled, compression, settings, advance)
+        return modal_basis(
+            terms.problem, norm, terms.middle_mass, sampled, compression, settings, advance, TOGETHER
+        )
     except np.linalg.LinAlgError:
         raise ReductionError(
             f"The masses of {name} move in fewer ways than the {settings.mode_count + 2} modes that are "
