@@ -18,9 +18,13 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from fe.full.operators import assemble
     from fe.full.statics import solve_static
     from fe.reduction.model_cache import reduced_model
+    from fe.reduction.structure_cache import reduced_structure
+    from fe.structure.operators import load_and_assemble as assemble_structure
+    from fe.structure.solution import natural_frequencies, static_responses
     from fe.wing.design import load_design
     from fmu_asset.door.session import FmiAsset
     from fmu_asset.packing.wing_fmu import build_fmu
+    from scenarios import structure_files
     from twin_master.learning.monitor import WatchfulEstimator
     from twin_master.mission.preparation import prepare_twin
     from twin_master.network.estimator import Carried, Estimate, ExactFilter
@@ -45,6 +49,7 @@ __all__ = [
     "Twin",
     "WatchfulEstimator",
     "assemble",
+    "assemble_structure",
     "build_fmu",
     "calibrate",
     "eigenmodes",
@@ -55,14 +60,18 @@ __all__ = [
     "load_design",
     "load_model",
     "load_scenario",
+    "natural_frequencies",
     "open_run",
     "prepare_twin",
     "read_campaign",
     "read_verdict",
     "reduced_model",
+    "reduced_structure",
     "report_figures",
     "resume",
     "solve_static",
+    "static_responses",
+    "structure_files",
     "value_iteration",
     "write_report",
 ]
@@ -77,6 +86,7 @@ _HOMES = {
     "Twin": "twin_master.network.twin",
     "WatchfulEstimator": "twin_master.learning.monitor",
     "assemble": "fe.full.operators",
+    "assemble_structure": "fe.structure.operators:load_and_assemble",
     "build_fmu": "fmu_asset.packing.wing_fmu",
     "calibrate": "calibration.wing.three_steps:calibrate_wing",
     "eigenmodes": "fe.full.modes",
@@ -87,14 +97,18 @@ _HOMES = {
     "load_design": "fe.wing.design",
     "load_model": "discrepancy.model_choice",
     "load_scenario": "twin_master.scenario.reading",
+    "natural_frequencies": "fe.structure.solution",
     "open_run": "twin_master.report.reading",
     "prepare_twin": "twin_master.mission.preparation",
     "read_campaign": "discrepancy.campaign.reading",
     "read_verdict": "discrepancy.files.verdict:read_verdict_folder",
     "reduced_model": "fe.reduction.model_cache",
+    "reduced_structure": "fe.reduction.structure_cache",
     "report_figures": "twin_master.report.page",
     "resume": "twin_master.workflow:resume_run",
     "solve_static": "fe.full.statics",
+    "static_responses": "fe.structure.solution",
+    "structure_files": "scenarios",
     "value_iteration": "twin_master.network.planner",
     "write_report": "twin_master.report.page",
 }

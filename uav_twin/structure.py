@@ -46,7 +46,10 @@ def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: t
     ]
     console.print(console_table(("part", "name", "set", "holds", "note"), parts, console.width))
     modes_found = [(f"{number}", f"{value:.6g}") for number, value in enumerate(record["frequencies"], 1)]
-    console.print(console_table(("mode", "frequency [Hz]"), modes_found, console.width))
+    if modes_found:
+        console.print(console_table(("mode", "frequency [Hz]"), modes_found, console.width))
+    else:
+        console.print("No modes: nothing has mass. Give the materials a density.", soft_wrap=True)
     for load in record["loads"]:
         of = f" at {load['control']} = {load['value']:g}" if load["control"] else ""
         largest = f"largest displacement {1e3 * load['largest_displacement']:.6g} mm"

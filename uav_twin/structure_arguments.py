@@ -11,10 +11,20 @@ if TYPE_CHECKING:
     from fe.runtime.structure_model import StructureModel
     from fe.structure.operators import Structure
 
-File = Annotated[Path, typer.Argument(help="A structure file (TOML) beside its mesh.", show_default=False)]
+File = Annotated[
+    Path,
+    typer.Argument(help="A structure file (TOML) beside its mesh, or a shipped one.", show_default=False),
+]
 MemoryLimit = Annotated[
     float | None, typer.Option(min=0.1, help="GiB that it may take; what the machine has left by default.")
 ]
+
+
+def located(file: Path) -> Path:
+    """Return a structure file, or the shipped one of that name where there is no such file."""
+    from scenarios import structure_files
+
+    return file if file.exists() else structure_files().get(str(file), file)
 
 
 def assembled(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool = False) -> "Structure":
@@ -22,14 +32,14 @@ def assembled(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool
     from fe.structure.operators import load_and_assemble
 
     with terminal.progress().stage("Reading the mesh and assembling"):
-        return load_and_assemble(file, _bytes(memory_limit), mass_as_stiffness=mass_as_stiffness)
+        return load_and_assemble(located(file), _bytes(memory_limit), mass_as_stiffness=mass_as_stiffness)
 
 
 def reduced(file: Path, memory_limit: float | None) -> "StructureModel":
     """Return the reduced model, from the cache where it is there."""
     from fe.reduction.structure_cache import reduced_structure
 
-    return reduced_structure(file, progress=terminal.progress(), memory_limit=_bytes(memory_limit))
+    return reduced_structure(located(file), progress=terminal.progress(), memory_limit=_bytes(memory_limit))
 
 
 def _bytes(memory_limit: float | None) -> float | None:

@@ -31,16 +31,19 @@ def field(
         raise FileNotWrittenError(f"{out} exists: choose another --out or give --replace.")
     structure = assembled(file, memory_limit)
     known = (*structure.parameters, *structure.regions, *structure.masses, *structure.controls)
-    values = dict(_named(text, known) for text in at or ())
-    for name, value in values.items():
-        lost, stiffness = name in structure.regions, name in structure.parameters
-        if (
-            (lost and not 0.0 <= value < 1.0)
-            or (stiffness and value <= 0.0)
-            or (name in structure.masses and value < 0.0)
-        ):
-            wanted = "at least 0 and below 1" if lost else "above 0" if stiffness else "at least 0"
-            raise typer.BadParameter(f"{name} must be {wanted}, but is {value:g}.", param_hint="--at")
+    values: dict[str, float] = {}
+    for text in at or ():
+        name, value = _named(text, known)
+        if name in values:
+            raise typer.BadParameter(f"{name} is given twice; give it once.", param_hint="--at")
+        low, high = structure.ranges[name]
+        if not low <= value <= high:
+            raise typer.BadParameter(
+                f"{name} must lie between {low:g} and {high:g}, but is {value:g}; give a value inside, or "
+                "widen its range in the structure file.",
+                param_hint="--at",
+            )
+        values[name] = value
     try:
         with terminal.progress().stage("Solving and writing the field"):
             write_structure_vtu(out, structure, values)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from reporting import terminal
-from uav_twin.structure_arguments import File, MemoryLimit, reduced
+from uav_twin.structure_arguments import File, MemoryLimit, located, reduced
 
 
 def fmu(
@@ -43,7 +43,7 @@ def fmu(
     from reporting.files import atomic_write_text
 
     target = checked_target(file.with_suffix(".fmu") if out is None else out, replace=replace)
-    taken = {file.resolve(): "the structure file", target.resolve(): "the FMU"}
+    taken = {located(file).resolve(): "the structure file", target.resolve(): "the FMU"}
     for name, path in (("binding", binding), ("rig", rig)):
         if path is None:
             continue
@@ -54,7 +54,7 @@ def fmu(
             raise FileNotWrittenError(f"{path} exists: choose another --{name} or give --replace.")
     text = None
     if rig is not None:
-        text = rig_text(load_structure(file), relpath(target, rig.parent))
+        text = rig_text(load_structure(located(file)), relpath(target, rig.parent))
     if kind == "compiled":
         find_compiler()  # before the structure is reduced, which can take minutes
     model = reduced(file, memory_limit)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from keyword import iskeyword
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator, model_validator
@@ -10,6 +11,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from discrepancy.campaign.records import Hold, Quantity, Start, TrialKind
 from discrepancy.campaign.units import units_of
 from discrepancy.errors import CampaignFileError
+from fe.runtime.expression import RESERVED
 from fe.runtime.patch import EVERY_CHANNEL
 from reporting.section import Section, shown
 
@@ -232,6 +234,10 @@ class EventSection(Section):
                 f"the event {self.name!r} is used in expressions, so its name must be of letters, digits and "
                 "underscores, a letter first"
             )
+        if self.name in RESERVED or iskeyword(self.name):
+            raise ValueError(
+                f"the event {self.name!r} has a name that means something else in an expression: rename it"
+            )
         if self.trial is not None and self.trials is not None:
             raise ValueError(f"the event {self.name!r} has `trial` and `trials`: give one of the two")
         if self.until is not None and self.until <= self.time:
@@ -394,6 +400,8 @@ def _sentence(error: Mapping[str, Any], table: Mapping[str, Any]) -> str:
         return f"`{where}` is missing."
     if error["type"] == "value_error":
         return f"{error['ctx']['error']}."
+    if error["type"] == "tuple_type" and isinstance(error["input"], Mapping):
+        return f"there can be several of `{where}`, so write [[{where}]] for each, not [{where}]."
     if error["type"] == "too_short":
         return f"`{where}` must have at least one entry."
     expected = str(error["msg"]).replace("Input should", "should", 1)

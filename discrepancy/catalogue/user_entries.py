@@ -53,7 +53,7 @@ from discrepancy.catalogue.effect_table import Table
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter, nowhere_else
 from discrepancy.errors import CatalogueError
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.expression import Expression
+from fe.runtime.expression import RESERVED, Expression
 from fe.runtime.patch import PRIMITIVES, SENSORS, ModelPatch, Primitive, Window
 from reporting.toml_file import read_toml
 
@@ -173,7 +173,7 @@ def _effect(table: Table) -> Effect:
 
 def _check_names(table: Table, names: frozenset[str], events: tuple[str, ...]) -> None:
     """Refuse names of parameters and events that mean something else in an expression."""
-    taken = {*SCALES, *PORT_SCALES, "pi", "place", "time"}
+    taken = {*SCALES, *PORT_SCALES, *RESERVED}
     for name in names:
         if not name.isidentifier() or name in taken:
             raise CatalogueError(f"{table.where}: a parameter must not be called {name!r}.")

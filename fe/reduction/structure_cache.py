@@ -45,15 +45,10 @@ def reduced_structure(
     FiniteElementError
         If the structure cannot be read, modelled or reduced.
     """
-    from fe.structure.design import load_structure, structure_hash
-
     from .structure_basis import StructureSettings
 
     file, settings = Path(file), settings or StructureSettings()
-    design = load_structure(file)
-    design_hash = structure_hash(design, file.parent / design.mesh)
-    content = f"{design_hash} {settings!r} {modelling_hash((*MODELLING_ROOMS, 'structure'))}"
-    path = cache_folder() / f"structure-{hashlib.sha256(content.encode()).hexdigest()[:32]}.npz"
+    design_hash, path = _place(file, settings)
 
     def load() -> StructureModel:
         model = StructureModel.load(path)
@@ -73,6 +68,32 @@ def reduced_structure(
     return built_once(
         path, load=load, build=build, keep=lambda model: write_bytes_atomically(path, model.to_bytes())
     )
+
+
+def check_structure(file: Path | str) -> None:
+    """Read a structure file with its mesh and assemble both, unless their reduced model is kept.
+
+    Raises
+    ------
+    FiniteElementError
+        If the structure cannot be read or modelled.
+    """
+    from fe.structure.operators import load_and_assemble
+
+    from .structure_basis import StructureSettings
+
+    if not _place(Path(file), StructureSettings())[1].is_file():
+        load_and_assemble(file)
+
+
+def _place(file: Path, settings: "StructureSettings") -> tuple[str, Path]:
+    """Return the hash of a structure with its mesh, and where its reduced model is kept."""
+    from fe.structure.design import load_structure, structure_hash
+
+    design = load_structure(file)
+    design_hash = structure_hash(design, file.parent / design.mesh)
+    content = f"{design_hash} {settings!r} {modelling_hash((*MODELLING_ROOMS, 'structure'))}"
+    return design_hash, cache_folder() / f"structure-{hashlib.sha256(content.encode()).hexdigest()[:32]}.npz"
 
 
 def reduced(

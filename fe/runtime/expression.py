@@ -45,6 +45,8 @@ _FUNCTIONS: dict[str, Callable[..., float]] = {
     "max": max,
     "step": step,
 }
+RESERVED = frozenset({*_FUNCTIONS, "pi", "place", "time"})
+"""What names in an expression mean already: no event and no parameter can have one of them."""
 _OF_ARRAYS: dict[str, Callable[..., Any]] = {
     **{name: getattr(np, name) for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "abs")},
     "min": lambda *given: reduce(np.minimum, given),

@@ -197,7 +197,7 @@ class _Reader:
     def mesh(self) -> FileMesh:
         """Return the mesh of all that was taken."""
         if self.kind is None:
-            _fail(str(self.path), "the deck holds no solid elements.")
+            _fail(str(self.path), "the deck holds no whole block of solid elements: was it cut off?")
         numbers = np.array(list(self.nodes), dtype=np.int64)
         place = {number: index for index, number in enumerate(self.nodes)}
         cell = {number: index for index, number in enumerate(self.elements)}

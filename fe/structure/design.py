@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from fe.full.assembly import rotate_elasticity
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
@@ -332,6 +332,13 @@ class StructureDesign(Part):
     displacement: tuple[PointOutput, ...] = ()
     acceleration: tuple[PointOutput, ...] = ()
     damping: Damping = Damping()
+
+    @field_validator("name", "mesh")
+    @classmethod
+    def _one_line(cls, text: str) -> str:
+        if not text.isprintable():
+            raise ValueError("one line of text is expected, without line breaks or other control characters")
+        return text
 
     @model_validator(mode="after")
     def _names_fit_together(self) -> "StructureDesign":

@@ -47,6 +47,12 @@ def read_mesh(path: Path, unit: float, unit_name: str) -> StructureMesh:
         One sentence that names the file and the place: cells of an unknown kind or of several, a negative
         Jacobian, a mid-edge node far from its edge, parts that do not hang together.
     """
+    if path.is_dir():
+        raise MeshError(
+            f"The mesh {path} is a folder; `mesh` must name a mesh file, as seen from the structure file."
+        )
+    if path.is_file() and not path.stat().st_size:
+        raise MeshError(f"The mesh file {path} is empty; write it anew.")
     found = read_abaqus(path) if path.suffix.lower() == ".inp" else _from_meshio(path)
     if not np.isfinite(found.points).all():
         number = int(found.node_numbers[~np.isfinite(found.points).all(axis=1)][0])
@@ -156,7 +162,9 @@ def _from_meshio(path: Path) -> FileMesh:
         why = " ".join(said.getvalue().split()).removeprefix("Error: ").rstrip(".")
         raise MeshError(f"The mesh file {path} cannot be read as {path.suffix}: {why}.") from None
     except Exception as error:  # noqa: BLE001 - the readers of formats fail in any way
-        raise MeshError(f"The mesh file {path} cannot be read as {path.suffix}: {error!r}.") from None
+        raise MeshError(
+            f"The mesh file {path} cannot be read as {path.suffix}; it is damaged or cut off ({error!r})."
+        ) from None
     kind = _one_kind(path, found)
     numbers = np.cumsum([0, *(len(block.data) for block in found.cells)])
     solid = [number for number, block in enumerate(found.cells) if block.type == kind.file_type]

@@ -136,6 +136,17 @@ def test_a_fault_ends_in_one_sentence(
     assert "none.toml" in capsys.readouterr().err
 
 
+def test_a_shipped_structure_goes_by_its_name_and_nothing_moves_without_mass(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, "info", "bracket", "--modes", "1") == 0
+    assert "HEEL" in capsys.readouterr().out
+    file.write_text(STRUCTURE.replace("density = 7800", "density = 0"))
+    assert call(monkeypatch, "info", str(file), "--modes", "3") == 0
+    assert "No modes: nothing has mass." in capsys.readouterr().out
+
+
 def test_a_structure_is_reduced_and_compared(
     write_beam: Callable[..., Path],
     tmp_path: Path,
@@ -162,18 +173,22 @@ def test_a_structure_is_reduced_and_compared(
 def test_the_field_is_written_for_paraview(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A bar under 20 MPa: 100 microstrain along, none across, half the stiffness gives twice of all."""
+    """A bar under 20 MPa: 100 microstrain along, none across, and by 1 / e more of all."""
     out = tmp_path / "bar.vtu"
-    assert call(monkeypatch, "field", str(file), "--out", str(out), "--at", "e=0.5") == 0
+    assert call(monkeypatch, "field", str(file), "--out", str(out), "--at", "e=0.9") == 0
     field = meshio.read(out)
-    assert field.cell_data["strain"][0][0] == pytest.approx([2e-4, 0, 0, 0, 0, 0], abs=1e-12)
-    assert field.point_data["displacement"][:, 0].max() == pytest.approx(2e-5, rel=1e-9)
+    assert field.cell_data["strain"][0][0] == pytest.approx([1e-4 / 0.9, 0, 0, 0, 0, 0], abs=1e-12)
+    assert field.point_data["displacement"][:, 0].max() == pytest.approx(1e-5 / 0.9, rel=1e-9)
     assert call(monkeypatch, "field", str(file), "--out", str(out)) != 0
     assert "exists" in capsys.readouterr().err
     before = out.read_bytes()
     for words in ("e=stiff", "e", "z9=0.1", "e=nan", "e=-1"):
         assert call(monkeypatch, "field", str(file), "--out", str(out), "--replace", "--at", words) == 2
-    assert "e must be above 0, but is -1" in " ".join(capsys.readouterr().err.split())
+    said = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert "e must lie between 0.9 and 1.1, but is -1; give a value inside" in said
+    twice = ("--replace", "--at", "e=1", "--at", "e=1.05")
+    assert call(monkeypatch, "field", str(file), "--out", str(out), *twice) == 2
+    assert "e is given twice" in capsys.readouterr().err
     assert out.read_bytes() == before
 
 

@@ -214,9 +214,11 @@ class StructureFmuSource(FmuSource):
 
         Raises
         ------
-        MissionInputError, InvalidDesignError, FmuError
-            A file cannot be read or is wrong, or the scenario speaks of what the structure does not have.
+        MissionInputError, FiniteElementError, FmuError
+            A file cannot be read or is wrong, the mesh does not hold what the structure names, or the
+            scenario speaks of what the structure does not have.
         """
+        from fe.reduction.structure_cache import check_structure
         from fmu_asset.door.binding import load_binding
         from fmu_asset.structures.binding import names_of_design, structure_binding
 
@@ -235,6 +237,7 @@ class StructureFmuSource(FmuSource):
         if not own:  # under a binding of one's own the names may be others
             _check_ranges(self._scenario, design, self._section.parameters)
             _check_history(self._scenario, design)
+        check_structure(self._section.all_files()[FLOWN_COPY])
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the structure and pack the FMU."""
@@ -292,11 +295,13 @@ class StructureSource:
 
         Raises
         ------
-        MissionInputError, InvalidDesignError
-            A file cannot be read or is wrong.
+        MissionInputError, FiniteElementError
+            A file cannot be read or is wrong, or the mesh does not hold what the structure names.
         MissingObservationModelError
             The scenario's states, controls or sensors are not those of the structure.
         """
+        from fe.reduction.structure_cache import check_structure
+
         self.files()
         design, scenario = self._design(), self._scenario
         _check_parameter(scenario, design)
@@ -323,6 +328,7 @@ class StructureSource:
                 f"expects {scenario.observation.count}."
             )
         _check_ranges(scenario, design, {})
+        check_structure(self._places[MODEL_COPY])
 
     def files(self) -> dict[str, bytes]:
         """Return structure file and mesh as they are given.

@@ -134,6 +134,9 @@ def test_events_survive_the_files(campaign: Campaign, tmp_path: Path) -> None:
         ('"pump_on"', '"pump on"', "must be of letters, digits and underscores"),
         ('trial = "pumping"\ntime', 'trial = "quiet"\ntrials = ["quiet"]\ntime', "give one of the two"),
         ("until = 8.0", 'until = 8.0\n[[event]]\nname = "pump_on"\ntime = 1.0', "moment 'pump_on' in"),
+        *(('name = "pump_on"', f'name = "{name}"', "means something else in an expression: rename it")
+          for name in ("time", "step", "max", "lambda")),
+        ("[[event]]", "[event]", "several of `event`, so write [[event]] for each, not [event]"),
         ("until = 8.0", 'until = 8.0\n[[event]]\nname = "pump_on_until"\ntime = 1.0', "'pump_on_until' in"),
         ('trial = "pumping"\ntime', "trials = []\ntime", "trials` must have at least one entry"),
     ],

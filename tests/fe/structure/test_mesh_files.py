@@ -170,6 +170,12 @@ def test_other_files_that_cannot_be_read_are_refused(
         return str(caught.value)
 
     assert "is not there" in sentence("none.msh")
+    assert "is a folder; `mesh` must name a mesh file" in sentence(".")
+    for name in ("e.msh", "e.inp"):
+        (tmp_path / name).touch()
+        assert f"{name} is empty" in sentence(name)
+    (tmp_path / "c.inp").write_text("*NODE\n1, 0, 0, 0\n")
+    assert "no whole block of solid elements: was it cut off?" in sentence("c.inp")
     (tmp_path / "m.msh").write_text("nonsense")
     assert "cannot be read" in sentence("m.msh")
     (tmp_path / "m.xyz").write_text("nonsense")

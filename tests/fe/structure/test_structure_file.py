@@ -89,6 +89,7 @@ def test_the_file_without_a_fault_is_taken(make: Callable[[str], Path]) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
+        ('name = "test"', 'name = "be\\nam"', "name: one line of text is expected"),
         ('"mm"', '"furlong"', r"length_unit: input should be 'm', 'cm', .* but 'furlong' came"),
         ("density = 2700", "density = -1", r"material\[1\]\.density: .* but -1 came"),
         ("density = 2700", 'density = "x"', r"material\[1\]\.density: a number is expected, but 'x' came"),

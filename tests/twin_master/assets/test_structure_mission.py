@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import tomllib
 from collections.abc import Callable
@@ -158,6 +159,22 @@ def test_what_does_not_fit_is_refused_before_a_folder_is_made(
 ) -> None:
     with pytest.raises((TwinMasterError, FiniteElementError), match=sentence):
         new_run(short(**changes), tmp_path / "run", report=False)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("table", ["asset", "belief"])
+def test_a_set_that_the_mesh_does_not_have_is_refused_before_a_folder_is_made(
+    table: str, tmp_path: Path
+) -> None:
+    """The sentence names the user's mesh, not a copy of it."""
+    file = tmp_path / "mine.toml"
+    shipped = structure_files()["bracket"]
+    shutil.copy(shipped.with_name("bracket.inp"), tmp_path)
+    file.write_text(
+        shipped.read_text(encoding="utf-8").replace('set = "HEEL"', 'set = "HEAL"'), encoding="utf-8"
+    )
+    with pytest.raises(FiniteElementError, match=re.escape(f"{tmp_path / 'bracket.inp'} holds no set")):
+        new_run(short(**{table: {"structure": str(file)}}), tmp_path / "run", report=False)
     assert not (tmp_path / "run").exists()
 
 
