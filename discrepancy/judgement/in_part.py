@@ -184,8 +184,12 @@ def _in_part(
         if explained.left > 0.0
         else "nothing is left beyond the noise"
     )
+    members = [best, *rivals]
+    if rivals and not any(weighed.laws_of(item) for item in members):
+        alike = " and ".join(dict.fromkeys(_words(named_effects(problem, item)) for item in members))
+        why = f"It is no name, as {alike} describe the readings alike: none has a pattern that is its own."
+        return _unexplained(told, weighed, best, first, why=why)
     if rivals and len(rivals) < SEARCH.largest_group:
-        members = [best, *rivals]
         told_of = [
             f"{_words(named_effects(problem, item))} ({100.0 * weighed.shares(item).value:.0f} %)"
             for item in members
