@@ -153,7 +153,8 @@ class SearchSettings:
     sliver: float = 0.004
     """Share of the gap below which one more effect has to earn its place against a remainder."""
     sliver_gain: float = 10.0
-    """By how much the evidence of a set with such an effect must be above that of the set without it."""
+    """By how much evidence and prior of a set with such an effect must be above those of the set without it:
+    it was chosen among all that may stand there."""
     stand_in_range: float = 3.0
     """Prior deviations beyond which a stand-in (clock, gain, drift, line) names nothing in part."""
     least_periods: float = 3.0

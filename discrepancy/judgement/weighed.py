@@ -222,7 +222,7 @@ class Weighed:
             sliver = self.shares(item).value > share - SEARCH.sliver
             if kept is not None and kept == own and sliver:
                 return item
-            if sliver and item.log_evidence > best.log_evidence - SEARCH.sliver_gain:
+            if sliver and self.found.score(item) > self.found.score(best) - SEARCH.sliver_gain:
                 return item
         return best
 
