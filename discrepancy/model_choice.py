@@ -13,7 +13,13 @@ from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
-from discrepancy.sources.from_run import CALIBRATION_FILE, DESIGN_FILE, patch_of_run, run_model
+from discrepancy.sources.from_run import (
+    CALIBRATION_FILE,
+    DESIGN_FILE,
+    is_calibrated_wing,
+    patch_of_run,
+    run_model,
+)
 from fe.reduction.stages import Progress
 from fe.runtime.errors import FiniteElementError
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
@@ -138,7 +144,8 @@ def choice_of_run(folder: Path) -> ModelChoice:
     """
     model = run_model(folder)
     calibration = folder / CALIBRATION_FILE
-    choice = _calibrated(calibration, None) if calibration.is_file() else _wing(folder / DESIGN_FILE, None)
+    tailored = is_calibrated_wing(folder)
+    choice = _calibrated(calibration, None) if tailored else _wing(folder / DESIGN_FILE, None)
     patch = patch_of_run(folder)
     if patch is None:
         return replace(choice, model=model)

@@ -206,13 +206,12 @@ def _asked(
     scenario: str | None, observations: str | None, follow: bool, ca_file: Path | None, teach: bool
 ) -> "tuple[LoadedScenario | None, str | None]":
     """Return the scenario, and where its observations come from, as far as either is said."""
-    from twin_master.errors import MissionInputError
     from twin_master.scenario.reading import load_scenario
-    from twin_master.watch.teaching import NO_ALARMS
+    from twin_master.watch.teaching import check_teachable
 
     loaded = None if scenario is None else load_scenario(scenario)
-    if teach and loaded is not None and loaded.scenario.notice is None:
-        raise MissionInputError(NO_ALARMS)
+    if teach and loaded is not None:
+        check_teachable(loaded.scenario)
     if observations is None and loaded is not None:
         observations = _recording(loaded.scenario.moved(loaded.path.parent))
     if observations is not None:

@@ -119,6 +119,7 @@ def _compared(
 ) -> "tuple[Campaign, ModelChoice]":  # fmt: skip
     """Return what is measured, and what it is compared with."""
     from discrepancy.campaign.reading import read_campaign
+    from discrepancy.errors import DiscrepancyError
     from discrepancy.model_choice import choice_of_run, choose_model
     from discrepancy.sources.from_run import RunPlan, run_campaign
     from twin_master.watch.snapshot import flown
@@ -127,9 +128,12 @@ def _compared(
         assert campaign is not None
         return read_campaign(campaign), choose_model(model, progress)
     first, last = turns
-    with flown(from_run, last, progress) as folder:
-        data = run_campaign(folder, RunPlan(first_turn=first, last_turn=last))
-        return data, choice_of_run(folder)
+    with flown(from_run, first, last, progress) as folder:
+        try:
+            data = run_campaign(folder, RunPlan(first_turn=first, last_turn=last))
+            return data, choice_of_run(folder)
+        except DiscrepancyError as error:  # a watch was read from a copy, which is nothing to its user
+            raise type(error)(str(error).replace(str(folder), str(from_run))) from error
 
 
 def one_thread() -> None:

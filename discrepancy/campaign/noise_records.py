@@ -58,11 +58,11 @@ def repeat_record(channel: Channel, trials: Sequence[Trial]) -> NoiseRecord | No
     """Return the noise of a channel from repeated static or flight trials, pooled; None without repeats.
 
     Trials are repeats of each other if kind, run, load place, noise factor, number of rows and every row's
-    force, load factor, temperature and health agree. Deviations are taken from the mean of each row over the
-    repeats; where the channel's zero is free in each trial (`offset_deviation` above zero), each trial's mean
-    deviation is removed too. R repeats of N rows then have (R - 1) N or (R - 1) (N - 1) degrees of freedom,
-    and sums of squares and degrees of freedom add up over groups of repeats. Fewer than three degrees of
-    freedom are no record.
+    force, load factor, inputs, temperature and health agree. Deviations are taken from the mean of each row
+    over the repeats; where the channel's zero is free in each trial (`offset_deviation` above zero), each
+    trial's mean deviation is removed too. R repeats of N rows then have (R - 1) N or (R - 1) (N - 1) degrees
+    of freedom, and sums of squares and degrees of freedom add up over groups of repeats. Fewer than three
+    degrees of freedom are no record.
     """
     squares, degrees = 0.0, 0
     for group in repeated(trials, channel.name):
@@ -103,7 +103,10 @@ def _repeats(first: Trial, second: Trial) -> bool:
         second.kind, second.run, second.load_place, len(second.time), second.noise_factor,
     ):  # fmt: skip
         return False
+    if [item.name for item in first.inputs] != [item.name for item in second.inputs]:
+        return False
     pairs = (
+        *zip([item.values for item in first.inputs], [item.values for item in second.inputs], strict=True),
         (first.force, second.force),
         (first.load_factor, second.load_factor),
         (first.temperature, second.temperature),

@@ -164,7 +164,6 @@ def _trial(
     user = f"the trial {section.name!r}"
     time, start = _times(section, table, user)
     zeros = np.zeros(len(table))
-    forced = section.kind in (TrialKind.STATIC, TrialKind.FORCED)
     chosen = _measured(section, table, campaign)
     known = {*INPUT_COLUMNS, *(channel.table_column for channel in campaign.channel)}
     known |= {item.table_column for item in campaign.input}
@@ -177,6 +176,9 @@ def _trial(
     columns, used = zip(*(_readings(channel, section, table, remarks) for channel in chosen), strict=True)
     health, health_deviation = _health(section, table, user)
     inputs = _inputs(section, table, campaign, user)
+    # at rest under other inputs no force need act
+    held = section.kind is TrialKind.STATIC and inputs and "force" not in table.columns
+    forced = section.kind in (TrialKind.STATIC, TrialKind.FORCED) and not held
     return Trial(
         name=section.name,
         kind=section.kind,
@@ -214,8 +216,8 @@ def _inputs(
     campaign: CampaignSection,
     user: str,
 ) -> tuple[RecordedInput, ...]:
-    """Return the recorded inputs of a driven trial: those whose columns are there."""
-    if section.kind is not TrialKind.DRIVEN:
+    """Return the recorded inputs of a driven or static trial: those whose columns are there."""
+    if section.kind not in (TrialKind.DRIVEN, TrialKind.STATIC):
         return ()
     found = []
     for item in campaign.input:

@@ -252,7 +252,8 @@ class Trial:
     begins : Start
         How a forced or driven trial began.
     inputs : tuple of RecordedInput
-        Driven trials: what acted. `force` is then the first force or torque among them, or zero.
+        Driven trials: what acted. `force` is then the first force or torque among them, or zero. Static
+        trials: what was held in each row beside the force.
     """
 
     name: str

@@ -99,7 +99,7 @@ class ChannelSection(ColumnSection):
 
 
 class InputSection(ColumnSection):
-    """`[[input]]`: a recorded input of driven trials."""
+    """`[[input]]`: a recorded input of driven trials, or what is held in each row of a static one."""
 
     hold: Hold | None = Field(default=None, strict=False)
     reference: bool = False
@@ -294,8 +294,8 @@ class CampaignSection(Section):
             twice = sorted({name for name in names if names.count(name) > 1})
             if twice:
                 raise ValueError(f"there is more than one {kind} called {twice[0]!r}: rename one")
-        if self.input and not any(item.kind is TrialKind.DRIVEN for item in self.trial):
-            raise ValueError('[[input]] is for trials of the kind "driven", and there is none')
+        if self.input and not any(item.kind in (TrialKind.DRIVEN, TrialKind.STATIC) for item in self.trial):
+            raise ValueError('[[input]] is for trials of the kind "driven" or "static", and there is none')
         every: tuple[ColumnSection, ...] = (*self.channel, *self.input)
         columns = [item.table_column for item in every]
         twice = sorted({column for column in columns if columns.count(column) > 1})

@@ -214,7 +214,7 @@ def _plausible(campaign: Campaign, name: str, trial: str) -> tuple[tuple[float, 
     Those between two units of the channel, or of what drives the trial, and no others in a driven trial.
     """
     inputs = next(item for item in campaign.trials if item.name == trial)
-    driven = inputs.kind is TrialKind.DRIVEN
+    driven = inputs.kind is TrialKind.DRIVEN or bool(inputs.inputs)
     found = set()
     own = campaign.channels[name].quantity
     for quantity in (own, *_INPUTS.get(inputs.kind, ()), *(item.quantity for item in inputs.inputs)):

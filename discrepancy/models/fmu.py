@@ -260,7 +260,7 @@ class FmuModel:
 
     def _at_rest_values(self, trial: Trial, conditions: Conditions, patch: SortedPatch) -> FloatArray:
         """Return all outputs (N, C) of a static trial or a flight."""
-        loads = self._trials.loads_at_rest(trial, patch)
+        loads = self._trials.loads_at_rest(trial, patch, conditions)
         states = [self._trials.state(trial, conditions, patch.settings, row) for row in range(len(loads))]
         if not len(patch.laws):
             return np.stack([self.motion.rest(s, g) for s, g in zip(states, loads, strict=True)])

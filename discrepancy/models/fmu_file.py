@@ -120,6 +120,14 @@ class ReleaseOf(Section):
         return self
 
 
+class InputOf(Section):
+    """`[[input]]`: an input that static trials hold in each row; `name` as in the campaign."""
+
+    name: Name
+    variable: Name | None = None
+    quantity: Quantity = Quantity.SIGNAL
+
+
 class OutputOf(Section):
     """`[[output]]`: what a channel's `output` names; `{a..b}` stands for all numbers from a to b."""
 
@@ -167,7 +175,7 @@ class FmuModelDescription(ModelDescription):
     binding : str, optional
         A binding file, seen from the file's folder, or a shipped binding by name. Without one, names here are
         variables of the FMU.
-    inputs, static, motion, release, output, port, parameter, scales
+    inputs, static, motion, release, input, output, port, parameter, scales
         See there.
     effects : table
         Kind of a primitive to the id of the FMU's effect (`effect.<id>.active`, `effect.<id>.<number>`).
@@ -184,6 +192,7 @@ class FmuModelDescription(ModelDescription):
     static: Rest = Field(default_factory=Rest)
     motion: Moving = Field(default_factory=Moving)
     release: ReleaseOf | None = None
+    input: tuple[InputOf, ...] = ()
     output: tuple[OutputOf, ...] = Field(min_length=1)
     port: tuple[PortOf, ...] = ()
     parameter: tuple[VariableParameter, ...] = ()
@@ -194,7 +203,9 @@ class FmuModelDescription(ModelDescription):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
-        for kind, items in (("port", self.port), ("parameter", self.parameter), ("output", self.output)):
+        for kind, items in (
+            ("port", self.port), ("parameter", self.parameter), ("output", self.output), ("input", self.input)
+        ):  # fmt: skip
             check_unique(kind, [item.name for item in items])
         for kind in self.effects:
             if kind not in CARRIED:

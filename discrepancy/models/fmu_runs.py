@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from math import pi
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ MOST_INSTANCES = 8
 """Instances (step sizes) that are open at the same time."""
 KEPT_BYTES = 256 * 2**20
 """Results that are remembered."""
+REVOLUTIONS = ("1/min", "rpm", "r/min", "rev/min")
+"""Units of FMUs in which an angular velocity is revolutions in a minute."""
 SETTLE_CHUNK = 200
 """Steps after which it is asked whether the motion has come to rest."""
 
@@ -42,6 +45,9 @@ class FmuRuns:
     ----------
     columns : dict of str to int
         Column of each output of the description, and of `port.NAME.displacement` and `.velocity`.
+    input_factors : dict of str to float
+        By which an `[[input]]` of the description is multiplied, by the FMU's name: revolutions in a minute
+        stand for an angular velocity and have no unit that converts to rad/s.
     run_count, step_count : int
         What has been asked of the FMU so far.
 
@@ -92,6 +98,7 @@ class FmuRuns:
         given, base = self._description, self._base
         wanted = given.inputs
         inputs: dict[str, Input] = {}
+        self.input_factors: dict[str, float] = {}
         units: dict[str | None, str] = {
             **dict.fromkeys(wanted.forces.values(), "N"),
             wanted.load_factor: "1", wanted.z1: "1", wanted.z2: "1",
@@ -100,6 +107,12 @@ class FmuRuns:
             given.release.hold if given.release else None: "N",
         }  # fmt: skip
         units |= {port.force: "N.m" if port.rotation else "N" for port in given.port}
+        for held in given.input:
+            driven = held.variable or held.name
+            unit = self._own_unit(self.variable(driven))
+            turning = held.quantity is Quantity.ANGULAR_VELOCITY and unit in REVOLUTIONS
+            self.input_factors[self.variable(driven)] = 30.0 / pi if turning else 1.0
+            units[driven] = unit if turning or held.quantity is Quantity.SIGNAL else _si(held.quantity)
         for name, unit in units.items():
             if name is not None:
                 variable = self.variable(name)
@@ -135,7 +148,7 @@ class FmuRuns:
                     f"{counted(len(names), 'name')}, but its variable for {len(variables)}; give as many."
                 )
             for name, variable in zip(names, variables, strict=True):
-                unit = "" if item.quantity is Quantity.SIGNAL else UNITS[item.quantity].si
+                unit = "" if item.quantity is Quantity.SIGNAL else _si(item.quantity)
                 at = columns.setdefault((self.variable(variable), unit), len(columns))
                 self.columns[name], self.quantities[name] = at, item.quantity
         for port in given.port:
@@ -279,6 +292,11 @@ class FmuRuns:
         """Return the largest size that an input may have, both signs."""
         low, high = self._first.input_range("load", self.variable(name))
         return min(abs(low), abs(high))
+
+
+def _si(quantity: Quantity) -> str:
+    """Return the SI unit of a quantity as FMUs write it."""
+    return UNITS[quantity].si.replace(" ", ".")
 
 
 def binding_file(description: FmuModelDescription, folder: Path) -> Path | None:

@@ -34,6 +34,7 @@ class FmuTrials:
         self._description, self._runs, self._name = description, runs, description.name
         self._keys = [runs.parameter(item.variable or item.name) for item in description.parameter]
         self._forces = {place: runs.variable(name) for place, name in description.inputs.forces.items()}
+        self._inputs = {item.name: runs.variable(item.variable or item.name) for item in description.input}
 
     @property
     def forces(self) -> tuple[str, ...]:
@@ -110,7 +111,9 @@ class FmuTrials:
                     )
         return loads
 
-    def loads_at_rest(self, trial: Trial, patch: SortedPatch) -> list[dict[str, float]]:
+    def loads_at_rest(
+        self, trial: Trial, patch: SortedPatch, conditions: Conditions
+    ) -> list[dict[str, float]]:
         """Return the inputs of each row of a static trial or a flight.
 
         Raises
@@ -126,6 +129,7 @@ class FmuTrials:
                 f"load_factor in [inputs]; leave it out."
             )
         count = len(trial.force)
+        held = self._held(trial, conditions)
         loads: list[dict[str, float]] = []
         for row in range(count):
             if flight:
@@ -133,7 +137,11 @@ class FmuTrials:
                 continue
             recorded = float(trial.force[row])
             acting = recorded * (1.0 + patch.gain) + patch.tare * (recorded != 0.0)
-            given = {self._input_of(trial.load_place): acting}
+            given = {name: float(values[row]) for name, values in held.items()}
+            if held and not np.any(trial.force):
+                loads.append(given)
+                continue
+            given[self._input_of(trial.load_place)] = acting
             for lever, moment in (
                 (patch.along_span, inputs.bending_moment),
                 (patch.along_chord, inputs.torque),
@@ -142,6 +150,21 @@ class FmuTrials:
                     given[self._runs.variable(moment)] = acting * lever
             loads.append(given)
         return loads
+
+    def _held(self, trial: Trial, conditions: Conditions) -> dict[str, FloatArray]:
+        """Return the inputs (N,) that a static trial holds, by the FMU's names."""
+        offsets = conditions.offset or (0.0,) * len(trial.inputs)
+        found = {}
+        for item, offset in zip(trial.inputs, offsets, strict=True):
+            if item.name not in self._inputs:
+                raise ModelError(
+                    f"The trial {trial.name!r} holds the input {item.name!r}, which the FMU model "
+                    f"{self._name!r} does not have; it has {', '.join(self._inputs) or 'none'}: name it in "
+                    "[[input]]."
+                )
+            variable = self._inputs[item.name]
+            found[variable] = self._runs.input_factors[variable] * (item.values + offset)
+        return found
 
     def state(
         self, trial: Trial, conditions: Conditions, settings: tuple[tuple[str, float], ...], row: int

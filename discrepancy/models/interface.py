@@ -243,6 +243,23 @@ class Model(Protocol):
         """
 
 
+def check_no_inputs(trial: Trial, what: str) -> None:
+    """Refuse a static trial under other inputs than a force, for a model that has none."""
+    if trial.kind is TrialKind.STATIC and trial.inputs:
+        names = ", ".join(repr(item.name) for item in trial.inputs)
+        raise ModelError(
+            f"The trial {trial.name!r} is static under the inputs {names}, which {what} does not have at "
+            'rest: describe the asset as an FMU model with [[input]], or record the trial as "driven".'
+        )
+
+
+def check_lumped(trial: Trial, what: str) -> None:
+    """Refuse a flight, and a static trial under other inputs than a force, for a model without either."""
+    if trial.kind is TrialKind.FLIGHT:
+        raise ModelError(f"The trial {trial.name!r} is a flight, but {what} has no lift; leave it out.")
+    check_no_inputs(trial, what)
+
+
 def check_plain(trial: Trial, what: str) -> None:
     """Refuse a driven trial, and a forced one that is not settled, for a model that cannot follow them."""
     if trial.kind is TrialKind.DRIVEN or trial.begins is not Start.SETTLED:

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
+from discrepancy.models.interface import (
+    Conditions,
+    ModelParameter,
+    PortScale,
+    Response,
+    Scales,
+    check_lumped,
+)
 from discrepancy.models.lumped_file import LumpedDescription, load_lumped, matrix_of
 from discrepancy.models.lumped_patch import laws_at, sorted_lumped
 from discrepancy.models.lumped_rig import LumpedRig
@@ -195,11 +202,7 @@ class LumpedModel:
 
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
         """
-        if trial.kind is TrialKind.FLIGHT:
-            raise ModelError(
-                f"The trial {trial.name!r} is a flight, but the lumped model {self.name!r} has no "
-                f"lift; leave it out."
-            )
+        check_lumped(trial, f"the lumped model {self.name!r}")
         self._check_outputs(outputs)
         quantities = [quantity for _, quantity in outputs]
         own = patch.in_trial(trial.name)

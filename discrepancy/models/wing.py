@@ -18,6 +18,7 @@ from discrepancy.models.interface import (
     PortScale,
     Response,
     Scales,
+    check_no_inputs,
     check_plain,
 )
 from discrepancy.models.memory import Memory
@@ -238,6 +239,7 @@ class WingModel:
         dynamic trial the structure is that at its first temperature.
         """
         check_plain(trial, self.name)
+        check_no_inputs(trial, self.name)
         if len(patch.of(PortLoad)):
             raise ModelError(f"{self.name} cannot carry the primitive {PortLoad.kind!r}.")
         if len(conditions.parameters) != len(self._parameters):

@@ -15,6 +15,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from calibration.errors import CalibrationError
+from calibration.reading import load_calibration
+from calibration.wing.result import CalibrationResult
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
 from discrepancy.models.interface import Model
@@ -196,7 +199,7 @@ def run_model(folder: Path | str) -> Model:
     folder = Path(folder)
     _config(folder)
     model: Model
-    if (folder / CALIBRATION_FILE).is_file():
+    if is_calibrated_wing(folder):
         model = WingModel.of_calibration(folder / CALIBRATION_FILE)
     elif (folder / DESIGN_FILE).is_file():
         model = WingModel.of_design(folder / DESIGN_FILE)
@@ -214,6 +217,17 @@ def run_model(folder: Path | str) -> Model:
         for effect in effects:
             model = PatchedModel(model, effect.patch)
     return model
+
+
+def is_calibrated_wing(folder: Path) -> bool:
+    """Return whether a run flew with the calibration of a wing; one of a model's parameters has no design."""
+    file = folder / CALIBRATION_FILE
+    if not file.is_file():
+        return False
+    try:
+        return isinstance(load_calibration(file), CalibrationResult)
+    except CalibrationError:  # said where it is used
+        return True
 
 
 def patch_of_run(folder: Path) -> Path | None:

@@ -55,7 +55,7 @@ from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, Reject
 from twin_master.watch.keeping import Keeper
 from twin_master.watch.replay import BelievedModel, Replayed, replay
 from twin_master.watch.stopping import Stopping
-from twin_master.watch.teaching import NO_ALARMS, Search, Teaching, Tutor, both_patches
+from twin_master.watch.teaching import Search, Teaching, Tutor, both_patches, check_teachable
 
 STORED_TURNS = 1_000
 """The last turns that `run.nc` and the report show if not told otherwise; the journal has all of them."""
@@ -187,10 +187,9 @@ class Watch:
     def _tutor(
         self, journal: JournalFile, keep: "Keeper", search: Search, source: Stopping, *, wait: bool
     ) -> Tutor:
-        notice = self.scenario.notice
-        if notice is None:
-            raise MissionInputError(NO_ALARMS)
-        teaching = Teaching(notice.threshold)
+        check_teachable(self.scenario)
+        assert self.scenario.notice is not None
+        teaching = Teaching(self.scenario.notice.threshold)
         for record, _ in read_records(self._path, self._hash):
             teaching.take(record)
         pupil = _Pupil(self, journal, keep, teaching)

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from reporting.json_file import read_json
 from reporting.progress import Progress
 from twin_master.assets.resolution import located_scenario
-from twin_master.errors import NotResumableError
+from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission.journal import JOURNAL_NAME, read_lines, record_of
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
@@ -18,15 +18,15 @@ from twin_master.watch.intake import Counts
 
 
 @contextmanager
-def flown(folder: Path, last: int | None, progress: Progress) -> Iterator[Path]:
+def flown(folder: Path, first: int | None, last: int | None, progress: Progress) -> Iterator[Path]:
     """Give the run folder of a flight up to a turn: of a watch, which may go on, a copy that ended there.
 
     Parameters
     ----------
     folder : Path
         Of a run, which is given as it is, or of a watch, which is only read.
-    last : int or None
-        The last turn; None for all that are in the journal.
+    first, last : int or None
+        The first turn that is wanted, and the last one; None for all that are in the journal.
     progress : Progress
         Shows stages.
 
@@ -34,17 +34,23 @@ def flown(folder: Path, last: int | None, progress: Progress) -> Iterator[Path]:
     ------
     NotResumableError
         The journal was changed or is damaged.
+    MissionInputError
+        There is no turn from the first one on.
     """
     config = read_json(folder / CONFIG_NAME, NotResumableError) if (folder / CONFIG_NAME).is_file() else None
     if not isinstance(config, dict) or not config.get("watched"):
         yield folder
         return
+    end, turn = _end_of(folder / JOURNAL_NAME, last)
+    if first is not None and turn < first:
+        known = f"the turns 0 to {turn}" if turn >= 0 else "no turn"
+        limit = "" if last is None else f" up to turn {last}"
+        raise MissionInputError(f"{folder} has {known}{limit}, and none from {first} on.")
     with TemporaryDirectory(prefix="uav_twin_") as place:
         copy = Path(place) / folder.resolve().name
         copy.mkdir()
         shutil.copy(folder / CONFIG_NAME, copy)
         shutil.copytree(folder / "asset", copy / "asset")
-        end = _end_of(folder / JOURNAL_NAME, last)
         with (folder / JOURNAL_NAME).open("rb") as journal:
             (copy / JOURNAL_NAME).write_bytes(journal.read(end))
         scenario = parse_scenario(config["scenario"], str(folder / CONFIG_NAME))
@@ -52,11 +58,14 @@ def flown(folder: Path, last: int | None, progress: Progress) -> Iterator[Path]:
         yield copy
 
 
-def _end_of(path: Path, last: int | None) -> int:
-    """Return where the lines of the turns up to a last one end [bytes]."""
-    end = 0
+def _end_of(path: Path, last: int | None) -> tuple[int, int]:
+    """Return where the lines of the turns up to a last one end [bytes], and the last turn; -1 for none."""
+    end, turn = 0, -1
     for number, (text, after) in enumerate(read_lines(path, None)):
-        if number and last is not None and int(record_of(path, number, text).get("turn", -1)) > last:
-            break
+        if number:
+            found = int(record_of(path, number, text).get("turn", -1))
+            if last is not None and found > last:
+                break
+            turn = max(turn, found)
         end = after
-    return end
+    return end, turn

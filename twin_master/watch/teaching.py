@@ -21,7 +21,8 @@ from fe.runtime.errors import FiniteElementError
 from fmu_asset.errors import FmuError
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
-from twin_master.errors import TwinMasterError
+from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.scenario.schema import Scenario
 
 SETTLE_TURNS = 10
 """Turns that an alarm must hold before its cause is looked for; they also show what it is."""
@@ -31,9 +32,31 @@ TRIED = ("named", "named in part")
 """Verdicts whose patch is tried; of a group it would be one of several that fit alike."""
 FOLDER = "teaching"
 NO_ALARMS = "--teach begins with an alarm: the scenario needs the table `[notice]`."
+NO_WING = (
+    "--teach looks for what the model of a wing lacks: strains under the damage states z1 and z2, predicted "
+    "by a design or a calibration, are needed, and this scenario has {}: leave --teach out, alarms are given "
+    "all the same."
+)
 _COURTESY = 10
 """Niceness of the search: the watch comes first."""
 _LOOK_AGAIN = 0.05
+
+
+def check_teachable(scenario: Scenario) -> None:
+    """Refuse a scenario whose alarms nothing could look into.
+
+    Raises
+    ------
+    MissionInputError
+        It gives no alarms, or is of another asset than a wing with a model that can be patched.
+    """
+    if scenario.notice is None:
+        raise MissionInputError(NO_ALARMS)
+    role, states = scenario.observation.role, ", ".join(scenario.state_names)
+    if role != "strain" or {*scenario.state_names} != {"z1", "z2"}:
+        raise MissionInputError(NO_WING.format(f"the role {role} under {states}"))
+    if not getattr(scenario.belief, "design", None):
+        raise MissionInputError(NO_WING.format(f"the belief `{scenario.belief.kind}` without a design"))
 
 
 @dataclass(frozen=True)

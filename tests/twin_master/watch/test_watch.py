@@ -28,6 +28,7 @@ import uav_twin
 from fe.runtime.patch import ModelPatch, SensorGain
 from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
+from scenarios import scenario_files
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission.journal import JOURNAL_NAME, line_of, read_records
@@ -606,12 +607,27 @@ def test_a_second_patch_stands_beside_the_first(tmp_path: Path) -> None:
 
 def test_a_watch_is_read_up_to_a_turn_while_it_goes_on(whole: Path) -> None:
     before = (whole / JOURNAL_NAME).read_bytes()
-    with flown(whole, 20, SilentProgress()) as copy:
+    with flown(whole, 3, 20, SilentProgress()) as copy:
         ended = [record for record, _ in read_records(copy / JOURNAL_NAME)]
         assert (copy / "run.nc").is_file()
     assert [record["turn"] for record in ended] == list(range(21))
     assert not copy.exists()
     assert (whole / JOURNAL_NAME).read_bytes() == before
+    with (
+        pytest.raises(MissionInputError, match=r"has the turns 0 to 20 up to turn 20, and none from 21 on"),
+        flown(whole, 21, 20, SilentProgress()),
+    ):
+        raise AssertionError
+
+
+def test_teaching_is_refused_at_the_start_where_nothing_could_look_for_a_cause(tmp_path: Path) -> None:
+    scenario = tmp_path / "bracket.toml"
+    scenario.write_text(scenario_files()["bracket"].read_text(encoding="utf-8") + "\n[notice]\n")
+    words = ["watch", str(scenario), "--observations", "-", "--out", str(tmp_path / "w"), "--teach"]
+    result = CliRunner().invoke(app(), words)
+    assert isinstance(result.exception, MissionInputError)
+    assert "this scenario has the role strain under z_heel, z_arm" in str(result.exception)
+    assert not (tmp_path / "w").exists()
 
 
 PASSWORD = "a password"

@@ -1,0 +1,148 @@
+"""An FMU with a binding: operating points at rest as a campaign, calibrated, flown."""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from calibration.parameters.result import ParameterCalibration
+from calibration.reading import load_calibration
+from fmu_asset.door.binding import load_binding
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.packing.script import build_script_fmu
+from scenarios import asset_scripts, binding_files, scenario_files
+from twin_master.assets.resolution import Overrides
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.workflow import new_run
+from uav_twin import cli
+
+TRUTH = 1.04
+NOISE = np.array([0.04, 0.05, 0.06, 0.015])
+OUTPUTS = (
+    ("flow", "flow", "l/min"), ("torque", "torque", "N m"), ("temperature", "temperature", "degC"),
+    ("filter_pressure", "pressure", "bar"),
+)  # fmt: skip
+MODEL = """format = 1
+kind = "fmu"
+name = "gear pump"
+fmu = "gear_pump.fmu"
+binding = "gear_pump"
+isolated = false
+static = { step = 28800.0 }
+input = [{ name = "speed", quantity = "angular_velocity" }, { name = "pressure", quantity = "pressure" }]
+"""
+PARAMETER = """[[parameter]]
+name = "viscosity_factor"
+mean = 1.0
+deviation = 0.03
+low = 0.85
+high = 1.15
+"""
+INPUTS = """[[input]]
+name = "speed"
+quantity = "angular_velocity"
+unit = "rpm"
+[[input]]
+name = "pressure"
+quantity = "pressure"
+unit = "bar"
+column = "load"
+[[trial]]
+name = "points"
+kind = "static"
+file = "points.csv"
+"""
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
+    monkeypatch.setattr(sys, "argv", ["uav-twin", *map(str, arguments)])
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    return int(caught.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the FMU, its model file and `lab`: nine operating points of a pump with thicker oil."""
+    folder = tmp_path_factory.mktemp("pump")
+    (folder / "lab").mkdir()
+    build_script_fmu(asset_scripts()["gear_pump"], folder / "gear_pump.fmu")
+    binding, random = load_binding(binding_files()["gear_pump"]), np.random.default_rng(7)
+    rows = ["speed,load," + ",".join(f"{name}_seen" for name, _, _ in OUTPUTS)]
+    with FmiAsset(folder / "gear_pump.fmu", binding, isolated=False) as pump:
+        for speed in (1000.0, 1400.0, 1800.0):
+            for pressure in (60.0, 120.0, 180.0):
+                pump.reset({"viscosity_factor": TRUTH})
+                shown = pump.step({"speed": speed, "pressure": pressure}).values
+                noisy = shown + NOISE * random.standard_normal(4)
+                rows.append(",".join(map(repr, [speed, pressure, *noisy.tolist()])))
+    (folder / "lab/points.csv").write_text("\n".join(rows))
+    model, campaign = MODEL, 'format = 1\nname = "bench"\n'
+    for (name, quantity, unit), noise in zip(OUTPUTS, NOISE.tolist(), strict=True):
+        model += f'[[output]]\nname = "{name}"\nquantity = "{quantity}"\n'
+        campaign += (
+            f'[[channel]]\nname = "{name}_seen"\nquantity = "{quantity}"\nunit = "{unit}"\n'
+            f'output = "{name}"\n'
+            f"noise = {{ standard_deviation = {noise} }}\n"
+        )
+    (folder / "model.toml").write_text(model + PARAMETER)
+    (folder / "lab/campaign.toml").write_text(campaign + INPUTS)
+    return folder
+
+
+def test_an_fmu_is_calibrated_at_operating_points_and_flown(
+    bench: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = (bench / "lab", "--model", bench / "model.toml", "--out", tmp_path / "out", "--no-report")
+    assert call(monkeypatch, "calibrate", "campaign", *arguments) == 0
+    file = tmp_path / "out/calibration.nc"
+    found = load_calibration(file)
+    assert isinstance(found, ParameterCalibration)
+    assert found.explained is True
+    deviation = found.standard_deviation("viscosity_factor")
+    assert abs(found.mean("viscosity_factor") - TRUTH) < 3.0 * deviation < 0.012
+
+    path = scenario_files()["pump_wear"]
+    table = tomllib.loads(path.read_text(encoding="utf-8"))
+    table["mission"] |= {"steps": 3, "prediction_steps": 2}
+    table["state"][0] |= {"levels_percent": [0, 30], "prior": [1, 0]}
+    table["state"][1] |= {"levels_percent": [0, 60], "prior": [1, 0]}
+    table["calibration"] |= {"draws": 4}
+    table["asset"] = {"kind": "script", "script": "gear_pump", "binding": "gear_pump", "isolated": False}
+    table["truth"]["gains"] = []
+    scenario = LoadedScenario(parse_scenario(table, "small_pump"), path, "0" * 64)
+    folder = new_run(scenario, tmp_path / "run", Overrides(calibration=file), report=False).folder
+    with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
+        tree.load()
+    assert set(tree["calibration"]["draw_value"].values) <= set(found.draws_of("viscosity_factor"))
+    binding = load_binding(binding_files()["gear_pump"])
+    with FmiAsset(bench / "gear_pump.fmu", binding, isolated=False) as pump:
+        pump.reset({"viscosity_factor": found.mean("viscosity_factor")})
+        wanted = pump.step({"speed": 1800.0, "pressure": 180.0}).values
+    np.testing.assert_allclose(tree["truth"]["operation"].values[0], wanted, rtol=1e-6)
+
+
+def test_what_an_fmu_does_not_have_is_one_sentence(
+    bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for old, new, words in (
+        ('name = "pressure", quantity', 'name = "pressuer", quantity', "pressuer"),
+        ("input = [", "input = [] # ", "does not have; it has none: name it in"),
+        ('binding = "gear_pump"', 'binding = "no_binding"', "no_binding"),
+        (PARAMETER, "", "has no parameter to calibrate"),
+    ):
+        model = bench / "wrong.toml"
+        model.write_text((bench / "model.toml").read_text().replace(old, new))
+        assert call(monkeypatch, "calibrate", "campaign", bench / "lab", "--model", model) != 0
+        said = capsys.readouterr().err
+        assert words in said
+        assert "Traceback" not in said
+    assert call(monkeypatch, "calibrate", "campaign", bench / "lab", "--model", bench / "gear_pump.fmu") != 0
+    assert "is an FMU: give a TOML file" in capsys.readouterr().err
+    assert call(monkeypatch, "calibrate", "campaign", bench / "lab", "--model", "single_mass_rig") != 0
+    assert "does not have" in capsys.readouterr().err
