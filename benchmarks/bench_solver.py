@@ -23,7 +23,7 @@ _SOLVE = """
 import json, resource, sys, time
 import numpy as np
 from scipy.sparse.linalg import splu
-from fe import cholesky
+from fe.full import cholesky
 from fe.wing.design import load_design
 from fe.full.operators import assemble
 from fe.full.statics import Factorisation, solve_static

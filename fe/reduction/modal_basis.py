@@ -183,6 +183,7 @@ def reduce_modes(
     nominal_masses: tuple[float, float],
     settings: ModalSettings,
     advance: Callable[[], object],
+    together: int = 1,
 ) -> ModalData:
     """Make the modal basis.
 
@@ -202,6 +203,8 @@ def reduce_modes(
         Accuracy.
     advance : callable
         Called after each sampled state.
+    together : int
+        As of `modal_basis`.
 
     Raises
     ------
@@ -216,6 +219,7 @@ def reduce_modes(
         compression_states(box),
         settings,
         advance,
+        together,
     )
     data = ModalData(basis, stiffness, mass, np.empty((2, 0)), settings.mode_count)
     shapes = _flapwise(data, system, nominal_masses)

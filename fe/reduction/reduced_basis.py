@@ -17,7 +17,7 @@ from fe.runtime.reduced import ReducedModel
 from .certified_basis import AffineProblem, StaticReduction, greedy
 from .compression import WING_JUDGEMENT, compressed, fewest_directions
 from .modal_basis import ModalData, reduce_modes
-from .settings import ReductionSettings, loss_splits, remaining_levels, training_set
+from .settings import ALONE, TOGETHER, ReductionSettings, loss_splits, remaining_levels, training_set
 from .stages import Progress, stage_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -89,6 +89,7 @@ def reduce_model(
     """
     settings = settings or ReductionSettings()
     regions = len(system.regions)
+    together = 1 if regions <= ALONE else TOGETHER
     reference = settings.reference(regions)
     with stage_of(progress, "Factorising the wing"):
         norm = Norm(affine_sum((*reference, 1.0), system.stiffness_terms))
@@ -101,6 +102,7 @@ def reduce_model(
             settings.nominal_masses,
             settings.modal,
             stage.advance,
+            together,
         )
     with stage_of(progress, "Reducing the statics") as stage:
         counts = settings.anchors(regions)
@@ -114,6 +116,7 @@ def reduce_model(
             anchors=[np.array((reference[0], *remaining, 1.0)) for remaining in levels],
             farthest=np.abs(ends - reference[:, np.newaxis]).max(axis=1),
             advance=stage.advance,
+            batch=together,
         )
         states = training_set(settings, regions)
         history = greedy(

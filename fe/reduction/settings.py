@@ -50,7 +50,7 @@ class ReductionSettings:
     pitot_mass: Range = (0.0, 0.30)
     nominal_masses: tuple[float, float] = (0.169, 0.134)
     bound_tolerance: float = 6e-4
-    most_snapshots: int = 24
+    most_snapshots: int = 60
     dual_anchors: tuple[int, ...] = ()
     modal: ModalSettings = field(default_factory=ModalSettings)
 
@@ -101,6 +101,11 @@ def loss_splits(loss: Range, count: int) -> FloatArray:
     return np.asarray(1.0 - high * (low / high) ** (np.arange(1, count) / count))
 
 
+ALONE = 2
+"""With so many regions a wing is reduced by one full solution after another, which repeats the shipped wing
+to the bit; with more, several at once."""
+TOGETHER = 4
+"""Full solutions of the search, and states whose modes are refined, at once."""
 TRAINING_LEVELS = 7
 """Losses of each region on the training set, while that is a grid."""
 CHOSEN_STATES = 512

@@ -21,7 +21,7 @@ from fe.structure.affine import AffineStructure
 from .certified_basis import AffineProblem, Judgement, State, StaticReduction, greedy
 from .compression import compressed, fewest_directions
 from .modal_basis import ModalSettings, ModalState, loss_corners, modal_basis
-from .settings import default_anchors, loss_splits, remaining_levels
+from .settings import TOGETHER, default_anchors, loss_splits, remaining_levels
 from .stages import Progress, stage_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -31,8 +31,6 @@ LEAST_COSINE = 1e-3
 nothing of the structure sees it there."""
 SAMPLED_INSIDE = 10
 """States inside the box at which the modes are refined."""
-TOGETHER = 4
-"""Full solutions of the search, and states whose modes are refined, at once."""
 CHOSEN_STATES = 128
 """States inside the box on the training set, beside corners."""
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import pytest
 
+from fe.wing.design import SHIPPED_DESIGN
 from scenarios import asset_scripts, binding_files, recording_files, scenario_files, structure_files
 from twin_master.mission.truth import Truth
 from twin_master.network.twin import build_graphical_model
@@ -12,7 +15,7 @@ from twin_master.scenario.reading import load_scenario
 
 def test_what_is_shipped() -> None:
     wings = {"level_turns", "growing_damage", "failing_gauges", "model_mismatch", "three_fmus"}
-    wings |= {"level_turns_learning"}
+    wings |= {"level_turns_learning", "three_regions"}
     assert set(scenario_files()) == {*wings, "pump_wear", "watched_wing", "bracket", "stiffened_panel"}
     assert set(binding_files()) == {"gear_pump", "three_fmus", "uav_wing", "uav_wing_laboratory"}
     assert set(asset_scripts()) == {"gear_pump"}
@@ -38,8 +41,20 @@ def test_each_scenario_names_a_shipped_binding_and_can_be_flown(name: str) -> No
     scenario = load_scenario(name).scenario
     assert scenario.asset.kind == "strain_library" or scenario.asset.binding in binding_files()
     model = build_graphical_model(scenario)
-    assert model.states.size == 25
+    assert model.states.size == (125 if name == "three_regions" else 25)
     assert Truth(scenario, model, 0).noise.shape == ((60, 4) if name == "pump_wear" else (50, 24))
+
+
+def test_the_wing_with_a_third_region_is_the_shipped_one_with_a_third_region() -> None:
+    shipped = tomllib.loads(SHIPPED_DESIGN.read_text(encoding="utf-8"))
+    three = tomllib.loads(SHIPPED_DESIGN.with_name("uav_wing_three_regions.toml").read_text(encoding="utf-8"))
+    third = three["defects"].pop()
+    assert set(third) == {"span_start", "span_end", "chord_start", "chord_end"}
+    assert three == shipped
+    scenario = load_scenario("three_regions").scenario
+    assert scenario.state_names == ("z1", "z2", "z3")
+    build_source = scenario.belief.source(scenario, scenario.asset.source(scenario))
+    build_source.check()
 
 
 def test_the_papers_figures() -> None:

@@ -17,7 +17,6 @@ from reporting.section import shown
 from scenarios import asset_scripts, binding_files, structure_files
 from twin_master.scenario.section import Section, short
 
-SHIPPED_DESIGN_NAME = "uav_wing"
 CALIBRATED_DESIGN_NAME = "calibration"
 """The tailored design inside the calibration file: with a file it takes the place of the scenario's."""
 
@@ -25,7 +24,7 @@ CALIBRATED_DESIGN_NAME = "calibration"
 def _shipped_designs() -> dict[str, Path]:
     from fe.wing.design import SHIPPED_DESIGN
 
-    return {SHIPPED_DESIGN_NAME: SHIPPED_DESIGN}
+    return {path.stem: path for path in sorted(SHIPPED_DESIGN.parent.glob("*.toml"))}
 
 
 class FileSection(Section):
