@@ -13,12 +13,14 @@ from calibration.parameters.result import ParameterCalibration
 from calibration.parameters.result_file import load_parameters, result_bytes
 from calibration.reading import load_calibration
 from calibration.samples.file import FILE_NAME
+from calibration.static.stiffness import calibrate_static, published_measurements, stiffness_curve_of
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Quantity, Trial
 from discrepancy.errors import CampaignDataError, ModelError
-from discrepancy.model_choice import ModelChoice, ModelKind
+from discrepancy.model_choice import ModelChoice, ModelKind, choose_model
 from discrepancy.models.interface import Conditions, ModelParameter, PortScale, Response, Scales
 from discrepancy.parameters.calibration import calibrate_parameters
+from fe.reduction.model_cache import reduced_model
 from fe.runtime.patch import ModelPatch, Primitive
 
 Float = NDArray[np.float64]
@@ -305,3 +307,30 @@ def test_held_out_trials_take_no_part(tmp_path: Path) -> None:
         ("fitted", False),
         ("held out", True),
     ]
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("wing")
+def test_the_published_load_test_gives_the_posterior_of_the_wings_own_calibration(tmp_path: Path) -> None:
+    """Errors of load and displacement as one: with f = k(e) x, their variances add as S(e) / k^2.
+
+    That S grows with e is left out, which is worth 0.03 deviations.
+    """
+    pairs, model = published_measurements(), reduced_model()
+    exact = calibrate_static(stiffness_curve_of(model), seed=0).exact
+    stiffness = float(model.tip_stiffness(exact.mean))
+    noise = np.hypot(pairs.displacement_standard_deviation, pairs.load_standard_deviation / stiffness)
+    rows = zip(pairs.load.tolist(), pairs.displacement.tolist(), strict=True)
+    (tmp_path / "pairs.csv").write_text("force,tip\n" + "".join(f"{f!r},{x!r}\n" for f, x in rows))
+    (tmp_path / "campaign.toml").write_text(
+        'format = 1\nname = "published"\n[parameters.young_modulus_factor]\nmean = 1.0\n'
+        f"deviation = {0.05 / 1.96!r}\n"
+        '[[channel]]\nname = "tip"\nquantity = "displacement"\nunit = "m"\n'
+        f'output = "load_point_displacement"\nnoise = {{ standard_deviation = {float(noise)!r} }}\n'
+        '[[trial]]\nname = "pairs"\nkind = "static"\nfile = "pairs.csv"\n'
+    )
+    found = calibrate_parameters(read_campaign(tmp_path), choose_model(None), samples=20_000)
+    assert found.mean("young_modulus_factor") == pytest.approx(exact.mean, abs=6e-4)
+    deviation = found.standard_deviation("young_modulus_factor")
+    assert deviation == pytest.approx(exact.standard_deviation, rel=0.03)
+    assert found.kept_share("servo_mass") > 0.95
