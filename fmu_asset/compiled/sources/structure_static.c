@@ -28,6 +28,9 @@ void structure_static_lay_out(structure_static *steady, const structure_model *m
     steady->output = structure_take(arena, model->loads * outputs);
     steady->residual = structure_take(arena, model->loads * r);
     steady->correction = structure_take(arena, model->loads * outputs);
+    steady->whole_coordinates = structure_take(arena, n);
+    steady->whole_residual = structure_take(arena, r);
+    steady->whole_correction = structure_take(arena, outputs);
     steady->work = structure_take(arena, larger((damaged + 1) * larger(n, larger(r, outputs)), model->terms));
 }
 
@@ -139,14 +142,11 @@ static size_t anchor_of(const structure_static *steady) {
     return index;
 }
 
-/* The residual of one unit response, and its product with the approximate dual solutions. */
-static void bound_unit(structure_static *steady, size_t load) {
+/* Make a residual of that of the loads, which it holds, and find its product with the approximate dual solutions. */
+static void take_residual(structure_static *steady, const double *coordinates, double *residual, double *correction) {
     const structure_model *model = steady->model;
     const size_t n = model->static_size, r = model->residual_size, outputs = model->output_count;
     const size_t lasting = model->lasting, damaged = model->terms - lasting;
-    const double *coordinates = steady->coordinates + load * n;
-    double *residual = steady->residual + load * r, *correction = steady->correction + load * outputs;
-    memcpy(residual, model->load_residual + load * r, r * sizeof *residual);
     structure_add_columns(residual, r, steady->lasting_residual, r, n, coordinates);
     /* The damaged terms, whose columns lie one after another. */
     for (size_t k = 0; k < damaged; ++k) {
@@ -158,6 +158,16 @@ static void bound_unit(structure_static *steady, size_t load) {
     memset(correction, 0, outputs * sizeof *correction);
     structure_add_columns(correction, outputs, model->correction_columns + anchor_of(steady) * r * outputs, outputs,
                           r, residual);
+}
+
+/* The same of one unit response, which is kept. */
+static void bound_unit(structure_static *steady, size_t load) {
+    const structure_model *model = steady->model;
+    const size_t r = model->residual_size;
+    double *residual = steady->residual + load * r;
+    memcpy(residual, model->load_residual + load * r, r * sizeof *residual);
+    take_residual(steady, steady->coordinates + load * model->static_size, residual,
+                  steady->correction + load * model->output_count);
     steady->bounded[load] = true;
 }
 
@@ -203,29 +213,40 @@ static double largest_bound(const structure_static *steady, double remainder, co
 structure_bounds structure_static_error_bounds(structure_static *steady, const double *load) {
     const structure_model *model = steady->model;
     const size_t outputs = model->output_count, gauges = model->gauges;
+    const size_t n = model->static_size, r = model->residual_size;
+    double *residual = steady->whole_residual, *correction = steady->whole_correction;
     solve_needed(steady, load);
+    superpose(steady->whole_coordinates, n, model, load, steady->coordinates);
+    size_t acting = 0;
     for (size_t k = 0; k < model->loads; ++k) {
-        if (load[k] != 0.0 && !steady->bounded[k]) {
-            bound_unit(steady, k);
+        acting += load[k] != 0.0;
+    }
+    if (acting > 2) { /* once for all of them is cheaper than once for each, to be kept */
+        superpose(residual, r, model, load, model->load_residual);
+        take_residual(steady, steady->whole_coordinates, residual, correction);
+    } else {
+        for (size_t k = 0; k < model->loads; ++k) {
+            if (load[k] != 0.0 && !steady->bounded[k]) {
+                bound_unit(steady, k);
+            }
         }
+        superpose(residual, r, model, load, steady->residual);
+        superpose(correction, outputs, model, load, steady->correction);
     }
     if (!steady->dual_known) {
         find_dual_norms(steady);
     }
     /* |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha */
-    superpose(steady->work, model->residual_size, model, load, steady->residual);
-    double remainder = structure_norm(steady->work, model->residual_size);
-    superpose(steady->work, model->static_size, model, load, steady->coordinates);
-    remainder += model->residual_allowance * structure_norm(steady->work, model->static_size);
+    double remainder = structure_norm(residual, r);
+    remainder += model->residual_allowance * structure_norm(steady->whole_coordinates, n);
     double coercivity = 1.0;
     for (size_t k = 0; k + 1 < model->terms; ++k) {
         coercivity = smaller(coercivity, steady->theta[k] / model->bound_reference[k]);
     }
     remainder /= coercivity;
-    superpose(steady->work, outputs, model, load, steady->correction);
     structure_bounds bounds = {
-        .strain = largest_bound(steady, remainder, steady->work, 0, gauges),
-        .displacement = largest_bound(steady, remainder, steady->work, gauges, outputs),
+        .strain = largest_bound(steady, remainder, correction, 0, gauges),
+        .displacement = largest_bound(steady, remainder, correction, gauges, outputs),
     };
     superpose(steady->work, outputs, model, load, steady->output);
     bounds.strain += model->rounding_allowance * structure_norm(steady->work, gauges);

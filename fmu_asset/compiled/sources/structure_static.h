@@ -32,6 +32,8 @@ typedef struct {
     double *output;                   /* (L, O) */
     double *residual;                 /* (L, R) */
     double *correction;               /* (L, O), the residual applied to the approximate dual solutions */
+    /* The same under all loads together: (N), (R), (O). */
+    double *whole_coordinates, *whole_residual, *whole_correction;
     double *work;                     /* the longest of N, R, O, times the number of damaged terms and one; or T */
 } structure_static;
 
