@@ -124,7 +124,7 @@ class Weighed:
         best = self.found.best()
         if len(best.candidate.terms) != 1 or self._stands_in(best):
             return
-        if self.shares(best).summary().low > 1.0 - SEARCH.rival_share:
+        if self.shares(best).summary().low > 1.0 - 0.5 * SEARCH.rival_share:
             return
         (own,) = best.candidate.terms
         singles: dict[tuple[str, str], CandidateFit] = {}
@@ -138,7 +138,7 @@ class Weighed:
         joined = dict(self.found.judged)
         for item in singles.values():
             free = self.free(item)
-            if free is not None:
+            if free is not None and self.found.score(free) > self.found.score(best):
                 joined[key_of(free.candidate)] = free
         self.found.judge(joined)
 
