@@ -61,7 +61,7 @@ def channel_rows(result: ParameterCalibration) -> list[tuple[str, ...]]:
 
 
 def _percent(share: float) -> str:
-    return f"{100.0 * share:.0f} %" if share > 0.095 else f"{100.0 * share:.1f} %"
+    return f"{min(100.0 * share, 100.0):.0f} %" if share > 0.095 else f"{100.0 * share:.1f} %"
 
 
 def _size(value: float) -> str:

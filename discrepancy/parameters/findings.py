@@ -92,8 +92,8 @@ def _untold(priors: tuple[ParameterPrior, ...], posterior: ParameterPosterior) -
     for prior, share in zip(priors, kept.tolist(), strict=True):
         if share > LEFT:
             said.append(
-                f"The campaign does not tell {prior.name}: {min(share, 1.0):.0%} of its prior deviation is "
-                "left, and what is believed of it is the prior."
+                f"The campaign does not tell {prior.name}: {min(100.0 * share, 100.0):.0f} % of its prior "
+                "deviation is left, and what is believed of it is the prior."
             )
     if len(priors) > 1:
         matrix = correlation(draws)
