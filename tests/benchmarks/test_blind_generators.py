@@ -65,6 +65,7 @@ def motion(
 # ---------------------------------------------------------------- laws
 
 
+@pytest.mark.long
 def test_dry_friction_takes_two_widths_from_every_half_swing_and_stops_within_one() -> None:
     friction = 0.4
     width = friction / STIFFNESS
@@ -106,7 +107,9 @@ def _after_half_swing(s: float, start: float) -> float:
     return -float(brentq(lambda x: kept(x) - kept(start), -start, -1e-9))
 
 
-@pytest.mark.parametrize("ratio", [0.1, 0.3, -0.2])
+@pytest.mark.parametrize(
+    "ratio", [0.1, *(pytest.param(more, marks=pytest.mark.long) for more in (0.3, -0.2))]
+)
 def test_cubic_spring_has_the_period_of_duffing(ratio: float) -> None:
     amplitude = 0.01
     values = motion(Law("x", POWER, (ratio * STIFFNESS / amplitude**2, 3.0, 0.0)), amplitude)

@@ -40,6 +40,7 @@ def test_the_shipped_wing_as_an_fmu(binding: Binding, tmp_path: Path) -> None:
             assert 0.0 < seen.extra["strain_error_bound"] < 1e-3 * seen.values.max()
 
 
+@pytest.mark.long
 def test_the_shipped_wing_with_effects_is_that_of_the_naming_side(tmp_path: Path) -> None:
     model, arrays = reduced_model(), patch_arrays()
     joint = MicroSlip("root", 2.0, 300.0, -0.3, 8)

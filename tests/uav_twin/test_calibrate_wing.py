@@ -221,6 +221,7 @@ def short_scenario(file: Path, *, parameters: bool = True) -> Path:
     return file
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_two_wings_are_two_flights(
     wings: dict[str, Tailored], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

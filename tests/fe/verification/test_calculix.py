@@ -60,6 +60,7 @@ def test_point_masses_count(coarse_operators: AffineOperators, tmp_path: Path) -
     assert modal_agreement(coarse_operators, tmp_path, heavy, 3).relative < 1e-5
 
 
+@pytest.mark.long
 @needs_calculix
 def test_a_ring_down_agrees(coarse_operators: AffineOperators, tmp_path: Path) -> None:
     agreement = ring_down_agreement(

@@ -430,6 +430,7 @@ class TestOnTheWing:
             if path.is_file():
                 assert str(place).encode() not in path.read_bytes(), path
 
+    @pytest.mark.long
     def test_the_study_prints_its_table(self, wing: ReducedModel, twisted: Path) -> None:
         """Scaled gauge by gauge, the model of the twin is that of this library, and is as good as the own."""
         result = subprocess.run(
