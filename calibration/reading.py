@@ -1,18 +1,27 @@
-"""A calibration of either kind, read from its file, and what the record of a run keeps of it."""
+"""A calibration of either kind: reading, the folder that it is written to, and the record of a run."""
 
 from pathlib import Path
 from typing import Any
 
+from calibration.errors import CalibrationRecordError
 from calibration.parameters import result_file as of_parameters
 from calibration.parameters.result import ParameterCalibration
-from calibration.samples.file import check_schema, read_file
+from calibration.samples.file import FILE_NAME, check_schema, read_file
 from calibration.samples.moments import drawn_record, sampled_record
 from calibration.wing import result_file as of_wing
 from calibration.wing.result import CalibrationResult
 from calibration.wing.wing_record import run_record as wing_run_record
+from reporting.errors import FileNotWrittenError
+
+AnyCalibration = CalibrationResult | ParameterCalibration
+
+_PROCEDURES: dict[type[AnyCalibration], str] = {
+    CalibrationResult: "from the laboratory of a wing (`uav-twin calibrate`)",
+    ParameterCalibration: "from a campaign (`uav-twin calibrate campaign`)",
+}
 
 
-def load_calibration(path: Path | str) -> CalibrationResult | ParameterCalibration:
+def load_calibration(path: Path | str) -> AnyCalibration:
     """Read the `calibration.nc` of a wing, or of the parameters of any model.
 
     Raises
@@ -28,7 +37,37 @@ def load_calibration(path: Path | str) -> CalibrationResult | ParameterCalibrati
     return of_parameters.load_parameters(path)
 
 
-def run_record(calibration: CalibrationResult | ParameterCalibration, parameter: str) -> dict[str, Any]:
+def check_folder(folder: Path, asset: str, kind: type[AnyCalibration]) -> None:
+    """Look at the place where a calibration of `asset` is to be written, before the work begins.
+
+    Raises
+    ------
+    FileNotWrittenError
+        If it is no folder, or holds the calibration of another asset or of another kind. A file that is no
+        calibration of either kind may be replaced.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise FileNotWrittenError(f"{folder} exists and is no folder: choose another --out.")
+    kept = folder / FILE_NAME
+    if not kept.exists():
+        return
+    try:
+        found = load_calibration(kept)
+    except CalibrationRecordError:
+        return  # what cannot be read is of no use to anyone
+    if found.asset != asset:
+        raise FileNotWrittenError(
+            f"{kept} is the calibration of {found.asset}, not of {asset}: choose another --out, one for each "
+            "asset."
+        )
+    if not isinstance(found, kind):
+        raise FileNotWrittenError(
+            f"{kept} is the calibration of {asset} {_PROCEDURES[type(found)]}, and one "
+            f"{_PROCEDURES[kind]} was asked for: choose another --out, one for each kind of calibration."
+        )
+
+
+def run_record(calibration: AnyCalibration, parameter: str) -> dict[str, Any]:
     """Return what `calibration.json` of a run folder holds, with the parameter that the twin draws."""
     if isinstance(calibration, CalibrationResult):
         return wing_run_record(calibration, parameter)

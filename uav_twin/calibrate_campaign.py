@@ -31,11 +31,9 @@ def calibrate_campaign(
     no_report: terminal.NoReport = False,
 ) -> None:
     """Posterior of the parameters of any model, an FMU or a structure too, from a campaign."""
-    from calibration.parameters.folder import (
-        REPORT_NAME,
-        check_parameters_folder,
-        write_parameters_folder,
-    )
+    from calibration.parameters.folder import REPORT_NAME, write_parameters_folder
+    from calibration.parameters.result import ParameterCalibration
+    from calibration.reading import check_folder
     from calibration.samples.record import check_name
     from discrepancy.campaign.reading import read_campaign
     from discrepancy.model_choice import choose_model
@@ -46,7 +44,7 @@ def calibrate_campaign(
     data = read_campaign(campaign)
     name = check_name(data.name if asset is None else asset)
     if out is not None:
-        check_parameters_folder(out, name)
+        check_folder(out, name, ParameterCalibration)
     progress = terminal.progress()
     choice = choose_model(model, progress)
     result = calibrate_parameters(data, choice, asset=name, samples=samples, seed=seed, progress=progress)

@@ -78,15 +78,17 @@ def calibrate_wing(
     if fitted and (data is None or measured is False):
         raise typer.BadParameter("--fitted needs --data with ring-down records, and no --published.")
     from calibration.dynamics.ringdown import Frequencies
-    from calibration.wing.folder import check_folder, write_calibration_folder
+    from calibration.reading import check_folder
+    from calibration.wing.folder import write_calibration_folder
     from calibration.wing.lab_data import Targets, published_data, read_lab_folder
+    from calibration.wing.result import CalibrationResult
     from calibration.wing.three_steps import calibrate_wing as calibrate
     from fe.wing.design import load_design
 
     drawn = load_design(design)
     name = drawn.name if asset is None else asset
     if out is not None:
-        check_folder(out, name)
+        check_folder(out, name, CalibrationResult)
     targets: Targets | None = None if measured is None else "measured" if measured else "published"
     frequencies = Frequencies.FITTED if fitted else Frequencies.PEAKS
     lab = published_data() if data is None else read_lab_folder(data, targets, frequencies)

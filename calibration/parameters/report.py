@@ -17,18 +17,19 @@ from calibration.parameters.text import (
 from calibration.samples.figures import corner_figure
 from reporting.page import Column, Page, Table
 
+FIGURE_NAMES = ("posterior", "prior_and_posterior")
+
 
 def report_figures(result: ParameterCalibration) -> dict[str, Figure]:
     """Draw every figure of the page, by the name of its file."""
     titles = [
         prior.figure.title + ("" if prior.unit == "1" else f" ({prior.unit})") for prior in result.priors
     ]
-    return {
-        "posterior": corner_figure(titles, result.samples, None, ("posterior", "")),
-        "prior_and_posterior": corner_figure(
-            titles, result.samples, result.prior_samples, ("posterior", "prior")
-        ),
-    }
+    drawn = (
+        corner_figure(titles, result.samples, None, ("posterior", "")),
+        corner_figure(titles, result.samples, result.prior_samples, ("posterior", "prior")),
+    )
+    return dict(zip(FIGURE_NAMES, drawn, strict=True))
 
 
 def render_page(result: ParameterCalibration, drawings: Mapping[str, bytes]) -> str:

@@ -4,21 +4,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 from calibration.samples.file import FILE_NAME
-from calibration.samples.folder import check_folder as check_any_folder
-from calibration.samples.folder import replaced_at_once
+from calibration.samples.folder import FIGURES, drawing_names, replaced_at_once
 from fe.reduction.fields import WingFields, write_modes_vtu, write_wing_vtu
 from fe.reduction.model_cache import wing_fields
 from reporting.figures import to_png, to_svg
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.progress import Progress
 
-from .report import render_page, report_figures
-from .result_file import load_calibration, result_bytes
+from .report import FIGURE_NAMES, render_page, report_figures
+from .result_file import result_bytes
 from .table_1 import table_1, write_table_1
 from .three_steps import WingCalibration
 
 LOAD_FACTOR = 3.0
 """Of the turn in which `wing.vtu` shows the wing."""
+
+WING_FIELDS, MODE_FIELDS = "wing.vtu", "modes.vtu"
 
 
 class CalibrationFiles(NamedTuple):
@@ -34,17 +35,6 @@ def calibration_files(folder: Path) -> CalibrationFiles:
     return CalibrationFiles(folder / FILE_NAME, folder / "report.html", folder / "table_1.csv")
 
 
-def check_folder(folder: Path, asset: str | None = None) -> None:
-    """Look at the place before the work begins.
-
-    Raises
-    ------
-    FileNotWrittenError
-        If it is no folder, or holds the calibration of another wing.
-    """
-    check_any_folder(folder, asset, load_calibration)
-
-
 def write_calibration_folder(
     calibration: WingCalibration, folder: Path, progress: Progress, *, report: bool = True
 ) -> CalibrationFiles:
@@ -53,7 +43,8 @@ def write_calibration_folder(
     Without a report, table and `calibration.nc` alone.
 
     Everything is written beside the folder first and moved into place when it is complete: a full disk leaves
-    the folder as it was. An older file of the same name is replaced.
+    the folder as it was. An older file of the same name is replaced, an older report that none replaces
+    removed.
 
     Raises
     ------
@@ -70,10 +61,11 @@ def write_calibration_folder(
             drawings = {name: to_svg(figure) for name, figure in figures.items()}
             pictures = {name: to_png(figure) for name, figure in figures.items()}
             page = render_page(calibration, drawings)
-    with replaced_at_once(folder) as fresh:
+    companions = [paths.report.name, WING_FIELDS, MODE_FIELDS, *drawing_names(FIGURE_NAMES)]
+    with replaced_at_once(folder, companions) as fresh:
         for name in drawings:
-            atomic_write_bytes(fresh / "figures" / f"{name}.svg", drawings[name])
-            atomic_write_bytes(fresh / "figures" / f"{name}.png", pictures[name])
+            atomic_write_bytes(fresh / FIGURES / f"{name}.svg", drawings[name])
+            atomic_write_bytes(fresh / FIGURES / f"{name}.png", pictures[name])
         write_table_1(table_1(calibration), fresh / paths.table.name)
         if report:
             _write_fields(calibration, fields, fresh)
@@ -85,14 +77,14 @@ def write_calibration_folder(
 def _write_fields(calibration: WingCalibration, fields: WingFields, folder: Path) -> None:
     state = calibration.result.mean_state()
     write_wing_vtu(
-        folder / "wing.vtu",
+        folder / WING_FIELDS,
         fields,
         young_modulus_factor=state.young_modulus_factor,
         stiffness_loss=state.stiffness_loss,
         load_factor=LOAD_FACTOR,
     )
     write_modes_vtu(
-        folder / "modes.vtu",
+        folder / MODE_FIELDS,
         fields,
         young_modulus_factor=state.young_modulus_factor,
         stiffness_loss=state.stiffness_loss,

@@ -21,6 +21,9 @@ from .tailoring import tailored_geometry
 from .three_steps import WingCalibration
 
 TITLES = {"joint": "the joint posterior", "paper": "the paper's procedure"}
+FIGURE_NAMES = ("quantities", "load_test", "residuals", "masses", "posterior", "modes", "ring_down")
+"""All that `report_figures` may draw, the last where there are records."""
+
 _STEP_TITLES = {1: "Planform", 2: "Load test", 3: "Ring-down"}
 
 
@@ -37,23 +40,23 @@ def report_figures(calibration: WingCalibration, fields: WingFields) -> dict[str
         f"mode {index + 1}, {frequency:.2f} Hz" + (f", {flapwise[index]}" if index in flapwise else "")
         for index, frequency in enumerate(modes.frequency[:6])
     ]
-    figures = {
-        "quantities": quantities_figure(calibration.result),
-        "load_test": calibration_figure(calibration.static),
-        "residuals": residual_figure(calibration.static),
-        "masses": masses_figure(calibration.paper, calibration.lab.authors),
-        "posterior": corner_figure(
+    drawn = [
+        quantities_figure(calibration.result),
+        calibration_figure(calibration.static),
+        residual_figure(calibration.static),
+        masses_figure(calibration.paper, calibration.lab.authors),
+        corner_figure(
             [AXIS_TITLES[entry.name] for entry in STATE],
             calibration.joint.samples * scale,
             paper * scale,
             ("joint posterior", "the paper's procedure"),
             math=True,
         ),
-        "modes": modes_figure(fields, modes, titles),
-    }
+        modes_figure(fields, modes, titles),
+    ]
     if calibration.lab.trials is not None:
-        figures["ring_down"] = ring_down_figure(calibration.lab.trials)
-    return figures
+        drawn.append(ring_down_figure(calibration.lab.trials))
+    return dict(zip(FIGURE_NAMES, drawn, strict=False))
 
 
 def render_page(calibration: WingCalibration, drawings: Mapping[str, bytes]) -> str:

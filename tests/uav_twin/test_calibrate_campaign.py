@@ -2,12 +2,15 @@
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from calibration.parameters.result import ParameterCalibration
 from calibration.reading import load_calibration
+from calibration.wing.result import CalibrationResult
+from calibration.wing.result_file import save_calibration
 from uav_twin import cli
 
 MODEL = """format = 1
@@ -85,9 +88,58 @@ def test_a_campaign_gives_a_file_a_report_and_a_table(
     first = (out / "calibration.nc").read_bytes()
     assert call(monkeypatch, lab, "--model", model, "--out", out, "--asset", "spring 7", "--no-report") == 0
     assert (out / "calibration.nc").read_bytes() == first
+    assert [path.name for path in out.iterdir()] == ["calibration.nc"]  # no page of other figures beside it
     capsys.readouterr()
     assert call(monkeypatch, lab, "--model", model, "--out", out, "--asset", "spring 8") != 0
     assert "is the calibration of spring 7, not of spring 8" in capsys.readouterr().err
+
+
+def test_a_report_of_something_else_stays(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = lab.parent / "out"
+    (out / "figures").mkdir(parents=True)
+    for name in ("report.html", "figures/posterior.svg"):
+        (out / name).write_text("mine")
+    assert call(monkeypatch, lab, "--model", lab.parent / "model.toml", "--out", out, "--no-report") == 0
+    assert [(out / n).read_text() for n in ("report.html", "figures/posterior.svg")] == ["mine", "mine"]
+
+
+def test_a_calibration_of_the_other_kind_is_not_overwritten(
+    lab: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    make_calibration: Callable[..., CalibrationResult],
+) -> None:
+    """A wing's by a campaign's and a campaign's by a wing's, of the same and of another asset."""
+    model, out = lab.parent / "model.toml", lab.parent / "out"
+    kept = save_calibration(make_calibration(), out / "calibration.nc")
+    before, wing = kept.read_bytes(), make_calibration().asset
+    for asset, words in (
+        (wing, f"is the calibration of {wing} from the laboratory of a wing (`uav-twin calibrate`), and one "
+               "from a campaign (`uav-twin calibrate campaign`) was asked for: choose another --out"),
+        ("spring 7", f"is the calibration of {wing}, not of spring 7: choose another --out"),
+    ):  # fmt: skip
+        assert call(monkeypatch, lab, "--model", model, "--out", out, "--asset", asset) == 1
+        assert words in " ".join(capsys.readouterr().err.split())
+        assert kept.read_bytes() == before
+    kept.write_bytes(before[:200])  # what nobody can read is replaced
+    assert call(monkeypatch, lab, "--model", model, "--out", out, "--asset", "spring 7", "--no-report") == 0
+    before = kept.read_bytes()
+    assert isinstance(load_calibration(kept), ParameterCalibration)
+    for asset, words in (
+        (
+            "spring 7",
+            "is the calibration of spring 7 from a campaign (`uav-twin calibrate campaign`), and one",
+        ),
+        ("UAV 1", "is the calibration of spring 7, not of UAV 1: choose another --out"),
+    ):
+        capsys.readouterr()
+        monkeypatch.setattr(
+            sys, "argv", ["uav-twin", "calibrate", "--out", str(out), "--asset", asset, "--no-report"]
+        )
+        with pytest.raises(SystemExit, match="1"):
+            cli.main()
+        assert words in " ".join(capsys.readouterr().err.split())
+        assert kept.read_bytes() == before
 
 
 def test_json_has_the_same_figures(

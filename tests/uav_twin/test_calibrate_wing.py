@@ -163,6 +163,9 @@ def test_a_calibration_repeats_to_the_byte_and_another_wing_is_not_overwritten(
     assert call(monkeypatch, "calibrate", "--out", tmp_path, "--asset", "other") == 1
     assert "is the calibration of soft, not of other: choose another --out" in capsys.readouterr().err
     assert (tmp_path / "calibration.nc").read_bytes() == before
+    assert call(monkeypatch, *arguments, "--out", tmp_path, "--no-report") == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"calibration.nc", "table_1.csv"}
+    assert (tmp_path / "calibration.nc").read_bytes() == before
 
 
 def test_two_wings_are_two_fmus(
