@@ -160,7 +160,12 @@ class ParameterCalibration(SampledCalibration):
 
     def kept_share(self, name: str) -> float:
         """Return the standard deviation of a parameter over that of its prior [1]."""
-        return self.standard_deviation(name) / float(np.std(self.draws_of(name, prior=True), ddof=1))
+        return self.standard_deviation(name) / self.prior_moments(name)[1]
+
+    def prior_moments(self, name: str) -> tuple[float, float]:
+        """Return mean and standard deviation of a parameter's prior, cut off at its range [unit]."""
+        draws = self.draws_of(name, prior=True)
+        return float(np.mean(draws)), float(np.std(draws, ddof=1))
 
     def interval(self, name: str, probability: float = 0.9) -> tuple[float, float]:
         """Return the central interval of a parameter [unit]."""

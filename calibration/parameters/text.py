@@ -43,7 +43,7 @@ def parameter_rows(result: ParameterCalibration) -> list[tuple[str, ...]]:
             (
                 prior.name,
                 "" if prior.unit == "1" else prior.unit,
-                with_deviation(prior.mean, prior.deviation),
+                with_deviation(*result.prior_moments(prior.name)),
                 with_deviation(result.mean(prior.name), deviation),
                 f"{figures(low, deviation)} to {figures(high, deviation)}",
                 _percent(result.kept_share(prior.name)),
@@ -61,7 +61,7 @@ def channel_rows(result: ParameterCalibration) -> list[tuple[str, ...]]:
 
 
 def _percent(share: float) -> str:
-    return f"{min(100.0 * share, 100.0):.0f} %" if share > 0.095 else f"{100.0 * share:.1f} %"
+    return f"{100.0 * share:.0f} %" if share > 0.095 else f"{100.0 * share:.1f} %"
 
 
 def _size(value: float) -> str:

@@ -1,6 +1,9 @@
 """What has to be said beside the posterior of parameters, a sentence each."""
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+from scipy.stats import truncnorm
 
 from calibration.parameters.result import ParameterPrior
 from calibration.samples.moments import correlation
@@ -14,7 +17,8 @@ FAR = 3.0
 TIED = 0.95
 """Correlation from which on two parameters are told together rather than one by one."""
 EDGE = 0.02
-"""Share of a posterior beyond the model's range from which on it is remarked on."""
+"""Share of a posterior beyond the model's range from which on it is remarked on, where the parameter is told:
+one that is not is cut off as its prior is."""
 
 
 def findings(
@@ -52,15 +56,16 @@ def _disagreements(priors: tuple[ParameterPrior, ...], posterior: ParameterPoste
                 f"{prior.name} comes out {abs(means[at]):.1f} prior deviations {side} what {prior.stated_by} "
                 "states: the prior is wrong, or the parameter stands for something that the model lacks."
             )
-    if posterior.cut > EDGE:
-        best = posterior.optima[0].point.shared[marginal.free]
-        deviation = np.sqrt(np.diag(posterior.optima[0].covariance)[marginal.free])
-        room = np.minimum(best - marginal.low, marginal.high - best) / np.maximum(deviation, 1e-12)
-        at = int(np.argmin(room))
-        said.append(
-            f"The posterior of {priors[at].name} reaches the end of its range, {priors[at].low:g} to "
-            f"{priors[at].high:g}, and is cut off there: widen the range if the model holds beyond it."
-        )
+    best = posterior.optima[0].point.shared[marginal.free]
+    deviation = np.maximum(np.sqrt(np.diag(posterior.optima[0].covariance)[marginal.free]), 1e-12)
+    beyond = ndtr((marginal.low - best) / deviation) + ndtr((best - marginal.high) / deviation)
+    told = kept_shares(posterior) <= LEFT
+    said += [
+        f"The posterior of {prior.name} reaches the end of its range, {prior.low:g} to {prior.high:g}, and "
+        "is cut off there: widen the range if the model holds beyond it."
+        for prior, share, known in zip(priors, beyond.tolist(), told.tolist(), strict=True)
+        if known and share > EDGE
+    ]
     if len(posterior.optima) > 1:
         evidence = np.array([item.log_evidence for item in posterior.optima])
         weight = np.exp(evidence - evidence.max())
@@ -85,14 +90,19 @@ def _disagreements(priors: tuple[ParameterPrior, ...], posterior: ParameterPoste
     return said
 
 
+def kept_shares(posterior: ParameterPosterior) -> NDArray[np.float64]:
+    """Return the deviation of each parameter (P,) over that of its prior, cut off at its range [1]."""
+    marginal = posterior.marginal
+    return np.asarray(posterior.draws.std(axis=0, ddof=1) / truncnorm.std(marginal.low, marginal.high))
+
+
 def _untold(priors: tuple[ParameterPrior, ...], posterior: ParameterPosterior) -> list[str]:
     said = []
     draws = posterior.draws
-    kept = draws.std(axis=0, ddof=1)
-    for prior, share in zip(priors, kept.tolist(), strict=True):
+    for prior, share in zip(priors, kept_shares(posterior).tolist(), strict=True):
         if share > LEFT:
             said.append(
-                f"The campaign does not tell {prior.name}: {min(100.0 * share, 100.0):.0f} % of its prior "
+                f"The campaign does not tell {prior.name}: {100.0 * share:.0f} % of its prior "
                 "deviation is left, and what is believed of it is the prior."
             )
     if len(priors) > 1:

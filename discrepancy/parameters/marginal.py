@@ -116,8 +116,7 @@ class Marginal:
             If the model fails at its prior mean.
         """
         problem = self._problem
-        first = fit(problem, NOTHING, problem.start(NOTHING), iterations=40)
-        found = [first]
+        found = [self._within(fit(problem, NOTHING, problem.start(NOTHING), iterations=40))]
         generator = np.random.default_rng(seed)
         for _ in range(STARTS):
             u = np.clip(generator.standard_normal(len(self.free)), self.low, self.high)
@@ -129,6 +128,7 @@ class Marginal:
                 )
             except (FitError, ModelError):
                 continue
+            other = self._within(other)
             near = [item for item in found if self._same(item, other)]
             if not near:
                 found.append(other)
@@ -138,6 +138,12 @@ class Marginal:
         best = found[0]
         self._near = best.point
         return [item for item in found if item.log_evidence > best.log_evidence - COMPARABLE]
+
+    def _within(self, found: CandidateFit) -> CandidateFit:
+        """Return a fit at the end of the range where its last step ended beyond it."""
+        shared = found.point.shared.copy()
+        shared[self.free] = np.clip(shared[self.free], self.low, self.high)
+        return replace(found, point=replace(found.point, shared=shared))
 
     def _same(self, first: CandidateFit, second: CandidateFit) -> bool:
         free = self.free

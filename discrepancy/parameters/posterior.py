@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator
+from scipy.special import ndtr
+from scipy.stats import multivariate_normal
 
 from calibration.parameters.result import Procedure
 from discrepancy.errors import FitError, ModelError
@@ -26,6 +28,8 @@ CUT = 0.01
 """Share of a Gaussian beyond the model's range from which on it is drawn otherwise."""
 EMPTY = 700.0
 """Energy [nat] above the least where nothing is left of a density."""
+REDRAWN = 1000
+"""Times that a draw beyond the model's range is drawn anew; the few that are left stand at its end."""
 LEAST_SPREAD = 1e-9
 """Nodes closer together than this share of the grid are one."""
 
@@ -80,7 +84,11 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
     procedure: Procedure
     if len(free) > 1 and len(optima) > 1:
         procedure = "several optima"
-        evidence = np.array([item.log_evidence for item in optima])
+        inside = [
+            mass_inside(centre, spread, marginal.low, marginal.high)
+            for centre, spread in zip(centres, spreads, strict=True)
+        ]
+        evidence = np.array([item.log_evidence for item in optima]) + np.log(np.maximum(inside, 1e-300))
         weight = np.exp(evidence - evidence.max())
         chosen = generator.choice(len(optima), count, p=weight / weight.sum())
         draws = np.concatenate(
@@ -114,6 +122,18 @@ def is_gaussian(marginal: Marginal, centre: FloatArray, covariance: FloatArray) 
 def _axes(covariance: FloatArray) -> FloatArray:
     spread, directions = np.linalg.eigh(covariance)
     return np.asarray(directions * np.sqrt(np.maximum(spread, 0.0)))
+
+
+def mass_inside(centre: FloatArray, covariance: FloatArray, low: FloatArray, high: FloatArray) -> float:
+    """Return the share of a Gaussian that lies between `low` and `high` (P,) in every direction [1]."""
+    if len(centre) == 1:
+        deviation = float(np.sqrt(covariance[0, 0]))
+        return float(ndtr((high[0] - centre[0]) / deviation) - ndtr((low[0] - centre[0]) / deviation))
+    return float(
+        multivariate_normal.cdf(
+            high, centre, covariance, allow_singular=True, lower_limit=low, rng=np.random.default_rng(0)
+        )
+    )
 
 
 def _inside(marginal: Marginal, u: FloatArray) -> NDArray[np.bool_]:
@@ -162,7 +182,11 @@ def _along_the_widest(
 
 
 class Slices:
-    """The posterior at fixed values of one parameter, the others fitted and integrated with the nuisances."""
+    """The posterior at fixed values of one parameter, the others fitted and integrated with the nuisances.
+
+    The others are Gaussian given the one and cut off at the model's range: the evidence of a slice has the
+    share of the Gaussian that lies within.
+    """
 
     def __init__(self, marginal: Marginal, index: int, best: CandidateFit) -> None:
         self._marginal, self._index, self._best = marginal, index, best
@@ -195,7 +219,7 @@ class Slices:
         energy = np.full(len(nodes), np.inf)
         for at, node in enumerate(nodes.tolist()):
             if (found := self._fits[node]) is not None:
-                energy[at] = 0.5 * node**2 - found.log_evidence
+                energy[at] = 0.5 * node**2 - found.log_evidence - self._log_inside(found)
         energy = np.minimum(energy - energy.min(), EMPTY)
         share = np.linspace(0.0, 1.0, BETWEEN, endpoint=False)
         fine = np.append((nodes[:-1, None] + np.diff(nodes)[:, None] * share).ravel(), nodes[-1])
@@ -203,23 +227,45 @@ class Slices:
         mass = np.concatenate(([0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))))
         return fine, mass / mass[-1]
 
+    def _rest(self, found: CandidateFit) -> tuple[FloatArray, FloatArray]:
+        """Return mean (P - 1,) and covariance of the others in a slice."""
+        free = self._marginal.free
+        rest = np.arange(len(free)) != self._index
+        return found.point.shared[free][rest], found.covariance[np.ix_(free, free)][np.ix_(rest, rest)]
+
+    def _log_inside(self, found: CandidateFit) -> float:
+        marginal = self._marginal
+        rest = np.arange(len(marginal.free)) != self._index
+        if not rest.any():
+            return 0.0
+        share = mass_inside(*self._rest(found), marginal.low[rest], marginal.high[rest])
+        return float(np.log(max(share, np.exp(-EMPTY))))
+
     def others(self, values: FloatArray, generator: np.random.Generator) -> FloatArray:
         """Return draws (N, P) of all parameters given the one, cut off at the model's range."""
-        marginal, free = self._marginal, self._marginal.free
-        draws = np.zeros((len(values), len(free)))
-        rest = np.flatnonzero(np.arange(len(free)) != self._index)
+        marginal, count = self._marginal, len(self._marginal.free)
+        draws = np.zeros((len(values), count))
+        rest = np.flatnonzero(np.arange(count) != self._index)
         draws[:, self._index] = values
         if not len(rest):
             return draws
         found = {node: item for node, item in self._fits.items() if item is not None}
         nodes = np.array(sorted(found))
-        centres = np.array([found[node].point.shared[free][rest] for node in nodes.tolist()])
-        drawn = Akima1DInterpolator(nodes, centres)(np.clip(values, nodes[0], nodes[-1]))
+        centres = np.array([self._rest(found[node])[0] for node in nodes.tolist()])
+        centre = Akima1DInterpolator(nodes, centres)(np.clip(values, nodes[0], nodes[-1]))
         nearest = np.abs(values[:, None] - nodes).argmin(axis=1)
+        low, high = marginal.low[rest], marginal.high[rest]
+        drawn = np.full_like(centre, np.inf)
         for at, node in enumerate(nodes.tolist()):
             rows = np.flatnonzero(nearest == at)
-            block = found[node].covariance[np.ix_(free, free)][np.ix_(rest, rest)]
-            shift = generator.multivariate_normal(np.zeros(len(rest)), block, len(rows), method="cholesky")
-            drawn[rows] += shift
-        draws[:, rest] = np.clip(drawn, marginal.low[rest], marginal.high[rest])
+            block = self._rest(found[node])[1]
+            for _ in range(REDRAWN):
+                if not len(rows):
+                    break
+                shift = generator.multivariate_normal(
+                    np.zeros(len(rest)), block, len(rows), method="cholesky"
+                )
+                drawn[rows] = centre[rows] + shift
+                rows = rows[np.any((drawn[rows] < low) | (drawn[rows] > high), axis=1)]
+        draws[:, rest] = np.clip(drawn, low, high)
         return draws

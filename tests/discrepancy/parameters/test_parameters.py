@@ -230,6 +230,49 @@ def test_what_is_not_told_is_said(tmp_path: Path) -> None:
     assert any("p1 and p2 are told together and hardly apart" in sentence for sentence in found.findings)
 
 
+def test_a_truth_beyond_the_range_ends_at_its_end(tmp_path: Path) -> None:
+    """The model refuses what lies outside, as an FMU does."""
+
+    def bounded(force: Float, parameters: Float) -> Float:
+        if not 0.9 <= parameters[0] <= 1.1:
+            raise ModelError(f"p1 = {float(parameters[0])!r} lies outside the range of the model.")
+        return spring(force, parameters)
+
+    noise = NOISE * np.random.default_rng(8).standard_normal(len(FORCE))
+    campaign = campaign_of(tmp_path, FORCE / 10.0 / 0.85 + noise)
+    found = calibrate_parameters(campaign, choice_of(bounded, (1.0, 0.05, 0.9, 1.1)), samples=500)
+    assert found.samples.min() >= 0.9
+    assert found.mean("p1") < 0.91
+    assert any("p1 reaches the end of its range, 0.9 to 1.1" in sentence for sentence in found.findings)
+
+
+def test_a_parameter_that_is_not_told_keeps_its_prior_as_it_is_cut_off(tmp_path: Path) -> None:
+    """Range of two prior deviations, beside a parameter that is told: moments of a dense grid."""
+
+    def weak(force: Float, parameters: Float) -> Float:
+        return np.asarray(force / 10.0 * parameters[0] + 0.02 * (force / 60.0) * parameters[1])
+
+    noise = NOISE * np.random.default_rng(2).standard_normal(len(FORCE))
+    values = weak(FORCE, np.array([1.02, 2.6])) + noise
+    priors = ((1.0, 0.05, 0.9, 1.1), (2.5, 0.625, 1.25, 3.75))
+    campaign = campaign_of(tmp_path, values)
+    found = calibrate_parameters(campaign, choice_of(weak, *priors), samples=4000)
+    first, second = np.meshgrid(np.linspace(0.9, 1.1, 801), np.linspace(1.25, 3.75, 801), indexing="ij")
+    misfit = values - FORCE / 10.0 * first[..., None] - 0.02 * (FORCE / 60.0) * second[..., None]
+    log = -0.5 * np.sum((misfit / NOISE) ** 2, axis=-1)
+    log += -0.5 * ((first - 1.0) / 0.05) ** 2 - 0.5 * ((second - 2.5) / 0.625) ** 2
+    weight = np.exp(log - log.max())
+    for name, grid in (("p1", first), ("p2", second)):
+        mean = float(np.average(grid, weights=weight))
+        deviation = float(np.sqrt(np.average((grid - mean) ** 2, weights=weight)))
+        assert found.mean(name) == pytest.approx(mean, abs=0.05 * deviation)
+        assert found.standard_deviation(name) == pytest.approx(deviation, rel=0.03)
+    assert np.sum((found.samples[:, 1] == 1.25) | (found.samples[:, 1] == 3.75)) == 0
+    assert found.kept_share("p2") == pytest.approx(1.0, abs=0.05)
+    assert any("does not tell p2: " in sentence for sentence in found.findings)
+    assert not any("reaches the end" in sentence for sentence in found.findings)
+
+
 def test_a_bent_ridge_is_followed(tmp_path: Path) -> None:
     def product(force: Float, parameters: Float) -> Float:
         return np.asarray(force / 10.0 * parameters[0] * parameters[1])
