@@ -25,6 +25,7 @@ from fe.runtime.errors import FiniteElementError
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
 from reporting.provenance import hash_file, hash_record
 from reporting.toml_file import read_toml
+from scenarios import structure_files
 
 
 class ModelKind(StrEnum):
@@ -104,8 +105,12 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
         content = read_toml(path, ModelError, what="model")
         if content.get("kind") == "fmu":
             return _fmu(path)
+        if "mesh" in content:  # neither a wing design nor a lumped model has one
+            raise _structure_error(str(path), path.name)
         if "format" not in content:  # a wing design has none
             return _wing(path, progress)
+    if not path.exists() and str(path) in structure_files():
+        raise _structure_error(str(path), str(path))
     model = LumpedModel.load(path)
     shipped = not path.suffix and not path.exists()
     file = SHIPPED_MODELS / f"{path}.toml" if shipped else path
@@ -156,6 +161,13 @@ def choice_of_run(folder: Path) -> ModelChoice:
 def shipped_lumped_models() -> tuple[str, ...]:
     """Return the names of the lumped models that come with the package."""
     return tuple(sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml")))
+
+
+def _structure_error(name: str, file: str) -> ModelError:
+    return ModelError(
+        f"{name} is a structure, and a model file is expected: `uav-twin structure fmu {file} --rig "
+        "MODEL.toml` writes one of it, beside its FMU."
+    )
 
 
 def _fmu(path: Path) -> ModelChoice:

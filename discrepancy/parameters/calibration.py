@@ -63,12 +63,12 @@ def calibrate_parameters(
     """
     progress = SilentProgress() if progress is None else progress
     model = choice.model
+    priors = stated_priors(campaign, choice)  # before the model is asked, which may refuse what is outside
     with progress.stage("Checking the data"):
         campaign, faults = checked(campaign, model, hold_out=False)
     fatal = [fault for fault in faults if fault.fatal]
     if fatal:
         raise CampaignDataError(fatal[0].sentence)
-    priors = stated_priors(campaign, choice)
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     cleaned = without_wrong_ends(problem)
     if cleaned is not campaign:

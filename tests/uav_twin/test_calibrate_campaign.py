@@ -11,6 +11,7 @@ from calibration.parameters.result import ParameterCalibration
 from calibration.reading import load_calibration
 from calibration.wing.result import CalibrationResult
 from calibration.wing.result_file import save_calibration
+from scenarios import structure_files
 from uav_twin import cli
 
 MODEL = """format = 1
@@ -179,6 +180,18 @@ def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
     assert words in said
     assert "Traceback" not in said
     assert not out.exists()
+
+
+def test_a_structure_is_no_model_file(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = lab.parent / "my_part.toml"
+    own.write_text(structure_files()["bracket"].read_text(encoding="utf-8"))
+    for name in ("bracket", str(own)):
+        assert call(monkeypatch, lab, "--model", name) != 0
+        said = " ".join(capsys.readouterr().err.split())
+        assert "is a structure, and a model file is expected" in said
+        assert "--rig MODEL.toml` writes one of it" in said
 
 
 def test_a_model_without_parameters_is_refused(

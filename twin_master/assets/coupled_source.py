@@ -13,7 +13,7 @@ from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.assets.asset_source import FlownAndBelieved
 from twin_master.assets.fmu_source import BINDING_COPY, FmuSection, FmuSource
-from twin_master.assets.parameter import check_calibration
+from twin_master.assets.parameter import check_calibration, read_calibration
 from twin_master.errors import MissionInputError
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, FileSection
 from twin_master.scenario.schema import Scenario
@@ -160,9 +160,10 @@ class SeveralSource(FmuSource):
         from fmu_asset.archive.fmu_file import plain_folder
         from fmu_asset.door.binding import load_binding
 
-        check_calibration(self._scenario.calibration)
+        read_calibration(self._scenario.calibration)
         self.files()
         binding = load_binding(self._section.binding_path)
+        check_calibration(self._scenario.calibration, binding.parameter, f"the binding {binding.name}")
         self._observed(binding)
         self._inner_roles(binding)
         self._check_names(binding)

@@ -19,7 +19,13 @@ from twin_master.assets.asset_source import (
 )
 from twin_master.assets.fmu_source import BINDING_COPY, FmuSection, FmuSource
 from twin_master.assets.interface import Asset
-from twin_master.assets.parameter import ParameterDraws, check_calibration, draw_parameter
+from twin_master.assets.parameter import (
+    OWN_OF_WING,
+    ParameterDraws,
+    check_calibration,
+    draw_parameter,
+    read_calibration,
+)
 from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, BeliefSection
@@ -191,7 +197,7 @@ class WingFmuSource(FmuSource):
         """
         from fmu_asset.door.binding import load_binding
 
-        check_calibration(self._scenario.calibration)
+        read_calibration(self._scenario.calibration)
         self.files()
         design = self._of.design()
         gauges = len(design.gauges.positions)
@@ -201,6 +207,8 @@ class WingFmuSource(FmuSource):
             from twin_master.assets.patches import effect_names
 
             effects = effect_names(self._of.patch_path, gauges)
+        known, where = (*binding.parameter, *effects), f"the binding {binding.name}"
+        check_calibration(self._scenario.calibration, known, where, advice=OWN_OF_WING)
         self._check_names(binding, effects)
         self._observed(binding)
         self._inner_roles(binding)
@@ -289,11 +297,15 @@ class DesignSource:
         MissingObservationModelError
             The scenario's states, controls, parameter or sensors are not those of the design's model.
         """
+        from fe.reduction.settings import ReductionSettings
         from twin_master.assets.wing_model import check_wing_scenario
 
-        check_calibration(self._scenario.calibration)
+        read_calibration(self._scenario.calibration)
         self.files()
         design = self._of.design()
+        where = f"the {_model_of(design.name)}"
+        ranges = {"young_modulus_factor": ReductionSettings().young_modulus_factor}
+        check_calibration(self._scenario.calibration, ranges, where, ranges=ranges, advice=OWN_OF_WING)
         gauges = len(design.gauges.positions)
         check_wing_scenario(self._scenario, design.regions, gauges)
         if self._of.patch_path is not None:

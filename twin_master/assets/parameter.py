@@ -3,6 +3,7 @@
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
     from calibration.static.stiffness_curve import StiffnessCurve, TipStiffnessModel
 
 Float = NDArray[np.float64]
+
+
+SAME_NAMES = "give parameters the same names in the model file of the calibration"
+OWN_OF_WING = "give a calibration of the wing's own, which `uav-twin calibrate` makes"
 
 
 @dataclass(frozen=True)
@@ -139,42 +144,67 @@ def _draws_of_file(calibration: Calibration, seed: int) -> ParameterDraws:
     )
 
 
-def check_calibration(
-    calibration: Calibration, known: Collection[str] | None = None, where: str = ""
-) -> None:
+def read_calibration(calibration: Calibration) -> None:
     """Read the calibration file, if there is one.
+
+    Raises
+    ------
+    CalibrationRecordError
+        It is damaged or of another kind, or has no samples of the parameter.
+    """
+    from calibration.reading import load_calibration
+
+    if calibration.file is not None:
+        load_calibration(Path(calibration.file)).draws_of(calibration.parameter)
+
+
+def check_calibration(
+    calibration: Calibration,
+    known: Collection[str],
+    where: str,
+    *,
+    ranges: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+    advice: str = SAME_NAMES,
+) -> None:
+    """Read the calibration file, if there is one, and see whether one from a campaign fits what is there.
 
     Parameters
     ----------
     calibration : Calibration
         Section of the scenario.
-    known : collection of str, optional
-        Parameters of what is believed or flown, each of which a calibration from a campaign must be of.
+    known : collection of str
+        Parameters of what is believed or flown; one of these each parameter of a calibration from a campaign
+        must be.
     where : str
         What has these, in the sentence.
+    ranges : mapping of str to (float, float)
+        Where what has these parameters holds, SI; a name that is not there has no range.
+    advice : str
+        What to do where it is not, in the sentence.
 
     Raises
     ------
     CalibrationRecordError
         It is damaged or of another kind, or has no samples of the parameter.
     MissionInputError
-        It has a parameter that is not known.
+        It has a parameter that is not known, or one whose posterior mean lies outside its range.
     """
-    if calibration.file is None:
-        return
-    from calibration.reading import load_calibration
-
-    load_calibration(Path(calibration.file)).draws_of(calibration.parameter)
+    read_calibration(calibration)
     found = _parameters_in(calibration)
-    if found is None or known is None:
+    if found is None:
         return
     unknown = sorted({prior.name for prior in found.priors} - {*known})
     if unknown:
         raise MissionInputError(
             f"the calibration of {found.asset} has the parameter {', '.join(unknown)}, which {where} "
-            f"does not know; it knows {', '.join(known) or 'none'}: give parameters the same names in the "
-            "model file of the calibration."
+            f"does not know; it knows {', '.join(known) or 'none'}: {advice}."
         )
+    for name, (low, high) in ranges.items():
+        if name in calibrated_means(calibration) and not low <= found.mean(name) <= high:
+            raise MissionInputError(
+                f"the calibration of {found.asset} has {name} = {found.mean(name):.6g}, but {where} holds "
+                f"from {low:g} to {high:g} of it: give one of that, or widen the range if its file has one."
+            )
 
 
 def is_of_parameters(file: Path | str) -> bool:

@@ -127,7 +127,8 @@ def _check_parameter(scenario: Scenario, design: "StructureDesign") -> None:
         )
     known = [part.name for part in design.parameter]
     known += [part.name for part in design.mass if part.free]
-    check_calibration(calibration, known, f"the structure {design.name}")
+    ranges = {part.name: part.range for part in (*design.parameter, *design.mass)}
+    check_calibration(calibration, known, f"the structure {design.name}", ranges=ranges)
     if calibration.parameter not in known:
         raise MissionInputError(
             f"the calibrated parameter {calibration.parameter} is none of the structure {design.name}, which "

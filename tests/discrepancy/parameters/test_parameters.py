@@ -340,6 +340,18 @@ def test_what_cannot_be_calibrated_is_one_sentence(
         calibrate_parameters(campaign, choice_of(spring, priors))
 
 
+def test_a_mean_outside_the_range_is_said_before_the_model_is_asked(tmp_path: Path) -> None:
+    def law(force: Float, parameters: Float) -> Float:
+        if parameters[0] > 1.5:
+            raise ModelError("The FMU refuses it.")
+        return spring(force, parameters)
+
+    more = "[parameters.p1]\nmean = 2.0\ndeviation = 0.1"
+    campaign = campaign_of(tmp_path, spring(FORCE, np.array([1.0])), more=more)
+    with pytest.raises(CampaignDataError, match=r"p1 = 2, outside the range .* correct \[parameters.p1\]"):
+        calibrate_parameters(campaign, choice_of(law, (1.0, 0.1, 0.5, 1.5)))
+
+
 def test_held_out_trials_take_no_part(tmp_path: Path) -> None:
     values = spring(FORCE, np.array([1.1]))
     whole = campaign_of(tmp_path, np.stack([values, 1.2 * values]))

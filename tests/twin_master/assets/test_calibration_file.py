@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from calibration.errors import CalibrationRecordError
+from calibration.parameters.result import ParameterCalibration, ParameterPrior
+from calibration.parameters.result_file import result_bytes
 from calibration.wing.result import CalibrationResult
 from calibration.wing.result_file import load_calibration, save_calibration
 from calibration.wing.wing_record import calibrated_wing, description, run_record
@@ -30,6 +32,7 @@ from twin_master.errors import MissionInputError, ScenarioError
 from twin_master.run_folder import to_json
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Calibration
+from twin_master.workflow import new_run
 
 MakeCalibration = Callable[..., CalibrationResult]
 TEXT = scenario_files()["level_turns"].read_text(encoding="utf-8")
@@ -38,6 +41,21 @@ TEXT = scenario_files()["level_turns"].read_text(encoding="utf-8")
 @pytest.fixture
 def file(tmp_path: Path, make_calibration: MakeCalibration) -> Path:
     return save_calibration(make_calibration(), tmp_path / "my wing.nc")
+
+
+def of_campaign(file: Path, **means: float) -> Path:
+    """Write the calibration of a model with these parameters from a campaign."""
+    values = np.array([*means.values()])
+    samples = values * (1.0 + 0.001 * np.random.default_rng(1).standard_normal((50, len(values))))
+    priors = tuple(
+        ParameterPrior(name, "1", mean, 0.1 * mean, 0.5 * mean, 2.0 * mean, "model.toml")
+        for name, mean in means.items()
+    )
+    found = ParameterCalibration(
+        "spring 7", "spring", "0" * 64, "Gaussian", priors, samples, samples, None, (), (), "test", 1, {}
+    )
+    file.write_bytes(result_bytes(found))
+    return file
 
 
 def section(file: Path | str | None, **others: object) -> Calibration:
@@ -195,3 +213,39 @@ def test_an_ssp_file_takes_the_place_of_a_script(tmp_path: Path) -> None:
     scenario = resolve_scenario(load_scenario("pump_wear"), Overrides(ssp=tmp_path / "pump.ssp"))
     assert scenario.asset.kind == "ssp"
     assert scenario.asset.parameters == load_scenario("pump_wear").scenario.asset.parameters
+
+
+COUPLED = next(
+    name for name, path in scenario_files().items() if 'kind = "coupled"' in path.read_text(encoding="utf-8")
+)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "means", "words"),
+    [
+        (
+            "level_turns",
+            {"young_modulus_factor": 1.0, "nonsense": 1.0},
+            r"spring 7 has the parameter nonsense, which the binding \w+ does not know; .*`uav-twin",
+        ),
+        (
+            "level_turns",
+            {"young_modulus_factor": 1.0, "servo_mass": 0.17},
+            r"the parameter servo_mass, which the reduced model of the design .* `uav-twin calibrate`",
+        ),
+        (
+            "level_turns",
+            {"young_modulus_factor": 1.3},
+            r"young_modulus_factor = 1\.[23]\d*, but .* 0\.9 to 1\.1",
+        ),
+        (COUPLED, {"young_modulus_factor": 1.0, "nonsense": 1.0}, "parameter nonsense, which the binding"),
+    ],
+)
+def test_what_a_calibration_from_a_campaign_has_must_be_known(
+    tmp_path: Path, scenario: str, means: dict[str, float], words: str
+) -> None:
+    loaded = load_scenario(scenario_files()[scenario])
+    file = of_campaign(tmp_path / "calibration.nc", **means)
+    with pytest.raises(MissionInputError, match=words):
+        new_run(loaded, tmp_path / "run", Overrides(calibration=file), report=False)
+    assert not (tmp_path / "run").exists()
