@@ -49,7 +49,7 @@ from twin_master.scenario.schema import Scenario
 from twin_master.store.learnt import learnt_record
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.outcome import RunOutcome, finished_run, read_outcome
-from twin_master.store.summary import control_changes, noticed, summarise
+from twin_master.store.summary import another_truth, control_changes, noticed, summarise
 from twin_master.store.writing import (
     store_mission,
     values_of,
@@ -278,17 +278,16 @@ def _given_policy(folder: Path, hashes: dict[str, str]) -> NDArray[np.float64] |
 
 
 def _tell_of_another_truth(knowledge: Knowledge, progress: Progress) -> None:
-    """Say so where the true wing of the scenario is not the one that the calibration file describes."""
+    """Say so where the true asset of the scenario is not the one that the calibration file describes."""
     draws, scenario = knowledge.draws, knowledge.scenario
     truth = scenario.asset.true_parameters.get(draws.name)
     if scenario.calibration.source != "file" or truth is None:
         return
-    off = abs(truth - draws.mean)
-    if off > 3.0 * draws.standard_deviation:
+    sentence = another_truth(draws.name, truth, draws.mean, draws.standard_deviation)
+    if sentence is not None:
         progress.note(
-            f"The scenario's true {draws.name} is {truth:.5g}, but the calibration says {draws.mean:.5g} "
-            f"± {draws.standard_deviation:.2g}: the twin flies with the model of another wing. To fly the "
-            "calibrated wing, leave it out of `parameters` in the scenario's table `asset`."
+            f"{sentence} To fly the calibrated asset, leave {draws.name} out of `parameters` in the "
+            "scenario's table `asset`."
         )
 
 

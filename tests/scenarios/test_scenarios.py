@@ -50,6 +50,7 @@ def test_the_wing_with_a_third_region_is_the_shipped_one_with_a_third_region() -
     three = tomllib.loads(SHIPPED_DESIGN.with_name("uav_wing_three_regions.toml").read_text(encoding="utf-8"))
     third = three["defects"].pop()
     assert set(third) == {"span_start", "span_end", "chord_start", "chord_end"}
+    assert (three.pop("name"), shipped.pop("name")) == ("UAV wing, three regions", "UAV wing")
     assert three == shipped
     scenario = load_scenario("three_regions").scenario
     assert scenario.state_names == ("z1", "z2", "z3")

@@ -134,14 +134,6 @@ def _figure(entry: object) -> CalibratedFigure | None:
         return None
 
 
-def departure(view: CalibrationView) -> float | None:
-    """Return by how many standard deviations of the draws the true value lies off; None if unknown."""
-    spread = float(view.draws.std())
-    if view.true_value is None or spread <= 0.0:
-        return None
-    return abs(view.true_value - float(view.draws.mean())) / spread
-
-
 def _table(record: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     value = record.get(key)
     return value if isinstance(value, Mapping) else {}

@@ -20,7 +20,6 @@ from twin_master.report.calibration import (
     calibration_caption,
     calibration_figure,
     calibration_view,
-    departure,
 )
 from twin_master.report.check import check_figure, predictive_check
 from twin_master.report.data import RunRecord
@@ -41,11 +40,9 @@ from twin_master.report.text import (
 )
 from twin_master.report.view import choose_sensors, default_now, sensor_title, sensor_word, state_scale
 from twin_master.store.outcome import REPORT_NAME
-from twin_master.store.summary import control_changes
+from twin_master.store.summary import another_truth, control_changes
 
 FIGURE_FOLDER = "figures"
-TRUTH_IS_OFF = 3.0
-"""Standard deviations of the calibration beyond which a true parameter is pointed out."""
 MAIN_FIGURE = "mission_now"
 """The figure that is also written as PNG."""
 
@@ -353,12 +350,10 @@ def _loss_notices(record: RunRecord) -> list[str]:
     view = calibration_view(record)
     notices = []
     fixed = view is not None and all(learnt.name != view.parameter for learnt in record.learnt)
-    if view is not None and fixed and (off := departure(view)) is not None and off > TRUTH_IS_OFF:
-        notices.append(
-            f"The asset flown has a {view.parameter.replace('_', ' ')} of {number(view.true_value)}, "
-            f"{off:.1f} standard deviations from what the twin was calibrated with: it flies with the model "
-            f"of another {'asset' if view.campaign else 'wing'}."
-        )
+    if view is not None and view.true_value is not None and fixed:
+        believed = float(view.draws.mean()), float(view.draws.std())
+        sentence = another_truth(view.parameter, view.true_value, *believed)
+        notices += [] if sentence is None else [sentence]
     lost = np.isnan(record.observation)
     if not lost.any():
         return notices

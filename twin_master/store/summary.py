@@ -24,6 +24,9 @@ Index = NDArray[np.int64]
 _TOLERANCE = 1e-9
 _CHANGES_SAID = 3
 
+TRUTH_IS_OFF = 3.0
+"""Standard deviations beyond which the asset flown is not the one that was calibrated."""
+
 
 @dataclass(frozen=True)
 class Figure:
@@ -383,3 +386,15 @@ def _misfit_figures(misfit: Misfit) -> list[Figure]:
 def to_record(figures: Sequence[Figure], heading: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of `summary.json`: the heading, and each figure beside its reference."""
     return {**heading, "figures": [asdict(figure) for figure in figures]}
+
+
+def another_truth(parameter: str, truth: float, mean: float, deviation: float) -> str | None:
+    """Return what to say of an asset whose truth is far off what its twin was calibrated with, or None."""
+    off = abs(truth - mean)
+    if off <= TRUTH_IS_OFF * deviation or deviation <= 0.0:
+        return None
+    return (
+        f"The true {parameter_title(parameter)} of the asset flown is {truth:.5g}, {off / deviation:.1f} "
+        f"standard deviations from the {mean:.5g} ± {deviation:.2g} that the twin was calibrated with: it "
+        "flies with the model of another asset."
+    )
