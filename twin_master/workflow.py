@@ -17,7 +17,7 @@ from reporting.files import atomic_write_text
 from reporting.folders import restore_folder
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance, hash_file, hash_record
-from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.asset_source import AssetSource, calibrated_with
 from twin_master.assets.mismatch import Misfit, find_misfit
 from twin_master.assets.resolution import (
     Overrides,
@@ -247,6 +247,9 @@ def _fly_and_store(
     ):
         knowledge = prepare_knowledge(scenario, source, scenario.mission.seed, policy)
         _tell_of_another_truth(knowledge, progress)
+        record, origin = knowledge.draws.record or {}, source.origin
+        if "campaign" in record:
+            progress.note(calibrated_with(str(record["model"]), origin.asset, origin.model))
         if knowledge.draws.record is not None:
             text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
             atomic_write_text(folder / CALIBRATION_NAME, text + "\n")

@@ -15,6 +15,7 @@ from calibration.parameters.result import ParameterCalibration
 from calibration.reading import load_calibration
 from fe.full.statics import Factorisation
 from fe.structure.operators import load_and_assemble
+from reporting.progress import SilentProgress
 from scenarios import scenario_files, structure_files
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
@@ -104,7 +105,13 @@ def test_the_twin_flies_with_it(calibrated: Path, tmp_path: Path) -> None:
     """Its draws are those of the file; what flies stands at the means; the mass follows the modulus."""
     found = load_calibration(calibrated)
     assert isinstance(found, ParameterCalibration)
-    folder = new_run(mission(), tmp_path / "run", Overrides(calibration=calibrated), report=False).folder
+    said: list[str] = []
+    folder = new_run(
+        mission(), tmp_path / "run", Overrides(calibration=calibrated), progress=_Noted(said)
+    ).folder
+    wanted_words = f"Calibrated was the model {found.model}; flown is the FMU of the structure bracket, and"
+    assert any(note.startswith(wanted_words) for note in said)
+    assert wanted_words in (folder / "report.html").read_text(encoding="utf-8")
     with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
         tree.load()
     draws = tree["calibration"]["draw_value"].values
@@ -129,9 +136,17 @@ def test_the_twin_flies_with_it(calibrated: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(ratio, 1.0 + arm, rtol=1e-3)
 
 
-def _silent() -> object:
-    from reporting.progress import SilentProgress
+class _Noted(SilentProgress):
+    """Keeps what is said."""
 
+    def __init__(self, said: list[str]) -> None:
+        self._said = said
+
+    def note(self, message: str) -> None:
+        self._said.append(message)
+
+
+def _silent() -> object:
     return SilentProgress()
 
 

@@ -50,6 +50,17 @@ class FlownAndBelieved:
     differ: bool = False
 
 
+def calibrated_with(model: str, asset: str, believed: str) -> str:
+    """Return which model a campaign calibrated and which is flown: whether they are one is not recorded."""
+    flown = f"flown and believed is the {asset}"
+    if asset != believed:
+        flown = f"flown is the {asset}, and the twin believes the {believed}"
+    return (
+        f"Calibrated was the model {model}; {flown}. The calibration file does not tell "
+        "whether these are one and the same."
+    )
+
+
 class AssetSource(Protocol):
     """Everything that a mission needs to know of its asset."""
 

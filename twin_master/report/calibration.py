@@ -52,6 +52,8 @@ class CalibrationView:
         Name of the wing, or of whatever else was calibrated, from its calibration file.
     campaign : str
         Name of the campaign that parameters of a model were calibrated from; empty for a wing.
+    model : str
+        Name of that model.
     findings : tuple of str
         What that did not tell, or what disagreed.
     figures : tuple of CalibratedFigure
@@ -69,6 +71,7 @@ class CalibrationView:
     wing: str = ""
     figures: tuple[CalibratedFigure, ...] = ()
     campaign: str = ""
+    model: str = ""
     findings: tuple[str, ...] = ()
 
 
@@ -99,6 +102,7 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
         stiffness=_moments(_table(kept, "tip_stiffness_exact") or _table(kept, "tip_stiffness")),
         wing=str(kept.get("asset") or ""),
         campaign=str(kept.get("campaign") or ""),
+        model=str(kept.get("model") or ""),
         findings=tuple(str(text) for text in kept.get("findings") or ()),
         figures=tuple(
             figure

@@ -13,6 +13,7 @@ from reporting.figures import to_png, to_svg
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.page import Column, Page, Table
 from reporting.words import parameter_title
+from twin_master.assets.asset_source import calibrated_with
 from twin_master.errors import RunFolderError
 from twin_master.report.belief import belief_figure, policy_figure
 from twin_master.report.calibration import (
@@ -207,6 +208,7 @@ def render_page(record: RunRecord, drawings: Sequence[Drawing]) -> str:
             page.add_figure(figure.svg, figure.caption, title=figure.title)
             if figure.name == "calibration":
                 _add_calibrated_wing(page, calibration_view(record))
+                _add_calibrated_model(page, record)
             if figure.name == "learnt":
                 for table, caption, title in learnt_tables(record):
                     page.add_table(table, caption, title=title)
@@ -323,6 +325,14 @@ def _add_calibrated_wing(page: Page, view: CalibrationView | None) -> None:
     )
     for sentence in view.findings:
         page.add_paragraph(sentence)
+
+
+def _add_calibrated_model(page: Page, record: RunRecord) -> None:
+    """Say which model a campaign calibrated, and which was flown."""
+    view = calibration_view(record)
+    asset, believed = (record.summary.get(key) for key in ("asset", "twin_model"))
+    if view is not None and view.campaign and asset and believed:
+        page.add_paragraph(calibrated_with(view.model, str(asset), str(believed)))
 
 
 def _notices(record: RunRecord) -> list[str]:
