@@ -127,12 +127,12 @@ def draw_parameter(
 
 
 def _draws_of_file(calibration: Calibration, seed: int) -> ParameterDraws:
+    from calibration.parameters.result import ParameterCalibration
     from calibration.reading import load_calibration, run_record
 
     name = calibration.parameter
     found = load_calibration(Path(calibration.file or ""))
     values = found.stratified_draws(name, calibration.draws, seed_sequence(seed, "calibration"))
-    of_parameters = _parameters_in(calibration)
     return ParameterDraws(
         name=name,
         values=values,
@@ -140,7 +140,7 @@ def _draws_of_file(calibration: Calibration, seed: int) -> ParameterDraws:
         standard_deviation=found.standard_deviation(name),
         source=f"calibration of {found.asset}, {found.procedure}, {len(found.calibrated.samples)} samples",
         record=run_record(found, name),
-        others={} if of_parameters is None else of_parameters.given(name, values),
+        others=found.given(name, values) if isinstance(found, ParameterCalibration) else {},
     )
 
 
@@ -193,14 +193,15 @@ def check_calibration(
     found = _parameters_in(calibration)
     if found is None:
         return
-    unknown = sorted({prior.name for prior in found.priors} - {*known})
+    names = {prior.name for prior in found.priors}
+    unknown = sorted(names - {*known})
     if unknown:
         raise MissionInputError(
             f"the calibration of {found.asset} has the parameter {', '.join(unknown)}, which {where} "
             f"does not know; it knows {', '.join(known) or 'none'}: {advice}."
         )
     for name, (low, high) in ranges.items():
-        if name in calibrated_means(calibration) and not low <= found.mean(name) <= high:
+        if name in names and not low <= found.mean(name) <= high:
             raise MissionInputError(
                 f"the calibration of {found.asset} has {name} = {found.mean(name):.6g}, but {where} holds "
                 f"from {low:g} to {high:g} of it: give one of that, or widen the range if its file has one."
