@@ -24,10 +24,8 @@ from discrepancy.models.interface import (
     Scales,
     check_plain,
 )
-from fe.runtime.patch import (
-    ModelPatch,
-    Primitive,
-)
+from fe.runtime.patch import ModelPatch, Primitive
+from fmu_asset.errors import FmuError
 from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
@@ -78,8 +76,18 @@ class FmuModel:
         self.runs.close()
 
     def _check_settings(self) -> None:
-        """Refuse effects and parameters of trials that the FMU does not have."""
+        """Refuse effects and parameters that the FMU does not have, and ranges wider than its own."""
         asset = self.runs.asset
+        for item in self.description.parameter:
+            key = self.runs.parameter(item.variable or item.name)
+            for end in (item.low, item.high):  # beyond its own range it refuses, and a posterior is cut there
+                try:
+                    asset.check_parameters({key: end})
+                except FmuError as cause:
+                    raise ModelError(
+                        f"The FMU model {self.name!r}: [[parameter]] {item.name} has the range {item.low:g} "
+                        f"to {item.high:g}, which the FMU {asset.description.path} cannot have: {cause}"
+                    ) from cause
         names = {
             f"effects.{kind}": f"effect.{identifier}.active"
             for kind, identifier in self.description.effects.items()

@@ -11,6 +11,7 @@ from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.observability import LEFT
 from discrepancy.parameters.posterior import ParameterPosterior
 from discrepancy.verdict import Gate
+from reporting.words import counted
 
 FAR = 3.0
 """Prior deviations from which on a posterior mean is remarked on."""
@@ -19,6 +20,9 @@ TIED = 0.95
 EDGE = 0.02
 """Share of a posterior beyond the model's range from which on it is remarked on, where the parameter is told:
 one that is not is cut off as its prior is."""
+
+REFUSED = 4.0
+"""Standard deviations from the optimum within which a place that the model refuses is remarked on."""
 
 
 def findings(
@@ -66,6 +70,16 @@ def _disagreements(priors: tuple[ParameterPrior, ...], posterior: ParameterPoste
         for prior, share, known in zip(priors, beyond.tolist(), told.tolist(), strict=True)
         if known and share > EDGE
     ]
+    missing = [item for item in marginal.refused if _told_apart(posterior, item[0]) < REFUSED]
+    if missing:
+        at, reason = missing[0]
+        values = zip(priors, marginal.values(at).tolist(), strict=True)
+        places = ", ".join(f"{prior.name} = {value:.4g}" for prior, value in values if np.isfinite(value))
+        said.append(
+            f"At {counted(len(missing), 'place')} near the optimum, and within its range, the model cannot "
+            f"be had, first at {places} ({reason.rstrip('.')}): the posterior has nothing there; correct "
+            "the range in the model's file."
+        )
     if len(posterior.optima) > 1:
         evidence = np.array([item.log_evidence for item in posterior.optima])
         weight = np.exp(evidence - evidence.max())
@@ -88,6 +102,14 @@ def _disagreements(priors: tuple[ParameterPrior, ...], posterior: ParameterPoste
             "The fit had not settled when it ended: the samples may be off; state the priors narrower."
         )
     return said
+
+
+def _told_apart(posterior: ParameterPosterior, u: NDArray[np.float64]) -> float:
+    """Return how far from the best optimum scaled parameters (P,) are [standard deviations]; NaN: any."""
+    known = np.flatnonzero(np.isfinite(u))
+    index, best = posterior.marginal.free[known], posterior.optima[0]
+    shift = u[known] - best.point.shared[index]
+    return float(np.sqrt(shift @ np.linalg.solve(best.covariance[np.ix_(index, index)], shift)))
 
 
 def kept_shares(posterior: ParameterPosterior) -> NDArray[np.float64]:

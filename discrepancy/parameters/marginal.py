@@ -40,6 +40,9 @@ class Marginal:
         Which calibrated parameters have a prior deviation; u is of these.
     low, high : (P,) ndarray
         Ends of the model's range as scaled parameters; the prior is cut off there.
+    refused : list of (ndarray, str)
+        Where within the range the model could not be had: scaled parameters (P,), NaN for those that were
+        fitted, and why.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -50,6 +53,7 @@ class Marginal:
         self.low = (shared.parameter_low[self.free] - mean) / scale
         self.high = (shared.parameter_high[self.free] - mean) / scale
         self._near = problem.start(NOTHING)
+        self.refused: list[tuple[FloatArray, str]] = []
 
     def values(self, u: FloatArray) -> FloatArray:
         """Return parameters (..., P) of scaled ones [units]."""
@@ -95,7 +99,11 @@ class Marginal:
         start = near or (self._near if trials is None else problem.start(NOTHING))
         at = start.shared.copy()
         at[held] = 0.0
-        return fit(problem, NOTHING, replace(start, shared=at))
+        try:
+            return fit(problem, NOTHING, replace(start, shared=at))
+        except ModelError as cause:
+            self.refused.append((np.where(np.isin(self.free, held), u, np.nan), str(cause)))
+            raise
 
     def __call__(self, u: FloatArray) -> float:
         """Return the energy at scaled parameters (P,); infinite outside the model's range."""

@@ -117,6 +117,18 @@ class OpenedFmu(SteppedAsset):
         """
         return self._exchange.input_range(role, name)
 
+    def check_parameters(self, parameters: Values) -> None:
+        """See whether parameters could be set, without setting them.
+
+        Raises
+        ------
+        BindingError
+            If one is neither in the binding nor a parameter of the FMU.
+        FmuInputError
+            If a value is not finite, not whole or outside its range.
+        """
+        self._exchange.settings(parameters)
+
     def describe(self) -> dict[str, Any]:
         """Return what the FMU is and how it is bound, as plain records for a listing.
 

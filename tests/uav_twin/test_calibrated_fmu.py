@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,14 @@ import pytest
 import xarray as xr
 
 from calibration.parameters.result import ParameterCalibration
+from calibration.parameters.result_file import result_bytes
 from calibration.reading import load_calibration
 from fmu_asset.door.binding import load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.script import build_script_fmu
 from scenarios import asset_scripts, binding_files, scenario_files
-from twin_master.assets.resolution import Overrides
+from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
+from twin_master.errors import MissionInputError
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.workflow import new_run
 from uav_twin import cli
@@ -126,6 +129,14 @@ def test_an_fmu_is_calibrated_at_operating_points_and_flown(
         wanted = pump.step({"speed": 1800.0, "pressure": 180.0}).values
     np.testing.assert_allclose(tree["truth"]["operation"].values[0], wanted, rtol=1e-6)
 
+    other = replace(found, priors=(replace(found.priors[0], high=9.0),), samples=found.samples + 0.25)
+    (tmp_path / "other.nc").write_bytes(result_bytes(other))  # of a pump that takes thicker oil
+    resolved = resolve_scenario(scenario, Overrides(calibration=tmp_path / "other.nc"))
+    with pytest.raises(
+        MissionInputError, match=r"range of 'viscosity_factor', 0\.8 to 1\.2.* calibration has"
+    ):
+        asset_source(resolved).check()
+
 
 def test_what_an_fmu_does_not_have_is_one_sentence(
     bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -135,11 +146,13 @@ def test_what_an_fmu_does_not_have_is_one_sentence(
         ("input = [", "input = [] # ", "does not have; it has none: name it in"),
         ('binding = "gear_pump"', 'binding = "no_binding"', "no_binding"),
         (PARAMETER, "", "has no parameter to calibrate"),
+        ("high = 1.15", "high = 1.25", "has the range 0.85 to 1.25, which the FMU"),
+        ("low = 0.85", "low = 0.75", "= 0.75 lies outside the range of 'viscosity_factor', 0.8 to 1.2"),
     ):
         model = bench / "wrong.toml"
         model.write_text((bench / "model.toml").read_text().replace(old, new))
         assert call(monkeypatch, "calibrate", "campaign", bench / "lab", "--model", model) != 0
-        said = capsys.readouterr().err
+        said = " ".join(capsys.readouterr().err.split())
         assert words in said
         assert "Traceback" not in said
     assert call(monkeypatch, "calibrate", "campaign", bench / "lab", "--model", bench / "gear_pump.fmu") != 0

@@ -169,7 +169,8 @@ class SeveralSource(FmuSource):
         self._check_names(binding)
         folder = plain_folder()
         try:
-            self._check_system(binding, folder)
+            with self._told_of_means():
+                self._check_system(binding, folder)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 

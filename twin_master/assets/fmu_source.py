@@ -1,6 +1,7 @@
 """An FMU as the asset of a mission: any FMU with a binding, given or packed of a model script."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, ClassVar, Literal, Self
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from fmu_asset.errors import FmuInputError
 from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.assets.asset_source import AssetBelief, FlownAndBelieved, keep_files, named_files, read_files
@@ -179,10 +181,29 @@ class FmuSource:
         binding = load_binding(self._section.binding_path)
         check_calibration(self._scenario.calibration, binding.parameter, f"the binding {binding.name}")
         self._check_names(binding)
-        with TemporaryDirectory(prefix="uav_twin_") as folder:
+        with TemporaryDirectory(prefix="uav_twin_") as folder, self._told_of_means():
             binding = self._fitted(binding, Path(folder))
         self._observed(binding)
         self._inner_roles(binding)
+
+    @contextmanager
+    def _told_of_means(self) -> Iterator[None]:
+        """Tell of a parameter that the FMU refuses that it may be one of the calibration."""
+        try:
+            yield
+        except FmuInputError as error:
+            means = calibrated_means(self._scenario.calibration)
+            own = [
+                f"{name} = {value:.6g}"
+                for name, value in means.items()
+                if name not in self._section.parameters
+            ]
+            if not own:
+                raise
+            raise MissionInputError(
+                f"{error} The calibration has {', '.join(own)}: give one of what is flown, or name the "
+                "parameter in `asset.parameters`."
+            ) from error
 
     def _fitted(self, binding: "Binding", folder: Path) -> "Binding":
         """Return the binding as the FMU fits it: only with that it is known how many values an array has."""

@@ -246,6 +246,22 @@ def test_a_truth_beyond_the_range_ends_at_its_end(tmp_path: Path) -> None:
     assert any("p1 reaches the end of its range, 0.9 to 1.1" in sentence for sentence in found.findings)
 
 
+def test_where_the_model_cannot_be_had_is_said(tmp_path: Path) -> None:
+    """Within its range a model refuses what the posterior holds: it ends there, and says so."""
+
+    def refusing(force: Float, parameters: Float) -> Float:
+        if parameters[0] > 1.1:
+            raise ModelError("a stiffness above 1.1 is not known.")
+        return spring(force, parameters)
+
+    words = "(a stiffness above 1.1 is not known): the posterior has nothing there"
+    for truth, said in ((1.096, True), (0.9, False)):
+        campaign = campaign_of(tmp_path, spring(FORCE, np.array([truth])))
+        found = calibrate_parameters(campaign, choice_of(refusing, (1.0, 0.2, 0.5, 1.5)))
+        assert np.max(found.draws_of("p1")) < 1.105
+        assert (words in " ".join(found.findings)) == said
+
+
 def test_a_parameter_that_is_not_told_keeps_its_prior_as_it_is_cut_off(tmp_path: Path) -> None:
     """Range of two prior deviations, beside a parameter that is told: moments of a dense grid."""
 
