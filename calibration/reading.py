@@ -78,8 +78,14 @@ def run_record(calibration: AnyCalibration, parameter: str) -> dict[str, Any]:
         "seed": calibration.seed,
         "samples": len(calibration.samples),
         "model": calibration.model,
+        "design_hash": calibration.design_hash,
         "campaign": calibration.source,
         "findings": list(calibration.findings),
         **sampled_record(calibration),
         **drawn_record(calibration, parameter),
+        "prior": next(
+            {"mean": item.mean, "standard_deviation": item.deviation, "range": [item.low, item.high]}
+            for item in calibration.priors
+            if item.name == parameter
+        ),
     }

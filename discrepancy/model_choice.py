@@ -23,6 +23,7 @@ from discrepancy.sources.from_run import (
 from fe.reduction.stages import Progress
 from fe.runtime.errors import FiniteElementError
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
+from fmu_asset.archive.design_record import packed_design_hash
 from reporting.provenance import hash_file, hash_record
 from reporting.toml_file import read_toml
 from scenarios import structure_files
@@ -56,6 +57,8 @@ class ModelChoice:
         Of a wing.
     path : Path or None
         Of its file; None for what is shipped.
+    design_hash : str
+        SHA-256 of the design or structure that it was made of; empty where that is not known.
     """
 
     model: Model
@@ -64,6 +67,7 @@ class ModelChoice:
     source_hash: str
     design: WingDesign | None = None
     path: Path | None = None
+    design_hash: str = ""
 
 
 def choose_model(name: str | Path | None, progress: Progress | None = None) -> ModelChoice:
@@ -178,7 +182,8 @@ def _fmu(path: Path) -> ModelChoice:
         "binding": binding_file(model.description, path.parent),
     }
     source = hash_record({name: hash_file(file) for name, file in files.items() if file is not None})
-    return ModelChoice(model, ModelKind.FMU, path.name, source, path=path)
+    packed = packed_design_hash(files["fmu"] or path)
+    return ModelChoice(model, ModelKind.FMU, path.name, source, path=path, design_hash=packed)
 
 
 def _wing(path: Path | None, progress: Progress | None) -> ModelChoice:
@@ -189,7 +194,8 @@ def _wing(path: Path | None, progress: Progress | None) -> ModelChoice:
         design = load_design(path)
     except FiniteElementError as cause:
         raise ModelError(str(cause)) from cause
-    return ModelChoice(model, ModelKind.WING, "" if path is None else path.name, source, design, path)
+    label = "" if path is None else path.name
+    return ModelChoice(model, ModelKind.WING, label, source, design, path, design.hash)
 
 
 def _calibrated(path: Path, progress: Progress | None) -> ModelChoice:
@@ -198,4 +204,4 @@ def _calibrated(path: Path, progress: Progress | None) -> ModelChoice:
         design = load_calibration(path).design
     except (CalibrationError, OSError) as cause:
         raise ModelError(f"The calibration {path} cannot be used: {cause}") from cause
-    return ModelChoice(model, ModelKind.CALIBRATION, path.name, hash_file(path), design, path)
+    return ModelChoice(model, ModelKind.CALIBRATION, path.name, hash_file(path), design, path, design.hash)

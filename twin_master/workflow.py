@@ -248,8 +248,9 @@ def _fly_and_store(
         knowledge = prepare_knowledge(scenario, source, scenario.mission.seed, policy)
         _tell_of_another_truth(knowledge, progress)
         record, origin = knowledge.draws.record or {}, source.origin
-        if "campaign" in record:
-            progress.note(calibrated_with(str(record["model"]), origin.asset, origin.model))
+        told = calibrated_with(record, origin.asset, origin.model, config["inputs"])
+        if told is not None:
+            progress.note(told)
         if knowledge.draws.record is not None:
             text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
             atomic_write_text(folder / CALIBRATION_NAME, text + "\n")

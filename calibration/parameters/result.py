@@ -102,6 +102,8 @@ class ParameterCalibration(SampledCalibration):
         Of all samples.
     provenance : mapping
         Versions and hashes.
+    design_hash : str
+        SHA-256 of the design or structure that the model was made of; empty where that is not known.
 
     Raises
     ------
@@ -122,6 +124,7 @@ class ParameterCalibration(SampledCalibration):
     source: str
     seed: int
     provenance: Mapping[str, Any]
+    design_hash: str = ""
 
     def __post_init__(self) -> None:
         check_name(self.asset)

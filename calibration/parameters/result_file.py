@@ -41,6 +41,7 @@ def result_bytes(result: ParameterCalibration) -> bytes:
         "asset": result.asset,
         "model": result.model,
         "model_hash": result.model_hash,
+        "design_hash": result.design_hash,
         "procedure": result.procedure,
         "explained": json_text(result.explained),
         "campaign": result.source,
@@ -82,6 +83,7 @@ def load_parameters(path: Path | str) -> ParameterCalibration:
             source=str(root["campaign"]),
             seed=int(root["seed"]),
             provenance=json.loads(root["provenance"]),
+            design_hash=str(root["design_hash"]),
         )
     except CalibrationError as error:
         reason = str(error).rstrip(".")

@@ -92,6 +92,7 @@ def calibrate_parameters(
         source=campaign.name,
         seed=seed,
         provenance=collect_provenance(seed, input_hashes=hashes).as_dict(),
+        design_hash=choice.design_hash,
     )
 
 

@@ -1,6 +1,5 @@
 """What goes into the compiled FMU: description, sources, FMI headers, data file."""
 
-import json
 from collections.abc import Mapping, Sequence
 from importlib.metadata import distribution, version
 from importlib.resources import files
@@ -8,6 +7,7 @@ from pathlib import Path
 
 from fe.runtime.reduced_arrays import ReducedArrays
 from fe.runtime.structure_arrays import StructureArrays
+from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
 from fmu_asset.description import documentation_page, model_description
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
@@ -86,7 +86,7 @@ def compiled_members(
         ),
         "documentation/index.html": documentation_page(table, description, host=HOST),
         DATA_FILE: data_file_bytes(model),
-        "resources/design.json": (json.dumps({"design_hash": model.design_hash}) + "\n").encode(),
+        f"resources/{DESIGN_RECORD}": design_record(model.design_hash),
         **{f"sources/{name}": content for name, content in sources.items()},
         **{f"sources/{name}": content for name, content in fmi_headers().items()},
     }

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from importlib.resources import files
 
 from fe.runtime.structure_model import StructureModel
+from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
 from fmu_asset.compiled.package import binary_of, compiled_members
 from fmu_asset.compiled.variable_header import Roles
 from fmu_asset.errors import FmuBuildError
@@ -129,6 +130,7 @@ def _python_template(
         description=description,
         resources={
             "structure.npz": model.to_bytes(),
+            DESIGN_RECORD: design_record(model.design_hash),
             "start.json": (json.dumps(start, sort_keys=True) + "\n").encode(),
         },
         units=_units(table),

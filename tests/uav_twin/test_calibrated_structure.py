@@ -15,6 +15,7 @@ from calibration.parameters.result import ParameterCalibration
 from calibration.reading import load_calibration
 from fe.full.statics import Factorisation
 from fe.structure.operators import load_and_assemble
+from fmu_asset.archive.design_record import packed_design_hash
 from reporting.progress import SilentProgress
 from scenarios import scenario_files, structure_files
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
@@ -110,8 +111,12 @@ def test_the_twin_flies_with_it(calibrated: Path, tmp_path: Path) -> None:
         mission(), tmp_path / "run", Overrides(calibration=calibrated), progress=_Noted(said)
     ).folder
     wanted_words = f"Calibrated was the model {found.model}; flown is the FMU of the structure bracket, and"
-    assert any(note.startswith(wanted_words) for note in said)
-    assert wanted_words in (folder / "report.html").read_text(encoding="utf-8")
+    assert found.design_hash == packed_design_hash(calibrated.parents[1] / "bracket.fmu")
+    believed = f"The twin believes the design that was calibrated, {found.design_hash[:12]}."
+    assert any(note.startswith(wanted_words) and note.endswith(believed) for note in said)
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert wanted_words in page
+    assert believed in page
     with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
         tree.load()
     draws = tree["calibration"]["draw_value"].values
@@ -155,12 +160,21 @@ def test_what_the_calibration_does_not_fit_is_refused(calibrated: Path, tmp_path
         new_run(mission(parameter="pomp"), tmp_path / "run", Overrides(calibration=calibrated), report=False)
     source = structure_files()["bracket"]
     shutil.copy(source.with_suffix(".inp"), tmp_path)
-    text = source.read_text(encoding="utf-8").replace("free = true", "")
-    (tmp_path / "fixed.toml").write_text(text, encoding="utf-8")
-    table = mission().scenario.to_dict()
-    for name in ("asset", "belief"):
-        table[name]["structure"] = str(tmp_path / "fixed.toml")
-    other = LoadedScenario(parse_scenario(table, "mission"), BRACKET, "0" * 64)
-    with pytest.raises(MissionInputError, match="parameter pump, which the structure bracket does not know"):
-        new_run(other, tmp_path / "run", Overrides(calibration=calibrated), report=False)
-    assert not (tmp_path / "run").exists()
+    text, table = source.read_text(encoding="utf-8"), mission().scenario.to_dict()
+    for tables, change, words in (
+        (
+            ("asset", "belief"),
+            ("free = true", ""),
+            "parameter pump, which the structure bracket does not know",
+        ),
+        (("belief",), ("density = ", "density = 1"), "bracket, which the twin believes, has the design"),
+    ):
+        (tmp_path / "other.toml").write_text(text.replace(*change), encoding="utf-8")
+        own = {name: table[name] | {"structure": str(tmp_path / "other.toml")} for name in tables}
+        other = LoadedScenario(parse_scenario(table | own, "mission"), BRACKET, "0" * 64)
+        with pytest.raises(MissionInputError, match=words):
+            new_run(other, tmp_path / "run", Overrides(calibration=calibrated), report=False)
+        assert not (tmp_path / "run").exists()
+    own = {"asset": table["asset"] | {"structure": str(tmp_path / "other.toml")}}  # the truth may be another
+    other = LoadedScenario(parse_scenario(table | own, "mission"), BRACKET, "0" * 64)
+    asset_source(resolve_scenario(other, Overrides(calibration=calibrated))).check()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,15 +50,36 @@ class FlownAndBelieved:
     differ: bool = False
 
 
-def calibrated_with(model: str, asset: str, believed: str) -> str:
-    """Return which model a campaign calibrated and which is flown: whether they are one is not recorded."""
+def calibrated_with(
+    record: Mapping[str, Any], asset: str, believed: str, hashes: Mapping[str, str]
+) -> str | None:
+    """Return which model a campaign calibrated, which is flown, and whether the twin believes that one.
+
+    Parameters
+    ----------
+    record : mapping
+        Of the calibration, as a run folder keeps it.
+    asset, believed : str
+        What is flown and what the twin believes, in words.
+    hashes : mapping of str to str
+        Of what went into the run.
+
+    Returns
+    -------
+    str or None
+        None where nothing was calibrated from a campaign.
+    """
+    if "campaign" not in record:
+        return None
     flown = f"flown and believed is the {asset}"
     if asset != believed:
         flown = f"flown is the {asset}, and the twin believes the {believed}"
-    return (
-        f"Calibrated was the model {model}; {flown}. The calibration file does not tell "
-        "whether these are one and the same."
-    )
+    own = hashes.get("design", hashes.get(FLOWN_DESIGN_HASH))
+    if own is not None and own == record.get("design_hash"):
+        same = f"The twin believes the design that was calibrated, {own[:12]}."
+    else:
+        same = "The calibration file does not tell whether these are one and the same."
+    return f"Calibrated was the model {record['model']}; {flown}. {same}"
 
 
 class AssetSource(Protocol):

@@ -305,7 +305,14 @@ class DesignSource:
         design = self._of.design()
         where = f"the {_model_of(design.name)}"
         ranges = {"young_modulus_factor": ReductionSettings().young_modulus_factor}
-        check_calibration(self._scenario.calibration, ranges, where, ranges=ranges, advice=OWN_OF_WING)
+        check_calibration(
+            self._scenario.calibration,
+            ranges,
+            where,
+            ranges=ranges,
+            design_hash=design.hash,
+            advice=OWN_OF_WING,
+        )
         gauges = len(design.gauges.positions)
         check_wing_scenario(self._scenario, design.regions, gauges)
         if self._of.patch_path is not None:

@@ -10,10 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from fmu_asset.archive.design_record import packed_design_hash
 from fmu_asset.errors import FmuInputError
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.asset_source import AssetBelief, FlownAndBelieved, keep_files, named_files, read_files
+from twin_master.assets.asset_source import (
+    FLOWN_DESIGN_HASH,
+    AssetBelief,
+    FlownAndBelieved,
+    keep_files,
+    named_files,
+    read_files,
+)
 from twin_master.assets.interface import Asset
 from twin_master.assets.parameter import (
     ParameterDraws,
@@ -179,7 +187,11 @@ class FmuSource:
 
         self.files()
         binding = load_binding(self._section.binding_path)
-        check_calibration(self._scenario.calibration, binding.parameter, f"the binding {binding.name}")
+        believed = isinstance(self._scenario.belief, AssetBelief)
+        check_calibration(
+            self._scenario.calibration, binding.parameter, f"the binding {binding.name}",
+            design_hash=packed_design_hash(self._section.all_files()[FMU_COPY]) if believed else "",
+        )  # fmt: skip
         self._check_names(binding)
         with TemporaryDirectory(prefix="uav_twin_") as folder, self._told_of_means():
             binding = self._fitted(binding, Path(folder))
@@ -257,7 +269,8 @@ class FmuSource:
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Make what is flown of the copies; return the hashes."""
-        return {"fmu": hash_file(self.fmu_path())}
+        packed = packed_design_hash(self.fmu_path())
+        return ({FLOWN_DESIGN_HASH: packed} if packed else {}) | {"fmu": hash_file(self.fmu_path())}
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the calibrated parameter."""

@@ -164,6 +164,7 @@ def check_calibration(
     where: str,
     *,
     ranges: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+    design_hash: str = "",
     advice: str = SAME_NAMES,
 ) -> None:
     """Read the calibration file, if there is one, and see whether one from a campaign fits what is there.
@@ -179,6 +180,8 @@ def check_calibration(
         What has these, in the sentence.
     ranges : mapping of str to (float, float)
         Where what has these parameters holds, SI; a name that is not there has no range.
+    design_hash : str
+        Of the design of what is believed; empty where it is not known, or of what is only flown.
     advice : str
         What to do where it is not, in the sentence.
 
@@ -187,7 +190,8 @@ def check_calibration(
     CalibrationRecordError
         It is damaged or of another kind, or has no samples of the parameter.
     MissionInputError
-        It has a parameter that is not known, or one whose posterior mean lies outside its range.
+        It has a parameter that is not known, or one whose posterior mean lies outside its range; or it is of
+        another design.
     """
     read_calibration(calibration)
     found = _parameters_in(calibration)
@@ -199,6 +203,12 @@ def check_calibration(
         raise MissionInputError(
             f"the calibration of {found.asset} has the parameter {', '.join(unknown)}, which {where} "
             f"does not know; it knows {', '.join(known) or 'none'}: {advice}."
+        )
+    if design_hash and found.design_hash not in ("", design_hash):
+        raise MissionInputError(
+            f"the calibration of {found.asset} is of the model {found.model} with the design "
+            f"{found.design_hash[:12]}, and {where}, which the twin believes, has the design "
+            f"{design_hash[:12]}: calibrate what is believed, or let the twin believe what was calibrated."
         )
     for name, (low, high) in ranges.items():
         if name in names and not low <= found.mean(name) <= high:

@@ -12,6 +12,7 @@ from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.assets.asset_source import (
     FLOWN_DESIGN_HASH,
+    AssetBelief,
     AssetSource,
     FlownAndBelieved,
     keep_files,
@@ -117,8 +118,13 @@ class StructureBelief(StructureFiles, BeliefSection):
         return StructureSource(scenario, self)
 
 
-def _check_parameter(scenario: Scenario, design: "StructureDesign") -> None:
-    """Refuse a calibration that a structure cannot have; raises `MissionInputError`."""
+def _check_parameter(scenario: Scenario, design: "StructureDesign", believed: Path | None) -> None:
+    """Refuse a calibration that a structure cannot have; raises `MissionInputError`.
+
+    `believed` is its file, where the twin believes it.
+    """
+    from fe.structure.design import structure_hash
+
     calibration = scenario.calibration
     if calibration.source == "static_test":
         raise MissionInputError(
@@ -128,7 +134,9 @@ def _check_parameter(scenario: Scenario, design: "StructureDesign") -> None:
     known = [part.name for part in design.parameter]
     known += [part.name for part in design.mass if part.free]
     ranges = {part.name: part.range for part in (*design.parameter, *design.mass)}
-    check_calibration(calibration, known, f"the structure {design.name}", ranges=ranges)
+    found = "" if believed is None else structure_hash(design, believed.parent / design.mesh)
+    where = f"the structure {design.name}"
+    check_calibration(calibration, known, where, ranges=ranges, design_hash=found)
     if calibration.parameter not in known:
         raise MissionInputError(
             f"the calibrated parameter {calibration.parameter} is none of the structure {design.name}, which "
@@ -225,7 +233,9 @@ class StructureFmuSource(FmuSource):
 
         self.files()
         design = self._design()
-        _check_parameter(self._scenario, design)
+        believes_it = isinstance(self._scenario.belief, AssetBelief)
+        file = self._section.all_files()[FLOWN_COPY]
+        _check_parameter(self._scenario, design, file if believes_it else None)
         own = self._section.binding
         binding = (
             load_binding(self._section.binding_path)
@@ -238,7 +248,7 @@ class StructureFmuSource(FmuSource):
         if not own:  # under a binding of one's own the names may be others
             _check_ranges(self._scenario, design, self._section.parameters)
             _check_history(self._scenario, design)
-        check_structure(self._section.all_files()[FLOWN_COPY])
+        check_structure(file)
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the structure and pack the FMU."""
@@ -305,7 +315,7 @@ class StructureSource:
 
         self.files()
         design, scenario = self._design(), self._scenario
-        _check_parameter(scenario, design)
+        _check_parameter(scenario, design, self._places[MODEL_COPY])
         observed = {
             "strain": len(design.gauge),
             "displacement": len(design.displacement),

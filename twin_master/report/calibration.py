@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from calibration.wing.result import QUANTITIES
 from reporting import figures as style
@@ -52,8 +53,8 @@ class CalibrationView:
         Name of the wing, or of whatever else was calibrated, from its calibration file.
     campaign : str
         Name of the campaign that parameters of a model were calibrated from; empty for a wing.
-    model : str
-        Name of that model.
+    ends : (low, high)
+        Range of the parameter, at which prior and posterior are cut off.
     findings : tuple of str
         What that did not tell, or what disagreed.
     figures : tuple of CalibratedFigure
@@ -71,7 +72,7 @@ class CalibrationView:
     wing: str = ""
     figures: tuple[CalibratedFigure, ...] = ()
     campaign: str = ""
-    model: str = ""
+    ends: tuple[float, float] = (-np.inf, np.inf)
     findings: tuple[str, ...] = ()
 
 
@@ -102,7 +103,7 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
         stiffness=_moments(_table(kept, "tip_stiffness_exact") or _table(kept, "tip_stiffness")),
         wing=str(kept.get("asset") or ""),
         campaign=str(kept.get("campaign") or ""),
-        model=str(kept.get("model") or ""),
+        ends=tuple(_table(kept, "prior").get("range", (-np.inf, np.inf))),
         findings=tuple(str(text) for text in kept.get("findings") or ()),
         figures=tuple(
             figure
@@ -205,12 +206,13 @@ def _density_panel(axes: Axes, view: CalibrationView, label: str) -> None:
         axes.axvline(center, color=style.PRESENT, label="value used")
     if view.prior is not None:
         mean, deviation = view.prior
-        x = np.linspace(low, high, 200)
+        x = np.linspace(max(low, view.ends[0]), min(high, view.ends[1]), 200)
+        mass = np.subtract(*ndtr((np.array(view.ends[::-1]) - mean) / deviation))
         density = np.exp(-0.5 * ((x - mean) / deviation) ** 2) / (deviation * np.sqrt(2.0 * np.pi))
-        axes.plot(x, density, color=style.PAST, linewidth=1.2, label="prior")
+        axes.plot(x, density / mass, color=style.PAST, linewidth=1.2, label="prior")
     if view.posterior is not None:
         grid, density = view.posterior
-        inside = (grid >= low) & (grid <= high)
+        inside = (grid >= max(low, view.ends[0])) & (grid <= min(high, view.ends[1]))
         axes.plot(grid[inside], density[inside], color=style.PRESENT, label="posterior")
     if view.true_value is not None:
         axes.axvline(

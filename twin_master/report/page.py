@@ -329,10 +329,13 @@ def _add_calibrated_wing(page: Page, view: CalibrationView | None) -> None:
 
 def _add_calibrated_model(page: Page, record: RunRecord) -> None:
     """Say which model a campaign calibrated, and which was flown."""
-    view = calibration_view(record)
     asset, believed = (record.summary.get(key) for key in ("asset", "twin_model"))
-    if view is not None and view.campaign and asset and believed:
-        page.add_paragraph(calibrated_with(view.model, str(asset), str(believed)))
+    if asset and believed:
+        inputs = record.config.get("inputs")
+        hashes = inputs if isinstance(inputs, Mapping) else {}
+        told = calibrated_with(record.calibration, str(asset), str(believed), hashes)
+        if told is not None:
+            page.add_paragraph(told)
 
 
 def _notices(record: RunRecord) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Any
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.progress import Progress
 from reporting.provenance import collect_provenance, hash_file, hash_record
-from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.asset_source import AssetSource, calibrated_with
 from twin_master.assets.design_source import DesignBelief
 from twin_master.assets.resolution import (
     Overrides,
@@ -96,6 +96,9 @@ class Watch:
         self._config = with_inputs(folder, config, hashes)
         with progress.stage("Calibrating and planning"):
             knowledge = prepare_knowledge(scenario, source, scenario.mission.seed)
+        told = calibrated_with(knowledge.draws.record or {}, WATCHED, source.origin.model, hashes)
+        if told is not None:
+            progress.note(told)
         self.models = [BelievedModel(0, knowledge)]
         own = getattr(scenario.belief, "patch", None)
         self._patches: list[Path | None] = [Path(own) if own else None]  # of these models
