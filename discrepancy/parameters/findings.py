@@ -72,8 +72,8 @@ def _disagreements(priors: tuple[ParameterPrior, ...], posterior: ParameterPoste
     ]
     missing = [item for item in marginal.refused if _told_apart(posterior, item[0]) < REFUSED]
     if missing:
-        at, reason = missing[0]
-        values = zip(priors, marginal.values(at).tolist(), strict=True)
+        place, reason = missing[0]
+        values = zip(priors, marginal.values(place).tolist(), strict=True)
         places = ", ".join(f"{prior.name} = {value:.4g}" for prior, value in values if np.isfinite(value))
         said.append(
             f"At {counted(len(missing), 'place')} near the optimum, and within its range, the model cannot "
