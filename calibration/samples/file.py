@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -44,13 +45,19 @@ def read_file(path: Path) -> tuple[dict[str, xr.Dataset], dict[str, Any]]:
             "`uav-twin calibrate --out DIR` leaves."
         )
     try:
-        tree = read_groups(path)
+        tree = _tree(path, hashlib.sha256(path.read_bytes()).digest())
     except DamagedFileError as error:
         raise CalibrationRecordError(
             f"{path} is damaged or no calibration file: it cannot be read as NetCDF; calibrate again."
         ) from error
     groups = {name: tree[name].to_dataset() for name in tree.children}
     return groups, {str(name): value for name, value in tree.attrs.items()}
+
+
+@lru_cache(maxsize=8)
+def _tree(path: Path, content: bytes) -> xr.DataTree:
+    """Read a file of a content (its hash) once: a run asks for the same calibration some twenty times."""
+    return read_groups(path)
 
 
 def check_schema(path: Path, root: Root, *schemas: str) -> None:
