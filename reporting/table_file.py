@@ -230,6 +230,7 @@ def parse_table(
         raise errors.layout(f"{name} has {'a header line but ' if header is None else ''}no rows.")
     for line, row in found:
         if len(row) != len(columns):
+            comma = separator and len(row) > len(columns) and all(map(_is_number, row))
             raise errors.layout(
                 f"{name}, line {line}: {counted(len(row), 'cell')} came, and "
                 + (
@@ -237,9 +238,18 @@ def parse_table(
                     if header is None
                     else f"{counted(len(columns), 'column')} ({', '.join(columns)}) are expected."
                 )
+                + (" A decimal comma makes two cells of a number: write it with a point." if comma else "")
             )
     cells = tuple(zip(*(row for _, row in found), strict=True))
     return TextTable(name, dict(zip(columns, cells, strict=True)), tuple(line for line, _ in found), errors)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        plain_number(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _separated(

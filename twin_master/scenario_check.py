@@ -60,8 +60,8 @@ class ScenarioCheck:
     memory: float
 
 
-def check_scenario(loaded: LoadedScenario) -> ScenarioCheck:
-    """Return what a scenario is, once everything that it names was looked at.
+def check_scenario(loaded: LoadedScenario, overrides: Overrides | None = None) -> ScenarioCheck:
+    """Return what a scenario is with the overrides, once everything that it names was looked at.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def check_scenario(loaded: LoadedScenario) -> ScenarioCheck:
     BindingError, InvalidDesignError, DesignFileError
         The binding or the design is wrong.
     """
-    scenario = resolve_scenario(loaded, Overrides())
+    scenario = resolve_scenario(loaded, overrides or Overrides())
     watched = scenario.asset.kind == WATCHED_KIND
     source = believed_source(scenario) if watched else asset_source(scenario)
     source.check()

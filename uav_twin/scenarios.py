@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from reporting import terminal
+from twin_master.command import Calibration
 
 scenario_app = typer.Typer(no_args_is_help=True)
 
@@ -44,15 +45,17 @@ def check(
     file: Annotated[
         str, typer.Argument(metavar="FILE", help="A scenario file, or a shipped name.", show_default=False)
     ],
+    calibration: Calibration = None,
     json: terminal.Json = False,
 ) -> None:
     """Say what a scenario flies and believes, and what it takes; exit code 1 if anything is wrong with it."""
     from dataclasses import asdict
 
+    from twin_master.assets.resolution import Overrides
     from twin_master.scenario.reading import load_scenario
     from twin_master.scenario_check import check_scenario
 
-    found = check_scenario(load_scenario(file))
+    found = check_scenario(load_scenario(file), Overrides(calibration=calibration))
     if json:
         terminal.print_json(asdict(found))
         return

@@ -271,8 +271,17 @@ class FmuModel:
         loads = self._trials.loads_at_rest(trial, patch, conditions)
         states = [self._trials.state(trial, conditions, patch.settings, row) for row in range(len(loads))]
         if not len(patch.laws):
-            return np.stack([self.motion.rest(s, g) for s, g in zip(states, loads, strict=True)])
+            return np.stack(
+                [self._rest(trial, row, *held) for row, held in enumerate(zip(states, loads, strict=True))]
+            )
         return rest_with_laws(self.motion, self.description, self.runs, trial.name, states, loads, patch.laws)
+
+    def _rest(self, trial: Trial, row: int, state: State, loads: dict[str, float]) -> FloatArray:
+        """Return all outputs (C,) of a row; what the FMU refuses is said with its place."""
+        try:
+            return self.motion.rest(state, loads)
+        except ModelError as cause:
+            raise ModelError(f"The trial {trial.name!r}, row {row + 1} of its table: {cause}") from cause
 
     # ------------------------------------------------------------ parts
 

@@ -88,7 +88,7 @@ class FmuTrials:
         at_ends = np.interp(step * np.arange(steps + 1), trial.time, trial.force)
         held = 0.5 * (at_ends[1:] + at_ends[:-1])
         on = (at_ends[1:] != 0.0) | (at_ends[:-1] != 0.0)
-        name = self._input_of(trial.load_place)
+        name = self._input_of(trial)
         loads = [(Excitation("input", name, held, float(trial.force[0])), 1.0 + patch.gain)]
         if patch.tare:
             loads.append(
@@ -141,7 +141,7 @@ class FmuTrials:
             if held and not np.any(trial.force):
                 loads.append(given)
                 continue
-            given[self._input_of(trial.load_place)] = acting
+            given[self._input_of(trial)] = acting
             for lever, moment in (
                 (patch.along_span, inputs.bending_moment),
                 (patch.along_chord, inputs.torque),
@@ -187,13 +187,15 @@ class FmuTrials:
         parameters |= dict(settings)
         return State(tuple(sorted(parameters.items())), tuple(sorted(inputs.items())))
 
-    def _input_of(self, place: str | tuple[float, float]) -> str:
+    def _input_of(self, trial: Trial) -> str:
+        place = trial.load_place
         if place == DEFAULT_PLACE and place not in self._forces and len(self._forces) == 1:
             return next(iter(self._forces.values()))
         if not isinstance(place, str) or place not in self._forces:
             known = ", ".join(self._forces) or "none"
+            said = "says no load_place" if place == DEFAULT_PLACE else f"is loaded at {place!r}"
             raise ModelError(
-                f"The load place {place!r} has no force input in the FMU model {self._name!r}; it has "
-                f"{known}."
+                f"The trial {trial.name!r} {said}, and the FMU model {self._name!r} takes forces at {known}: "
+                + ("name one of these as its load_place." if self._forces else "name an input in [inputs].")
             )
         return self._forces[place]

@@ -156,7 +156,10 @@ def extract_fmu(description: FmuDescription) -> Path:
 
 def _size_and_hash(file: Path) -> tuple[int, str]:
     if not file.exists():
-        raise FmuFileError(f"There is no FMU {file}; check the path, or build it with `uav-twin fmu build`.")
+        raise FmuFileError(
+            f"There is no FMU {file}; check the path, or make it: `uav-twin fmu build` packs a wing or a "
+            "script, `uav-twin structure fmu` a structure."
+        )
     if not file.is_file():
         raise FmuFileError(f"{file} is a folder, not an FMU file.")
     try:

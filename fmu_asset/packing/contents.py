@@ -70,7 +70,7 @@ def checked_target(path: str | os.PathLike[str], *, replace: bool) -> Path:
     if target.suffix != ".fmu":
         raise FmuBuildError(f"An FMU must have the suffix .fmu, but {target} was given.")
     if target.exists() and not replace:
-        raise FmuBuildError(f"{target} exists; choose another name or ask for it to be replaced.")
+        raise FmuBuildError(f"{target} exists: choose another name, or give --replace.")
     return target
 
 

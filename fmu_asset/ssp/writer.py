@@ -40,7 +40,7 @@ def write_ssp(
     if target.suffix != ".ssp":
         raise SspError(f"An SSP file must have the suffix .ssp, but {target} was given.")
     if target.exists() and not replace:
-        raise SspError(f"{target} exists; choose another name or ask for it to be replaced.")
+        raise SspError(f"{target} exists: choose another name, or give --replace.")
     content = ssp_bytes(wiring, parameter_names=parameter_names, stop_time=stop_time)
     return atomic_write_bytes(target, content)
 

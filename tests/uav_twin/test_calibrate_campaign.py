@@ -159,10 +159,11 @@ def test_json_has_the_same_figures(
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (("[[parameter]]", "[[place]]"), ""),
+        (("[[parameter]]", "[[place]]"), "'place[1].terms' is not a key of a lumped model"),
         (('unit = "mm"', 'unit = "m"'), "1000"),
         (("mean = 1.0", "mean = 1.6"), "a factor needs 0 < low <= mean <= high"),
         (('unit = "mm"', 'unit = "N"'), "unit"),
+        ((".", ","), "line 2: 4 cells came, and the header has 2 columns. A decimal comma makes two cells"),
     ],
 )
 def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
@@ -172,12 +173,13 @@ def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
     change: tuple[str, str],
     words: str,
 ) -> None:
-    for file in (lab / "campaign.toml", lab.parent / "model.toml"):
+    changed = (lab / "up.csv",) if change[0] == "." else (lab / "campaign.toml", lab.parent / "model.toml")
+    for file in changed:
         file.write_text(file.read_text().replace(*change))
     out = lab.parent / "out"
     assert call(monkeypatch, lab, "--model", lab.parent / "model.toml", "--out", out) != 0
     said = capsys.readouterr().err.strip()
-    assert words in said
+    assert words in " ".join(said.split())
     assert "Traceback" not in said
     assert not out.exists()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import tomllib
 from dataclasses import replace
@@ -155,6 +156,14 @@ def test_what_an_fmu_does_not_have_is_one_sentence(
         said = " ".join(capsys.readouterr().err.split())
         assert words in said
         assert "Traceback" not in said
+    shutil.copytree(bench / "lab", bench / "far")
+    (bench / "far/points.csv").write_text(
+        (bench / "lab/points.csv").read_text().replace("1400.0,", "9400.0,", 1)
+    )
+    assert call(monkeypatch, "calibrate", "campaign", bench / "far", "--model", bench / "model.toml") != 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "The trial 'points', row 4 of its table" in said
+    assert "lies outside the range of 'speed', 500 to 2500" in said
     assert call(monkeypatch, "calibrate", "campaign", bench / "lab", "--model", bench / "gear_pump.fmu") != 0
     assert "is an FMU: give a TOML file" in capsys.readouterr().err
     assert call(monkeypatch, "calibrate", "campaign", bench / "lab", "--model", "single_mass_rig") != 0

@@ -59,6 +59,8 @@ def test_a_scenario_is_described(monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert record["memory"] > 8 * (100 * 25 * 2 * 24 + 2 * 25**2 + 25 * 60)
     assert call(monkeypatch, "scenario", "check", "level_turns", "-q") == 0
     assert capsys.readouterr().out == ""
+    assert call(monkeypatch, "scenario", "check", "level_turns", "--calibration", "no_such.nc") == 1
+    assert "no_such.nc" in capsys.readouterr().err
     assert call(monkeypatch, "scenario", "check", "level_turns", "-q", "-v") == 2
     assert "exclude each other" in capsys.readouterr().err
 

@@ -53,6 +53,8 @@ class CalibrationView:
         Name of the wing, or of whatever else was calibrated, from its calibration file.
     campaign : str
         Name of the campaign that parameters of a model were calibrated from; empty for a wing.
+    moments : (mean, standard deviation) or None
+        Of the calibrated parameter in the samples of its calibration file.
     ends : (low, high)
         Range of the parameter, at which prior and posterior are cut off.
     findings : tuple of str
@@ -72,6 +74,7 @@ class CalibrationView:
     wing: str = ""
     figures: tuple[CalibratedFigure, ...] = ()
     campaign: str = ""
+    moments: tuple[float, float] | None = None
     ends: tuple[float, float] = (-np.inf, np.inf)
     findings: tuple[str, ...] = ()
 
@@ -103,6 +106,7 @@ def calibration_view(record: RunRecord) -> CalibrationView | None:
         stiffness=_moments(_table(kept, "tip_stiffness_exact") or _table(kept, "tip_stiffness")),
         wing=str(kept.get("asset") or ""),
         campaign=str(kept.get("campaign") or ""),
+        moments=_moments(_table(_table(kept, "state"), record.parameter_name)),
         ends=tuple(_table(kept, "prior").get("range", (-np.inf, np.inf))),
         findings=tuple(str(text) for text in kept.get("findings") or ()),
         figures=tuple(

@@ -364,7 +364,7 @@ def _loss_notices(record: RunRecord) -> list[str]:
     notices = []
     fixed = view is not None and all(learnt.name != view.parameter for learnt in record.learnt)
     if view is not None and view.true_value is not None and fixed:
-        believed = float(view.draws.mean()), float(view.draws.std())
+        believed = view.moments or (float(view.draws.mean()), float(view.draws.std()))
         sentence = another_truth(view.parameter, view.true_value, *believed)
         notices += [] if sentence is None else [sentence]
     lost = np.isnan(record.observation)
