@@ -42,7 +42,7 @@ ROOMS = {
     ),
     "twin_master": (
         "errors", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library", "mission",
-        "store", "report", "viewer", "workflow", "watch", "scenario_check", "study", "command",
+        "store", "report", "viewer", "workflow", "watch", "scenario_check", "study", "fleet", "command",
         "watch_command", "__main__",
     ),
     "discrepancy": (

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
+from twin_master.fleet.command import Cluster, Workers, engine_of, run_ensemble
 from twin_master.viewer.command import View, shown
 
 if TYPE_CHECKING:
@@ -50,6 +51,13 @@ Library = Annotated[
 InProcess = Annotated[
     bool, typer.Option("--in-process", help="Run the FMU in this process instead of a worker.")
 ]
+Seeds = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FIRST:END",
+        help="Fly one mission for each of these seeds, END left out, into a store; see `uav-twin fleet`.",
+    ),
+]
 WithScenario = Annotated[
     str | None, typer.Option("--scenario", help="What is flown with the SSP file that SCENARIO names.")
 ]
@@ -71,22 +79,24 @@ def run(
     with_scenario: WithScenario = None,
     no_report: terminal.NoReport = False,
     json: terminal.Json = False,
+    seeds: Seeds = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
 ) -> None:
     """Fly a scenario: model, reduce, pack, calibrate, fly, report."""
     from twin_master.assets.resolution import Overrides
     from twin_master.scenario.reading import load_scenario
     from twin_master.workflow import new_run, resume_run
 
-    ssp = None
-    if scenario is not None and Path(scenario).suffix.lower() == ".ssp":
-        if with_scenario is None:
-            raise typer.BadParameter(
-                "an SSP file says what is flown, not how: name a scenario as well.", param_hint="--scenario"
-            )
-        scenario, ssp = with_scenario, Path(scenario)
-    elif with_scenario is not None:
-        raise typer.BadParameter("belongs to an SSP file as SCENARIO.", param_hint="--scenario")
+    scenario, ssp = _flown(scenario, with_scenario)
     overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration, ssp, library)
+    if seeds is not None:
+        chosen = _alone(scenario, resume is not None or seed is not None or view)
+        engine = engine_of(workers, cluster)
+        run_ensemble(chosen, seeds, out, overrides, engine, replace=replace, json=json)
+        return
+    if workers is not None or cluster is not None:
+        raise typer.BadParameter("belongs to --seeds: one mission flies alone.", param_hint="--workers")
     progress, report = terminal.progress(), not no_report
     if resume is not None:
         if out is not None or replace or overrides != Overrides():
@@ -115,6 +125,29 @@ def run(
             terminal.print_json(_record(outcome))
         else:
             show_outcome(outcome)
+
+
+def _alone(scenario: str | None, beside: bool) -> str:
+    """Return the scenario of an ensemble; refuse what is for one mission."""
+    if scenario is None or beside:
+        raise typer.BadParameter(
+            "many seeds need a scenario, and neither --resume (repeat the command), --seed nor --view.",
+            param_hint="--seeds",
+        )
+    return scenario
+
+
+def _flown(scenario: str | None, with_scenario: str | None) -> tuple[str | None, Path | None]:
+    """Return the scenario, and the SSP file that is flown in the place of its asset."""
+    if scenario is not None and Path(scenario).suffix.lower() == ".ssp":
+        if with_scenario is None:
+            raise typer.BadParameter(
+                "an SSP file says what is flown, not how: name a scenario as well.", param_hint="--scenario"
+            )
+        return with_scenario, Path(scenario)
+    if with_scenario is not None:
+        raise typer.BadParameter("belongs to an SSP file as SCENARIO.", param_hint="--scenario")
+    return scenario, None
 
 
 def _record(outcome: "RunOutcome") -> dict[str, Any]:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 __all__ = [
     "AssetOutputError",
+    "FleetError",
     "ImpossibleObservation",
     "InvalidDistributionError",
     "InvalidModelError",
@@ -114,6 +115,10 @@ class NotResumableError(RunFolderError):
 
 class MissionInputError(MissionError, ValueError):
     """Something that a mission was told to use is not there or does not fit."""
+
+
+class FleetError(TwinMasterError, RuntimeError):
+    """A fleet cannot be flown, read or learnt from as asked."""
 
 
 class ViewError(TwinMasterError, RuntimeError):

@@ -8,6 +8,7 @@ from discrepancy.errors import DiscrepancyError
 from reporting import terminal
 from twin_master.command import guarded
 from twin_master.command import run as run_command
+from twin_master.fleet.command import compare, fleet_app
 from twin_master.viewer.command import view as view_command
 from twin_master.watch_command import watch as watch_command
 from uav_twin.calibrate_commands import calibrate_app
@@ -46,6 +47,7 @@ def uav_twin(
 app.command("run")(run_command)
 app.command("view")(view_command)
 app.command("watch")(watch_command)
+app.command("compare")(compare)
 app.command("scenarios")(list_scenarios)
 app.add_typer(scenario_app, name="scenario", help="Check a scenario before it is flown.")
 app.add_typer(
@@ -55,6 +57,7 @@ app.add_typer(
     calibrate_app, name="calibrate", help="Tailor the model to one wing: all steps in order, or one of them."
 )
 app.add_typer(discrepancy_app, name="discrepancy")
+app.add_typer(fleet_app, name="fleet")
 app.add_typer(fmu_app, name="fmu")
 app.add_typer(library_app, name="library")
 app.add_typer(ssp_app, name="ssp")

@@ -280,7 +280,8 @@ class DesignSource:
         return FlownAndBelieved(model, model)
 
     @property
-    def _model(self) -> "ReducedModel":
+    def wing(self) -> "ReducedModel":
+        """The reduced model, once prepared."""
         if self._wing is None:
             raise MissionInputError("the model was not prepared: call `prepare` first.")
         return self._wing
@@ -348,7 +349,7 @@ class DesignSource:
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of e."""
-        draws = draw_parameter(self._scenario.calibration, seed, self._model)
+        draws = draw_parameter(self._scenario.calibration, seed, self.wing)
         self._mean = draws.mean
         return draws
 
@@ -357,13 +358,13 @@ class DesignSource:
         from twin_master.assets.patches import model_observation_table
 
         patch = self._of.patch_path
-        return model_observation_table(self._model, self._scenario, draws, model, patch, self._of.design())
+        return model_observation_table(self.wing, self._scenario, draws, model, patch, self._of.design())
 
     def open(self) -> Asset:
         """Return the model as an asset."""
         from twin_master.assets.wing_model import wing_asset
 
-        return wing_asset(self._model, self._scenario)
+        return wing_asset(self.wing, self._scenario)
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write displacement and strain of the wing as VTU."""

@@ -267,6 +267,10 @@ class FmuSource:
         hashes = {name: hash_file(self._path(copy)) for name, copy in hashed.items() if copy in contents}
         return hashes | self._make(progress)
 
+    def use(self, folder: Path) -> None:
+        """Fly what an earlier `prepare` left in a folder, without making it again."""
+        self._folder = folder
+
     def _make(self, progress: Progress) -> dict[str, str]:
         """Make what is flown of the copies; return the hashes."""
         packed = packed_design_hash(self.fmu_path())

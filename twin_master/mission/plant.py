@@ -32,6 +32,29 @@ class PlantRecord:
     monitors: dict[str, Float]
 
 
+def checked_values(scenario: Scenario, reading: AssetReading, step: int, control: str) -> Float:
+    """Return the observation (G,) of a reading.
+
+    Raises
+    ------
+    AssetOutputError
+        If it holds NaN, an infinity or the wrong number of values.
+    """
+    values = np.asarray(reading.values, dtype=np.float64)
+    if values.shape != (scenario.observation.count,):
+        raise AssetOutputError(
+            f"step {step}: the scenario expects {scenario.observation.count} values of "
+            f"`{scenario.observation.role}` and the asset returned {values.shape}"
+        )
+    if not np.all(np.isfinite(values)):
+        bad = ", ".join(str(index + 1) for index in np.flatnonzero(~np.isfinite(values)))
+        raise AssetOutputError(
+            f"step {step}: the asset returned NaN or an infinity for `{scenario.observation.role}` "
+            f"{bad} under the control `{control}`; the run stops here and can be resumed"
+        )
+    return values
+
+
 class Plant:
     """An asset, driven by its truth.
 
@@ -71,18 +94,7 @@ class Plant:
             state = self._truth.state(step, previous, previous_control_index)
             health = dict(zip(self._scenario.state_names, state.tolist(), strict=True))
             reading = self._asset.step(control.values, health)
-        values = np.asarray(reading.values, dtype=np.float64)
-        if values.shape != (self._scenario.observation.count,):
-            raise AssetOutputError(
-                f"step {step}: the scenario expects {self._scenario.observation.count} values of "
-                f"`{self._scenario.observation.role}` and the asset returned {values.shape}"
-            )
-        if not np.all(np.isfinite(values)):
-            bad = ", ".join(str(index + 1) for index in np.flatnonzero(~np.isfinite(values)))
-            raise AssetOutputError(
-                f"step {step}: the asset returned NaN or an infinity for `{self._scenario.observation.role}` "
-                f"{bad} under the control `{control.name}`; the run stops here and can be resumed"
-            )
+        values = checked_values(self._scenario, reading, step, control.name)
         self._states.append(state)
         self._observations.append(values)
         for name, value in reading.monitors.items():

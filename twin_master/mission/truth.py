@@ -4,6 +4,7 @@ The truth belongs to the scenario and drives the asset. The twin is never handed
 only in the run store, for scoring.
 """
 
+from bisect import bisect_right
 from collections.abc import Callable
 from enum import IntEnum
 
@@ -51,6 +52,8 @@ class Truth:
         Drift added to the raw observation, in its SI unit.
     status : (T, G)
         `SensorStatus` of each sensor.
+    uniform : (T,)
+        What drives random growth; zeros where damage is scripted.
     in_asset : bool
         Whether the asset carries damage, noise and faults; then all of the above is zero, and the asset
         tells what happened.
@@ -64,12 +67,14 @@ class Truth:
         self.status: NDArray[np.int8] = np.zeros((steps, sensors), dtype=np.int8)
         self._apply_faults(scenario)
         self.in_asset = scenario.truth.kind == "asset"
+        self.uniform: Float = np.zeros(steps)
         if self.in_asset:
             self._state: StateRule = _untold
         elif scenario.truth.kind == "scripted":
             self._state = _scripted(scenario, model)
         else:
-            self._state = _random_growth(model, generator(seed, "damage").random(steps))
+            self.uniform = generator(seed, "damage").random(steps)
+            self._state = _random_growth(model, self.uniform)
 
     def _apply_faults(self, scenario: Scenario) -> None:
         steps = np.arange(scenario.mission.steps)
@@ -133,18 +138,31 @@ def _scripted(scenario: Scenario, model: GraphicalModel) -> StateRule:
     return rule
 
 
+class DamageGrowth:
+    """Damage that follows the prior and the transitions of a model, driven by uniform numbers."""
+
+    def __init__(self, model: GraphicalModel) -> None:
+        self._model = model
+        self._rows: dict[tuple[int, int] | None, tuple[list[float], list[int]]] = {}
+
+    def following(self, control: int | None, index: int | None, uniform: float) -> int:
+        """Return the index of the state that follows one under a control; both are None at the first step."""
+        key = None if control is None or index is None else (control, index)
+        if key not in self._rows:
+            row = self._model.prior if key is None else self._model.transition.row(*key)
+            possible = np.flatnonzero(row > 0.0)
+            self._rows[key] = np.cumsum(row[possible]).tolist(), possible.tolist()
+        reached, possible_states = self._rows[key]
+        return possible_states[min(bisect_right(reached, uniform), len(possible_states) - 1)]
+
+
 def _random_growth(model: GraphicalModel, uniform: Float) -> StateRule:
     """Return the rule of damage that follows the prior and transitions of the model; `uniform` is (T,)."""
-    coordinates = model.states.coordinates
+    states, growth = model.states, DamageGrowth(model)
 
     def rule(step: int, previous_state: Float | None, previous_control: int | None) -> Float:
-        if previous_state is None or previous_control is None:
-            row = model.prior
-        else:
-            row = model.transition.row(previous_control, model.states.index(tuple(previous_state)))
-        possible = np.flatnonzero(row > 0.0)
-        chosen = int(np.searchsorted(np.cumsum(row[possible]), uniform[step], side="right"))
-        state: Float = coordinates[possible[min(chosen, len(possible) - 1)]].copy()
+        before = None if previous_state is None else states.index(tuple(previous_state))
+        state: Float = states.coordinates[growth.following(previous_control, before, uniform[step])].copy()
         return state
 
     return rule

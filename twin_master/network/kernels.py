@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fe.compilation import compiled
 
-__all__ = ["backward_pass", "forward_pass", "smooth_many"]
+__all__ = ["backward_pass", "forward_pass", "smooth_many", "step_many"]
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -154,6 +154,30 @@ def backward_pass(
             total += smoothed[t, state]
         for state in range(size):
             smoothed[t, state] /= total
+
+
+@compiled
+def step_many(
+    log_prior: Float,
+    start: Unsigned,
+    source: Unsigned,
+    probability: Float,
+    log_probability: Float,
+    control: Index,
+    first: int,
+    log_likelihood: Float,
+    forecast: Float,
+    filtered: Float,
+    log_filtered: Float,
+    log_evidence: Float,
+    failed: Index,
+) -> None:
+    """Filter the rows from `first` on of each twin of a batch, as `forward_pass` those of one."""
+    for twin in range(len(control)):
+        failed[twin] = forward_pass(
+            log_prior, start, source, probability, log_probability, control[twin], log_likelihood[twin],
+            first, forecast[twin], filtered[twin], log_filtered[twin], log_evidence[twin],
+        )  # fmt: skip
 
 
 @compiled

@@ -1,0 +1,146 @@
+"""Twins flown side by side against the same twins flown alone: equal to the last bit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin_master.assets.interface import AssetReading, StatelessAsset
+from twin_master.assets.strain_library import load_strain_library
+from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.errors import AssetOutputError
+from twin_master.mission.loop import fly
+from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
+from twin_master.mission.truth import DamageGrowth
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.transition import TransitionModel
+from twin_master.scenario.reading import load_scenario
+
+ARRAYS = ("observed", "control_index", "state", "filtered", "log_evidence")
+
+
+def known(name: str, library_file: Path, decide_on: str = "filtered") -> tuple[Knowledge, StatelessAsset]:
+    scenario = load_scenario(name).scenario
+    planner = scenario.planner.model_copy(update={"decide_on": decide_on})
+    mission = scenario.mission.model_copy(update={"steps": 35})
+    scenario = scenario.model_copy(update={"planner": planner, "mission": mission})
+    source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
+    asset = source.open()
+    assert isinstance(asset, StatelessAsset)
+    return prepare_knowledge(scenario, source, 3), asset
+
+
+def same(first: Flights, second: Flights) -> bool:
+    pairs = ((getattr(first, name), getattr(second, name)) for name in ARRAYS)
+    return first.failure == second.failure and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+
+
+@pytest.mark.parametrize(
+    ("name", "decide_on"),
+    [("level_turns", "filtered"), ("growing_damage", "predicted"), ("failing_gauges", "filtered")],
+)
+def test_each_twin_flies_what_it_flies_alone(name: str, decide_on: str, library_file: Path) -> None:
+    knowledge, asset = known(name, library_file, decide_on)
+    truths = [knowledge.truth(seed) for seed in range(5)]
+    together = fly_side_by_side(knowledge, truths, [asset] * 5)
+    assert same(together, fly_one_by_one(knowledge, truths, [asset] * 5))
+    for cut in (1, 2):
+        halves = [
+            fly_side_by_side(knowledge, some, [asset] * len(some)) for some in (truths[:cut], truths[cut:])
+        ]
+        assert same(together, Flights.joined(halves))
+    alone = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(truths[4], asset))
+    assert np.array_equal(alone.control_index, together.control_index[4])
+    assert len(np.unique(together.state[:, -1], axis=0)) > 1 or name != "growing_damage"
+
+
+class Remembering:
+    """An asset that is none of `StatelessAsset`, so that it is driven by a plant of its own."""
+
+    def __init__(self, asset: StatelessAsset) -> None:
+        self._asset = asset
+        self.units: dict[str, str] = {}
+
+    def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        return self._asset.step(control, health)
+
+    def save_state(self) -> bytes:
+        return b""
+
+    def restore_state(self, state: bytes) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+def test_an_asset_with_a_memory_flies_the_same(library_file: Path) -> None:
+    knowledge, asset = known("growing_damage", library_file)
+    truths = [knowledge.truth(seed) for seed in (7, 8)]
+    plain = fly_side_by_side(knowledge, truths, [asset] * 2)
+    assert same(plain, fly_side_by_side(knowledge, truths, [Remembering(asset), Remembering(asset)]))
+
+
+@pytest.mark.parametrize("remembering", [False, True])
+def test_an_asset_that_fails_does_not_touch_the_others(remembering: bool, library_file: Path) -> None:
+    knowledge, asset = known("growing_damage", library_file)
+    truths = [knowledge.truth(seed) for seed in range(6)]
+    whole = fly_side_by_side(knowledge, truths, [asset] * 6)
+
+    def refusing(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        if health["z1"] >= 0.4:
+            raise AssetOutputError("too soft")
+        return asset.step(control, health)
+
+    made = StatelessAsset(refusing)
+    assets = [Remembering(made) for _ in truths] if remembering else [made] * 6
+    found = fly_side_by_side(knowledge, truths, assets)
+    softened = whole.state[:, :, 0] >= 0.4 - 1e-9
+    assert [text != "" for text in found.failure] == softened.any(axis=1).tolist()
+    assert 0 < sum(text != "" for text in found.failure) < 6
+    for twin in range(6):
+        end = int(np.argmax(softened[twin])) if softened[twin].any() else 35
+        assert np.array_equal(found.filtered[twin, :end], whole.filtered[twin, :end])
+        assert np.isnan(found.filtered[twin, end:]).all()
+        assert (found.control_index[twin, end:] == -1).all()
+
+
+def test_an_impossible_observation_ends_one_flight_only(library_file: Path) -> None:
+    knowledge, asset = known("level_turns", library_file)
+    truths = [knowledge.truth(seed) for seed in range(2)]
+    truths[1].noise[4] = 1e200
+    with np.errstate(over="ignore"):
+        found = fly_side_by_side(knowledge, truths, [asset] * 2)
+        single = fly_one_by_one(knowledge, truths, [asset] * 2)
+    assert found.failure == single.failure
+    assert found.failure[0] == ""
+    assert "step 4" in found.failure[1]
+
+
+def test_a_product_of_tables_flies_the_same(library_file: Path) -> None:
+    knowledge, asset = known("growing_damage", library_file)
+    model = knowledge.model
+    tables = model.transition.blocks[0].reshape(2, 5, 5, 5, 5)
+    first = tables[:, :, 0].sum(axis=-1)
+    second = tables[:, 0].sum(axis=2)
+    product = replace(knowledge, model=GraphicalModel(
+        model.states, model.controls, model.prior, TransitionModel((first, second))
+    ))  # fmt: skip
+    assert product.model.transition.is_product
+    truths = [product.truth(seed) for seed in range(2)]
+    assert same(fly_side_by_side(product, truths, [asset] * 2), fly_one_by_one(product, truths, [asset] * 2))
+
+
+def test_damage_grows_with_the_probabilities_of_the_model(library_file: Path) -> None:
+    knowledge, _ = known("growing_damage", library_file)
+    growth = DamageGrowth(knowledge.model)
+    uniform = (np.arange(2000) + 0.5) / 2000
+    for control in (0, 1):
+        row = knowledge.model.transition.row(control, 6)
+        found = np.bincount([growth.following(control, 6, value) for value in uniform.tolist()], minlength=25)
+        np.testing.assert_allclose(found / 2000, row, atol=1.5 / 2000)

@@ -1,0 +1,165 @@
+"""`uav-twin fleet`, and `uav-twin run --seeds`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from reporting import terminal
+
+if TYPE_CHECKING:
+    from twin_master.assets.resolution import Overrides
+    from twin_master.fleet.engine import Engine
+    from twin_master.fleet.flight import FleetOutcome
+    from twin_master.fleet.plan import Fleet
+    from twin_master.study import Estimated
+
+fleet_app = typer.Typer(no_args_is_help=True, help="Fly fleets of assets, and learn across them.")
+
+SHOWN = 10
+"""Failures that are printed; the others stand in `fleet.json`."""
+
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=0, help="Worker processes; 0 flies in this process.", show_default="one for each processor"
+    ),
+]
+Cluster = Annotated[
+    str | None, typer.Option(help="Fly on the Dask cluster of this scheduler, such as tcp://host:8786.")
+]
+Replace = Annotated[bool, typer.Option("--replace", help="Replace another fleet in the folder.")]
+
+
+@fleet_app.callback()
+def fleet() -> None:
+    """Fly fleets of assets, and learn across them."""
+
+
+@fleet_app.command("run")
+def run(
+    file: Annotated[Path, typer.Argument(help="The fleet file.", show_default=False)],
+    out: Annotated[Path | None, typer.Option(help="The folder to make.", show_default="runs/NAME")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed, in the place of that of the file.")] = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
+    replace: Replace = False,
+    json: terminal.Json = False,
+) -> None:
+    """Fly the assets of a fleet; repeated after an interruption, it goes on where it stopped."""
+    from twin_master.fleet.plan import load_fleet
+
+    found = load_fleet(file, seed)
+    fly_and_show(found, out, engine_of(workers, cluster), replace=replace, json=json)
+
+
+def engine_of(workers: int | None, cluster: str | None) -> "Engine":
+    """Return who flies, by what the user said."""
+    import os
+
+    from twin_master.fleet.engine import Engine
+
+    if cluster is not None:
+        if workers is not None:
+            raise typer.BadParameter("a cluster has its own workers.", param_hint="--workers")
+        return Engine(cluster=cluster)
+    return Engine(len(os.sched_getaffinity(0)) if workers is None else workers)
+
+
+def run_ensemble(
+    scenario: str,
+    seeds: str,
+    out: Path | None,
+    overrides: "Overrides",
+    engine: "Engine",
+    *,
+    replace: bool,
+    json: bool,
+) -> None:
+    """Fly one scenario under many seeds, for `uav-twin run --seeds`."""
+    from twin_master.fleet.plan import ensemble, seed_range
+
+    fly_and_show(ensemble(scenario, seed_range(seeds), overrides), out, engine, replace=replace, json=json)
+
+
+def fly_and_show(
+    fleet: "Fleet", out: Path | None, engine: "Engine", *, replace: bool, json: bool
+) -> "FleetOutcome":
+    """Fly a fleet and print what became of it."""
+    from twin_master.fleet.flight import fly_fleet
+
+    folder = out if out is not None else Path("runs") / fleet.name
+    try:
+        outcome = fly_fleet(fleet, folder, engine, replace_old=replace, progress=terminal.progress())
+    except KeyboardInterrupt:
+        sentence = f"Interrupted; what was flown is kept in {folder}: repeat the command to go on."
+        typer.secho(sentence, fg="red", err=True)
+        raise typer.Exit(terminal.INTERRUPTED) from None
+    figures = _figures([outcome.folder])
+    if json:
+        told = {"folder": str(outcome.folder), "twins": outcome.twins, "failed": outcome.failed}
+        terminal.print_json(told | {"failures": outcome.failures, "groups": _plain(figures)})
+    else:
+        _show(outcome, figures)
+    return outcome
+
+
+def compare(
+    folders: Annotated[
+        list[Path], typer.Argument(help="Folders of fleets or ensembles.", show_default=False)
+    ],
+    json: terminal.Json = False,
+) -> None:
+    """Show the figures of several fleets or ensembles side by side."""
+    figures = _figures(folders)
+    if json:
+        terminal.print_json(_plain(figures))
+    else:
+        _table(figures)
+
+
+Figures = dict[str, dict[str, "Estimated | int"]]
+
+
+def _figures(folders: list[Path]) -> Figures:
+    """Return the figures of each group; with the folder's name where there are several folders."""
+    from twin_master.fleet.reading import fleet_groups, group_figures
+
+    found = {}
+    for folder in folders:
+        for name, group in fleet_groups(folder).items():
+            found[name if len(folders) == 1 else f"{folder}: {name}"] = group_figures(group)
+    return found
+
+
+def _plain(figures: Figures) -> dict[str, Any]:
+    return {
+        name: {title: value if isinstance(value, int) else vars(value) for title, value in group.items()}
+        for name, group in figures.items()
+    }
+
+
+def _table(figures: Figures) -> None:
+    from rich import box
+    from rich.table import Table
+
+    from twin_master.fleet.reading import shown
+
+    table = Table("figure", *figures, box=box.SIMPLE_HEAD)
+    titles = dict.fromkeys(title for group in figures.values() for title in group)
+    for title in titles:
+        table.add_row(title, *(shown(group.get(title)) for group in figures.values()))
+    terminal.console().print(table)
+
+
+def _show(outcome: "FleetOutcome", figures: Figures) -> None:
+    console = terminal.console()
+    _table(figures)
+    kept = f", {outcome.shards_kept} shards were there" if outcome.shards_kept else ""
+    rate = f"{outcome.twins} twins in {outcome.seconds:.3g} s{kept}"
+    console.print(f"{rate}; {outcome.failed} failed in flight.", soft_wrap=True)
+    for name, sentence in list(outcome.failures.items())[:SHOWN]:
+        console.print(f"  {name}: {sentence}", soft_wrap=True, style="yellow")
+    if outcome.failed > SHOWN:
+        console.print(f"  and {outcome.failed - SHOWN} more, in {outcome.folder / 'fleet.json'}")
+    console.print(f"Fleet: {outcome.folder}", soft_wrap=True)

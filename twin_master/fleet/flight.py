@@ -1,0 +1,300 @@
+"""A fleet from its plan to its store: checked whole, prepared, flown in shards, resumed where it stopped."""
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reporting.files import atomic_write_bytes, atomic_write_text
+from reporting.folders import lock_folder
+from reporting.json_file import read_json
+from reporting.progress import Progress, SilentProgress
+from reporting.provenance import collect_provenance
+from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.resolution import asset_source, believed_source, located_scenario, portable_scenario
+from twin_master.errors import FleetError, RunFolderExistsError
+from twin_master.fleet.engine import Engine, Piece, flown
+from twin_master.fleet.outcome import FAILED, sizes_of
+from twin_master.fleet.plan import Fleet, Group
+from twin_master.fleet.shard import Kit, ShardResult, with_parameters
+from twin_master.fleet.store import FleetStore, written
+from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME, keep_knowledge
+from twin_master.mission.preparation import prepare_knowledge
+from twin_master.mission.side_by_side import IN_FLIGHT
+from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
+from twin_master.scenario.schema import Scenario
+
+KIND = "uav-twin fleet"
+RESULT_NAME = "fleet.json"
+GROUPS = "groups"
+
+
+@dataclass(frozen=True)
+class FleetOutcome:
+    """A flown fleet.
+
+    Attributes
+    ----------
+    folder : Path
+    twins, failed : int
+        How many flew, and how many of them failed in flight.
+    failures : dict of str to str
+        What ended the flight of each that failed, by group and name.
+    seconds : float
+        Wall clock of this call.
+    shards_flown, shards_kept : int
+        How many shards this call flew, and how many were there already.
+    """
+
+    folder: Path
+    twins: int
+    failures: Mapping[str, str]
+    seconds: float
+    shards_flown: int
+    shards_kept: int
+
+    @property
+    def failed(self) -> int:
+        """How many twins failed in flight."""
+        return len(self.failures)
+
+
+def fly_fleet(
+    fleet: Fleet,
+    folder: Path | str,
+    engine: Engine | None = None,
+    *,
+    replace_old: bool = False,
+    progress: Progress | None = None,
+) -> FleetOutcome:
+    """Fly a fleet, or the rest of one.
+
+    Parameters
+    ----------
+    fleet : Fleet
+    folder : Path
+        Of the store; a fleet that was begun there with the same plan and program is gone on with.
+    engine : Engine, optional
+        Who flies; this process by default.
+    replace_old : bool
+        Begin anew where another fleet was flown.
+    progress : Progress, optional
+
+    Raises
+    ------
+    FleetError
+        An asset cannot fly: all such assets are in one list, and nothing was begun. Or the cluster cannot be
+        used; what was flown is kept.
+    RunFolderExistsError
+        The folder holds something else.
+    NotResumableError
+        The fleet there was begun with another version of the program.
+    FileNotWrittenError
+        The disk is full or the folder cannot be written; what was flown is kept.
+    """
+    begin = time.perf_counter()
+    folder, progress = Path(folder), progress or SilentProgress()
+    config = {"kind": KIND, "format": 1, "fleet": fleet.record()}
+    _look_at(folder, config, fleet.seed, replace_old=replace_old)
+    _check(fleet)
+    lock = _begun(folder, config, fleet.seed)
+    try:
+        store = FleetStore(folder, fleet)
+        kept = len(store.done)
+        _fly(fleet, folder, engine or Engine(), store, progress)
+        failures = {name: text for told in store.done.values() for name, text in told["failures"].items()}
+        failures = dict(sorted(failures.items()))
+        told = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "twins": fleet.size}
+        atomic_write_text(folder / RESULT_NAME, to_json(told | {"failures": failures}))
+    finally:
+        os.close(lock)
+    seconds = time.perf_counter() - begin
+    return FleetOutcome(folder, fleet.size, failures, seconds, len(store.done) - kept, kept)
+
+
+def _look_at(folder: Path, config: Mapping[str, Any], seed: int, *, replace_old: bool) -> None:
+    """See that a folder is free, or holds the same fleet, begun with the same program."""
+    if folder.exists() and not folder.is_dir():
+        raise RunFolderExistsError(f"{folder} exists and is no folder: choose another --out.")
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    found = fleet_config(folder)
+    if replace_old:
+        shutil.rmtree(folder)
+        return
+    if {key: found.get(key) for key in config} != json.loads(to_json(config)):
+        raise RunFolderExistsError(
+            f"{folder} holds another fleet, or the same with other files: choose another --out, or give "
+            "--replace."
+        )
+    check_versions(folder, found, seed)
+
+
+def fleet_config(folder: Path) -> dict[str, Any]:
+    """Return the configuration of a folder that holds a fleet.
+
+    Raises
+    ------
+    RunFolderExistsError
+        It holds something else.
+    """
+    path = folder / CONFIG_NAME
+    found = read_json(path, RunFolderExistsError) if path.is_file() else None
+    if not isinstance(found, dict) or found.get("kind") != KIND or not isinstance(found.get("fleet"), dict):
+        raise RunFolderExistsError(f"{folder} is not the folder of a fleet, so it is not touched.")
+    return found
+
+
+def _begun(folder: Path, config: Mapping[str, Any], seed: int) -> int:
+    """Make the folder with its configuration, if it is not there, and hold it for this process."""
+    with written(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = lock_folder(folder)
+    if lock is None:
+        raise FleetError(f"another process flies the fleet in {folder}: wait for it to end.")
+    try:
+        if not (folder / CONFIG_NAME).is_file():
+            provenance = collect_provenance(seed).as_dict()
+            atomic_write_text(folder / CONFIG_NAME, to_json({**config, "provenance": provenance}))
+    except BaseException:
+        os.close(lock)
+        raise
+    return lock
+
+
+def flies_model(scenario: Scenario) -> bool:
+    """Return whether the reduced model itself is flown, in the place of the FMU that is packed of it."""
+    asset, belief = scenario.asset, scenario.belief
+    same = (asset.kind, belief.kind) == ("design", "design") and not scenario.another_model
+    return same and getattr(asset, "design", None) == getattr(belief, "design", None)
+
+
+def _source(scenario: Scenario) -> AssetSource:
+    return believed_source(scenario) if flies_model(scenario) else asset_source(scenario)
+
+
+def _check(fleet: Fleet) -> None:
+    """Check every asset before the first one flies.
+
+    Raises
+    ------
+    FleetError
+        With all that cannot fly, and why.
+    """
+    wrong = []
+    for group in fleet.groups:
+        means = {name: spread.mean for name, spread in group.spreads.items()}
+        names = group.files or ("",)
+        for name, scenario in zip(names, group.scenarios, strict=True):
+            try:
+                _check_group(group, scenario)
+                _source(with_parameters(scenario, means)).check()
+            except IN_FLIGHT as error:
+                wrong.append(f"{group.name} {name}".rstrip() + f": {error}")
+    if wrong:
+        raise FleetError("\n".join([f"{len(wrong)} of the assets cannot fly, so none did:", *wrong]))
+
+
+def _check_group(group: Group, scenario: Scenario) -> None:
+    one_life = scenario.truth.kind == "asset" and not getattr(scenario.asset, "seeds", ())
+    if one_life and len(group.scenarios) < len(group.members):
+        raise FleetError(
+            "the damage and noise of this asset are its own, so that every seed would fly the same life: "
+            "name its seeds in `asset.seeds`, or fly the scenario with --seed."
+        )
+    unknown = sorted({*group.spreads} - {"young_modulus_factor"})
+    if flies_model(scenario) and unknown:
+        raise FleetError(
+            f"`parameters` names {', '.join(unknown)}, and the model of a wing knows only "
+            "young_modulus_factor."
+        )
+    if sizes_of(scenario) != sizes_of(group.scenarios[0]):
+        raise FleetError("it has other states or sensors than the first asset of its group.")
+
+
+def prepared(scenario: Scenario, folder: Path, progress: Progress) -> bytes:
+    """Return the packed `Kit` of a scenario, what belongs to it made in a folder."""
+    located = located_scenario(portable_scenario(scenario), folder)
+    for name, content in _source(scenario).files().items():
+        if not (folder / name).exists():
+            atomic_write_bytes(folder / name, content)
+    source = _source(located)
+    source.prepare(folder, progress)
+    if not (folder / KNOWLEDGE_NAME).is_file():
+        keep_knowledge(folder, prepare_knowledge(located, source, scenario.mission.seed))
+    wing = getattr(source, "wing", None) if flies_model(scenario) else None
+    files = {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+    return Kit(portable_scenario(scenario).to_dict(), files, wing).packed()
+
+
+def group_folder(folder: Path, group: Group, place: int) -> Path:
+    """Return where what the twins of a group know is kept, or one of them where each has files of its own."""
+    own = folder / GROUPS / group.name
+    return own / str(place) if group.files else own
+
+
+@dataclass
+class _Left:
+    """What is to come of a shard, and what came: workers may cut it."""
+
+    twins: int
+    failures: dict[str, str] = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+def _fly(fleet: Fleet, folder: Path, engine: Engine, store: FleetStore, progress: Progress) -> None:
+    """Fly what is not in the store yet."""
+
+    @lru_cache(maxsize=2)
+    def kit(number: int, place: int) -> bytes:
+        group = fleet.groups[number]
+        return prepared(group.scenarios[place], group_folder(folder, group, place), SilentProgress())
+
+    def pieces() -> Iterator[Piece]:
+        for piece in whole:
+            if piece.shard not in store.done:
+                yield piece
+
+    whole = list(_shards(fleet, kit))
+    left = {piece.shard: _Left(len(piece.members)) for piece in whole}
+    with progress.stage("Flying", total=fleet.size, unit="twins") as stage:
+        stage.advance(sum(len(piece.members) for piece in whole if piece.shard in store.done))
+        for piece, result in flown(engine, pieces(), progress):
+            group = fleet.groups[piece.group]
+            rows = slice(piece.members[0].row, piece.members[-1].row + 1)
+            if isinstance(result, str):
+                seed = np.array([piece.members[0].seed])
+                result = ShardResult(
+                    {"status": np.array([FAILED]), "seed": seed}, {rows.start: result}, 0.0, ""
+                )
+            store.write(group.name, rows, result.arrays)
+            told = left[piece.shard]
+            told.twins -= len(piece.members)
+            told.seconds += result.seconds
+            names = {row: f"{group.name}/{group.members[row].name}" for row in result.failures}
+            told.failures |= {names[row]: sentence for row, sentence in result.failures.items()}
+            if not told.twins:
+                store.finish(piece.shard, {"failures": told.failures, "seconds": told.seconds})
+            stage.advance(len(piece.members))
+
+
+def _shards(fleet: Fleet, kit: Callable[[int, int], bytes]) -> Iterator[Piece]:
+    """Yield all shards in their order: twins that share all files, no more of them than a shard holds."""
+    shard = 0
+    for number, group in enumerate(fleet.groups):
+        size = 1 if group.files else fleet.shard
+        for first in range(0, len(group.members), size):
+            place = first if group.files else 0
+            yield Piece(shard, number, partial(kit, number, place), group.members[first : first + size])
+            shard += 1

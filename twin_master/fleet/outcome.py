@@ -1,0 +1,107 @@
+"""What is kept of a twin's mission: the variables of the store, and their shapes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin_master.fleet.plan import Member
+from twin_master.mission.preparation import Knowledge
+from twin_master.mission.side_by_side import Flights
+from twin_master.scenario.schema import Scenario
+from twin_master.store.summary import find_fallback
+from twin_master.study import in_credible_set
+
+__all__ = ["FAILED", "FLOWN", "VARIABLES", "Variable", "outcomes_of", "sizes_of"]
+
+FLOWN, FAILED = 1, 2
+"""Values of `status`; 0 has not flown yet."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable of the store: its dimensions after `twin`, its type, and what it is."""
+
+    dimensions: tuple[str, ...]
+    type: str
+    title: str
+    unit: str = "1"
+
+
+VARIABLES: Mapping[str, Variable] = {
+    "status": Variable((), "i1", "0: has not flown, 1: has flown to its end, 2: failed in flight"),
+    "seed": Variable((), "i8", "seed of the mission"),
+    "observed": Variable(("turn", "sensor"), "f4", "what the sensors said; NaN where lost", "SI"),
+    "control_index": Variable(("turn",), "i1", "control in force; -1 after a failure"),
+    "state": Variable(("turn", "factor"), "f4", "true state", "SI"),
+    "mean": Variable(("turn", "factor"), "f4", "mean of the filtered belief", "SI"),
+    "standard_deviation": Variable(("turn", "factor"), "f4", "standard deviation of the same", "SI"),
+    "log_evidence": Variable(("turn",), "f4", "log p(o_t | o_0..o_t-1)"),
+    "belief": Variable(("level",), "f4", "filtered belief after the last turn, over all joint states"),
+    "delay": Variable(
+        (),
+        "f4",
+        "turns from the damage that calls for a fallback to it; infinite: none came, NaN: not called",
+    ),
+    "early": Variable((), "i1", "whether another control than the first was flown before that damage"),
+    "credible": Variable((), "f4", "share of turns with the true state in the 90 % set of the belief"),
+}
+"""What is stored of each twin, by its name; true parameters that differ from twin to twin stand beside it."""
+
+
+def sizes_of(scenario: Scenario) -> dict[str, int]:
+    """Return the lengths of the dimensions."""
+    return {
+        "turn": scenario.mission.steps,
+        "sensor": scenario.observation.count,
+        "factor": len(scenario.state),
+        "level": int(np.prod([len(factor.levels) for factor in scenario.state])),
+    }
+
+
+def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member]) -> dict[str, NDArray[Any]]:
+    """Return the variables of B twins, as they are stored."""
+    model, scenario = knowledge.model, knowledge.scenario
+    coordinates = model.states.coordinates
+    # A product for each twin: what is stored of it does not depend on its neighbours.
+    mean = np.matmul(flights.filtered, coordinates)
+    variance = np.matmul(flights.filtered, coordinates**2) - mean**2
+    steps = flights.control_index.shape[1]
+    rows = (-1, model.states.size), (-1, len(scenario.state))
+    inside = in_credible_set(model, flights.filtered.reshape(rows[0]), flights.state.reshape(rows[1]))
+    failed = np.array([bool(text) for text in flights.failure])
+    delay, early = _fallbacks(knowledge, flights)
+    found: dict[str, Any] = {
+        "status": np.where(failed, FAILED, FLOWN),
+        "seed": np.array([member.seed for member in members]),
+        "observed": flights.observed,
+        "control_index": flights.control_index,
+        "state": flights.state,
+        "mean": mean,
+        "standard_deviation": np.sqrt(np.maximum(variance, 0.0)),
+        "log_evidence": flights.log_evidence,
+        "belief": flights.filtered[:, -1],
+        "delay": np.where(failed, np.nan, delay),
+        "early": early & ~failed,
+        "credible": np.where(failed, np.nan, inside.reshape(-1, steps).mean(axis=1)),
+    }
+    found = {name: np.ascontiguousarray(values, VARIABLES[name].type) for name, values in found.items()}
+    for name in members[0].parameters:
+        found[name] = np.array([member.parameters[name] for member in members])
+    return found
+
+
+def _fallbacks(knowledge: Knowledge, flights: Flights) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the delay of the fallback and whether it came early, of each twin."""
+    scenario, plan = knowledge.scenario, knowledge.plan
+    first = scenario.control_names.index(scenario.mission.first_control)
+    delay = np.full(len(flights.state), np.nan)
+    early = np.zeros(len(delay), dtype=bool)
+    for twin, (control, state) in enumerate(zip(flights.control_index, flights.state, strict=True)):
+        fallback = find_fallback(knowledge.model, plan.control_index, first, control, state)
+        early[twin] = fallback.early_step is not None
+        if fallback.called_for_step is not None:
+            delay[twin] = np.inf if fallback.delay is None else fallback.delay
+    return delay, early

@@ -1,0 +1,267 @@
+"""What a fleet flies: its file, its groups, and the seed of every twin."""
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from reporting.section import checked
+from reporting.toml_file import read_toml
+from twin_master.assets.resolution import Overrides, portable_scenario, resolve_scenario
+from twin_master.errors import FleetError, TwinMasterError
+from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import Count, Name, NotNegative, Number, Section, Seed
+from twin_master.seeds import generator
+
+__all__ = ["Fleet", "Group", "Member", "ensemble", "load_fleet", "seed_range"]
+
+SHARD = 256
+"""Twins that are flown in one piece, unless the file says otherwise."""
+
+
+class Spread(Section):
+    """A parameter of the true assets: normally distributed over the group."""
+
+    mean: Number
+    standard_deviation: NotNegative = 0.0
+
+
+class GroupSection(Section):
+    """Assets that share a scenario."""
+
+    name: Name
+    scenario: Annotated[str, Field(min_length=1)]
+    count: Count | None = None
+    fmus: str | None = None
+    """A pattern of files: one asset for each FMU."""
+    calibrations: str | None = None
+    """A pattern of files: one asset for each calibration."""
+    fmu: str | None = None
+    binding: str | None = None
+    calibration: str | None = None
+    steps: Count | None = None
+    parameters: dict[str, Spread] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if sum(given is not None for given in (self.count, self.fmus, self.calibrations)) != 1:
+            raise ValueError(
+                f"the group `{self.name}` needs one of `count`, `fmus` and `calibrations`, which say how "
+                "many assets it has"
+            )
+        return self
+
+
+class FleetSection(Section):
+    """The fleet as a whole."""
+
+    name: Name
+    title: str = ""
+    seed: Seed = 0
+    shard: Annotated[int, Field(strict=True, ge=1, le=4096)] = SHARD
+
+
+class FleetFile(Section):
+    """A fleet file."""
+
+    format: Literal[1]
+    fleet: FleetSection
+    group: Annotated[tuple[GroupSection, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        names = [group.name for group in self.group]
+        if len(set(names)) != len(names):
+            raise ValueError(f"each group needs a name of its own, and the names are {', '.join(names)}")
+        return self
+
+
+@dataclass(frozen=True)
+class Member:
+    """One asset with its twin.
+
+    Attributes
+    ----------
+    row : int
+        Its number in the group.
+    name : str
+    seed : int
+        What happens to it; the same mission flies with ``uav-twin run --seed``.
+    parameters : dict of str to float
+        Its true parameters, where the group spreads them, SI.
+    """
+
+    row: int
+    name: str
+    seed: int
+    parameters: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Assets that share a scenario, or that fly it each with a file of its own.
+
+    Attributes
+    ----------
+    name : str
+    scenarios : tuple of Scenario
+        Resolved; one for all assets, or one for each.
+    spreads : dict of str to Spread
+        Parameters that differ from asset to asset.
+    members : tuple of Member
+    files : tuple of str
+        Name of the file that sets each asset apart; empty where they share all of them.
+    """
+
+    name: str
+    scenarios: tuple[Scenario, ...]
+    spreads: Mapping[str, Spread]
+    members: tuple[Member, ...]
+    files: tuple[str, ...] = ()
+
+    def record(self) -> dict[str, Any]:
+        """Return the group for `config.json`."""
+        return {
+            "name": self.name,
+            "scenarios": [portable_scenario(scenario).to_dict() for scenario in self.scenarios],
+            "parameters": {name: spread.model_dump() for name, spread in self.spreads.items()},
+            "members": [[member.name, member.seed] for member in self.members],
+            "files": list(self.files),
+        }
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """What is to be flown; see `FleetSection`."""
+
+    name: str
+    title: str
+    seed: int
+    shard: int
+    groups: tuple[Group, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of twins."""
+        return sum(len(group.members) for group in self.groups)
+
+    def record(self) -> dict[str, Any]:
+        """Return the fleet for `config.json`."""
+        heading = {"name": self.name, "title": self.title, "seed": self.seed, "shard": self.shard}
+        return heading | {"groups": [group.record() for group in self.groups]}
+
+
+def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
+    """Read a fleet file; relative paths start at its folder.
+
+    Parameters
+    ----------
+    path : Path or str
+        TOML.
+    seed : int, optional
+        In the place of that of the file.
+
+    Raises
+    ------
+    FleetError
+        The file cannot be read or breaks the schema, or a scenario of it does; all groups that are wrong are
+        in one list.
+    """
+    path = Path(path)
+    found = checked(
+        FleetFile, read_toml(path, FleetError, what="fleet"), str(path), FleetError, what="a fleet"
+    )
+    head = found.fleet if seed is None else found.fleet.model_copy(update={"seed": seed})
+    groups, wrong = [], []
+    for section in found.group:
+        try:
+            groups.append(_group(section, path.resolve().parent, head.seed))
+        except TwinMasterError as error:
+            wrong.append(f"group {section.name}: {error}")
+    if wrong:
+        raise FleetError("\n".join([f"{path}: nothing was begun, for", *wrong]))
+    return Fleet(head.name, head.title, head.seed, head.shard, tuple(groups))
+
+
+def ensemble(scenario: str, seeds: range, overrides: Overrides | None = None, *, shard: int = SHARD) -> Fleet:
+    """Return one asset under many seeds, as a fleet of one group.
+
+    The calibration is drawn once, under the seed of the scenario or of the overrides, for all of them.
+    """
+    loaded = load_scenario(scenario)
+    resolved = resolve_scenario(loaded, overrides or Overrides())
+    members = tuple(Member(row, f"seed-{seed}", seed, {}) for row, seed in enumerate(seeds))
+    group = Group(resolved.mission.name, (resolved,), {}, members)
+    mission = resolved.mission
+    return Fleet(mission.name, mission.title, mission.seed, shard, (group,))
+
+
+def seed_range(text: str) -> range:
+    """Return the seeds that ``FIRST:END`` stands for, END left out.
+
+    Raises
+    ------
+    FleetError
+        It is none.
+    """
+    first, colon, end = text.partition(":")
+    if not (colon and first.isdecimal() and end.isdecimal() and int(first) < int(end)):
+        raise FleetError(f"--seeds is FIRST:END, as in 0:1000 for the seeds 0 to 999, and `{text}` came.")
+    return range(int(first), int(end))
+
+
+def _group(section: GroupSection, folder: Path, seed: int) -> Group:
+    given = Path(section.scenario)
+    local = folder / given
+    loaded = load_scenario(local if local.is_file() else section.scenario)
+
+    def path(name: str | None) -> Path | None:
+        return None if name is None else folder / name
+
+    common = Overrides(
+        seed=seed, fmu=path(section.fmu), binding=path(section.binding), calibration=path(section.calibration)
+    )
+    if section.count is not None:
+        scenarios: list[Scenario] = [resolve_scenario(loaded, common)]
+        names = [f"{section.name}-{number}" for number in range(section.count)]
+        files: list[str] = []
+    else:
+        key, pattern = ("fmu", section.fmus) if section.fmus else ("calibration", section.calibrations)
+        found = sorted(folder.glob(str(pattern)))
+
+        def own(file: Path) -> Overrides:
+            return replace(common, fmu=file) if key == "fmu" else replace(common, calibration=file)
+
+        if not found:
+            raise FleetError(f'no file fits `{key}s = "{pattern}"` in {folder}.')
+        scenarios, wrong = [], []
+        for file in found:
+            try:
+                scenarios.append(resolve_scenario(loaded, own(file)))
+            except TwinMasterError as error:
+                wrong.append(f"{file.name}: {error}")
+        if wrong:
+            raise FleetError("\n".join(["assets that cannot fly:", *wrong]))
+        names, files = [file.stem for file in found], [file.name for file in found]
+    if section.steps is not None:
+        mission = scenarios[0].mission.model_copy(update={"steps": section.steps})
+        scenarios = [scenario.model_copy(update={"mission": mission}) for scenario in scenarios]
+    members = tuple(_member(section, seed, row, name) for row, name in enumerate(names))
+    return Group(section.name, tuple(scenarios), section.parameters, members, tuple(files))
+
+
+def _member(section: GroupSection, seed: int, row: int, name: str) -> Member:
+    # Keyed by group and number: a twin meets the same fate whatever else flies.
+    sequence = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(section.name.encode()), row))
+    own = int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1))
+    normal = generator(own, "population").standard_normal(len(section.parameters))
+    drawn = {
+        key: spread.mean + spread.standard_deviation * float(value)
+        for (key, spread), value in zip(sorted(section.parameters.items()), normal, strict=True)
+    }
+    return Member(row, name, own, drawn)

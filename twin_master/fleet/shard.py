@@ -1,0 +1,207 @@
+"""What a worker does: it flies some twins of one group, and hands back arrays.
+
+A piece of work carries all that it needs, so that it can be done on any machine, by any process, any number
+of times: the result is the same to the last bit.
+"""
+
+import pickle
+import shutil
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import TYPE_CHECKING, Any
+from weakref import finalize
+
+from numpy.typing import NDArray
+
+from reporting.files import atomic_write_bytes
+from reporting.progress import SilentProgress
+from reporting.provenance import collect_provenance, hash_record
+from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.fmu_source import FmuSource
+from twin_master.assets.interface import Asset, StatelessAsset
+from twin_master.assets.resolution import located_scenario
+from twin_master.fleet.outcome import outcomes_of
+from twin_master.fleet.plan import Member
+from twin_master.mission.kept_knowledge import kept_knowledge
+from twin_master.mission.preparation import Knowledge
+from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one, fly_side_by_side
+from twin_master.mission.truth import Truth
+from twin_master.scenario.schema import Scenario
+
+if TYPE_CHECKING:
+    from fe.runtime.reduced import ReducedModel
+
+
+@dataclass(frozen=True)
+class Kit:
+    """All that the twins of a scenario need, on any machine.
+
+    Attributes
+    ----------
+    scenario : dict
+        Portable.
+    files : dict of str to bytes
+        The prepared folder by its paths: what the twin knows, and the FMU.
+    wing : ReducedModel or None
+        The model that is flown in the place of an FMU.
+    """
+
+    scenario: Mapping[str, Any]
+    files: Mapping[str, bytes]
+    wing: "ReducedModel | None"
+
+    def packed(self) -> bytes:
+        """Return it as bytes, for `fly_shard`."""
+        return pickle.dumps(self, protocol=pickle.HIGHEST_PROTOCOL)
+
+
+@dataclass(frozen=True)
+class ShardResult:
+    """What a worker hands back.
+
+    Attributes
+    ----------
+    arrays : dict of str to array
+        Variables of the store with B rows.
+    failures : dict of int to str
+        What ended flights, by the number in the group.
+    seconds : float
+        Processor time.
+    version : str
+        Of the program that flew.
+    """
+
+    arrays: Mapping[str, NDArray[Any]]
+    failures: Mapping[int, str]
+    seconds: float
+    version: str
+
+
+@cache
+def program_version() -> str:
+    """Return a hash of this program and the packages that its numbers depend on."""
+    found = collect_provenance().as_dict()
+    return hash_record([found["versions"], found["source_hashes"], list(sys.version_info[:2])])
+
+
+class _Unpacked:
+    """A kit, ready to fly."""
+
+    def __init__(self, packed: bytes) -> None:
+        kit: Kit = pickle.loads(packed)
+        self._folder = folder = Path(mkdtemp(prefix="uav_twin_fleet_"))
+        finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        for name, content in kit.files.items():
+            atomic_write_bytes(folder / name, content)
+        self.scenario = located_scenario(Scenario.model_validate(kit.scenario), folder)
+        self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
+        self._wing = kit.wing
+        self._model: Asset | None = None
+
+    def model(self, parameters: Mapping[str, float]) -> Asset:
+        """Return the reduced model as an asset with true parameters; one object for all that share them."""
+        from twin_master.assets.wing_model import wing_asset
+
+        assert self._wing is not None
+        if parameters:
+            return wing_asset(self._wing, with_parameters(self.scenario, parameters))
+        if self._model is None:
+            self._model = wing_asset(self._wing, self.scenario)
+        return self._model
+
+    @property
+    def flies_model(self) -> bool:
+        return self._wing is not None
+
+    def asset_of(self, member: Member) -> tuple[Mapping[str, float], int | None]:
+        """Return what sets an asset apart: its parameters, and its seed where it has seeds of its own."""
+        own = getattr(self.scenario.asset, "seeds", ())
+        return member.parameters, member.seed if own else None
+
+    def source(self, parameters: Mapping[str, float], seed: int | None) -> AssetSource:
+        """Return what is flown, ready to be opened."""
+        scenario = with_parameters(self.scenario, parameters)
+        if seed is not None:
+            mission = scenario.mission.model_copy(update={"seed": seed})
+            scenario = scenario.model_copy(update={"mission": mission})
+        source: AssetSource = scenario.asset.source(scenario)
+        if isinstance(source, FmuSource):
+            source.use(self._folder)  # packed already
+        else:
+            source.prepare(self._folder, SilentProgress())
+        return source
+
+
+_kept: dict[bytes, _Unpacked] = {}
+"""The last kit of this process: shards of a group follow each other."""
+
+
+def with_parameters(scenario: Scenario, parameters: Mapping[str, float]) -> Scenario:
+    """Return a scenario whose asset has these true parameters, beside those that it has."""
+    if not parameters:
+        return scenario
+    table = {**scenario.asset.true_parameters, **parameters}
+    return scenario.model_copy(update={"asset": scenario.asset.model_copy(update={"parameters": table})})
+
+
+def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:
+    """Fly some twins of one group.
+
+    Parameters
+    ----------
+    packed : bytes
+        Of a `Kit`.
+    members : sequence of Member
+        B of them.
+    """
+    begin = time.process_time()
+    if packed not in _kept:
+        _kept.clear()
+        _kept[packed] = _Unpacked(packed)
+    kit = _kept[packed]
+    truths = [kit.knowledge.truth(member.seed) for member in members]
+    learns = kit.scenario.learning is not None or kit.scenario.notice is not None
+    fly = fly_one_by_one if learns else fly_side_by_side
+    if kit.flies_model:
+        flights = fly(kit.knowledge, truths, [kit.model(member.parameters) for member in members])
+    else:
+        flights = _fly_each(kit, truths, members, fly)
+    failures = {m.row: text for m, text in zip(members, flights.failure, strict=True) if text}
+    arrays = outcomes_of(kit.knowledge, flights, members)
+    return ShardResult(arrays, failures, time.process_time() - begin, program_version())
+
+
+def _fly_each(
+    kit: _Unpacked,
+    truths: Sequence[Truth],
+    members: Sequence[Member],
+    fly: Callable[[Knowledge, Sequence[Truth], Sequence[Asset]], Flights],
+) -> Flights:
+    """Fly assets that may have a memory one after the other; what fails is opened anew for the next."""
+    flown: list[Flights] = []
+    asset, start, opened = None, b"", None
+    with ExitStack() as closing:
+        for truth, member in zip(truths, members, strict=True):
+            wanted = kit.asset_of(member)
+            try:
+                if asset is None or opened != wanted:
+                    closing.close()
+                    asset = kit.source(*wanted).open()
+                    closing.callback(asset.close)
+                    start, opened = asset.save_state(), wanted
+                    if isinstance(asset, StatelessAsset) and all(kit.asset_of(m) == wanted for m in members):
+                        return fly(kit.knowledge, truths, [asset] * len(members))
+                else:
+                    asset.restore_state(start)
+                flown.append(fly(kit.knowledge, [truth], [asset]))
+            except IN_FLIGHT as error:
+                flown.append(replace(Flights.empty(kit.knowledge, 1), failure=(str(error),)))
+            if flown[-1].failure[0]:
+                asset = None
+    return Flights.joined(flown)

@@ -1,0 +1,233 @@
+"""Many twins of one scenario, flown side by side: each flies what `fly` flies, bit for bit.
+
+What does not depend on the neighbours is the same for every size of a batch: sums run over the states, the
+sensors and the draws of one twin, never over twins.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fe.runtime.errors import FiniteElementError
+from fmu_asset.errors import FmuError
+from twin_master.assets.interface import Asset, StatelessAsset
+from twin_master.errors import ImpossibleObservation, TwinMasterError
+from twin_master.mission.loop import fly
+from twin_master.mission.plant import Plant, checked_values
+from twin_master.mission.preparation import Knowledge
+from twin_master.mission.truth import DamageGrowth, SensorStatus, Truth
+from twin_master.network.step_many import decide_many, filter_step_many
+
+__all__ = ["Flights", "fly_one_by_one", "fly_side_by_side"]
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+IN_FLIGHT = (TwinMasterError, FmuError, FiniteElementError, OSError)
+"""What may end the flight of one asset, and not that of the others."""
+
+
+@dataclass(frozen=True)
+class Flights:
+    """B flown missions of T turns; a twin that failed has NaN, and -1 as control, from its failure on.
+
+    Attributes
+    ----------
+    observed : (B, T, G)
+        What the sensors said, SI; NaN where lost.
+    control_index : (B, T)
+        Control in force in each turn.
+    state : (B, T, F)
+        True state, SI.
+    filtered : (B, T, S)
+        p(D_t | o_0..o_t).
+    log_evidence : (B, T)
+        log p(o_t | o_0..o_{t-1}).
+    failure : tuple of str
+        What ended the flight of each twin; empty for one that flew to its end.
+    """
+
+    observed: Float
+    control_index: Index
+    state: Float
+    filtered: Float
+    log_evidence: Float
+    failure: tuple[str, ...]
+
+    @classmethod
+    def empty(cls, knowledge: Knowledge, count: int) -> "Flights":
+        """Return B missions before their first turn."""
+        steps, size = knowledge.scenario.mission.steps, knowledge.model.states.size
+        sensors, factors = knowledge.scenario.observation.count, len(knowledge.scenario.state)
+        return cls(
+            observed=np.full((count, steps, sensors), np.nan),
+            control_index=np.full((count, steps), -1, dtype=np.int64),
+            state=np.full((count, steps, factors), np.nan),
+            filtered=np.full((count, steps, size), np.nan),
+            log_evidence=np.full((count, steps), np.nan),
+            failure=("",) * count,
+        )
+
+    @classmethod
+    def joined(cls, parts: "Sequence[Flights]") -> "Flights":
+        """Return the missions of several batches as one."""
+        names = ("observed", "control_index", "state", "filtered", "log_evidence")
+        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return cls(**arrays, failure=tuple(text for part in parts for text in part.failure))
+
+
+class _Plants(Protocol):
+    """The assets of B twins with their truths."""
+
+    def turn(self, step: int, control: Index, flying: NDArray[np.bool_]) -> tuple[Float, Float]:
+        """Return what the sensors say (B, G) and the true states (B, F), under the controls (B,)."""
+
+    failure: dict[int, str]
+    """What ended the flight of a twin."""
+
+
+class _Each:
+    """Assets of any kind, each driven by its own `Plant`."""
+
+    def __init__(self, knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]) -> None:
+        pairs = zip(truths, assets, strict=True)
+        self._plants: list[Plant] = [knowledge.plant(truth, asset) for truth, asset in pairs]
+        self._shape = len(self._plants), knowledge.scenario.observation.count, len(knowledge.scenario.state)
+        self._before: Index | None = None
+        self.failure: dict[int, str] = {}
+
+    def turn(self, step: int, control: Index, flying: NDArray[np.bool_]) -> tuple[Float, Float]:
+        count, sensors, factors = self._shape
+        observed, state = np.full((count, sensors), np.nan), np.full((count, factors), np.nan)
+        for twin in np.flatnonzero(flying).tolist():
+            before = None if self._before is None else int(self._before[twin])
+            try:
+                observed[twin] = self._plants[twin].turn(int(control[twin]), before)
+                state[twin] = self._plants[twin].latest()[0]
+            except IN_FLIGHT as error:
+                self.failure[twin] = str(error)
+        self._before = control.copy()
+        return observed, state
+
+
+class _Stateless:
+    """Assets without memory: what one shows under a control and a state is asked once."""
+
+    def __init__(self, knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]) -> None:
+        self._scenario, self._states = knowledge.scenario, knowledge.model.states
+        distinct = {id(asset): asset for asset in assets}
+        self._assets = list(distinct.values())
+        numbers = {key: number for number, key in enumerate(distinct)}
+        self._asset = np.array([numbers[id(asset)] for asset in assets])
+        self._growth = DamageGrowth(knowledge.model)
+        self._noise = np.stack([truth.noise for truth in truths])
+        self._uniform = np.stack([truth.uniform for truth in truths])
+        self._truth = truths[0]  # script, drift and losses are the scenario's, the same for all
+        self._before: list[tuple[int | None, int | None]] = [(None, None)] * len(assets)
+        self._seen: dict[tuple[int, int, bytes], Float | str] = {}
+        self.failure: dict[int, str] = {}
+
+    def turn(self, step: int, control: Index, flying: NDArray[np.bool_]) -> tuple[Float, Float]:
+        place, state = self._grown(step, control)
+        code = (self._asset * len(self._scenario.control) + control) * self._states.size + place
+        _, first, inverse = np.unique(np.where(flying, code, -1), return_index=True, return_inverse=True)
+        distinct = np.full((len(first), self._noise.shape[2]), np.nan)
+        for row, twin in enumerate(first.tolist()):
+            shown = self._shown(step, int(self._asset[twin]), int(control[twin]), state[twin])
+            if isinstance(shown, str):
+                self.failure |= {int(other): shown for other in np.flatnonzero(inverse == row)}
+            else:
+                distinct[row] = shown
+        observed = distinct[inverse] + self._noise[:, step] + self._truth.drift[step]
+        observed[:, self._truth.status[step] == SensorStatus.LOST] = np.nan
+        return observed, state
+
+    def _grown(self, step: int, control: Index) -> tuple[Index, Float]:
+        """Return the true states: their numbers (B,), zeros where they are scripted, and levels (B, F)."""
+        if self._scenario.truth.kind == "scripted":
+            state = self._truth.state(step, None, None)
+            return np.zeros_like(control), np.broadcast_to(state, (len(control), len(state)))
+        uniform = self._uniform[:, step].tolist()
+        moved = zip(self._before, uniform, strict=True)
+        grown = [self._growth.following(*before, value) for before, value in moved]
+        self._before = list(zip(control.tolist(), grown, strict=True))
+        place = np.array(grown)
+        return place, self._states.coordinates[place]
+
+    def _shown(self, step: int, asset: int, control: int, state: Float) -> Float | str:
+        """Return what an asset shows without noise (G,), or why it does not."""
+        key = asset, control, state.tobytes()
+        if key not in self._seen:
+            chosen = self._scenario.control[control]
+            health = dict(zip(self._scenario.state_names, state.tolist(), strict=True))
+            try:
+                reading = self._assets[asset].step(chosen.values, health)
+                self._seen[key] = checked_values(self._scenario, reading, step, chosen.name)
+            except IN_FLIGHT as error:
+                self._seen[key] = str(error)
+        return self._seen[key]
+
+
+def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]) -> Flights:
+    """Fly B missions of one scenario in lock-step.
+
+    Parameters
+    ----------
+    knowledge : Knowledge
+        What all twins know; the scenario neither learns nor gives notice.
+    truths : sequence of Truth
+        One for each twin.
+    assets : sequence of Asset
+        One for each twin, at its start; one without memory may stand for several twins.
+    """
+    scenario, model = knowledge.scenario, knowledge.model
+    count = len(truths)
+    flights, failure = Flights.empty(knowledge, count), [""] * count
+    stateless = all(isinstance(asset, StatelessAsset) for asset in assets)
+    plants: _Plants = (_Stateless if stateless else _Each)(knowledge, truths, assets)
+    control = np.full(count, scenario.control_names.index(scenario.mission.first_control))
+    flying = np.ones(count, dtype=bool)
+    before: tuple[Float | None, Index | None] = None, None
+    for step in range(scenario.mission.steps):
+        observed, state = plants.turn(step, control, flying)
+        flying[list(plants.failure)] = False
+        observed[~flying] = np.nan
+        likelihood = knowledge.sensor_model.log_likelihood_sequence(observed, control)
+        filtered, log_filtered, evidence, impossible = filter_step_many(model, *before, likelihood)
+        for twin in np.flatnonzero(impossible & flying).tolist():
+            worst = knowledge.sensor_model.worst_residuals(observed[twin], int(control[twin]))
+            plants.failure[twin] = str(ImpossibleObservation(scenario.mission.name, step, worst))
+        flying &= ~impossible
+        log_filtered[impossible] = model.log_prior  # of a failed twin: anything that can be gone on with
+        kept = (flights.observed, observed), (flights.control_index, control), (flights.state, state)
+        for array, row in (*kept, (flights.filtered, filtered), (flights.log_evidence, evidence)):
+            array[flying, step] = row[flying]
+        before = log_filtered, control
+        control = decide_many(model, filtered, control, knowledge.plan.policy, scenario.planner.decide_on)
+    for twin, sentence in plants.failure.items():
+        failure[twin] = sentence
+    return replace(flights, failure=tuple(failure))
+
+
+def fly_one_by_one(knowledge: Knowledge, truths: Sequence[Truth], assets: Iterable[Asset]) -> Flights:
+    """Fly B missions one after the other with `fly`: for twins that learn, or give notice.
+
+    Parameters
+    ----------
+    knowledge, truths, assets
+        As of `fly_side_by_side`; an asset is asked for when its twin begins.
+    """
+    flights, failure = Flights.empty(knowledge, len(truths)), [""] * len(truths)
+    for twin, (truth, asset) in enumerate(zip(truths, assets, strict=True)):
+        try:
+            flight = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(truth, asset))
+        except IN_FLIGHT as error:
+            failure[twin] = str(error)
+            continue
+        flights.observed[twin], flights.control_index[twin] = flight.observed, flight.control_index
+        flights.state[twin], flights.filtered[twin] = flight.happened.state, flight.filtered
+        flights.log_evidence[twin] = flight.log_evidence
+    return replace(flights, failure=tuple(failure))

@@ -1,0 +1,94 @@
+"""One turn of many twins of a model: what each would conclude alone, to the last bit."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin_master.errors import ImpossibleObservation
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.inference import filter_step
+from twin_master.network.kernels import step_many
+
+__all__ = ["decide_many", "filter_step_many"]
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+def filter_step_many(
+    model: GraphicalModel,
+    previous_log_filtered: Float | None,
+    previous_control: Index | None,
+    log_likelihood: Float,
+) -> tuple[Float, Float, Float, NDArray[np.bool_]]:
+    """Assimilate one observation of each of B twins, as `filter_step` does for one.
+
+    Parameters
+    ----------
+    model : GraphicalModel
+    previous_log_filtered : (B, S) or None
+        `log_filtered` of the step before; None at the first step.
+    previous_control : (B,) or None
+        Control in force in the step before; None at the first step.
+    log_likelihood : (B, S)
+        log p(o_t | D_t, u_t).
+
+    Returns
+    -------
+    filtered, log_filtered : (B, S)
+    log_evidence : (B,)
+    impossible : (B,)
+        Whether the observation has probability zero wherever the belief has support; the rest of such a row
+        means nothing.
+    """
+    first = 0 if previous_control is None or previous_log_filtered is None else 1
+    count, size = log_likelihood.shape
+    rows = np.zeros((count, first + 1, size))
+    rows[:, first] = log_likelihood
+    control = np.zeros((count, first + 1), dtype=np.int64)
+    log_filtered, filtered, forecast = np.zeros_like(rows), np.zeros_like(rows), np.zeros_like(rows)
+    log_evidence, failed = np.zeros((count, first + 1)), np.full(count, -1)
+    if previous_control is not None and previous_log_filtered is not None:
+        control[:] = previous_control[:, None]
+        log_filtered[:, 0] = previous_log_filtered
+        filtered[:, 0] = np.exp(previous_log_filtered)
+    if model.transition.is_product:
+        for twin in range(count):
+            before, in_force = (log_filtered[twin, 0], int(control[twin, 0])) if first else (None, None)
+            try:
+                step = filter_step(model, before, in_force, rows[twin, first])
+            except ImpossibleObservation:
+                failed[twin] = first
+                continue
+            filtered[twin, first], log_filtered[twin, first] = step.filtered, step.log_filtered
+            log_evidence[twin, first] = step.log_evidence
+    else:
+        sparse = model.transition.sparse
+        step_many(
+            model.log_prior, sparse.start, sparse.source, sparse.probability, sparse.log_probability, control,
+            first, rows, forecast, filtered, log_filtered, log_evidence, failed,
+        )  # fmt: skip
+    return filtered[:, first], log_filtered[:, first], log_evidence[:, first], failed >= 0
+
+
+def decide_many(model: GraphicalModel, filtered: Float, control: Index, policy: Float, on: str) -> Index:
+    """Return the next control of each of B twins (B,): the mode of the policy over its belief (B, S).
+
+    Parameters
+    ----------
+    model : GraphicalModel
+    filtered : (B, S)
+        p(D_t | o_0..o_t).
+    control : (B,)
+        Control in force in turn t.
+    policy : (S, U)
+        p(U | D).
+    on : {"filtered", "predicted"}
+        Which belief is decided on, see `Twin`.
+    """
+    belief = filtered
+    if on == "predicted":
+        pairs = zip(control.tolist(), filtered, strict=True)
+        belief = np.stack([model.transition.forward(in_force, row) for in_force, row in pairs])
+    # One product for each twin, so that its last bit does not depend on how many there are.
+    chosen: Index = np.argmax(np.matmul(belief[:, None, :], policy)[:, 0], axis=1)
+    return chosen
