@@ -15,7 +15,7 @@ demo: $(VENV)/.runtime ## Set up, fly the paper's mission and say where the repo
 
 .PHONY: test
 test: $(VENV)/.dev ## Set up and run all tests (with UAV_TWIN_LONG_TESTS=1 those that take minutes, too)
-	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 3 --dist loadgroup --no-loadscope-reorder
 
 .PHONY: setup
 setup: $(VENV)/.dev ## Make .venv with everything that development needs

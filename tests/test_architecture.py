@@ -6,6 +6,7 @@ import ast
 import io
 import tokenize
 import tomllib
+from bisect import bisect
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -159,24 +160,25 @@ def test_modules_and_functions_are_short_or_say_why_not() -> None:
         place = path.relative_to(ROOT).as_posix()
         if text.count("\n") > LONGEST_MODULE:
             long[place] = text.count("\n")
-        lines = code_lines(text)
-        for node in ast.walk(ast.parse(text)):
+        nodes = list(ast.walk(ast.parse(text)))
+        lines = sorted(code_lines(text, nodes))
+        for node in nodes:
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                length = len([row for row in lines if node.lineno <= row <= (node.end_lineno or 0)])
+                length = bisect(lines, node.end_lineno or 0) - bisect(lines, node.lineno - 1)
                 if length > LONGEST_FUNCTION:
                     long[f"{place}:{node.name}"] = length
     assert {place: length for place, length in long.items() if place not in LONGER} == {}
     assert not set(LONGER) - set(long), "no longer long"
 
 
-def code_lines(text: str) -> set[int]:
+def code_lines(text: str, nodes: list[ast.AST]) -> set[int]:
     """Return the rows of a module that hold code: no comment, no docstring, not blank."""
     ignored = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
     rows: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type not in ignored:
             rows.update(range(token.start[0], token.end[0] + 1))
-    for node in ast.walk(ast.parse(text)):
+    for node in nodes:
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):  # a docstring
             rows.difference_update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
     return rows

@@ -79,6 +79,7 @@ def test_dry_friction_takes_two_widths_from_every_half_swing_and_stops_within_on
     assert abs(values[-1]) <= width
 
 
+@pytest.mark.long
 def test_structural_damping_has_the_same_decrement_at_every_amplitude() -> None:
     loss = 0.05
     tops = peaks(motion(Law("x", FRICTION, (loss * STIFFNESS, 1.0))))
@@ -107,9 +108,7 @@ def _after_half_swing(s: float, start: float) -> float:
     return -float(brentq(lambda x: kept(x) - kept(start), -start, -1e-9))
 
 
-@pytest.mark.parametrize(
-    "ratio", [0.1, *(pytest.param(more, marks=pytest.mark.long) for more in (0.3, -0.2))]
-)
+@pytest.mark.parametrize("ratio", [pytest.param(ratio, marks=pytest.mark.long) for ratio in (0.1, 0.3, -0.2)])
 def test_cubic_spring_has_the_period_of_duffing(ratio: float) -> None:
     amplitude = 0.01
     values = motion(Law("x", POWER, (ratio * STIFFNESS / amplitude**2, 3.0, 0.0)), amplitude)

@@ -82,6 +82,7 @@ def test_the_authors_table_gives_their_figures() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.xdist_group("wing")
 def test_our_wing_on_the_published_targets() -> None:
     if not REFERENCE.is_dir():
         pytest.skip("the reference data are not beside the project")

@@ -62,7 +62,7 @@ def test_slopes_are_differences_of_values(virtual_model: LocalModel) -> None:
         assert slope == pytest.approx(difference, rel=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_jacobian_is_that_of_the_full_model(
     virtual_model: LocalModel,
     virtual_design: WingDesign,

@@ -195,7 +195,12 @@ def outliers(generator, shape):  # type: ignore[no-untyped-def]
 
 @pytest.mark.parametrize(
     "how",
-    [{"noise_scale": 3.0}, {"noise_scale": 0.4}, {"noise": coloured}, {"noise": outliers}],
+    [
+        pytest.param({"noise_scale": 3.0}, marks=pytest.mark.long),
+        {"noise_scale": 0.4},
+        {"noise": coloured},
+        pytest.param({"noise": outliers}, marks=pytest.mark.long),
+    ],
     ids=["understated", "overstated", "correlated", "outliers"],
 )
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
