@@ -48,6 +48,9 @@ Library = Annotated[
     Path | None,
     typer.Option(help="Believe this observation library, made by `uav-twin library sample`."),
 ]
+Learnt = Annotated[
+    Path | None, typer.Option(help="Fly with what a fleet has learnt, a file of `uav-twin fleet learn`.")
+]
 InProcess = Annotated[
     bool, typer.Option("--in-process", help="Run the FMU in this process instead of a worker.")
 ]
@@ -74,6 +77,7 @@ def run(
     strain_library: StrainLibrary = None,
     calibration: Calibration = None,
     library: Library = None,
+    learnt: Learnt = None,
     in_process: InProcess = False,
     view: View = False,
     with_scenario: WithScenario = None,
@@ -89,7 +93,7 @@ def run(
     from twin_master.workflow import new_run, resume_run
 
     scenario, ssp = _flown(scenario, with_scenario)
-    overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration, ssp, library)
+    overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration, ssp, library, learnt)
     if seeds is not None:
         chosen = _alone(scenario, resume is not None or seed is not None or view)
         engine = engine_of(workers, cluster)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from twin_master.assets.asset_source import AssetSource, PairedSource
+from twin_master.assets.learnt_file import apply_learnt
 from twin_master.assets.parameter import is_of_parameters
 from twin_master.assets.strain_library import FILE_NAME
 from twin_master.errors import MissionInputError
@@ -30,6 +31,10 @@ class Overrides:
         file of that library.
     library : Path or None
         Believe this observation library.
+    learnt : Path or None
+        Fly with what a fleet has learnt, the file of `uav-twin fleet learn`.
+    learnt_group : str or None
+        With what it has learnt of this group, where the file tells.
     in_process : bool
         Fly the FMU in this process instead of a worker.
     calibration : Path or None
@@ -46,6 +51,8 @@ class Overrides:
     calibration: Path | None = None
     ssp: Path | None = None
     library: Path | None = None
+    learnt: Path | None = None
+    learnt_group: str | None = None
 
 
 def given_overrides(given: Overrides | Mapping[str, Any] | None) -> Overrides:
@@ -98,6 +105,8 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
             "the design of a calibration is asked for, and there is no calibration file: give --calibration, "
             'or `source = "file"` in the table `calibration`.'
         )
+    if overrides.learnt:
+        apply_learnt(table, overrides.learnt, overrides.learnt_group)
     if overrides.seed is not None:
         table["mission"]["seed"] = overrides.seed
     return parse_scenario(table, str(loaded.path))

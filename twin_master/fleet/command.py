@@ -53,6 +53,50 @@ def run(
     fly_and_show(found, out, engine_of(workers, cluster), replace=replace, json=json)
 
 
+@fleet_app.command("learn")
+def learn(
+    folder: Annotated[Path, typer.Argument(help="The folder of the fleet.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="The file to write.")] = Path("learnt.toml"),
+    json: terminal.Json = False,
+) -> None:
+    """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ."""
+    from twin_master.fleet.learn import learn_fleet
+    from twin_master.fleet.lessons import lessons_record, write_learnt
+
+    lessons = learn_fleet(folder, progress=terminal.progress())
+    write_learnt(out, lessons)
+    record = lessons_record(lessons)
+    if json:
+        terminal.print_json({"file": str(out), **record})
+        return
+    _show_lessons(record)
+    terminal.say(f"Learnt: {out}")
+
+
+def _show_lessons(record: dict[str, Any]) -> None:
+    from rich import box
+    from rich.table import Table
+
+    table = Table("group", "learnt", "assumed", "mean", "95 % interval", box=box.SIMPLE_HEAD)
+    for name, group in record["groups"].items():
+        heading = f"{name}, {group['twins']} twins"
+        for control, rate in group["probability"].items():
+            interval = f"{rate['lower_95']:.4f} to {rate['upper_95']:.4f}"
+            learnt = f"probability to worsen, {control}"
+            table.add_row(heading, learnt, f"{rate['assumed']:.4f}", f"{rate['mean']:.4f}", interval)
+            heading = ""
+        rows = [("noise over the assumed", "1", group["noise_factor"])]
+        if "population" in group:
+            parameter, told = group["population"]["parameter"], group["population"]
+            rows += [(f"{parameter}, mean", "", told["mean"]), (f"{parameter}, spread", "", told["spread"])]
+        for title, assumed, line in rows:
+            table.add_row("", title, assumed, f"{line['mean']:.5g} ± {line['standard_deviation']:.2g}", "")
+    for control, told in record.get("shared", {}).items():
+        mean = f"{told['mean']:.4f} ± {told['standard_deviation']:.2g}"
+        table.add_row("all groups", f"mean over groups, {control}", "", mean, "")
+    terminal.console().print(table)
+
+
 def engine_of(workers: int | None, cluster: str | None) -> "Engine":
     """Return who flies, by what the user said."""
     import os

@@ -176,7 +176,8 @@ def flies_model(scenario: Scenario) -> bool:
     return same and getattr(asset, "design", None) == getattr(belief, "design", None)
 
 
-def _source(scenario: Scenario) -> AssetSource:
+def source_of(scenario: Scenario) -> AssetSource:
+    """Return what flies in a fleet, and what its twin believes."""
     return believed_source(scenario) if flies_model(scenario) else asset_source(scenario)
 
 
@@ -195,7 +196,7 @@ def _check(fleet: Fleet) -> None:
         for name, scenario in zip(names, group.scenarios, strict=True):
             try:
                 _check_group(group, scenario)
-                _source(with_parameters(scenario, means)).check()
+                source_of(with_parameters(scenario, means)).check()
             except IN_FLIGHT as error:
                 wrong.append(f"{group.name} {name}".rstrip() + f": {error}")
     if wrong:
@@ -222,10 +223,10 @@ def _check_group(group: Group, scenario: Scenario) -> None:
 def prepared(scenario: Scenario, folder: Path, progress: Progress) -> bytes:
     """Return the packed `Kit` of a scenario, what belongs to it made in a folder."""
     located = located_scenario(portable_scenario(scenario), folder)
-    for name, content in _source(scenario).files().items():
+    for name, content in source_of(scenario).files().items():
         if not (folder / name).exists():
             atomic_write_bytes(folder / name, content)
-    source = _source(located)
+    source = source_of(located)
     source.prepare(folder, progress)
     if not (folder / KNOWLEDGE_NAME).is_file():
         keep_knowledge(folder, prepare_knowledge(located, source, scenario.mission.seed))

@@ -13,9 +13,9 @@ from reporting.section import checked
 from reporting.toml_file import read_toml
 from twin_master.assets.resolution import Overrides, portable_scenario, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
-from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Count, Name, NotNegative, Number, Section, Seed
+from twin_master.scenario.section import Count, Name, NotNegative, Number, Probability, Section, Seed
 from twin_master.seeds import generator
 
 __all__ = ["Fleet", "Group", "Member", "ensemble", "load_fleet", "seed_range"]
@@ -44,8 +44,12 @@ class GroupSection(Section):
     fmu: str | None = None
     binding: str | None = None
     calibration: str | None = None
+    learnt: str | None = None
+    """A file of `uav-twin fleet learn`."""
     steps: Count | None = None
     parameters: dict[str, Spread] = Field(default_factory=dict)
+    true_probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
+    """What `truth.probability` is in this group."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -224,7 +228,12 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
         return None if name is None else folder / name
 
     common = Overrides(
-        seed=seed, fmu=path(section.fmu), binding=path(section.binding), calibration=path(section.calibration)
+        seed=seed,
+        fmu=path(section.fmu),
+        binding=path(section.binding),
+        calibration=path(section.calibration),
+        learnt=path(section.learnt),
+        learnt_group=section.name,
     )
     if section.count is not None:
         scenarios: list[Scenario] = [resolve_scenario(loaded, common)]
@@ -248,11 +257,19 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
         if wrong:
             raise FleetError("\n".join(["assets that cannot fly:", *wrong]))
         names, files = [file.stem for file in found], [file.name for file in found]
-    if section.steps is not None:
-        mission = scenarios[0].mission.model_copy(update={"steps": section.steps})
-        scenarios = [scenario.model_copy(update={"mission": mission}) for scenario in scenarios]
+    scenarios = [_of_group(section, scenario) for scenario in scenarios]
     members = tuple(_member(section, seed, row, name) for row, name in enumerate(names))
     return Group(section.name, tuple(scenarios), section.parameters, members, tuple(files))
+
+
+def _of_group(section: GroupSection, scenario: Scenario) -> Scenario:
+    """Return a scenario with what the group says otherwise."""
+    table = scenario.to_dict()
+    if section.steps is not None:
+        table["mission"]["steps"] = section.steps
+    if section.true_probability:
+        table["truth"]["probability"] = section.true_probability
+    return parse_scenario(table, f"group {section.name}")
 
 
 def _member(section: GroupSection, seed: int, row: int, name: str) -> Member:

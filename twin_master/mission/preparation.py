@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -96,9 +97,18 @@ class Knowledge:
             estimator=estimator,
         )
 
+    @cached_property
+    def true_model(self) -> GraphicalModel:
+        """States and transitions of what really happens, where it is random growth."""
+        true = self.scenario.truth.probability
+        if not true:
+            return self.model
+        transition = self.scenario.transition.model_copy(update={"probability": true})
+        return build_graphical_model(self.scenario.model_copy(update={"transition": transition}))
+
     def truth(self, seed: int) -> Truth:
         """Return what really happens under a seed."""
-        return Truth(self.scenario, self.model, seed)
+        return Truth(self.scenario, self.true_model, seed)
 
     def plant(self, truth: Truth, asset: Asset) -> Plant:
         """Return an asset, driven by a truth."""

@@ -122,7 +122,7 @@ class _Stateless:
         self._assets = list(distinct.values())
         numbers = {key: number for number, key in enumerate(distinct)}
         self._asset = np.array([numbers[id(asset)] for asset in assets])
-        self._growth = DamageGrowth(knowledge.model)
+        self._growth = DamageGrowth(knowledge.true_model)
         self._noise = np.stack([truth.noise for truth in truths])
         self._uniform = np.stack([truth.uniform for truth in truths])
         self._truth = truths[0]  # script, drift and losses are the scenario's, the same for all

@@ -300,7 +300,9 @@ class Scenario(Section):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the scenario as plain data in SI; `Scenario.model_validate` reads it back."""
-        absent = {name for name in OPTIONAL_TABLES if getattr(self, name) is None}
+        absent: dict[str, Any] = {name: True for name in OPTIONAL_TABLES if getattr(self, name) is None}
+        if not self.truth.probability:
+            absent["truth"] = {"probability"}
         return self.model_dump(mode="json", exclude=absent)
 
     @model_validator(mode="after")
@@ -396,7 +398,14 @@ class Scenario(Section):
                 )
 
     def _check_transition(self) -> None:
-        transition = self.transition
+        transition, true = self.transition, self.truth.probability
+        if true and (self.truth.kind, transition.kind) != ("random_growth", "independent_worsening"):
+            raise ValueError(
+                "`truth.probability` belongs to the kind `random_growth`, and to transitions of the kind "
+                "`independent_worsening`"
+            )
+        if true:
+            _same(true, self.control_names, "truth.probability", "control")
         if transition.kind == "independent_worsening":
             if transition.tables:
                 raise ValueError("`transition.tables` belongs to the kind `independent_tables`")

@@ -10,6 +10,7 @@ from twin_master.scenario.section import (
     Name,
     NotNegative,
     Number,
+    Probability,
     Section,
     Step,
 )
@@ -66,6 +67,8 @@ class TruthSection(Section):
 
     kind: Literal["scripted", "random_growth", "asset"]
     gains: tuple[Gain, ...] = ()
+    probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
+    """`random_growth`: the true probabilities to worsen, as in `transition`; those of the twin if absent."""
     noise: Noise = Noise(standard_deviation=0.0)
     sensor_faults: tuple[SensorFault, ...] = ()
     state: dict[str, Name] = Field(default_factory=dict)

@@ -1,0 +1,237 @@
+"""What a fleet teaches, against enumeration, closed forms and the truth."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin_master.assets.resolution import Overrides, resolve_scenario
+from twin_master.errors import FleetError, MissionInputError
+from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
+from twin_master.fleet.flight import fly_fleet
+from twin_master.fleet.learn import learn_fleet, population
+from twin_master.fleet.lessons import lessons_record, write_learnt
+from twin_master.fleet.plan import Fleet, ensemble, load_fleet
+from twin_master.fleet.posterior import Grid, logistic, logit, points_of, refined, shared
+from twin_master.network.inference import filter_sequence
+from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.scenario.schema import Scenario
+
+
+def tiny(probability: object, levels: int = 3) -> Scenario:
+    """Return `growing_damage` with few levels."""
+    table = load_scenario("growing_damage").scenario.to_dict()
+    for state in table["state"]:
+        state["levels"] = np.linspace(0.0, 0.4, levels).tolist()
+        state["prior"] = [1.0] + [0.0] * (levels - 1)
+    table["transition"]["probability"] = probability
+    return parse_scenario(table, "tiny")
+
+
+def enumerated(scenario: Scenario, control: list[int], likelihood: np.ndarray) -> float:
+    """Return the evidence as the sum over all paths of the state."""
+    model = build_graphical_model(scenario)
+    total = 0.0
+    for path in product(range(model.states.size), repeat=len(control)):
+        share = model.prior[path[0]] * likelihood[0, path[0]]
+        for t in range(1, len(path)):
+            share *= model.transition.matrix[control[t - 1], path[t - 1], path[t]] * likelihood[t, path[t]]
+        total += share
+    return float(np.log(total))
+
+
+@pytest.mark.parametrize(
+    "probability",
+    [
+        {"2g": 0.07, "3g": 0.2},
+        {"2g": {"z1": 0.07, "z2": 0.3}, "3g": {"z1": 0.2, "z2": 0.01}},
+    ],
+)
+def test_evidence_of_a_twin_is_that_of_all_paths(probability: object) -> None:
+    scenario = tiny(probability)
+    worsening = Worsening.of(scenario)
+    assert len(worsening.names) == (2 if "z1" not in str(probability) else 4)
+    generator = np.random.default_rng(4)
+    likelihood = generator.random((2, 4, 9))
+    control = generator.integers(0, 2, (2, 4))
+    points = np.array([worsening.assumed, 0.5 * worsening.assumed + 0.3])
+    found = transition_evidence(worsening, points, likelihood, control)
+    for row, point in enumerate(points):
+        given: dict[str, object] = {}
+        for (name, factor), value in zip(worsening.keys, point.tolist(), strict=True):
+            if factor is None:
+                given[name] = value
+            else:
+                given.setdefault(name, {})[factor] = value  # type: ignore[index]
+        other = tiny(given)
+        for twin in range(2):
+            expected = enumerated(other, control[twin].tolist(), likelihood[twin])
+            assert found[twin, row] == pytest.approx(expected, abs=1e-12)
+
+
+def test_evidence_is_that_of_the_filter() -> None:
+    scenario = tiny({"2g": 0.07, "3g": 0.2}, levels=5)
+    model, worsening = build_graphical_model(scenario), Worsening.of(scenario)
+    generator = np.random.default_rng(5)
+    values = 1e-3 * (1.0 + generator.random((3, 25, 2, 24)))
+    sensors = GaussianSensorModel(values, 1e-4)
+    observed = values[1, 3, 0] + 1e-4 * generator.standard_normal((2, 6, 24))
+    observed[0, 2] = np.nan
+    observed[1, :, 5] = np.nan
+    control = generator.integers(0, 2, (2, 6))
+    scaled, common = scaled_likelihood(sensors, observed, control)
+    found = transition_evidence(worsening, worsening.assumed[None], scaled, control)[:, 0] + common
+    for twin in range(2):
+        rows = sensors.log_likelihood_sequence(observed[twin], control[twin])
+        expected = filter_sequence(model, control[twin], rows).log_evidence.sum()
+        assert found[twin] == pytest.approx(expected, rel=1e-12)
+    spread = sensors.total_standard_deviation
+    nodes = node_evidence(worsening, worsening.assumed, values, spread, observed, control)
+    for node in range(3):
+        alone = GaussianSensorModel(values[node : node + 1], 1e-4)
+        scaled, common = scaled_likelihood(alone, observed, control)
+        expected = transition_evidence(worsening, worsening.assumed[None], scaled, control)[:, 0] + common
+        seen = np.isfinite(observed).sum(axis=(1, 2))
+        np.testing.assert_allclose(nodes[:, node] - 0.5 * seen * np.log(2.0 * np.pi), expected, rtol=1e-12)
+
+
+def test_a_grid_has_the_moments_of_a_beta() -> None:
+    from scipy.stats import beta
+
+    counts = ((3, 50), (400, 3600))
+
+    def log_likelihood(points: np.ndarray) -> np.ndarray:
+        sums = [a * np.log(points[:, k]) + b * np.log1p(-points[:, k]) for k, (a, b) in enumerate(counts)]
+        return np.asarray(np.sum(sums, axis=0))
+
+    grid = refined(log_likelihood, 2)
+    for (a, b), marginal in zip(counts, grid.marginals, strict=True):
+        exact = beta(a + 1, b + 1)
+        assert marginal.mean == pytest.approx(exact.mean(), rel=2e-4)
+        assert marginal.standard_deviation == pytest.approx(exact.std(), rel=5e-3)
+        np.testing.assert_allclose(marginal.interval(), exact.interval(0.95), rtol=4e-3)
+
+
+def groups_of(counts: list[tuple[int, int]]) -> list[Grid]:
+    return [refined(lambda p, a=a, b=b: a * np.log(p[:, 0]) + b * np.log1p(-p[:, 0]), 1) for a, b in counts]
+
+
+def test_groups_share_what_a_dense_sum_says() -> None:
+    from scipy.stats import betabinom
+
+    counts = [(3, 47), (6, 44), (2, 48), (9, 41), (4, 46)]
+    grids = groups_of(counts)
+    found = shared(grids)
+    low, high = min(g.axes[0][0] for g in grids), max(g.axes[0][-1] for g in grids)
+    m, kappa = np.meshgrid(logistic(np.linspace(low, high, 41)), np.geomspace(3.0, 3000.0, 13), indexing="ij")
+    a, b = m * kappa, (1.0 - m) * kappa
+    weight = np.prod([betabinom.pmf(n, n + k, a, b) for n, k in counts], axis=0)
+    weight /= weight.sum()
+    assert found.mean[0][0] == pytest.approx(float((weight * m).sum()), rel=1e-3)
+    assert found.concentration[0][0] == pytest.approx(float((weight * np.log10(kappa)).sum()), rel=1e-3)
+    for (n, k), (marginal,) in zip(counts, found.groups, strict=True):
+        exact = float((weight * (a + n) / (kappa + n + k)).sum())
+        assert marginal.mean == pytest.approx(exact, rel=2e-3)
+    means = [marginal.mean for (marginal,) in found.groups]
+    assert np.std(means) < 0.8 * np.std([n / (n + k) for n, k in counts])
+
+
+def test_groups_with_two_probabilities_are_those_of_one_where_they_do_not_meet() -> None:
+    counts = [(3, 47), (6, 44), (12, 38)]
+    single = shared(groups_of(counts))
+    pairs = [
+        refined(
+            lambda p, seen=((a, 5), (b, 95)): (
+                np.log(p) @ np.array(seen[0], float) + np.log1p(-p) @ np.array(seen[1], float)
+            ),
+            2,
+        )
+        for a, b in counts
+    ]
+    both = shared(pairs)
+    for one, two in zip(single.groups, both.groups, strict=True):
+        assert two[0].mean == pytest.approx(one[0].mean, rel=2e-2)
+
+
+def test_a_population_is_that_of_normal_members() -> None:
+    generator = np.random.default_rng(8)
+    nodes = np.linspace(0.94, 1.06, 61)
+    own, blur = 1.01 + 0.01 * generator.standard_normal(400), 0.004
+    seen = own + blur * generator.standard_normal(400)
+    mean, spread = population(nodes, -0.5 * ((nodes - seen[:, None]) / blur) ** 2)
+    assert mean.mean == pytest.approx(seen.mean(), abs=2e-5)
+    assert mean.standard_deviation == pytest.approx(np.std(seen) / 20.0, rel=0.05)
+    assert spread.mean == pytest.approx(np.sqrt(np.var(seen) - blur**2), rel=0.02)
+
+
+def test_points_are_those_of_the_axes() -> None:
+    axes = (np.array([-1.0, 0.0]), np.array([0.0, 1.0, 2.0]))
+    found = points_of(axes)
+    assert found.shape == (6, 2)
+    np.testing.assert_allclose(logit(found[4]), [0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def grown(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Fleet, Path]:
+    folder = tmp_path_factory.mktemp("grown")
+    fleet = ensemble("growing_damage", range(60), Overrides(strain_library=library_file))
+    return fleet, fly_fleet(fleet, folder / "fleet").folder
+
+
+def test_a_fleet_learns_and_flies_what_it_has_learnt(grown: tuple[Fleet, Path], tmp_path: Path) -> None:
+    fleet, folder = grown
+    lessons = learn_fleet(folder)
+    record = lessons_record(lessons)["groups"]["growing_damage"]
+    for control, truth in (("2g", 0.05), ("3g", 0.1)):
+        rate = record["probability"][control]
+        assert abs(rate["mean"] - truth) < 4.0 * rate["standard_deviation"] < 0.1
+        assert rate["lower_95"] < rate["mean"] < rate["upper_95"]
+    file = write_learnt(tmp_path / "learnt.toml", lessons)
+    scenario = resolve_scenario(load_scenario("growing_damage"), Overrides(learnt=file))
+    assert scenario.transition.probability["3g"] == record["probability"]["3g"]["mean"]
+    assumed = fleet.groups[0].scenarios[0].observation.standard_deviation
+    found = scenario.observation.standard_deviation
+    assert found == pytest.approx(np.multiply(assumed, record["noise_factor"]["mean"]))
+
+
+def test_what_was_learnt_must_fit(grown: tuple[Fleet, Path], tmp_path: Path) -> None:
+    file = tmp_path / "learnt.toml"
+    file.write_text('format = 1\n[transition]\nprobability = { "4g" = 0.1 }\n')
+    with pytest.raises(MissionInputError, match="probabilities for 4g"):
+        resolve_scenario(load_scenario("growing_damage"), Overrides(learnt=file))
+    file.write_text('format = 1\n[calibration]\nparameter = "colour"\nmean = 1.0\nstandard_deviation = 0.1\n')
+    with pytest.raises(MissionInputError, match="has learnt colour"):
+        resolve_scenario(load_scenario("growing_damage"), Overrides(learnt=file))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(Exception, match="not the folder of a fleet"):
+        learn_fleet(tmp_path / "empty")
+
+
+def test_tables_are_not_learnt() -> None:
+    table = tiny({"2g": 0.1, "3g": 0.1}).to_dict()
+    rows = [[0.9, 0.1, 0.0], [0.0, 0.9, 0.1], [0.0, 0.0, 1.0]]
+    tables = {control: {"z1": rows, "z2": rows} for control in ("2g", "3g")}
+    table["transition"] = {"kind": "independent_tables", "tables": tables}
+    with pytest.raises(FleetError, match="independent_worsening"):
+        Worsening.of(parse_scenario(table, "tables"))
+
+
+def test_true_rates_may_differ_from_those_believed(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.toml"
+    path.write_text(
+        'format = 1\n[fleet]\nname = "slow"\n[[group]]\nname = "slow"\n'
+        'scenario = "growing_damage"\ncount = 1\n'
+        'true_probability = { "2g" = 0.0, "3g" = 0.0 }\n'
+    )
+    scenario = load_fleet(path).groups[0].scenarios[0]
+    assert scenario.truth.probability == {"2g": 0.0, "3g": 0.0}
+    assert scenario.transition.probability == {"2g": 0.05, "3g": 0.1}
+    assert "probability" not in load_scenario("growing_damage").scenario.to_dict()["truth"]
+    path.write_text(path.read_text().replace("growing_damage", "level_turns"))
+    with pytest.raises(FleetError, match=r"truth\.probability"):
+        load_fleet(path)

@@ -1,0 +1,253 @@
+"""The log evidence of each twin's observations, as a function of what a fleet can learn.
+
+Twins are independent given what they share, so that the log evidence of a fleet is the sum of theirs: exact,
+in any order, shard by shard. What the twins decided takes no part, for they decided by what they had seen.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fe.compilation import compiled
+from twin_master.errors import FleetError
+from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.schema import Scenario
+
+__all__ = ["Worsening", "node_evidence", "scaled_likelihood", "transition_evidence"]
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+Unsigned = NDArray[np.uint64]
+
+
+@compiled
+def _forward(
+    prior: Float, start: Unsigned, source: Unsigned, probability: Float, control: Index, likelihood: Float
+) -> float:
+    """Return the log evidence of one twin: likelihood (T, S) is scaled so that the largest of a row is 1."""
+    steps, size = likelihood.shape
+    belief, following = prior.copy(), np.empty(size)
+    result = 0.0
+    for t in range(steps):
+        total = 0.0
+        for state in range(size):
+            value = belief[state]
+            if t > 0:
+                row = control[t - 1] * size + state
+                value = 0.0
+                for k in range(start[row], start[row + 1]):
+                    value += belief[source[k]] * probability[k]
+            following[state] = value * likelihood[t, state]
+            total += following[state]
+        if total <= 0.0:
+            return -np.inf
+        result += np.log(total)
+        for state in range(size):
+            belief[state] = following[state] / total
+    return float(result)
+
+
+@compiled
+def _on_points(
+    prior: Float,
+    start: Unsigned,
+    source: Unsigned,
+    probability: Float,
+    control: Index,
+    likelihood: Float,
+    result: Float,
+) -> None:
+    """Fill result (B, P) for probabilities (P, non-zeros) of P points."""
+    for twin in range(len(control)):
+        for point in range(len(probability)):
+            result[twin, point] = _forward(
+                prior, start, source, probability[point], control[twin], likelihood[twin]
+            )
+
+
+@compiled
+def _on_nodes(
+    prior: Float,
+    start: Unsigned,
+    source: Unsigned,
+    probability: Float,
+    control: Index,
+    observed: Float,
+    value: Float,
+    inverse_deviation: Float,
+    result: Float,
+) -> None:
+    """Fill result (E,) for predicted values (U, S, G, E) of E nodes, up to what all nodes share."""
+    steps, sensors = observed.shape
+    size, nodes = value.shape[1], value.shape[3]
+    exponent = np.empty((steps, size, nodes))
+    for t in range(steps):
+        u = control[t]
+        for s in range(size):
+            exponent[t, s, :] = 0.0
+            for g in range(sensors):
+                if np.isnan(observed[t, g]):
+                    continue
+                scale = inverse_deviation[u, s, g]
+                shift = np.log(scale)
+                for e in range(nodes):
+                    residual = (observed[t, g] - value[u, s, g, e]) * scale
+                    exponent[t, s, e] += shift - 0.5 * residual * residual
+    likelihood = np.empty((steps, size))
+    for e in range(nodes):
+        common = 0.0
+        for t in range(steps):
+            best = exponent[t, 0, e]
+            for s in range(1, size):
+                best = max(best, exponent[t, s, e])
+            common += best
+            for s in range(size):
+                likelihood[t, s] = np.exp(exponent[t, s, e] - best)
+        result[e] = common + _forward(prior, start, source, probability, control, likelihood)
+
+
+@dataclass(frozen=True)
+class Worsening:
+    """The K probabilities to worsen of a scenario, and what its transitions make of them.
+
+    An entry of the joint table is a product: p for each factor that worsens, 1 - p for each that could.
+
+    Attributes
+    ----------
+    names : tuple of str
+        One for each probability: the control, and the factor where each has its own.
+    assumed : (K,)
+        What the scenario assumes.
+    start, source
+        The predecessor lists, see `SparseTransition`.
+    worsens, stays : (non-zeros, K)
+        How often each probability, and its complement, is a factor of an entry.
+    prior : (S,)
+        p(D_0).
+    """
+
+    names: tuple[str, ...]
+    assumed: Float
+    start: Unsigned
+    source: Unsigned
+    worsens: Float
+    stays: Float
+    prior: Float
+    keys: tuple[tuple[str, str | None], ...] = field(default=())
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> "Worsening":
+        """Return those of a scenario.
+
+        Raises
+        ------
+        FleetError
+            Its transitions are tables.
+        """
+        if scenario.transition.kind != "independent_worsening":
+            raise FleetError("probabilities are learnt of transitions of the kind `independent_worsening`.")
+        given, keys, assumed = scenario.transition.probability, [], []
+        for control in scenario.control_names:
+            entry = given[control]
+            own = entry if isinstance(entry, dict) else {None: entry}
+            keys += [(control, name) for name in own]
+            assumed += list(own.values())
+        halved = scenario.transition.model_copy(
+            update={"probability": dict.fromkeys(scenario.control_names, 0.5)}
+        )
+        model = build_graphical_model(scenario.model_copy(update={"transition": halved}))
+        sparse, shape, size = model.transition.sparse, model.states.shape, model.states.size
+        length = sparse.start[1:].astype(np.int64) - sparse.start[:-1].astype(np.int64)
+        row = np.repeat(np.arange(len(length)), length)
+        in_force, to = np.divmod(row, size)
+        before, after = np.unravel_index(sparse.source.astype(np.int64), shape), np.unravel_index(to, shape)
+        worsens, stays = np.zeros((len(row), len(keys))), np.zeros((len(row), len(keys)))
+        for factor, name in enumerate(scenario.state_names):
+            for number, chosen in enumerate(scenario.control_names):
+                k = keys.index((chosen, name) if (chosen, name) in keys else (chosen, None))
+                here = in_force == number
+                worsens[:, k] += here & (after[factor] == before[factor] + 1)
+                can = before[factor] < shape[factor] - 1
+                stays[:, k] += here & can & (after[factor] == before[factor])
+        names = tuple(control if name is None else f"{control}, {name}" for control, name in keys)
+        return cls(
+            names, np.array(assumed), sparse.start, sparse.source, worsens, stays, model.prior, tuple(keys)
+        )
+
+    def probability(self, points: Float) -> Float:
+        """Return the entries of the lists (P, non-zeros) for probabilities (P, K) between 0 and 1."""
+        return np.asarray(np.exp(np.log(points) @ self.worsens.T + np.log1p(-points) @ self.stays.T))
+
+
+def scaled_likelihood(model: GaussianSensorModel, observed: Float, control: Index) -> tuple[Float, Float]:
+    """Return p(o_t | D_t, u_t) of B twins over the largest of each turn (B, T, S), and the logs of that (B,).
+
+    Parameters
+    ----------
+    model : GaussianSensorModel
+    observed, control
+        (B, T, G), SI, NaN where lost, and (B, T).
+    """
+    rows = model.log_likelihood_sequence(observed.reshape(-1, observed.shape[-1]), control.ravel()).reshape(
+        *control.shape, -1
+    )
+    best = rows.max(axis=2, keepdims=True)
+    scaled: Float = np.exp(rows - best)
+    return scaled, best.sum(axis=(1, 2))
+
+
+def transition_evidence(worsening: Worsening, points: Float, likelihood: Float, control: Index) -> Float:
+    """Return the log evidence of B twins at P points (P, K): (B, P), up to a constant of each twin.
+
+    Parameters
+    ----------
+    worsening : Worsening
+    points : (P, K)
+        Probabilities, between 0 and 1.
+    likelihood : (B, T, S)
+        Of `scaled_likelihood`.
+    control : (B, T)
+        Controls in force.
+    """
+    result = np.empty((len(control), len(points)))
+    _on_points(
+        worsening.prior, worsening.start, worsening.source, worsening.probability(points), control,
+        likelihood, result,
+    )  # fmt: skip
+    return result
+
+
+def node_evidence(
+    worsening: Worsening,
+    probability: Float,
+    values: Float,
+    deviation: Float,
+    observed: Float,
+    control: Index,
+) -> Float:
+    """Return the log evidence of B twins at E values of a parameter that does not change in time: (B, E).
+
+    Parameters
+    ----------
+    worsening : Worsening
+    probability : (K,)
+        To worsen.
+    values : (E, S, U, G)
+        Predicted observations at each node, SI.
+    deviation : (S, U, G)
+        Of noise and model error, SI.
+    observed, control
+        (B, T, G), SI, NaN where lost, and (B, T).
+    """
+    by_control = np.ascontiguousarray(values.transpose(2, 1, 3, 0))
+    inverse = np.ascontiguousarray(1.0 / deviation.transpose(1, 0, 2))
+    entries = worsening.probability(probability[None])[0]
+    result = np.empty((len(control), len(values)))
+    for twin in range(len(control)):
+        _on_nodes(
+            worsening.prior, worsening.start, worsening.source, entries, control[twin], observed[twin],
+            by_control, inverse, result[twin],
+        )  # fmt: skip
+    return result

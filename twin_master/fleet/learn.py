@@ -1,0 +1,320 @@
+"""What a fleet teaches: how fast damage grows, how noisy the sensors are, how the assets differ."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reporting.progress import Progress, SilentProgress
+from reporting.provenance import hash_record
+from twin_master.assets.parameter import ParameterDraws
+from twin_master.assets.resolution import located_scenario
+from twin_master.errors import FleetError
+from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
+from twin_master.fleet.flight import GROUPS, fleet_config, source_of
+from twin_master.fleet.outcome import FLOWN
+from twin_master.fleet.posterior import Grid, Marginal, Shared, refined, shared
+from twin_master.fleet.store import open_group
+from twin_master.mission.kept_knowledge import kept_knowledge
+from twin_master.mission.preparation import Knowledge
+from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.scenario.schema import Scenario
+
+__all__ = ["FleetLessons", "GroupLessons", "Line", "learn_fleet"]
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+NOISE_TWINS = 100
+"""Twins of a group from which the noise is learnt: they know it to one part in a few hundred."""
+LARGEST_NOISE = 3.0
+"""Factor on the assumed noise, and one over it, up to which is looked."""
+NODES, NODE_DEVIATIONS = 61, 6.0
+"""Values of the parameter, and how many deviations of its calibration they reach to either side."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """Posterior of one figure on equally spaced values.
+
+    Attributes
+    ----------
+    values, weight : (n,)
+    """
+
+    values: Float
+    weight: Float
+
+    @property
+    def mean(self) -> float:
+        """Mean."""
+        return float(self.weight @ self.values)
+
+    @property
+    def standard_deviation(self) -> float:
+        """Standard deviation."""
+        return float(np.sqrt(self.weight @ (self.values - self.mean) ** 2))
+
+
+@dataclass(frozen=True)
+class GroupLessons:
+    """What the twins of one group teach.
+
+    Attributes
+    ----------
+    name : str
+    twins, unexplained : int
+        How many taught, and how many were left out because no probability explains what they saw.
+    worsening : Worsening
+        The probabilities and what was assumed of them.
+    grid : Grid
+        Their likelihood.
+    noise : Line
+        Factor on the assumed standard deviation of the sensors.
+    parameter : str
+        That is calibrated.
+    population : tuple of Line or None
+        Mean and spread of it over the assets, SI; None where its calibration is fixed.
+    """
+
+    name: str
+    twins: int
+    unexplained: int
+    worsening: Worsening
+    grid: Grid
+    noise: Line
+    parameter: str
+    population: tuple[Line, Line] | None
+
+
+@dataclass(frozen=True)
+class FleetLessons:
+    """What a fleet teaches.
+
+    Attributes
+    ----------
+    groups : tuple of GroupLessons
+    shared : Shared or None
+        Groups under a distribution that they share; None for one group, or for groups of other controls.
+    source : dict
+        Where it comes from.
+    scenarios : dict of str to Scenario
+        Of each group.
+    """
+
+    groups: tuple[GroupLessons, ...]
+    shared: Shared | None
+    source: dict[str, Any]
+    scenarios: dict[str, Scenario]
+
+    def probabilities(self, group: int) -> tuple[Marginal, ...]:
+        """Return the posterior of each probability of a group, under what the groups share."""
+        return self.groups[group].grid.marginals if self.shared is None else self.shared.groups[group]
+
+
+def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> FleetLessons:
+    """Learn from the store of a fleet, which may still grow.
+
+    The prior of each probability is uniform; that of several groups is a Beta distribution which they share.
+
+    Raises
+    ------
+    RunFolderExistsError, FleetError
+        There is no fleet, nothing has flown, or its transitions cannot be learnt.
+    """
+    folder, progress = Path(folder), progress or SilentProgress()
+    config = fleet_config(folder)
+    found, scenarios = [], {}
+    records = config["fleet"]["groups"]
+    with progress.stage("Learning", total=len(records), unit="groups") as stage:
+        for record in records:
+            scenarios[record["name"]] = Scenario.model_validate(record["scenarios"][0])
+            lessons = _group_lessons(folder, record)
+            if lessons is not None:
+                found.append(lessons)
+            stage.advance()
+    if not found:
+        raise FleetError(f"{folder} holds no twin that has flown to its end: fly the fleet first.")
+    alike = len({lessons.worsening.names for lessons in found}) == 1 and len(found[0].worsening.names) <= 2
+    source = {
+        "fleet": config["fleet"]["name"],
+        "seed": config["fleet"]["seed"],
+        "twins": sum(lessons.twins for lessons in found),
+        "config": hash_record({key: config[key] for key in ("kind", "format", "fleet")}),
+        "program": config["provenance"]["versions"].get("uav-twin", ""),
+    }
+    together = shared([lessons.grid for lessons in found]) if alike and len(found) > 1 else None
+    return FleetLessons(tuple(found), together, source, scenarios)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What some twins of a group saw, and what they knew."""
+
+    knowledge: Knowledge
+    observed: Float
+    control: Index
+    folder: Path
+
+
+def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
+    """Learn the noise first, for what else is learnt rests on it, then the rates, then the population."""
+    parts = list(_seen(folder, record))
+    if not parts:
+        return None
+    worsening = Worsening.of(parts[0].knowledge.scenario)
+    nodes = _nodes(parts)
+    noise = _noise(parts[0], worsening, nodes)
+    models = [_noisier(part.knowledge.sensor_model, noise.mean) for part in parts]
+    likelihoods = [
+        scaled_likelihood(model, part.observed, part.control)[0]
+        for model, part in zip(models, parts, strict=True)
+    ]
+
+    def evidence(points: Float) -> list[Float]:
+        pairs = zip(likelihoods, parts, strict=True)
+        return [transition_evidence(worsening, points, own, part.control) for own, part in pairs]
+
+    explained = [np.isfinite(own[:, 0]) for own in evidence(worsening.assumed.clip(1e-3, 0.9)[None])]
+
+    def log_likelihood(points: Float) -> Float:
+        pairs = zip(evidence(points), explained, strict=True)
+        return np.asarray(np.sum([own[kept].sum(axis=0) for own, kept in pairs], axis=0))
+
+    grid = refined(log_likelihood, len(worsening.names))
+    learnt = np.array([marginal.mean for marginal in grid.marginals])
+    own = None
+    if nodes is not None:
+        spread, seen = models[0].total_standard_deviation, (parts[0].observed, parts[0].control)
+        own = population(nodes.values, node_evidence(worsening, learnt, nodes.predicted, spread, *seen))
+    twins = sum(int(kept.sum()) for kept in explained)
+    left_out = sum(len(kept) for kept in explained) - twins
+    parameter = parts[0].knowledge.draws.name
+    return GroupLessons(record["name"], twins, left_out, worsening, grid, noise, parameter, own)
+
+
+def _seen(folder: Path, record: dict[str, Any]) -> Iterator[_Seen]:
+    """Yield the twins of a group that flew, those together that share what they know."""
+    group = open_group(folder, record["name"])
+    flown = np.flatnonzero(group["status"].values == FLOWN)
+    if not len(flown):
+        return
+    observed = group["observed"].values[flown].astype(np.float64)
+    control = group["control_index"].values[flown].astype(np.int64)
+    for place, table in enumerate(record["scenarios"]):
+        own = folder / GROUPS / record["name"]
+        mine = np.arange(len(flown))
+        if record["files"]:
+            own, mine = own / str(place), np.flatnonzero(flown == place)
+        if len(mine):
+            scenario = located_scenario(Scenario.model_validate(table), own)
+            yield _Seen(kept_knowledge(own, scenario), observed[mine], control[mine], own)
+
+
+@dataclass(frozen=True)
+class _Nodes:
+    """Values of the calibrated parameter (E,), their prior (E,), and what the sensors show there."""
+
+    values: Float
+    prior: Float
+    predicted: Float
+
+
+def _nodes(parts: list[_Seen]) -> _Nodes | None:
+    """Return values of the parameter about its calibration; None where it is fixed, or no model tells."""
+    draws, model = parts[0].knowledge.draws, parts[0].knowledge.model
+    if draws.standard_deviation <= 0.0 or len(parts) > 1:
+        return None
+    deviations = np.linspace(-NODE_DEVIATIONS, NODE_DEVIATIONS, NODES)
+    values = draws.mean + draws.standard_deviation * deviations
+    prior = np.exp(-0.5 * deviations**2)
+    source = source_of(parts[0].knowledge.scenario)
+    source.prepare(parts[0].folder, SilentProgress())
+    given = ParameterDraws(draws.name, values, draws.mean, draws.standard_deviation, "nodes")
+    predicted = source.observation_table(given, model)
+    if len(predicted) != NODES:  # a library has draws of its own
+        return None
+    return _Nodes(values, prior / prior.sum(), predicted)
+
+
+def _noisier(model: GaussianSensorModel, factor: float) -> GaussianSensorModel:
+    """Return a sensor model with a factor on its noise."""
+    return GaussianSensorModel(
+        model.value_per_draw,
+        model.standard_deviation * factor,
+        average="inside" if model.averages_inside else "outside",
+        model_error=model.model_error,
+    )
+
+
+def _noise(part: _Seen, worsening: Worsening, nodes: _Nodes | None) -> Line:
+    """Return the posterior of the factor on the assumed noise, uniform in its logarithm before the data.
+
+    The parameter of an asset is the same in all its turns: a twin that draws it anew in each takes a part of
+    the noise for it.
+    """
+    observed, control = part.observed[:NOISE_TWINS], part.control[:NOISE_TWINS]
+    assumed = worsening.assumed.clip(1e-3, 0.9)
+
+    def log_likelihood(factor: float) -> float:
+        model = _noisier(part.knowledge.sensor_model, factor)
+        if nodes is None:
+            scaled, common = scaled_likelihood(model, observed, control)
+            evidence = transition_evidence(worsening, assumed[None], scaled, control)[:, 0] + common
+        else:
+            spread = model.total_standard_deviation
+            each = node_evidence(worsening, assumed, nodes.predicted, spread, observed, control)
+            best = each.max(axis=1, keepdims=True)
+            evidence = best[:, 0] + np.log(np.exp(each - best) @ nodes.prior)
+        return float(evidence[np.isfinite(evidence)].sum())
+
+    return _line(log_likelihood, -np.log(LARGEST_NOISE), np.log(LARGEST_NOISE))
+
+
+def _line(log_likelihood: Callable[[float], float], low: float, high: float) -> Line:
+    """Return the posterior of the exponential of a figure, narrowed until it is resolved."""
+    while True:
+        x = np.linspace(low, high, 13)
+        density = np.array([log_likelihood(float(value)) for value in np.exp(x)])
+        weight = np.exp(density - density.max())
+        weight /= weight.sum()
+        inside = np.flatnonzero(weight > np.exp(-13.0) * weight.max())
+        if len(inside) >= 7:
+            return Line(np.exp(x), weight)
+        step = x[1] - x[0]
+        low, high = x[inside[0]] - step, x[inside[-1]] + step
+
+
+def population(nodes: Float, log_evidence: Float) -> tuple[Line, Line]:
+    """Return the posterior of mean and spread of a normal population.
+
+    Parameters
+    ----------
+    nodes : (E,)
+        Equally spaced values of the parameter.
+    log_evidence : (B, E)
+        Of each of B members at each value.
+    """
+    from scipy.interpolate import CubicSpline
+
+    reach = nodes[-1] - nodes[0]
+    fine = np.linspace(nodes[0], nodes[-1], 8 * (len(nodes) - 1) + 1)
+    known = log_evidence[np.isfinite(log_evidence).all(axis=1)]
+    known = np.maximum(known - known.max(axis=1, keepdims=True), -700.0)
+    likelihood = np.exp(CubicSpline(nodes, known, axis=1)(fine))
+    likelihood /= likelihood.sum(axis=1, keepdims=True)
+    best = likelihood @ fine
+    middle, wide = float(best.mean()), float(best.std())
+    reach_of_mean = max(6.0 * (wide + (fine[1] - fine[0])) / np.sqrt(len(known)), 3.0 * (fine[1] - fine[0]))
+    means = np.linspace(middle - reach_of_mean, middle + reach_of_mean, 41)
+    spreads = np.linspace(1.5 * (fine[1] - fine[0]), max(2.5 * wide, reach / 20.0), 41)
+    density = np.empty((len(means), len(spreads)))
+    for column, spread in enumerate(spreads):
+        weight = np.exp(-0.5 * ((fine[:, None] - means) / spread) ** 2) / spread
+        density[:, column] = np.log(np.maximum(likelihood @ weight, 1e-300)).sum(axis=0)
+    joint = np.exp(density - density.max())
+    joint /= joint.sum()
+    return Line(means, joint.sum(axis=1)), Line(spreads, joint.sum(axis=0))

@@ -1,0 +1,110 @@
+"""What a fleet has learnt, for people and as `learnt.toml`, with which a scenario is flown."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reporting.files import atomic_write_text
+from twin_master.fleet.learn import FleetLessons, GroupLessons
+from twin_master.fleet.posterior import Marginal
+
+__all__ = ["lessons_record", "write_learnt"]
+
+
+def write_learnt(path: Path, lessons: FleetLessons) -> Path:
+    """Write what takes the place of the tables of a scenario, whole: for a new asset, and for each group.
+
+    A new asset has the means that the groups share, and the population of the parameter over the largest
+    group. Figures are in SI.
+    """
+    lines = [
+        "# Learnt by `uav-twin fleet learn`. Fly with it: `uav-twin run SCENARIO --learnt THIS_FILE`, or",
+        '# `learnt = "THIS_FILE"` in a group of a fleet.',
+        "format = 1",
+        f"source = {_inline(lessons.source)}",
+        "",
+    ]
+    largest = max(range(len(lessons.groups)), key=lambda number: lessons.groups[number].twins)
+    means = [marginal.mean for marginal in lessons.probabilities(largest)]
+    if lessons.shared is not None:
+        means = [mean for mean, _ in lessons.shared.mean]
+    lines += _tables(lessons, lessons.groups[largest], means, "")
+    if len(lessons.groups) > 1:
+        for number, group in enumerate(lessons.groups):
+            own = [marginal.mean for marginal in lessons.probabilities(number)]
+            lines += _tables(lessons, group, own, f"group.{group.name}.")
+    return atomic_write_text(path, "\n".join(lines))
+
+
+def _tables(lessons: FleetLessons, group: GroupLessons, means: list[float], prefix: str) -> list[str]:
+    probability: dict[str, Any] = {}
+    for (control, factor), mean in zip(group.worsening.keys, means, strict=True):
+        if factor is None:
+            probability[control] = mean
+        else:
+            probability.setdefault(control, {})[factor] = mean
+    assumed = np.asarray(lessons.scenarios[group.name].observation.standard_deviation)
+    noise = (assumed * group.noise.mean).tolist()
+    lines = [f"[{prefix}transition]", f"probability = {_inline(probability)}", ""]
+    lines += [f"[{prefix}observation]", f"standard_deviation = {json.dumps(noise)}", ""]
+    if group.population is not None:
+        middle, spread = group.population
+        total = float(np.hypot(spread.mean, middle.standard_deviation))
+        lines += [f"[{prefix}calibration]", f"parameter = {json.dumps(group.parameter)}"]
+        lines += [f"mean = {middle.mean!r}", f"standard_deviation = {total!r}", ""]
+    return lines
+
+
+def _inline(table: dict[str, Any]) -> str:
+    """Return a table as TOML in one line."""
+    entries = (
+        f"{json.dumps(key)} = {_inline(value) if isinstance(value, dict) else json.dumps(value)}"
+        for key, value in table.items()
+    )
+    return f"{{ {', '.join(entries)} }}"
+
+
+def lessons_record(lessons: FleetLessons) -> dict[str, Any]:
+    """Return what was learnt beside what was assumed, for JSON and the report."""
+    groups = {}
+    for number, group in enumerate(lessons.groups):
+        rates = {
+            name: {"assumed": float(assumed), **_figures(marginal)}
+            for name, assumed, marginal in zip(
+                group.worsening.names, group.worsening.assumed, lessons.probabilities(number), strict=True
+            )
+        }
+        found: dict[str, Any] = {"twins": group.twins, "left_out": group.unexplained, "probability": rates}
+        found["noise_factor"] = _line(group.noise)
+        if group.population is not None:
+            mean, spread = group.population
+            found["population"] = {
+                "parameter": group.parameter, "mean": _line(mean), "spread": _line(spread)
+            }  # fmt: skip
+        groups[group.name] = found
+    record: dict[str, Any] = {"source": lessons.source, "groups": groups}
+    if lessons.shared is not None:
+        names = lessons.groups[0].worsening.names
+        pairs = zip(names, lessons.shared.mean, lessons.shared.concentration, strict=True)
+        record["shared"] = {
+            name: {
+                "mean": mean[0],
+                "standard_deviation": mean[1],
+                "log10_concentration": size[0],
+                "log10_concentration_standard_deviation": size[1],
+            }
+            for name, mean, size in pairs
+        }
+    return record
+
+
+def _figures(marginal: Marginal) -> dict[str, float]:
+    low, high = marginal.interval()
+    deviation = marginal.standard_deviation
+    return {"mean": marginal.mean, "standard_deviation": deviation, "lower_95": low, "upper_95": high}
+
+
+def _line(line: Any) -> dict[str, float]:
+    return {"mean": line.mean, "standard_deviation": line.standard_deviation}

@@ -1,0 +1,219 @@
+"""Posteriors on grids: refined until they are resolved, marginal, and shared by groups."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Grid", "Marginal", "Shared", "refined", "shared"]
+
+Float = NDArray[np.float64]
+
+POINTS = {1: 17, 2: 13, 3: 9, 4: 7}
+"""Points of each axis of the grid, by the number of axes."""
+LOWEST, HIGHEST = 1e-4, 0.9
+"""Probabilities between which is looked."""
+BELOW = 13.0
+"""A point counts whose log density is lower than the largest by no more: five deviations of a normal."""
+RESOLVED = 1.2
+"""Spacing of a grid as a share of the standard deviation at which its sums are exact to 1e-6."""
+FINE = 121
+"""Points of an axis on which groups share a distribution."""
+
+
+def logit(p: Float) -> Float:
+    """Return log p / (1 - p)."""
+    return np.asarray(np.log(p) - np.log1p(-p))
+
+
+def logistic(x: Float) -> Float:
+    """Return the probability of a log odds."""
+    return np.asarray(1.0 / (1.0 + np.exp(-x)))
+
+
+@dataclass(frozen=True)
+class Marginal:
+    """Distribution of one probability.
+
+    Attributes
+    ----------
+    x : (n,)
+        Log odds, equally spaced.
+    weight : (n,)
+        Probability of each, summing to one.
+    """
+
+    x: Float
+    weight: Float
+
+    @property
+    def mean(self) -> float:
+        """Mean of the probability."""
+        return float(self.weight @ logistic(self.x))
+
+    @property
+    def standard_deviation(self) -> float:
+        """Standard deviation of the probability."""
+        return float(np.sqrt(self.weight @ (logistic(self.x) - self.mean) ** 2))
+
+    def interval(self, probability: float = 0.95) -> tuple[float, float]:
+        """Return the bounds of the central interval, by the cubic through the log density."""
+        from scipy.interpolate import CubicSpline
+
+        fine = np.linspace(self.x[0], self.x[-1], 2001)
+        log_weight = np.log(np.maximum(self.weight, 1e-300))
+        density = np.exp(CubicSpline(self.x, log_weight)(fine) - log_weight.max())
+        reached = np.cumsum(density) / density.sum()
+        low, high = np.interp([0.5 - probability / 2.0, 0.5 + probability / 2.0], reached, fine)
+        return float(logistic(np.array(low))), float(logistic(np.array(high)))
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Log likelihood of K probabilities on a tensor grid of their log odds.
+
+    Attributes
+    ----------
+    axes : tuple of (n,)
+        Log odds, equally spaced.
+    log_likelihood : (n, ..., n)
+    """
+
+    axes: tuple[Float, ...]
+    log_likelihood: Float
+
+    @property
+    def weight(self) -> Float:
+        """Posterior probability of each point under a uniform prior of each probability."""
+        log_density = self.log_likelihood.copy()
+        for k, axis in enumerate(self.axes):
+            shape = [1] * len(self.axes)
+            shape[k] = -1
+            log_density += np.log(logistic(axis) * logistic(-axis)).reshape(shape)
+        weight = np.exp(log_density - log_density.max())
+        return np.asarray(weight / weight.sum())
+
+    @property
+    def marginals(self) -> tuple[Marginal, ...]:
+        """Posterior of each probability under a uniform prior."""
+        weight = self.weight
+        others = [tuple(i for i in range(weight.ndim) if i != k) for k in range(weight.ndim)]
+        return tuple(
+            Marginal(axis, weight.sum(axis=other)) for axis, other in zip(self.axes, others, strict=True)
+        )
+
+
+def points_of(axes: Sequence[Float]) -> Float:
+    """Return all points of a tensor grid as probabilities: (P, K)."""
+    return logistic(np.array(list(product(*axes))))
+
+
+def refined(log_likelihood: Callable[[Float], Float], count: int) -> Grid:
+    """Return a grid that resolves the posterior of K probabilities.
+
+    Parameters
+    ----------
+    log_likelihood : callable
+        Of points (P, K) -> (P,).
+    count : int
+        K.
+    """
+    low, high = (float(logit(np.array(p))) for p in (LOWEST, HIGHEST))
+    number = POINTS[count]
+    axes = tuple(np.linspace(low, high, number) for _ in range(count))
+    while True:
+        shape = (number,) * count
+        grid = Grid(axes, log_likelihood(points_of(axes)).reshape(shape))
+        weight = grid.weight
+        peak = np.log(np.maximum(weight, 1e-300)) - np.log(weight.max())
+        bounds, resolved = [], True
+        for k, axis in enumerate(axes):
+            profile = peak.max(axis=tuple(i for i in range(count) if i != k))
+            inside, step = np.flatnonzero(profile > -BELOW), axis[1] - axis[0]
+            bounds.append((max(low, axis[inside[0]] - step), min(high, axis[inside[-1]] + step)))
+            marginal = grid.marginals[k]
+            spread = np.sqrt(marginal.weight @ (axis - marginal.weight @ axis) ** 2)
+            resolved &= bool(step <= RESOLVED * spread) and len(inside) >= number // 3
+        # Where the next grid would be no finer, this is what can be had (a posterior at the bounds).
+        if resolved or all(b - a > 0.8 * (x[-1] - x[0]) for (a, b), x in zip(bounds, axes, strict=True)):
+            return grid
+        axes = tuple(np.linspace(a, b, number) for a, b in bounds)
+
+
+@dataclass(frozen=True)
+class Shared:
+    """Probabilities of groups that come from one Beta distribution each, whose m and kappa are inferred.
+
+    Attributes
+    ----------
+    mean, concentration : tuple of (float, float)
+        Mean and standard deviation of m, and of log10 kappa, for each of the K probabilities.
+    groups : tuple of tuple of Marginal
+        The K probabilities of each group.
+    """
+
+    mean: tuple[tuple[float, float], ...]
+    concentration: tuple[tuple[float, float], ...]
+    groups: tuple[tuple[Marginal, ...], ...]
+
+
+def shared(grids: Sequence[Grid]) -> Shared:
+    """Infer Beta(m kappa, (1 - m) kappa) of one or two probabilities over groups, and each group under it.
+
+    m is uniform in its log odds and kappa in its logarithm, from 3 to 3000, before the data.
+    """
+    from scipy.special import betaln
+
+    count = len(grids[0].axes)
+    low = min(float(axis[0]) for grid in grids for axis in grid.axes)
+    high = max(float(axis[-1]) for grid in grids for axis in grid.axes)
+    x = np.linspace(low, high, FINE)
+    likelihoods = [_resampled(grid, x) for grid in grids]
+    m = logistic(np.linspace(low, high, 41))
+    kappa = np.geomspace(3.0, 3000.0, 13)
+    means, sizes = (array.ravel() for array in np.meshgrid(m, kappa, indexing="ij"))
+    a, b = means * sizes, (1.0 - means) * sizes
+    p = logistic(x)
+    # Density in the log odds: that in p times p (1 - p).
+    prior = np.exp(a[:, None] * np.log(p) + b[:, None] * np.log1p(-p) - betaln(a, b)[:, None])
+    if count == 1:
+        evidence = [prior @ likelihood for likelihood in likelihoods]
+    else:
+        evidence = [prior @ likelihood @ prior.T for likelihood in likelihoods]
+    total = np.sum([np.log(np.maximum(one, 1e-300)) for one in evidence], axis=0)
+    weight = np.exp(total - total.max())
+    weight /= weight.sum()
+    groups = []
+    for likelihood, own in zip(likelihoods, evidence, strict=True):
+        share = weight / np.maximum(own, 1e-300)
+        joint = likelihood * (share @ prior if count == 1 else prior.T @ share @ prior)
+        joint /= joint.sum()
+        sums = (joint,) if count == 1 else (joint.sum(axis=1), joint.sum(axis=0))
+        groups.append(tuple(Marginal(x, np.asarray(one)) for one in sums))
+    hyper = (weight,) if count == 1 else (weight.sum(axis=1), weight.sum(axis=0))
+    return Shared(
+        tuple(_moments(one, means) for one in hyper),
+        tuple(_moments(one, np.log10(sizes)) for one in hyper),
+        tuple(groups),
+    )
+
+
+def _moments(weight: Float, values: Float) -> tuple[float, float]:
+    mean = float(weight @ values)
+    return mean, float(np.sqrt(max(0.0, float(weight @ (values - mean) ** 2))))
+
+
+def _resampled(grid: Grid, x: Float) -> Float:
+    """Return the likelihood of a grid on common axes, zero outside of its own; the largest is one."""
+    from scipy.interpolate import CubicSpline, RectBivariateSpline
+
+    # Far below the largest there is nothing but what would make the spline swing.
+    log_likelihood = np.maximum(grid.log_likelihood - grid.log_likelihood.max(), -60.0)
+    inside = [(x >= axis[0] - 1e-9) & (x <= axis[-1] + 1e-9) for axis in grid.axes]
+    if len(grid.axes) == 1:
+        found = np.exp(CubicSpline(grid.axes[0], log_likelihood)(x))
+        return np.asarray(np.where(inside[0], found, 0.0))
+    found = np.exp(RectBivariateSpline(*grid.axes, log_likelihood)(x, x))
+    return np.asarray(np.where(np.outer(*inside), found, 0.0))
