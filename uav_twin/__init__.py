@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same when it runs
+    from calibration.dynamics.modal_identification import identify_modes
     from calibration.reading import load_calibration
     from calibration.wing.three_steps import calibrate_wing as calibrate
     from discrepancy.campaign.reading import read_campaign
@@ -55,6 +56,7 @@ __all__ = [
     "eigenmodes",
     "filter_sequence",
     "fly",
+    "identify_modes",
     "investigate",
     "load_calibration",
     "load_design",
@@ -92,6 +94,7 @@ _HOMES = {
     "eigenmodes": "fe.full.modes",
     "filter_sequence": "twin_master.network.inference",
     "fly": "twin_master.workflow:new_run",
+    "identify_modes": "calibration.dynamics.modal_identification",
     "investigate": "discrepancy.workflow",
     "load_calibration": "calibration.reading",
     "load_design": "fe.wing.design",

@@ -10,6 +10,8 @@ from reporting import terminal
 from uav_twin.fmu_bind import bind
 from uav_twin.fmu_check import check
 from uav_twin.fmu_simulate import simulate
+from uav_twin.structure_arguments import is_structure
+from uav_twin.structure_fmu import fmu as build_structure
 
 _SWITCH = re.compile(r"effect\.[A-Za-z0-9_]+\.active")
 """The switch of a missing effect among the variables of an FMU."""
@@ -19,8 +21,14 @@ fmu_app = typer.Typer(no_args_is_help=True, help="Build, describe, bind, check a
 
 @fmu_app.command("build")
 def build(
-    out: Annotated[Path, typer.Option(help="The file to write.")] = Path("uav_wing.fmu"),
-    design: Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="The file to write: by default uav_wing.fmu, of a structure beside its file."),
+    ] = None,
+    design: Annotated[
+        Path | None,
+        typer.Option(help="Wing design, or a structure file beside its mesh; the shipped wing by default."),
+    ] = None,
     kind: Annotated[
         Literal["python", "compiled", "source"],
         typer.Option(help="Run by Python, compiled C, or C sources to be compiled elsewhere."),
@@ -42,18 +50,40 @@ def build(
     ] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
-    """Pack the wing (or a model script) as an FMI 2.0 co-simulation FMU; equal input gives equal bytes."""
+    """Pack a wing, a structure or a model script as an FMI 2.0 FMU; equal input gives equal bytes."""
+    if script is None and design is not None and is_structure(design):
+        if calibration is not None or patch is not None or activate:
+            raise typer.BadParameter(
+                "--calibration, --patch and --activate are for wings, and the design is a structure."
+            )
+        build_structure(design, out, kind, None, None, replace, None)
+        return
+    out = out or Path("uav_wing.fmu")
+    _refuse_contradictions(out, design, calibration, patch, activate=activate, replace=replace)
+    if script is not None:
+        for_the_wing = design is not None or calibration is not None or kind != "python" or patch is not None
+        _build_script(script, out, replace=replace, other=for_the_wing)
+        return
+    _build_wing(out, design, kind, calibration, patch, activate=activate, replace=replace)
+
+
+def _build_wing(
+    out: Path,
+    design: Path | None,
+    kind: Literal["python", "compiled", "source"],
+    calibration: Path | None,
+    patch: Path | None,
+    *,
+    activate: bool,
+    replace: bool,
+) -> None:
+    """Pack a wing, tailored where it was calibrated."""
     from fe.wing.design import load_design
     from fmu_asset.compiled.compiler import find_compiler
     from fmu_asset.packing.patch_file import load_patch
     from fmu_asset.packing.wing_fmu import check_kind
     from fmu_asset.packing.wing_packing import pack_wing
 
-    _refuse_contradictions(out, design, calibration, patch, activate=activate, replace=replace)
-    if script is not None:
-        for_the_wing = design is not None or calibration is not None or kind != "python" or patch is not None
-        _build_script(script, out, replace=replace, other=for_the_wing)
-        return
     effects = None if patch is None else load_patch(patch)
     if effects is not None:
         check_kind(kind)

@@ -27,6 +27,14 @@ def located(file: Path) -> Path:
     return file if file.exists() else structure_files().get(str(file), file)
 
 
+def is_structure(design: Path) -> bool:
+    """Return whether a design is that of a structure, which names a mesh; a wing's does not."""
+    from fe.runtime.errors import DesignFileError
+    from reporting.toml_file import read_toml
+
+    return "mesh" in read_toml(located(design), DesignFileError, what="wing design")
+
+
 def assembled(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool = False) -> "Structure":
     """Return the full model; `memory_limit` in GiB."""
     from fe.structure.operators import load_and_assemble

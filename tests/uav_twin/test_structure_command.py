@@ -68,8 +68,8 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "bar.toml"
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["uav-twin", "structure", *arguments])
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: str, group: str = "structure") -> int:
+    monkeypatch.setattr(sys, "argv", ["uav-twin", group, *arguments])
     monkeypatch.setenv("COLUMNS", "120")
     with pytest.raises(SystemExit) as caught:
         cli.main()
@@ -190,6 +190,19 @@ def test_the_field_is_written_for_paraview(
     assert call(monkeypatch, "field", str(file), "--out", str(out), *twice) == 2
     assert "e is given twice" in capsys.readouterr().err
     assert out.read_bytes() == before
+
+
+def test_fmu_build_packs_a_structure_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`fmu build --design` gives the bytes of `structure fmu`; what is for wings alone is refused."""
+    target, other = tmp_path / "one.fmu", tmp_path / "two.fmu"
+    assert call(monkeypatch, "fmu", "bracket", "--out", str(target)) == 0
+    assert call(monkeypatch, "build", "--design", "bracket", "--out", str(other), group="fmu") == 0
+    assert target.read_bytes() == other.read_bytes()
+    capsys.readouterr()
+    assert call(monkeypatch, "build", "--design", "bracket", "--activate", group="fmu") == 2
+    assert "are for wings" in capsys.readouterr().err
 
 
 def test_a_file_beside_an_fmu_is_neither_the_fmu_nor_the_structure(

@@ -24,9 +24,16 @@ from twin_master.assets.interface import Asset, AssetReading, StatelessAsset
 from twin_master.assets.parameter import (
     ParameterDraws,
     calibrated_means,
-    check_calibration,
     draw_parameter,
 )
+from twin_master.assets.structure_checks import (
+    check_history,
+    check_observed,
+    check_parameter,
+    check_ranges,
+    frequencies_observed,
+)
+from twin_master.assets.structure_modes import RecordedStructure, modal_values
 from twin_master.errors import MissingObservationModelError, MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import BeliefSection, FileSection
@@ -35,6 +42,8 @@ from twin_master.scenario.schema import Scenario
 if TYPE_CHECKING:
     from fe.runtime.structure_model import StructureModel
     from fe.structure.design import StructureDesign
+    from fmu_asset.door.binding import Binding
+    from fmu_asset.door.session import FmiAsset
 
 Float = NDArray[np.float64]
 
@@ -77,6 +86,8 @@ class StructureSection(StructureFiles, FmuSection):
     structure: str
     binding: str = ""
     """A binding of one's own; without one it follows from the structure file."""
+    packed: Literal["python", "compiled"] = "python"
+    """What evaluates the FMU: Python, or C compiled here."""
 
     def copies(self) -> Mapping[str, str]:
         """Return where the copies of binding and structure stand in a run folder."""
@@ -118,94 +129,11 @@ class StructureBelief(StructureFiles, BeliefSection):
         return StructureSource(scenario, self)
 
 
-def _check_parameter(scenario: Scenario, design: "StructureDesign", believed: Path | None) -> None:
-    """Refuse a calibration that a structure cannot have; raises `MissionInputError`.
-
-    `believed` is its file, where the twin believes it.
-    """
-    from fe.structure.design import structure_hash
-
-    calibration = scenario.calibration
-    if calibration.source == "static_test":
-        raise MissionInputError(
-            "the calibration source `static_test` is for wings: of a structure give `file`, or `normal` or "
-            "`fixed` with `mean`."
-        )
-    known = [part.name for part in design.parameter]
-    known += [part.name for part in design.mass if part.free]
-    ranges = {part.name: part.range for part in (*design.parameter, *design.mass)}
-    found = "" if believed is None else structure_hash(design, believed.parent / design.mesh)
-    where = f"the structure {design.name}"
-    check_calibration(calibration, known, where, ranges=ranges, design_hash=found)
-    if calibration.parameter not in known:
-        raise MissionInputError(
-            f"the calibrated parameter {calibration.parameter} is none of the structure {design.name}, which "
-            f"has {', '.join(known) or 'none: give one in a table [[parameter]]'}."
-        )
-
-
-def _check_ranges(scenario: Scenario, design: "StructureDesign", parameters: Mapping[str, float]) -> None:
-    """Refuse levels, controls and `parameters` outside the ranges of a structure; raises `MissionInputError`.
-
-    A name that the structure does not have is passed over.
-    """
-    ranges = {part.name: part.range for part in (*design.parameter, *design.mass, *design.control)}
-    ranges |= {part.name: (0.0, part.largest_loss) for part in design.damage}
-    given = [(f"parameter {name}", name, value) for name, value in parameters.items()]
-    given += [
-        (f"level of {state.name}", state.name, level) for state in scenario.state for level in state.levels
-    ]
-    given += [
-        (f"{name} of the control {control.name}", name, value)
-        for control in scenario.control
-        for name, value in control.values.items()
-    ]
-    for what, name, value in given:
-        low, high = ranges.get(name, (value, value))
-        if not low <= value <= high:
-            raise MissionInputError(
-                f"the {what} is {value:g}, but the structure {design.name} gives {name} the range {low:g} to "
-                f"{high:g}; give a value inside, or widen the range in the structure file."
-            )
-
-
-def _check_history(scenario: Scenario, design: "StructureDesign") -> None:
-    """Refuse a scripted truth that leaves the ranges of the damage regions; raises `MissionInputError`."""
-    last_step = scenario.mission.steps - 1
-    largest = {part.name: part.largest_loss for part in design.damage}
-    for state in scenario.state:  # each is a region: names were checked
-        gains = np.zeros(last_step + 1)
-        gains[0] = state.levels[int(np.argmax(state.prior))]
-        for entry in scenario.truth.gains:
-            if entry.state == state.name:
-                end = entry.first_step if entry.last_step is None else entry.last_step
-                gains[entry.first_step : end + 1] += entry.gain
-        loss = np.cumsum(gains)
-        outside = np.flatnonzero((loss < -1e-9) | (loss > largest[state.name] + 1e-9))
-        if outside.size:
-            raise MissionInputError(
-                f"`truth.gains` bring {state.name} to {loss[outside[0]]:.6g} in {scenario.mission.step_name} "
-                f"{outside[0]}, but the structure {design.name} gives it the range 0 to "
-                f"{largest[state.name]:g}; give smaller gains, or another `largest_loss` in its file."
-            )
-
-
-def _frequencies(scenario: Scenario) -> int:
-    """Return how many natural frequencies a scenario observes; raises `MissionInputError` for too many."""
-    from fe.reduction.modal_basis import ModalSettings
-
-    if scenario.observation.role != "frequency":
-        return 0
-    count, most = scenario.observation.count, ModalSettings().mode_count
-    if count > most:
-        raise MissionInputError(f"a structure tells its first {most} frequencies, and {count} are observed.")
-    return count
-
-
 class StructureFmuSource(FmuSource):
     """The FMU that is packed of a structure."""
 
     _section: StructureSection
+    _model: "StructureModel | None" = None
 
     @property
     def origin(self) -> FlownAndBelieved:
@@ -228,26 +156,32 @@ class StructureFmuSource(FmuSource):
             scenario speaks of what the structure does not have.
         """
         from fe.reduction.structure_cache import check_structure
+        from fmu_asset.compiled.compiler import find_compiler
         from fmu_asset.door.binding import load_binding
         from fmu_asset.structures.binding import names_of_design, structure_binding
 
         self.files()
         design = self._design()
+        if self._section.packed == "compiled":
+            find_compiler()  # before the structure is reduced, which can take minutes
         believes_it = isinstance(self._scenario.belief, AssetBelief)
         file = self._section.all_files()[FLOWN_COPY]
-        _check_parameter(self._scenario, design, file if believes_it else None)
+        check_parameter(self._scenario, design, file if believes_it else None)
         own = self._section.binding
         binding = (
             load_binding(self._section.binding_path)
             if own
-            else structure_binding(names_of_design(design), _frequencies(self._scenario))
+            else structure_binding(names_of_design(design), frequencies_observed(self._scenario))
         )
         self._check_names(binding)
-        self._observed(binding)
+        if self._scenario.observation.modes is None:
+            self._observed(binding)
+        else:
+            check_observed(self._scenario, design)
         self._inner_roles(binding)
         if not own:  # under a binding of one's own the names may be others
-            _check_ranges(self._scenario, design, self._section.parameters)
-            _check_history(self._scenario, design)
+            check_ranges(self._scenario, design, self._section.parameters)
+            check_history(self._scenario, design)
         check_structure(file)
 
     def _make(self, progress: Progress) -> dict[str, str]:
@@ -258,11 +192,34 @@ class StructureFmuSource(FmuSource):
 
         model = reduced_structure(self._path(FLOWN_COPY), progress=progress)
         if not self._path(BINDING_COPY).exists():
-            text = structure_binding_text(names_of_model(model), _frequencies(self._scenario))
+            text = structure_binding_text(names_of_model(model), frequencies_observed(self._scenario))
             atomic_write_text(self._path(BINDING_COPY), text)
         with progress.stage("Packing the FMU"):
-            build_structure_fmu(model, self.fmu_path(), replace=True)
+            build_structure_fmu(model, self.fmu_path(), kind=self._section.packed, replace=True)
+        self._model = model
         return {FLOWN_DESIGN_HASH: model.design_hash, "fmu": hash_file(self.fmu_path())}
+
+    def open(self) -> Asset:
+        """Return the FMU at its start; where modes are observed, in motion with an identification behind."""
+        section = self._scenario.observation.modes
+        if section is None:
+            return super().open()
+        assert self._model is not None
+        return RecordedStructure(
+            self._scenario, self._model, self._recorder, self.binding(), self.parameters()
+        )
+
+    def _recorder(self, binding: "Binding", parameters: Mapping[str, float]) -> "FmiAsset":
+        from fmu_asset.door.session import FmiAsset
+
+        section = self._section
+        return FmiAsset(
+            self.fmu_path(),
+            binding,
+            isolated=section.isolated,
+            step_timeout=section.step_timeout,
+            parameters=parameters,
+        )
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the parameter."""
@@ -315,17 +272,10 @@ class StructureSource:
 
         self.files()
         design, scenario = self._design(), self._scenario
-        _check_parameter(scenario, design, self._places[MODEL_COPY])
-        observed = {
-            "strain": len(design.gauge),
-            "displacement": len(design.displacement),
-            "frequency": _frequencies(scenario) or 1,
-        }
-        role = scenario.observation.role
+        check_parameter(scenario, design, self._places[MODEL_COPY])
         for what, came, known in (
             ("state", scenario.state_names, [part.name for part in design.damage]),
             ("control input", scenario.control[0].values, [part.name for part in design.control]),
-            ("observation", [role], [name for name, count in observed.items() if count]),
         ):
             unknown = sorted({*came} - {*known})
             if unknown:
@@ -333,12 +283,8 @@ class StructureSource:
                     f"the scenario has the {what} {', '.join(unknown)}, which the model of the structure "
                     f"{design.name} does not know; it knows {', '.join(known) or 'none'}."
                 )
-        if scenario.observation.count != observed[role]:
-            raise MissingObservationModelError(
-                f"the structure {design.name} has {observed[role]} sensors of `{role}`, and the scenario "
-                f"expects {scenario.observation.count}."
-            )
-        _check_ranges(scenario, design, {})
+        check_observed(scenario, design)
+        check_ranges(scenario, design, {})
         check_structure(self._places[MODEL_COPY])
 
     def files(self) -> dict[str, bytes]:
@@ -373,9 +319,9 @@ class StructureSource:
         return found
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return strains, displacements or natural frequencies (E, S, U, G).
+        """Return strains, displacements, natural frequencies or features of modes (E, S, U, G).
 
-        Frequencies are in rising order and do not depend on the control.
+        Frequencies are in rising order; they and modes do not depend on the control.
 
         Raises
         ------
@@ -395,9 +341,13 @@ class StructureSource:
             vectors[:, place(name)] = states[state, column]
         for name in controls[0].values:
             vectors[:, place(name)] = np.array([item.values[name] for item in controls])[control]
-        if scenario.observation.role == "frequency":
+        modes = scenario.observation.modes
+        if modes is not None or scenario.observation.role == "frequency":
             first = vectors.reshape(*shape, -1)[:, :, 0].reshape(-1, vectors.shape[1])
-            found = np.array([reduced.modes(vector).frequency[:count] for vector in first])
+            if modes is None:
+                found = np.array([reduced.modes(vector).frequency[:count] for vector in first])
+            else:
+                found = np.array([modes.observed(modal_values(reduced, vector, modes)) for vector in first])
             return np.repeat(found.reshape(*shape[:2], 1, count), shape[2], axis=2)
         return reduced.static_outputs(vectors)[:, self._observed].reshape(*shape, count)
 
@@ -410,11 +360,13 @@ class StructureSource:
         """Return the model as an asset, with the parameters of the scenario's true structure."""
         model, observed = self._prepared, self._observed
         true = {**calibrated_means(self._scenario.calibration), **self._scenario.asset.true_parameters}
-        role, count = self._scenario.observation.role, self._scenario.observation.count
+        role, count, modes = (getattr(self._scenario.observation, key) for key in ("role", "count", "modes"))
         known = {name: value for name, value in true.items() if name in model.chosen}
 
         def observe(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
             values = {**known, **health, **control}
+            if modes is not None:
+                return AssetReading(modes.observed(modal_values(model, model.vector(values), modes)))
             if role == "frequency":
                 return AssetReading(model.modes(values).frequency[:count])
             found = model.static_response(values)

@@ -40,7 +40,8 @@ class Reading:
     Attributes
     ----------
     observed : (G,)
-        What the sensors say, SI; NaN where lost.
+        What the sensors say, SI; NaN where lost. Where modes are observed, a row with their covariance; see
+        `network.identified`.
     control : int or None
         Index of the control in force; None for the one that the twin proposed.
     revises : int or None
@@ -213,7 +214,7 @@ def fly(
         The decisions of the checkpoint do not follow from its observations.
     """
     steps = scenario.mission.steps
-    beliefs = Beliefs()
+    beliefs = Beliefs(scenario.observation.count)
     timing: list[TurnTiming] = []
     if checkpoint is not None:
         _replay(twin, checkpoint, beliefs)
@@ -266,8 +267,9 @@ class _Flown:
 
 @dataclass
 class Beliefs:
-    """What is kept of each turn of a twin, for the store."""
+    """What is kept of each turn of a twin, for the store; `sensors` values of each row that is observed."""
 
+    sensors: int | None = None
     observed: list[Float] = field(default_factory=list)
     control_index: list[int] = field(default_factory=list)
     filtered: list[Float] = field(default_factory=list)
@@ -282,7 +284,7 @@ class Beliefs:
 
     def add(self, observed: Float, turn: TwinTurn) -> None:
         """Keep a turn."""
-        self.observed.append(observed)
+        self.observed.append(observed[: self.sensors])
         self.control_index.append(turn.control_index)
         self.filtered.append(turn.filtered)
         self.log_evidence.append(turn.log_evidence)

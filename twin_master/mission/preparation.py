@@ -20,6 +20,7 @@ from twin_master.mission.plant import Plant
 from twin_master.mission.truth import Truth
 from twin_master.network.estimator import Estimator
 from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.identified import IdentifiedSensorModel
 from twin_master.network.planner import PlannedPolicy, given_policy, value_iteration
 from twin_master.network.rewards import RewardModel, RewardSettings
 from twin_master.network.sensor_model import GaussianSensorModel, check_noise
@@ -175,7 +176,8 @@ def knowledge_of(
         The shapes do not fit the scenario.
     """
     section = scenario.observation
-    sensor_model = GaussianSensorModel(
+    kind = GaussianSensorModel if section.modes is None else IdentifiedSensorModel
+    sensor_model = kind(
         predicted,
         section.standard_deviation,
         average=section.average_over_draws,

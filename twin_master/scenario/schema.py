@@ -14,6 +14,7 @@ from pydantic import Field, SerializeAsAny, model_validator
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
 from twin_master.scenario.learning import Learning
 from twin_master.scenario.notice import Noticing
+from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.section import (
     Count,
     Name,
@@ -98,40 +99,6 @@ class Control(Section):
     name: Name
     title: str = ""
     values: Annotated[dict[str, Number], Field(min_length=1)]
-
-
-class ObservationSection(Section):
-    """What is observed (a role of the binding) and the sensor noise that the twin assumes."""
-
-    units: ClassVar[Mapping[str, str]] = {"standard_deviation": "microstrain", "model_error": "percent"}
-    role: Name = "strain"
-    count: Count
-    titles: tuple[str, ...] = ()
-    """What each sensor is called in the report; without them they have numbers."""
-    unit: str | tuple[str, ...] = "1"
-    """Unit of the observed values, one for all sensors or one for each; a strain without unit is printed in
-    microstrain."""
-    standard_deviation: PerSensor
-    """Of the noise that the twin assumes, one for all sensors or one for each."""
-    model_error: NotNegative | tuple[NotNegative, ...] = 0.0
-    """Standard deviation of the predicted value as a share of it, one for all sensors or one for each; added
-    to the noise in quadrature."""
-    average_over_draws: Literal["outside", "inside"] = "outside"
-    """Where the average over the draws of the parameter stands: outside the product over the sensors as in
-    the integral (30), or inside it as eq. (32) is printed."""
-
-    @property
-    def sensor_units(self) -> tuple[str, ...]:
-        """Unit of each sensor."""
-        return (self.unit,) * self.count if isinstance(self.unit, str) else self.unit
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        for key, value in (("unit", self.unit), ("standard_deviation", self.standard_deviation)):
-            check_one_or_each(f"observation.{key}", value, self.count)
-        if self.titles:
-            check_one_or_each("observation.titles", self.titles, self.count)
-        return self
 
 
 class Transition(Section):
@@ -301,8 +268,9 @@ class Scenario(Section):
     def to_dict(self) -> dict[str, Any]:
         """Return the scenario as plain data in SI; `Scenario.model_validate` reads it back."""
         absent: dict[str, Any] = {name: True for name in OPTIONAL_TABLES if getattr(self, name) is None}
-        if not self.truth.probability:
-            absent["truth"] = {"probability"}
+        absent["truth"] = {name for name in ("probability", "record") if not getattr(self.truth, name)}
+        if self.observation.modes is None:
+            absent["observation"] = {"modes"}
         return self.model_dump(mode="json", exclude=absent)
 
     @model_validator(mode="after")
@@ -346,6 +314,7 @@ class Scenario(Section):
             _known(gain.state, states, "truth.gains.state", "state")
         self._check_model_error()
         self._check_sensors()
+        self._check_modes()
         for fault in self.truth.sensor_faults:
             if fault.sensors != "all" and max(fault.sensors) > self.observation.count:
                 raise ValueError(
@@ -360,6 +329,32 @@ class Scenario(Section):
             raise ValueError(
                 f"`observation.model_error_percent` must be one number or one for each of the "
                 f"{self.observation.count} sensors, and {len(error)} came"
+            )
+
+    def _check_modes(self) -> None:
+        modes, record = self.observation.modes, self.truth.record
+        if modes is None:
+            if record is not None:
+                raise ValueError("`truth.record` belongs to the role `modes` of `observation`")
+            return
+        for name in ("learning", "notice"):
+            if getattr(self, name) is not None:
+                raise ValueError(
+                    f"`{name}` does not take observations with a covariance of their own: leave it out"
+                )
+        if self.observation.average_over_draws == "inside":
+            raise ValueError("modes are averaged over the draws `outside`: leave out `average_over_draws`")
+        if self.asset.kind == WATCHED_KIND:
+            return
+        if record is None:
+            raise ValueError(
+                "the role `modes` needs `truth.record`, which says how the record of a turn is made"
+            )
+        _known(record.input, tuple(sorted(self.control[0].values)), "truth.record.input", "control input")
+        if modes.bands[-1][1] > 0.5 * record.sampling_rate:
+            raise ValueError(
+                f"`truth.record.sampling_rate` {record.sampling_rate:g} shows nothing above "
+                f"{0.5 * record.sampling_rate:g} Hz, and a band ends at {modes.bands[-1][1]:g} Hz"
             )
 
     def _check_sensors(self) -> None:

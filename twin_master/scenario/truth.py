@@ -5,6 +5,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from twin_master.scenario.modes import RecordSection
 from twin_master.scenario.section import (
     Count,
     Name,
@@ -78,8 +79,18 @@ class TruthSection(Section):
     received: Name | None = None
     """`asset`: the observation of the binding that is 0 where a sensor is lost."""
 
+    record: RecordSection | None = None
+    """Where modes are observed: the record of each turn."""
+
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if self.record is not None:
+            if self.kind == "asset" or self.sensor_faults or self.noise.standard_deviation:
+                raise ValueError(
+                    "with `truth.record` the noise is that of the record (`truth.record.noise`), and the "
+                    "truth the scenario's: leave out `truth.noise`, `truth.sensor_faults`, the kind `asset`"
+                )
+            return self
         if self.kind == "asset":
             if self.gains or self.sensor_faults or self.noise.standard_deviation:
                 raise ValueError(

@@ -173,7 +173,8 @@ class Flight:
 
     def observed(self, first: int, end: int) -> Float:
         """Return what the sensors said in turns first..end - 1: (n, G), SI; NaN where lost."""
-        return np.array([turn.observed for turn in self.seen(first, end)])
+        sensors = self.scenario.observation.count
+        return np.array([turn.observed[:sensors] for turn in self.seen(first, end)])
 
     def truth(self, first: int, end: int) -> Float:
         """Return the true state of turns first..end - 1: (n, K), SI; NaN where nobody knows it."""

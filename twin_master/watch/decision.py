@@ -25,7 +25,7 @@ def decision_of(
         scenario, model, turn.filtered, turn.control_index, turn.next_control, turn.decision_probability
     )
     record |= {
-        "lost_sensors": int(np.isnan(reading.observed).sum()),
+        "lost_sensors": int(np.isnan(reading.observed[: scenario.observation.count]).sum()),
         "log_evidence": turn.log_evidence,
         "notices": [vars(notice) for notice in turn.notices],
     }
@@ -55,7 +55,7 @@ def last_decision(path: Path, scenario: Scenario, model: GraphicalModel) -> dict
             array_of(last["decision_probability"]),
         )  # fmt: skip
         record |= {
-            "lost_sensors": last["observed"].count(None),
+            "lost_sensors": last["observed"][: scenario.observation.count].count(None),
             "log_evidence": last["log_evidence"],
             "notices": last.get("notices", []),
         }

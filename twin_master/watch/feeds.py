@@ -211,7 +211,8 @@ class FolderFeed:
             turn = int(record.get("observation_turn", record["turn"]))
         except (KeyError, TypeError, ValueError):
             return Refused("the line has another layout")
-        if len(observed) != self._scenario.observation.count or control >= len(self._scenario.control):
+        sensors = self._scenario.observation
+        if len(observed) not in (sensors.count, sensors.width) or control >= len(self._scenario.control):
             return Refused("it is of an asset with other sensors or controls")
         return Message(observed, turn, None, control)
 

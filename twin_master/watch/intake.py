@@ -3,7 +3,7 @@
 import json
 from collections import deque
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -125,7 +125,7 @@ class Intake:
 
     def __init__(self, scenario: Scenario, feed: Feed, rejected: RejectedFile) -> None:
         self._section = scenario.watch
-        self._sensors = scenario.observation.count
+        self._width = scenario.observation.width
         self._feed = feed
         self._rejected = rejected
         self._messages: Iterator[tuple[Message | Refused, str]] | None = None
@@ -203,7 +203,7 @@ class Intake:
         self._refuse(str(error))
         if reading.revises is not None:
             return Reading(self._before, None, reading.revises)
-        return Reading(np.full(self._sensors, np.nan), reading.control)
+        return Reading(np.full(self._width, np.nan), reading.control)
 
     def _refuse(self, reason: str) -> None:
         self.counts.rejected += 1
@@ -244,6 +244,10 @@ class Intake:
 
     def _sort(self, twin: Twin, message: Message) -> None:
         turn = self._turn_of(twin, message)
+        if len(message.observed) < self._width:  # recorded without covariances
+            row = np.full(self._width, np.nan)
+            row[: len(message.observed)] = message.observed
+            message = replace(message, observed=row)
         ahead = turn - twin.turns
         given = _ASSUMED if message.control is None else _GIVEN
         if ahead > self._section.longest_gap:
@@ -254,7 +258,7 @@ class Intake:
         if ahead < 0:
             self._sort_late(twin, turn, message, given)
             return
-        lost = np.full(self._sensors, np.nan)
+        lost = np.full(self._width, np.nan)
         self._pending += [(twin.turns + gap, Reading(lost), MISSING) for gap in range(ahead)]
         self._pending.append((turn, Reading(message.observed, message.control), given))
 

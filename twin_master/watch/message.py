@@ -38,7 +38,7 @@ class Message:
     Attributes
     ----------
     observed : (G,)
-        SI; NaN where a sensor is absent or null.
+        SI; NaN where a sensor is absent or null. Where modes are observed, a row with their covariance.
     turn : int or None
         Its turn, if it says so.
     time : float or None
@@ -149,13 +149,16 @@ class MessageReader:
         Refused
             It is none.
         """
-        observed = np.full(self._observation.count, np.nan)
+        observed = np.full(self._observation.width, np.nan)
         given: set[int] = set()
         unit = record.get("unit", "")
         if not isinstance(unit, str):
             raise Refused("`unit` is the name of a unit")
         for name, value in record.items():
             if name in ("turn", "time", "control", "unit") or name.startswith("_"):
+                continue
+            if name == "covariance" and self._observation.modes is not None:
+                observed[self._observation.count :] = self._covariance(value)
                 continue
             if name == self._observation.role and isinstance(value, list):
                 pairs: Iterable[tuple[int, float, object]] = self._all(value, unit)
@@ -181,6 +184,22 @@ class MessageReader:
         if len(values) != self._observation.count:
             raise Refused(f"{self._observation.count} values are expected, and {len(values)} came")
         return [(sensor, self._factor(sensor, unit), value) for sensor, value in enumerate(values)]
+
+    def _covariance(self, value: object) -> Float:
+        """Return the lower triangle of the covariance of all values, SI."""
+        count = self._observation.count
+        try:
+            matrix = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            matrix = np.empty(0)
+        if matrix.shape != (count, count) or not np.isfinite(matrix).all():
+            raise Refused(f"`covariance` is {count} rows of {count} numbers, in SI units; null is none")
+        size = np.sqrt(np.abs(np.diag(matrix)))
+        size[size == 0.0] = 1.0
+        scaled = matrix / np.outer(size, size)
+        if np.abs(scaled - scaled.T).max() > 1e-6 or np.linalg.eigvalsh(scaled)[0] < -1e-6:
+            raise Refused("`covariance` is not symmetric with eigenvalues of zero or more")
+        return matrix[np.tril_indices(count)]
 
     def _value(self, name: str, sensor: int, factor: float, value: object) -> float:
         if value is None:

@@ -49,7 +49,7 @@ class Replayed:
     """
 
     twin: Twin
-    beliefs: Beliefs = field(default_factory=Beliefs)
+    beliefs: Beliefs
     first_turn: int = 0
     last: dict[str, Any] | None = None
 
@@ -131,7 +131,8 @@ def _filtered(tail: _Tail, given: Sequence[BelievedModel], lag: int | None) -> R
         twin.restore_state(tail.state)
     for turn in sorted(turn for turn in tail.seen if turn < twin.turns):
         twin.revise(turn, *tail.seen[turn])
-    found = Replayed(twin, first_turn=twin.turns)
+    sensors = models[at].knowledge.scenario.observation.count
+    found = Replayed(twin, Beliefs(sensors), first_turn=twin.turns)
     while twin.turns in tail.seen:
         if at + 1 < len(models) and models[at + 1].from_turn <= twin.turns:
             at += 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import tomllib
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -121,6 +122,18 @@ def test_a_resumed_flight_is_bit_identical_after_the_files_are_gone(
     resume_run(moved, report=False)
     for name in ("csv/observed.csv", "csv/estimated.csv", "csv/decisions.csv"):
         assert (moved / name).read_bytes() == (flown / name).read_bytes(), name
+
+
+def test_the_compiled_fmu_is_flown_where_the_scenario_says_so(flown: Path, tmp_path: Path) -> None:
+    """Strains are those of the Python FMU within 1e-12 of the largest; the run folder holds the binary."""
+    folder = new_run(short(asset={"packed": "compiled"}), tmp_path / "run", report=False).folder
+    with zipfile.ZipFile(folder / "asset" / "asset.fmu") as archive:
+        assert any(name.endswith(".so") for name in archive.namelist())
+    python, compiled = (
+        xr.open_datatree(run / "run.nc", engine="h5netcdf")["truth"]["strain"].load().values
+        for run in (flown, folder)
+    )
+    np.testing.assert_allclose(compiled, python, rtol=0.0, atol=1e-12 * np.abs(python).max())
 
 
 def test_the_field_of_the_last_estimate_is_written(flown: Path) -> None:
