@@ -92,6 +92,11 @@ class JournalFile:
             self.flush()
             synchronise_folder(path.parent)
 
+    @property
+    def size(self) -> int:
+        """Bytes of its whole lines."""
+        return self._size
+
     def truncate(self, size: int) -> None:
         """Drop what lies beyond a size in bytes, the end of some line."""
         self._size = size
@@ -246,6 +251,16 @@ def records_backwards(path: Path) -> Iterator[dict[str, Any]]:
             for line in reversed(lines):
                 if line.endswith(b"\n") and _is_whole(line):
                     yield json.loads(line[_DIGEST + 1 :])
+
+
+def records_behind(path: Path, end: int) -> Iterator[dict[str, Any]]:
+    """Return the records of the whole lines behind the first `end` bytes, the end of some line."""
+    with path.open("rb") as file:
+        file.seek(end)
+        for line in file:
+            if not line.endswith(b"\n") or not _is_whole(line):
+                return
+            yield json.loads(line[_DIGEST + 1 :])
 
 
 def _is_whole(line: bytes) -> bool:

@@ -6,14 +6,12 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.progress import Progress
 from reporting.provenance import collect_provenance, hash_file, hash_record
-from twin_master.assets.asset_source import AssetSource, calibrated_with
-from twin_master.assets.design_source import DesignBelief
+from twin_master.assets.asset_source import calibrated_with
 from twin_master.assets.resolution import (
     Overrides,
     believed_source,
@@ -50,12 +48,13 @@ from twin_master.store.learnt import learnt_record
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure, control_changes, noticed, summarise
 from twin_master.store.writing import store_mission, values_of, write_summary
-from twin_master.watch.decision import decision_of, gap_of
+from twin_master.watch.decision import decision_of
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile
 from twin_master.watch.keeping import Keeper
 from twin_master.watch.replay import BelievedModel, Replayed, replay
 from twin_master.watch.stopping import Stopping
 from twin_master.watch.teaching import Search, Teaching, Tutor, both_patches, check_teachable
+from twin_master.watch.trial import Judge, Outcome, Trial, judged, patched_model
 
 STORED_TURNS = 1_000
 """The last turns that `run.nc` and the report show if not told otherwise; the journal has all of them."""
@@ -65,11 +64,10 @@ FLUSH_SECONDS = 1.0
 
 @dataclass(frozen=True)
 class Patched:
-    """A patch of the twin's model, the turn from which on it is believed, and what is said of it."""
+    """A patch of the twin's model, and the turn from which on it is believed."""
 
     file: Path
     from_turn: int
-    notice: Mapping[str, Any] | None = None
 
 
 class Watch:
@@ -116,18 +114,7 @@ class Watch:
                 self._adopted = (*self._adopted, model)
                 file = self.folder / model["patch"]
                 self._patches.append(file)
-                self.models.append(self._with_patch(file, model["from_turn"]))
-
-    def _with_patch(self, file: Path, from_turn: int) -> BelievedModel:
-        belief = self.scenario.belief
-        if not isinstance(belief, DesignBelief):
-            raise MissionInputError("only a twin that believes a design can be given a patch of its model.")
-        scenario = self.scenario.model_copy(update={"belief": belief.model_copy(update={"patch": str(file)})})
-        source: AssetSource = scenario.belief.source(scenario, None)
-        source.check()
-        with TemporaryDirectory(prefix="uav_twin_") as folder:
-            source.prepare(Path(folder), self._progress)
-            return BelievedModel(from_turn, prepare_knowledge(scenario, source, scenario.mission.seed))
+                self.models.append(patched_model(self.scenario, file, model["from_turn"], self._progress))
 
     def run(
         self, feed: Feed, decide: Callable[[Mapping[str, Any]], None], *, turns: int | None = None,
@@ -152,7 +139,7 @@ class Watch:
         intake = Intake(self.scenario, feed, rejected)
         with open_journal(self.folder, self._hash, FLUSH_SECONDS if feed.replayable else 0.0) as journal:
             if patched is not None:
-                self.adopt(journal, patched)
+                self._patch(journal, patched)
             found = self._replayed(None)
             intake.restore(None if found.last is None else found.last["intake"])
             if found.last is not None:
@@ -178,7 +165,7 @@ class Watch:
         while True:
             keep.twin = twin
             if keep.tutor is not None and keep.tutor.act():
-                keep.twin = twin = self._replayed(None).twin
+                twin = keep.twin
             for reading, turn, _ in operate(twin, source, keep):
                 decision = decision_of(self.scenario, self.models[-1].knowledge.model, twin, reading, turn)
                 decide(decision | {"notices": [*decision["notices"], *keep.told]})
@@ -195,70 +182,60 @@ class Watch:
         teaching = Teaching(self.scenario.notice.threshold)
         for record, _ in read_records(self._path, self._hash):
             teaching.take(record)
-        pupil = _Pupil(self, journal, keep, teaching)
+        pupil = _Pupil(self, journal, keep, teaching, Judge(wait=wait))
         step = self.scenario.mission.step_name
         return Tutor(pupil, teaching, search, step, wait=wait, asked_to_end=lambda: source.asked)
 
-    def gained(self, patched: Patched, first: int) -> float:
-        """Return how much more log evidence the turns from `first` on have with a patch [nats]."""
-        place = self.folder / f"asset/model_patch_{len(self.models)}.json"
-        before = self._replayed(first)
-        candidate = self._candidate(place, patched)
-        self.models.append(candidate)
-        try:
-            after = self._replayed(min(patched.from_turn, first))
-        finally:
-            self.models.pop()
-            place.unlink()
-        said = [sum(found.beliefs.log_evidence[first - found.first_turn :]) for found in (before, after)]
-        return float(said[1] - said[0])
-
-    def _candidate(self, place: Path, patched: Patched) -> BelievedModel:
-        """Return the model with a patch beside what is believed there already; its file is put in a place."""
-        believed = [m for m in range(len(self.models)) if self.models[m].from_turn <= patched.from_turn]
-        atomic_write_bytes(place, both_patches(self._patches[max(believed)], patched.file))
-        try:
-            return self._with_patch(place, patched.from_turn)
-        except BaseException:
-            place.unlink()
-            raise
+    def trial(
+        self, journal: JournalFile, file: Path, from_turn: int, compared: tuple[int, int] = (0, 0)
+    ) -> Trial:
+        """Return the question what comes of a patch from a turn on, after all lines of the journal."""
+        believed = [m for m in range(len(self.models)) if self.models[m].from_turn <= from_turn]
+        patch = both_patches(self._patches[max(believed)], file)
+        models = tuple(self.models)
+        return Trial(self._path, self._hash, journal.size, self.scenario, models, patch, from_turn, compared)
 
     def _replayed(self, first_turn: int | None, *, lag: bool = True) -> Replayed:
         kept = self.scenario.watch.lag if lag else None
         return replay(self._path, self._hash, self.models, kept, first_turn=first_turn)
 
-    def adopt(self, journal: JournalFile, patched: Patched) -> dict[str, Any]:
-        """Believe a patched model from a turn on: it and those behind it are filtered again."""
-        before = self._replayed(patched.from_turn)
-        if not 0 <= patched.from_turn <= before.twin.turns or before.last is None:
+    def _patch(self, journal: JournalFile, patched: Patched) -> None:
+        """Believe a patch that is given from a turn on."""
+        turns = self._turns()
+        if not turns or not 0 <= patched.from_turn <= turns:
             raise MissionInputError(
-                f"--from-turn names one of the {before.twin.turns} turns watched so far, or the next one."
+                f"--from-turn names one of the {turns} turns watched so far, or the next one."
             )
-        name = f"asset/model_patch_{len(self.models)}.json"
-        candidate = self._candidate(self.folder / name, patched)
-        first, believed = patched.from_turn, self.models[-1].knowledge.sensor_model
-        self.models.append(candidate)
+        self.adopt(
+            journal, judged(self.trial(journal, patched.file, patched.from_turn), self._progress), None
+        )
+
+    def adopt(
+        self, journal: JournalFile, outcome: Outcome, notice: Mapping[str, Any] | None
+    ) -> tuple[dict[str, Any], Twin]:
+        """Believe a patched model; return the line of the journal, and the twin that goes on."""
+        name, first = f"asset/model_patch_{len(self.models)}.json", outcome.model.from_turn
+        atomic_write_bytes(self.folder / name, outcome.trial.patch)
+        twin, alarms = outcome.twin()
+        self.models.append(outcome.model)
         self._patches.append(self.folder / name)
-        after = self._replayed(patched.from_turn)
-        alarms = [vars(n) for turn, n in after.beliefs.notices if turn >= first and n.kind == "alarm"]
         model: dict[str, Any] = {
             "patch": name, "sha256": hash_file(self.folder / name), "from_turn": first,
-            "before": gap_of(before.beliefs, first - before.first_turn, believed),
-            "after": gap_of(after.beliefs, first - after.first_turn, candidate.knowledge.sensor_model),
-            "alarms": alarms, **({} if patched.notice is None else {"notice": dict(patched.notice)}),
+            "before": outcome.before, "after": outcome.after, "alarms": [vars(alarm) for alarm in alarms],
+            **({} if notice is None else {"notice": dict(notice)}),
         }  # fmt: skip
         line = {
-            "turn": after.twin.turns - 1,
-            "next_control": after.twin.proposed_control,
-            "intake": before.last["intake"],
+            "turn": twin.turns - 1,
+            "next_control": twin.proposed_control,
+            "intake": next(records_backwards(self._path))["intake"],
             "model": model,
-            "twin_state": base64.b64encode(after.twin.save_state()).decode("ascii"),
+            "twin_state": base64.b64encode(twin.save_state()).decode("ascii"),
         }
         journal.append(line)
         self._adopted = (*self._adopted, model)
-        keep_knowledge(self.folder, candidate.knowledge)
+        keep_knowledge(self.folder, outcome.model.knowledge)
         self._progress.note(
-            f"The patched model is believed from {self.scenario.mission.step_name} {patched.from_turn} on: "
+            f"The patched model is believed from {self.scenario.mission.step_name} {first} on: "
             + ", ".join(
                 f"{what} {model['before'][key]:.4g} before, {model['after'][key]:.4g} after"
                 for key, what in (("rms_residual", "rms residual"), ("log_evidence", "log evidence"))
@@ -266,12 +243,16 @@ class Watch:
             )
             + "."
         )
-        return line
+        return line, twin
+
+    def _turns(self) -> int:
+        """Return how many turns were watched."""
+        lines = records_backwards(self._path)
+        return next((int(line["turn"]) + 1 for line in lines if {"filtered", "model"} & {*line}), 0)
 
     def store(self, counts: Counts, *, last: int = STORED_TURNS, report: bool = True) -> None:
         """Write `run.nc`, tables, summary and report of the last turns."""
-        lines = records_backwards(self._path)
-        turns = next((int(line["turn"]) + 1 for line in lines if {"filtered", "model"} & {*line}), 0)
+        turns = self._turns()
         if not turns:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
@@ -429,9 +410,11 @@ def resume_watch(folder: Path, loaded: LoadedScenario | None, progress: Progress
 class _Pupil:
     """A watch that is taught, see `teaching.Pupil`."""
 
-    def __init__(self, watch: Watch, journal: JournalFile, keep: Keeper, teaching: Teaching) -> None:
+    def __init__(
+        self, watch: Watch, journal: JournalFile, keep: Keeper, teaching: Teaching, judge: Judge
+    ) -> None:
         self.folder, self._watch, self._journal = watch.folder, watch, journal
-        self._keep, self._teaching = keep, teaching
+        self._keep, self._teaching, self._judge = keep, teaching, judge
 
     def write(self, record: Mapping[str, Any]) -> None:
         twin = self._keep.twin
@@ -440,8 +423,12 @@ class _Pupil:
         self._journal.append(line)
         self._teaching.take(line)
 
-    def gained(self, file: Path, from_turn: int, first: int) -> float:
-        return self._watch.gained(Patched(file, from_turn), first)
+    def outcome(self, file: Path, from_turn: int, compared: tuple[int, int]) -> Outcome | None:
+        return self._judge.outcome(lambda: self._watch.trial(self._journal, file, from_turn, compared))
 
-    def adopt(self, file: Path, from_turn: int, notice: Mapping[str, Any]) -> None:
-        self._teaching.take(self._watch.adopt(self._journal, Patched(file, from_turn, notice)))
+    def adopt(self, outcome: Outcome, notice: Mapping[str, Any]) -> None:
+        line, self._keep.twin = self._watch.adopt(self._journal, outcome, notice)
+        self._teaching.take(line)
+
+    def end(self) -> None:
+        self._judge.end()

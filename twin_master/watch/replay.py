@@ -64,7 +64,13 @@ class _Tail:
 
 
 def replay(
-    path: Path, config_hash: str, models: Sequence[BelievedModel], lag: int | None, *, first_turn: int | None
+    path: Path,
+    config_hash: str,
+    models: Sequence[BelievedModel],
+    lag: int | None,
+    *,
+    first_turn: int | None,
+    end: int | None = None,
 ) -> Replayed:
     """Filter the end of a watch again, what came late in its place.
 
@@ -81,6 +87,8 @@ def replay(
         Of the twin.
     first_turn : int or None
         The first turn whose belief is wanted; None for the twin alone, from the last snapshot.
+    end : int, optional
+        Bytes of the journal that are read; all of it if left out.
 
     Raises
     ------
@@ -88,7 +96,9 @@ def replay(
         The journal was changed or is damaged, or decided otherwise.
     """
     tail, last, adopted = _Tail(), None, 0
-    for number, (record, _) in enumerate(read_records(path, config_hash), start=1):
+    for number, (record, place) in enumerate(read_records(path, config_hash), start=1):
+        if end is not None and place > end:
+            break
         try:
             if "model" in record:
                 adopted += 1

@@ -7,22 +7,19 @@ the very command that the alarm names. Its verdict is a line of the journal behi
 
 import json
 import math
-import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from fe.runtime.errors import FiniteElementError
-from fmu_asset.errors import FmuError
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.scenario.schema import Scenario
+from twin_master.watch.trial import CANNOT, Outcome, beside, last_words
 
 SETTLE_TURNS = 10
 """Turns that an alarm must hold before its cause is looked for; they also show what it is."""
@@ -37,8 +34,6 @@ NO_WING = (
     "by a design or a calibration, are needed, and this scenario has {}: leave --teach out, alarms are given "
     "all the same."
 )
-_COURTESY = 10
-"""Niceness of the search: the watch comes first."""
 _LOOK_AGAIN = 0.05
 
 
@@ -186,7 +181,7 @@ class Search:
                 self._begin(question)
             elif (code := self._process.poll()) is not None and not (folder / "verdict.json").is_file():
                 self._process = None
-                raise TwinMasterError(self._last_words(question, code))
+                raise TwinMasterError(last_words(self._log(question), code))
             if not wait or asked_to_end():
                 return None
             time.sleep(_LOOK_AGAIN)
@@ -200,17 +195,7 @@ class Search:
     def _begin(self, question: Question) -> None:
         log = self._log(question)
         log.parent.mkdir(exist_ok=True)
-        with log.open("wb") as file:
-            self._process = subprocess.Popen(
-                [*self.command, *self.words(question)],
-                stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True,
-            )  # fmt: skip
-        with suppress(ProcessLookupError):
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, _COURTESY)
-
-    def _last_words(self, question: Question, code: int) -> str:
-        lines = self._log(question).read_text(encoding="utf-8", errors="replace").split("\n")
-        return next((line.strip() for line in reversed(lines) if line.strip()), f"exit code {code}")
+        self._process = beside([*self.command, *self.words(question)], log)
 
     def end(self) -> None:
         """End the process, if there is one; a watch that is taken up again asks again."""
@@ -292,11 +277,17 @@ class Pupil(Protocol):
     def write(self, record: Mapping[str, Any]) -> None:
         """Add a line to the journal."""
 
-    def gained(self, file: Path, from_turn: int, first: int) -> float:
-        """Return the log evidence [nats] that a patch gains in the turns from `first` on."""
+    def outcome(self, file: Path, from_turn: int, compared: tuple[int, int]) -> Outcome | None:
+        """Return what comes of a patch from a turn on; None while it is worked out.
 
-    def adopt(self, file: Path, from_turn: int, notice: Mapping[str, Any]) -> None:
-        """Believe a patch from a turn on."""
+        `compared` are the first turn whose evidence is compared, and how many.
+        """
+
+    def adopt(self, outcome: Outcome, notice: Mapping[str, Any]) -> None:
+        """Believe a patch."""
+
+    def end(self) -> None:
+        """End what is worked out."""
 
 
 class Tutor:
@@ -348,14 +339,16 @@ class Tutor:
             return False
         file = self._pupil.folder / trial["folder"] / "patch.json"
         try:
-            gained = self._pupil.gained(file, trial["from_turn"], trial["turn"] + 1)
-        except (TwinMasterError, FmuError, FiniteElementError) as error:
+            outcome = self._pupil.outcome(file, trial["from_turn"], (trial["turn"] + 1, TRIAL_TURNS))
+        except CANNOT as error:
             sentence = f"The patch cannot be believed by this twin: {error}"
             self._pupil.write({"verdict": {**trial, "tried": False, "notice": notice_of("trial", sentence)}})
             return False
-        notice = notice_of("trial", trial_sentence(trial, gained, self._step))
-        if gained > 0.0:
-            self._pupil.adopt(file, trial["from_turn"], notice)
+        if outcome is None:
+            return False
+        notice = notice_of("trial", trial_sentence(trial, outcome.gained, self._step))
+        if outcome.gained > 0.0:
+            self._pupil.adopt(outcome, notice)
             return True
         self._pupil.write({"verdict": {**trial, "tried": False, "notice": notice}})
         return False
@@ -363,3 +356,4 @@ class Tutor:
     def end(self) -> None:
         """End what is under way."""
         self._search.end()
+        self._pupil.end()

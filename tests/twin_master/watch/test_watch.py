@@ -44,6 +44,7 @@ from twin_master.watch.mqtt import PASSWORD_VARIABLE, MqttFeed, broker_of
 from twin_master.watch.replay import BelievedModel
 from twin_master.watch.snapshot import flown
 from twin_master.watch.teaching import Question, Search, Teaching, both_patches
+from twin_master.watch.trial import Judge
 
 
 @pytest.fixture(scope="module")
@@ -564,6 +565,54 @@ def test_live_turns_do_not_wait_for_the_search(base: Watch, loose: Path, tmp_pat
     (verdict, *_) = [record for record in lines(watch) if "verdict" in record]
     assert (verdict["turn"], verdict["verdict"]["turn"]) == (40, 40)
     assert verdict["verdict"]["to_turn"] < 35
+
+
+def test_live_turns_do_not_wait_for_the_patched_model(
+    base: Watch, mission: Flight, loose: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is built beside them, and believed behind the turn that the journal says, to the bit."""
+    judges: list[Judge] = []
+
+    class Kept(Judge):
+        def __init__(self, *, wait: bool) -> None:
+            super().__init__(wait=wait)
+            judges.append(self)
+
+    monkeypatch.setattr("twin_master.watch.folder.Judge", Kept)
+    monkeypatch.setattr("twin_master.watch.trial.COURTESY", 0)
+    watch = watchful(base, tmp_path / "watch")
+    feed = CsvFeed(loose, watch.scenario)
+    feed.replayable = False  # as a broker
+    finder = search(watch, tmp_path, "named", -0.3)
+    trial_end = 0
+
+    def decide(decision: Any) -> None:
+        nonlocal trial_end
+        verdict = next((record["verdict"] for record in lines(watch) if "verdict" in record), None)
+        teaching = watch.folder / "teaching"
+        while verdict is None and teaching.is_dir() and not [*teaching.glob("turns*/verdict.json")]:
+            time.sleep(0.02)
+        trial_end = verdict["turn"] + 10 if verdict else 0
+        if trial_end and decision["turn"] == trial_end + 3:
+            while not judges[0].answered:  # the turns between were decided while it was built
+                time.sleep(0.02)
+
+    watch.run(feed, decide, search=finder)
+    model = next(record for record in lines(watch) if "model" in record)
+    assert model["turn"] == trial_end + 3
+    assert model["model"]["from_turn"] < 20
+    twin, first = base.models[0].knowledge.twin(), model["model"]["from_turn"]
+    observed = mission.observed.copy()
+    observed[15:, 4] *= 0.7
+    knew = watch.models[1].knowledge.twin()
+    for number, row in enumerate(observed):
+        if number == first:
+            knew.restore_state(twin.save_state())
+            twin = knew
+        found = twin.turn(row, int(mission.control_index[number]))
+    assert lines(watch)[-1]["filtered"] == found.filtered.tolist()
+    again = watchful(watch, tmp_path / "again")
+    assert again._replayed(None).twin.save_state() == watch._replayed(None).twin.save_state()
 
 
 def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,259 @@
+"""A patch beside what a watch believes: the patched model, its turns filtered again, and what that gains.
+
+All of it follows from a journal up to one of its lines, so that it may be worked out in another process while
+the watch goes on: what came meanwhile is filtered behind it.
+"""
+
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory, mkdtemp
+from typing import Any
+
+from fe.runtime.errors import FiniteElementError
+from fmu_asset.errors import FmuError
+from reporting.files import atomic_write_bytes
+from reporting.progress import Progress, SilentProgress
+from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.design_source import DesignBelief
+from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.mission.journal import array_of, records_behind
+from twin_master.mission.preparation import prepare_knowledge
+from twin_master.network.estimator import Notice
+from twin_master.network.twin import Twin
+from twin_master.scenario.schema import Scenario
+from twin_master.watch.decision import gap_of
+from twin_master.watch.replay import BelievedModel, replay
+
+COURTESY = 10
+"""Niceness of what is worked out beside a watch: the watch comes first."""
+CANNOT = (TwinMasterError, FmuError, FiniteElementError)
+"""Why a twin cannot believe a patch."""
+_ASKED, _ANSWER, _LOG = "asked", "answer", "log"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What is asked.
+
+    Attributes
+    ----------
+    journal : Path
+    config_hash : str
+        Of the configuration that it belongs to.
+    end : int
+        Bytes of it that are read.
+    scenario : Scenario
+    models : tuple of BelievedModel
+        What was believed so far.
+    patch : bytes
+        Content of the patch file that would be believed, with what is believed already.
+    from_turn : int
+        From which on.
+    compared : tuple of int
+        The first turn whose evidence is compared, and how many.
+    """
+
+    journal: Path
+    config_hash: str
+    end: int
+    scenario: Scenario
+    models: tuple[BelievedModel, ...]
+    patch: bytes
+    from_turn: int
+    compared: tuple[int, int] = (0, 0)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of it.
+
+    Attributes
+    ----------
+    trial : Trial
+    model : BelievedModel
+        The patched one.
+    gained : float
+        Log evidence of the turns that were compared, with the patch less without [nats].
+    before, after : mapping
+        The gap of the turns from `trial.from_turn` on, see `decision.gap_of`.
+    alarms : tuple of Notice
+        What the patched model does not explain of these.
+    state : bytes
+        Of the twin that believes it, after the last turn.
+    """
+
+    trial: Trial
+    model: BelievedModel
+    gained: float
+    before: Mapping[str, Any]
+    after: Mapping[str, Any]
+    alarms: tuple[Notice, ...]
+    state: bytes
+
+    def twin(self) -> tuple[Twin, tuple[Notice, ...]]:
+        """Return the twin that believes the patch, after all turns of the journal, and its alarms."""
+        twin = self.model.knowledge.twin(lag=self.trial.scenario.watch.lag)
+        twin.restore_state(self.state)
+        alarms = [*self.alarms]
+        for record in records_behind(self.trial.journal, self.trial.end):
+            if "observed" not in record:
+                continue
+            at, observed = int(record["observation_turn"]), array_of(record["observed"])
+            if at < twin.turns:
+                twin.revise(at, observed, int(record["control_index"]))
+            else:
+                found = twin.turn(observed, int(record["control_index"]))
+                alarms += [notice for notice in found.notices if notice.kind == "alarm"]
+        return twin, tuple(alarms)
+
+
+def patched_model(
+    scenario: Scenario, file: Path, from_turn: int, progress: Progress | None = None
+) -> BelievedModel:
+    """Return the model of a scenario with a patch.
+
+    Raises
+    ------
+    TwinMasterError, FmuError, FiniteElementError
+        The twin cannot believe it.
+    """
+    belief = scenario.belief
+    if not isinstance(belief, DesignBelief):
+        raise MissionInputError("only a twin that believes a design can be given a patch of its model.")
+    scenario = scenario.model_copy(update={"belief": belief.model_copy(update={"patch": str(file)})})
+    source: AssetSource = scenario.belief.source(scenario, None)
+    source.check()
+    with TemporaryDirectory(prefix="uav_twin_") as folder:
+        source.prepare(Path(folder), progress or SilentProgress())
+        return BelievedModel(from_turn, prepare_knowledge(scenario, source, scenario.mission.seed))
+
+
+def judged(trial: Trial, progress: Progress | None = None) -> Outcome:
+    """Return what comes of a patch.
+
+    Raises
+    ------
+    TwinMasterError, FmuError, FiniteElementError
+        The twin cannot believe it.
+    """
+    with TemporaryDirectory(prefix="uav_twin_") as folder:
+        file = Path(folder) / "patch.json"
+        file.write_bytes(trial.patch)
+        model = patched_model(trial.scenario, file, trial.from_turn, progress)
+    first, (begin, count) = trial.from_turn, trial.compared
+    wanted = min(first, begin) if count else first
+    before, after = (
+        replay(
+            trial.journal,
+            trial.config_hash,
+            models,
+            trial.scenario.watch.lag,
+            first_turn=wanted,
+            end=trial.end,
+        )
+        for models in (trial.models, (*trial.models, model))
+    )
+    evidence = [
+        sum(found.beliefs.log_evidence[begin - found.first_turn :][:count]) for found in (before, after)
+    ]
+    believed = trial.models[-1].knowledge.sensor_model
+    return Outcome(
+        trial=trial,
+        model=model,
+        gained=float(evidence[1] - evidence[0]),
+        before=gap_of(before.beliefs, first - before.first_turn, believed),
+        after=gap_of(after.beliefs, first - after.first_turn, model.knowledge.sensor_model),
+        alarms=tuple(n for turn, n in after.beliefs.notices if turn >= first and n.kind == "alarm"),
+        state=after.twin.save_state(),
+    )
+
+
+class Judge:
+    """Works out what comes of a patch: at once, or in a process of low priority beside a live watch.
+
+    Parameters
+    ----------
+    wait : bool
+        Whether the turns can wait for it.
+    """
+
+    def __init__(self, *, wait: bool) -> None:
+        self._wait = wait
+        self._folder: Path | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def outcome(self, asked: Callable[[], Trial]) -> Outcome | None:
+        """Return what came of the patch; None while it is worked out, of what was asked first.
+
+        Raises
+        ------
+        TwinMasterError, FmuError, FiniteElementError
+            The twin cannot believe it, or the process ended without an answer.
+        """
+        if self._wait:
+            return judged(asked())
+        if self._folder is None or self._process is None:
+            self._folder = Path(mkdtemp(prefix="uav_twin_"))
+            (self._folder / _ASKED).write_bytes(pickle.dumps(asked()))
+            command = [sys.executable, "-c", f"from {__name__} import work; work()", str(self._folder)]
+            self._process = beside(command, self._folder / _LOG)
+        code = self._process.poll()
+        if not self.answered and code is None:
+            return None
+        found: Outcome | str
+        if self.answered:
+            found = pickle.loads((self._folder / _ANSWER).read_bytes())
+        else:
+            found = last_words(self._folder / _LOG, code)
+        self.end()
+        if isinstance(found, str):
+            raise TwinMasterError(found)
+        return found
+
+    @property
+    def answered(self) -> bool:
+        """Whether the process has left its answer."""
+        return self._folder is not None and (self._folder / _ANSWER).is_file()
+
+    def end(self) -> None:
+        """End the process, if there is one; a watch that is taken up again begins it anew."""
+        if self._process is not None and self._folder is not None:
+            self._process.terminate()
+            self._process.wait()
+            shutil.rmtree(self._folder, ignore_errors=True)
+        self._process = self._folder = None
+
+
+def beside(command: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
+    """Begin a process of low priority that no key of this terminal ends; what it says goes to a file."""
+    with log.open("wb") as file:
+        process = subprocess.Popen(
+            [*command], stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
+        )
+    with suppress(ProcessLookupError):
+        os.setpriority(os.PRIO_PROCESS, process.pid, COURTESY)
+    return process
+
+
+def last_words(log: Path, code: int | None) -> str:
+    """Return the last line that a process has said, or else its exit code."""
+    lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
+    return next((line.strip() for line in reversed(lines) if line.strip()), f"exit code {code}")
+
+
+def work() -> None:
+    """Answer what is asked in the folder that the command line names."""
+    folder = Path(sys.argv[-1])
+    found: Outcome | str
+    try:
+        found = judged(pickle.loads((folder / _ASKED).read_bytes()))
+    except CANNOT as error:
+        found = str(error)
+    atomic_write_bytes(folder / _ANSWER, pickle.dumps(found))
