@@ -94,14 +94,14 @@ def run(
 
     scenario, ssp = _flown(scenario, with_scenario)
     overrides = Overrides(seed, fmu, binding, strain_library, in_process, calibration, ssp, library, learnt)
+    progress, report = terminal.progress(), not no_report
     if seeds is not None:
         chosen = _alone(scenario, resume is not None or seed is not None or view)
         engine = engine_of(workers, cluster)
-        run_ensemble(chosen, seeds, out, overrides, engine, replace=replace, json=json)
+        run_ensemble(chosen, seeds, out, overrides, engine, replace=replace, report=report, json=json)
         return
     if workers is not None or cluster is not None:
         raise typer.BadParameter("belongs to --seeds: one mission flies alone.", param_hint="--workers")
-    progress, report = terminal.progress(), not no_report
     if resume is not None:
         if out is not None or replace or overrides != Overrides():
             raise typer.BadParameter(

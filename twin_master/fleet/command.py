@@ -44,28 +44,36 @@ def run(
     workers: Workers = None,
     cluster: Cluster = None,
     replace: Replace = False,
+    no_report: terminal.NoReport = False,
     json: terminal.Json = False,
 ) -> None:
     """Fly the assets of a fleet; repeated after an interruption, it goes on where it stopped."""
     from twin_master.fleet.plan import load_fleet
 
     found = load_fleet(file, seed)
-    fly_and_show(found, out, engine_of(workers, cluster), replace=replace, json=json)
+    engine = engine_of(workers, cluster)
+    fly_and_show(found, out, engine, replace=replace, report=not no_report, json=json)
 
 
 @fleet_app.command("learn")
 def learn(
     folder: Annotated[Path, typer.Argument(help="The folder of the fleet.", show_default=False)],
     out: Annotated[Path, typer.Option(help="The file to write.")] = Path("learnt.toml"),
+    no_report: terminal.NoReport = False,
     json: terminal.Json = False,
 ) -> None:
     """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ."""
+    from reporting.files import atomic_write_text
     from twin_master.fleet.learn import learn_fleet
-    from twin_master.fleet.lessons import lessons_record, write_learnt
+    from twin_master.fleet.lessons import LESSONS_NAME, lessons_record, write_learnt
+    from twin_master.run_folder import to_json
 
     lessons = learn_fleet(folder, progress=terminal.progress())
     write_learnt(out, lessons)
     record = lessons_record(lessons)
+    atomic_write_text(folder / LESSONS_NAME, to_json(record))
+    if not no_report:
+        _report(folder)
     if json:
         terminal.print_json({"file": str(out), **record})
         return
@@ -118,16 +126,18 @@ def run_ensemble(
     engine: "Engine",
     *,
     replace: bool,
+    report: bool,
     json: bool,
 ) -> None:
     """Fly one scenario under many seeds, for `uav-twin run --seeds`."""
     from twin_master.fleet.plan import ensemble, seed_range
 
-    fly_and_show(ensemble(scenario, seed_range(seeds), overrides), out, engine, replace=replace, json=json)
+    found = ensemble(scenario, seed_range(seeds), overrides)
+    fly_and_show(found, out, engine, replace=replace, report=report, json=json)
 
 
 def fly_and_show(
-    fleet: "Fleet", out: Path | None, engine: "Engine", *, replace: bool, json: bool
+    fleet: "Fleet", out: Path | None, engine: "Engine", *, replace: bool, report: bool, json: bool
 ) -> "FleetOutcome":
     """Fly a fleet and print what became of it."""
     from twin_master.fleet.flight import fly_fleet
@@ -139,6 +149,8 @@ def fly_and_show(
         sentence = f"Interrupted; what was flown is kept in {folder}: repeat the command to go on."
         typer.secho(sentence, fg="red", err=True)
         raise typer.Exit(terminal.INTERRUPTED) from None
+    if report:
+        _report(outcome.folder)
     figures = _figures([outcome.folder])
     if json:
         told = {"folder": str(outcome.folder), "twins": outcome.twins, "failed": outcome.failed}
@@ -146,6 +158,13 @@ def fly_and_show(
     else:
         _show(outcome, figures)
     return outcome
+
+
+def _report(folder: Path) -> None:
+    from twin_master.fleet.report import write_fleet_report
+
+    with terminal.progress().stage("Writing the report"):
+        write_fleet_report(folder)
 
 
 def compare(
@@ -206,4 +225,5 @@ def _show(outcome: "FleetOutcome", figures: Figures) -> None:
         console.print(f"  {name}: {sentence}", soft_wrap=True, style="yellow")
     if outcome.failed > SHOWN:
         console.print(f"  and {outcome.failed - SHOWN} more, in {outcome.folder / 'fleet.json'}")
-    console.print(f"Fleet: {outcome.folder}", soft_wrap=True)
+    page = outcome.folder / "report.html"
+    console.print(f"Report: {page}" if page.is_file() else f"Fleet: {outcome.folder}", soft_wrap=True)

@@ -10,7 +10,10 @@ from reporting.files import atomic_write_text
 from twin_master.fleet.learn import FleetLessons, GroupLessons
 from twin_master.fleet.posterior import Marginal
 
-__all__ = ["lessons_record", "write_learnt"]
+__all__ = ["LESSONS_NAME", "lessons_record", "write_learnt"]
+
+LESSONS_NAME = "learnt.json"
+"""In the folder of a fleet: what was learnt from it, for its report."""
 
 
 def write_learnt(path: Path, lessons: FleetLessons) -> Path:

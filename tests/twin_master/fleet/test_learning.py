@@ -11,11 +11,13 @@ import pytest
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
-from twin_master.fleet.flight import fly_fleet
+from twin_master.fleet.flight import fly_fleet, group_folder
 from twin_master.fleet.learn import learn_fleet, population
 from twin_master.fleet.lessons import lessons_record, write_learnt
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import Grid, logistic, logit, points_of, refined, shared
+from twin_master.fleet.report import attention, write_fleet_report
+from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.network.inference import filter_sequence
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
@@ -235,3 +237,27 @@ def test_true_rates_may_differ_from_those_believed(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("growing_damage", "level_turns"))
     with pytest.raises(FleetError, match=r"truth\.probability"):
         load_fleet(path)
+
+
+def test_the_report_names_who_needs_attention(grown: tuple[Fleet, Path]) -> None:
+    fleet, folder = grown
+    text = write_fleet_report(folder).read_text()
+    for words in ("60 assets in 1 group", "The assets by health", "Who needs attention next", "seed-"):
+        assert words in text
+    scenario = fleet.groups[0].scenarios[0]
+    knowledge = kept_knowledge(group_folder(folder, fleet.groups[0], 0), scenario)
+    model, policy = knowledge.model, knowledge.plan.control_index
+    belief = np.eye(model.states.size)
+    found = attention(knowledge, belief, 1)
+    assert (found[policy != 1] == 1.0).all()
+    # By enumeration of whole lives: the damage moves under the control in force as long as it is kept.
+    generator = np.random.default_rng(2)
+    start, left, lives = 0, 0, 4000
+    cumulative = np.cumsum(model.transition.matrix[1], axis=1)
+    for _ in range(lives):
+        state, leaves = start, policy[start] != 1
+        for uniform in generator.random(scenario.mission.prediction_steps - 1):
+            state = int(np.searchsorted(cumulative[state], uniform))
+            leaves |= policy[state] != 1
+        left += int(leaves)
+    assert found[start] == pytest.approx(left / lives, abs=4.0 * np.sqrt(0.25 / lives))

@@ -1,0 +1,250 @@
+"""The page of a fleet: its assets by health, who needs attention next, what was learnt, what failed.
+
+From nothing but the folder of the fleet, which may still be growing. What it shows does not grow with the
+number of assets: a cell of a map for each, and tables of the few that matter.
+"""
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from reporting import figures as style
+from reporting.files import atomic_write_text
+from reporting.page import Column, Page, Table
+from twin_master.errors import TwinMasterError
+from twin_master.fleet.flight import GROUPS, RESULT_NAME, fleet_config
+from twin_master.fleet.lessons import LESSONS_NAME
+from twin_master.fleet.outcome import FAILED, FLOWN
+from twin_master.fleet.reading import group_figures, shown
+from twin_master.fleet.store import open_group
+from twin_master.mission.kept_knowledge import kept_knowledge
+from twin_master.mission.preparation import Knowledge
+from twin_master.scenario.schema import Scenario
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["REPORT_NAME", "attention", "write_fleet_report"]
+
+Float = NDArray[np.float64]
+
+REPORT_NAME = "report.html"
+NEXT, FAILURES = 15, 10
+"""Rows of the tables of who needs attention next, and of failures."""
+
+
+def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
+    """Return the probability that the policy leaves a control within the steps that are predicted: (B,).
+
+    Parameters
+    ----------
+    knowledge : Knowledge
+        Of the twins.
+    belief : (B, S)
+        After the last turn.
+    control : int
+        In force then; it stays so until the policy leaves it.
+    """
+    keeps = (knowledge.plan.control_index == control).astype(np.float64)
+    stays = keeps.copy()
+    for _ in range(knowledge.scenario.mission.prediction_steps - 1):
+        stays = keeps * knowledge.model.transition.expected(control, stays)
+    return np.asarray(1.0 - belief @ stays)
+
+
+def write_fleet_report(folder: Path | str) -> Path:
+    """Write the page of a fleet.
+
+    Raises
+    ------
+    RunFolderExistsError, FleetError
+        The folder holds no fleet.
+    FileNotWrittenError
+        The disk is full or the folder cannot be written.
+    """
+    folder = Path(folder)
+    fleet = fleet_config(folder)["fleet"]
+    failures = json.loads((folder / RESULT_NAME).read_text())["failures"]
+    groups = {record["name"]: open_group(folder, record["name"]) for record in fleet["groups"]}
+    twins = sum(group.sizes["twin"] for group in groups.values())
+    page = Page(
+        fleet["title"] or fleet["name"],
+        f"{twins} assets in {len(groups)} group{'s' if len(groups) > 1 else ''}, seed {fleet['seed']}",
+    )
+    page.add_section("The fleet")
+    _figures(page, groups)
+    if failures:
+        _failures(page, failures, twins)
+    lessons = folder / LESSONS_NAME
+    if lessons.is_file():
+        page.add_section("Learnt across the fleet")
+        _lessons(page, json.loads(lessons.read_text()))
+    for record in fleet["groups"]:
+        page.add_section(f"Group {record['name']}")
+        _group(page, folder, record, groups[record["name"]])
+    atomic_write_text(folder / REPORT_NAME, page.render())
+    return folder / REPORT_NAME
+
+
+def _figures(page: Page, groups: "dict[str, xr.Dataset]") -> None:
+    found = {name: group_figures(group) for name, group in groups.items()}
+    titles = dict.fromkeys(title for figures in found.values() for title in figures)
+    rows = [[title, *(shown(figures.get(title)) for figures in found.values())] for title in titles]
+    columns = [Column("figure"), *(Column(name, numeric=True) for name in found)]
+    caption = "Means over the twins that flew to their end, with their standard errors; states in SI."
+    page.add_table(Table(columns, rows), caption, title="How the twins fared")
+
+
+def _failures(page: Page, failures: dict[str, str], twins: int) -> None:
+    page.add_notice(f"{len(failures)} of {twins} assets failed in flight; their twins end there.")
+    kinds = Counter(failures.values()).most_common(FAILURES)
+    rows = []
+    for sentence, count in kinds:
+        names = [name for name, text in failures.items() if text == sentence]
+        rows.append([sentence, str(count), ", ".join(names[:3]) + (", ..." if count > 3 else "")])
+    columns = [Column("what ended the flight"), Column("assets", numeric=True), Column("such as")]
+    page.add_table(Table(columns, rows), f"All of them stand in {RESULT_NAME}.", title="Failures")
+
+
+def _lessons(page: Page, record: dict[str, Any]) -> None:
+    rows = []
+    for name, group in record["groups"].items():
+        for control, rate in group["probability"].items():
+            interval = f"{rate['lower_95']:.4f} to {rate['upper_95']:.4f}"
+            off = not rate["lower_95"] <= rate["assumed"] <= rate["upper_95"]
+            assumed = f"{rate['assumed']:.4f}{' (outside)' if off else ''}"
+            rows.append([name, f"probability to worsen, {control}", assumed, f"{rate['mean']:.4f}", interval])
+        lines = [("noise over the assumed", "1", group["noise_factor"])]
+        if "population" in group:
+            told = group["population"]
+            lines += [(f"{told['parameter']}, {moment}", "", told[moment]) for moment in ("mean", "spread")]
+        for title, assumed, line in lines:
+            low, high = (line["mean"] + sign * 1.96 * line["standard_deviation"] for sign in (-1.0, 1.0))
+            rows.append([name, title, assumed, f"{line['mean']:.5g}", f"{low:.5g} to {high:.5g}"])
+    heads = ("group", "learnt", "assumed", "mean", "95 % interval")
+    columns = [Column(head, numeric=head in heads[2:]) for head in heads]
+    caption = "Exact posteriors of all twins together; several groups share a distribution of their rates."
+    page.add_table(Table(columns, rows), caption, title="What was learnt beside what was assumed")
+
+
+def _group(page: Page, folder: Path, record: dict[str, Any], group: "xr.Dataset") -> None:
+    scenario = Scenario.model_validate(record["scenarios"][0])
+    flown = np.flatnonzero(group["status"].values == FLOWN)
+    if not len(flown):
+        page.add_paragraph("No twin of this group has flown to its end yet.")
+        return
+    scale, unit = _scale(scenario)
+    mean = scale * group["mean"].values[flown]  # (B, T, F)
+    failed = int(np.sum(group["status"].values == FAILED))
+    with style.publication_style():
+        page.add_figure(
+            style.to_svg(_map_figure(scenario, mean[:, -1], failed, unit)),
+            f"Filtered mean after the last {scenario.mission.step_name}, one cell for each asset, "
+            f"the worst first by the sum of its states. Grey: {failed} that failed in flight.",
+            title="The assets by health",
+        )
+        page.add_figure(
+            style.to_svg(_course_figure(scenario, mean, scale * group["state"].values[flown], unit)),
+            "Bands hold 90 and 50 % of the assets; the line is the median of the filtered means, "
+            "the dash-dotted one that of the true states.",
+            title="Health over time",
+        )
+    _attention(page, folder, record, group, flown)
+
+
+def _scale(scenario: Scenario) -> tuple[float, str]:
+    units = {factor.unit for factor in scenario.state}
+    if units == {"1"}:
+        return 100.0, "%"
+    return 1.0, units.pop() if len(units) == 1 else "SI"
+
+
+def _map_figure(scenario: Scenario, last: Float, failed: int, unit: str) -> Figure:
+    """Return a map of the assets: (B, F), a panel for each factor."""
+    count = len(last) + failed
+    wide = max(1, int(np.ceil(np.sqrt(2.0 * count))))
+    high = -(-count // wide)
+    order = np.argsort(-last.sum(axis=1), kind="stable")
+    cells = np.full((last.shape[1], high * wide), np.nan)
+    cells[:, : len(last)] = last[order].T
+    figure = style.new_figure(0.4 + 1.9 * last.shape[1])
+    norm = Normalize(0.0, float(max(factor.levels[-1] for factor in scenario.state)) * _scale(scenario)[0])
+    for number, factor in enumerate(scenario.state):
+        axes = figure.add_subplot(last.shape[1], 1, number + 1)
+        image = axes.imshow(
+            np.ma.masked_invalid(cells[number].reshape(high, wide)),
+            cmap=style.LEVELS, norm=norm, aspect="auto", interpolation="nearest",
+        )  # fmt: skip
+        if failed:
+            rest = np.full(high * wide, np.nan)
+            rest[len(last) : count] = 1.0
+            axes.imshow(
+                np.ma.masked_invalid(rest.reshape(high, wide)), cmap="Greys", vmin=0.0, vmax=2.0,
+                aspect="auto", interpolation="nearest",
+            )  # fmt: skip
+        axes.set_xticks([])
+        axes.set_yticks([])
+        style.panel_label(axes, "abcdefgh"[number % 8], factor.title or factor.name)
+        figure.colorbar(image, ax=axes, label=unit)
+    figure.tight_layout()
+    return figure
+
+
+def _course_figure(scenario: Scenario, mean: Float, state: Float, unit: str) -> Figure:
+    figure = style.new_figure(2.4)
+    steps = np.arange(mean.shape[1])
+    for number, factor in enumerate(scenario.state):
+        axes = figure.add_subplot(1, len(scenario.state), number + 1)
+        low, quarter, middle, three, top = np.quantile(
+            mean[:, :, number], [0.05, 0.25, 0.5, 0.75, 0.95], axis=0
+        )
+        for below, above in ((low, top), (quarter, three)):
+            axes.fill_between(steps, below, above, color=style.PRESENT, alpha=style.BAND_OPACITY, linewidth=0)
+        axes.plot(steps, middle, color=style.PRESENT)
+        true = np.median(state[:, :, number], axis=0)
+        axes.plot(steps, true, color=style.TRUTH, linewidth=1.0, linestyle=(0, (4, 1.5, 1, 1.5)))
+        axes.set_xlabel(scenario.mission.step_name)
+        axes.set_ylabel(f"{factor.title or factor.name} ({unit})")
+        style.panel_label(axes, "abcdefgh"[number % 8])
+    figure.tight_layout()
+    return figure
+
+
+def _attention(
+    page: Page, folder: Path, record: dict[str, Any], group: "xr.Dataset", flown: NDArray[np.int64]
+) -> None:
+    """Add the table of the assets whose control is likely to change next."""
+    scenario = Scenario.model_validate(record["scenarios"][0])
+    own = folder / GROUPS / record["name"]
+    try:
+        knowledge = kept_knowledge(own / "0" if record["files"] else own, scenario)
+    except TwinMasterError as error:
+        page.add_paragraph(f"Who needs attention next is not known: {error}")
+        return
+    belief = group["belief"].values.astype(np.float64)
+    control = group["control_index"].values[:, -1]
+    chance = np.zeros(len(belief))
+    for index in np.unique(control[flown]):
+        mine = flown[control[flown] == index]
+        chance[mine] = attention(knowledge, belief[mine], int(index))
+    scale, unit = _scale(scenario)
+    rows = []
+    for row in flown[np.argsort(-chance[flown], kind="stable")][:NEXT].tolist():
+        pairs = zip(group["mean"].values[row, -1], group["standard_deviation"].values[row, -1], strict=True)
+        states = [f"{scale * mean:.1f} ± {scale * deviation:.1f}" for mean, deviation in pairs]
+        name = record["members"][row][0]
+        rows.append([name, *states, scenario.control_names[int(control[row])], f"{100.0 * chance[row]:.0f}"])
+    columns = [Column("asset"), *(Column(factor.name, unit, numeric=True) for factor in scenario.state)]
+    columns += [Column("control"), Column("change", "%", numeric=True)]
+    steps = scenario.mission.prediction_steps
+    caption = (
+        f"Change: probability that the policy leaves the control within {steps} "
+        f"{scenario.mission.step_name}s; for assets with calibrations of their own by one policy."
+    )
+    page.add_table(Table(columns, rows), caption, title="Who needs attention next")
