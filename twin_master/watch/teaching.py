@@ -25,8 +25,10 @@ SETTLE_TURNS = 10
 """Turns that an alarm must hold before its cause is looked for; they also show what it is."""
 TRIAL_TURNS = 10
 """Turns behind a verdict, none of which it has seen, in which model and patched model are compared."""
-TRIED = ("named", "named in part")
-"""Verdicts whose patch is tried; of a group it would be one of several that fit alike."""
+GROUP = "group"
+TRIED = ("named", "named in part", GROUP)
+"""Verdicts whose patch is tried; that of a group is its most probable member. All members explain the gap
+alike, so that the state is estimated alike whichever is true; turns that none has seen must bear it out."""
 FOLDER = "teaching"
 NO_ALARMS = "--teach begins with an alarm: the scenario needs the table `[notice]`."
 NO_WING = (
@@ -235,7 +237,8 @@ def verdict_of(
     tried, patch = kind in TRIED and (folder / "patch.json").is_file(), folder / "patch.json"
     sentence = f"{where}: {kind}. {said}"
     if tried:
-        sentence += f" The patch is tried beside the model for {TRIAL_TURNS} {step}s."
+        which = "patch of the most probable of these" if kind == GROUP else "patch"
+        sentence += f" The {which} is tried beside the model for {TRIAL_TURNS} {step}s."
     elif patch.is_file():
         options = f"--model-patch DIR/{patch.relative_to(watch)} --from-turn {question.from_turn}"
         sentence += f" To believe it none the less: uav-twin watch --resume --out DIR {options}"
@@ -250,7 +253,9 @@ def trial_sentence(trial: Mapping[str, Any], gained: float, step: str) -> str:
     first = trial["from_turn"]
     compared = f"Beside the model for {TRIAL_TURNS} {step}s the patch gained {gained:.3g} nats of evidence"
     if gained > 0.0:
-        return f"{compared}: it is believed from {step} {first} on, and these {step}s were filtered anew."
+        said = f"{compared}: it is believed from {step} {first} on, and these {step}s were filtered anew."
+        one = " It is one of a group: which of them is true these data cannot tell."
+        return said + (one if trial["kind"] == GROUP else "")
     return f"{compared}, and is not adopted."
 
 

@@ -531,10 +531,10 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
     assert journal == (watch.folder / JOURNAL_NAME).read_bytes()
 
 
-def test_a_wrong_name_is_not_adopted_and_a_group_is_told(base: Watch, loose: Path, tmp_path: Path) -> None:
+def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base: Watch, loose: Path, tmp_path: Path) -> None:
     for kind, gain, sentence in (
         ("named", 0.3, "and is not adopted."),
-        ("group", -0.3, "--model-patch DIR/teaching/turns_"),
+        ("family", -0.3, "--model-patch DIR/teaching/turns_"),
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
     ):
         watch = watchful(base, tmp_path / f"{kind}{gain}")
@@ -583,7 +583,7 @@ def test_live_turns_do_not_wait_for_the_patched_model(
     watch = watchful(base, tmp_path / "watch")
     feed = CsvFeed(loose, watch.scenario)
     feed.replayable = False  # as a broker
-    finder = search(watch, tmp_path, "named", -0.3)
+    finder = search(watch, tmp_path, "group", -0.3)
     trial_end = 0
 
     def decide(decision: Any) -> None:
@@ -601,6 +601,7 @@ def test_live_turns_do_not_wait_for_the_patched_model(
     model = next(record for record in lines(watch) if "model" in record)
     assert model["turn"] == trial_end + 3
     assert model["model"]["from_turn"] < 20
+    assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
     twin, first = base.models[0].knowledge.twin(), model["model"]["from_turn"]
     observed = mission.observed.copy()
     observed[15:, 4] *= 0.7
