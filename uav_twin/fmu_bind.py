@@ -20,6 +20,8 @@ def bind(
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Draft a binding for an FMU: which variable is which role, in which unit."""
+    import gc
+
     from fmu_asset.archive.fmu_file import read_fmu
     from fmu_asset.door.draft import draft_binding
     from fmu_asset.errors import BindingError
@@ -27,7 +29,11 @@ def bind(
 
     if out is not None and out.exists() and not replace:
         raise BindingError(f"{out} exists: choose another --out or give --replace.")
-    text = draft_binding(read_fmu(file), step_size=step_size)
+    gc.disable()  # of 100,000 variables nothing is garbage, and looking for it takes a third of the time
+    try:
+        text = draft_binding(read_fmu(file), step_size=step_size)
+    finally:
+        gc.enable()
     if out is None:
         typer.echo(text, nl=False)
         return

@@ -4,8 +4,8 @@ import json
 import math
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from itertools import count
 
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError
@@ -70,10 +70,12 @@ class _Draft:
         self._outputs = [v for v in usable if v.causality == "output"]
         self._parameters = [v for v in usable if v.causality == "parameter" and v.variability != "constant"]
         self._others = [v for v in usable if v.causality in ("local", "calculatedParameter", "none")]
-        self._left_out = [v for v in description.variables if v not in usable and v.causality != "local"]
+        names = {v.name for v in usable}
+        self._left_out = [v for v in description.variables if v.name not in names and v.causality != "local"]
         declared = step_size or description.fixed_step or description.step_size
         self._step_size, self._step_known = declared or 1.0, declared is not None
         self._keys: set[tuple[str, str]] = set()
+        self._wished: Counter[tuple[str, str]] = Counter()
 
     def text(self) -> str:
         lines = self._header()
@@ -200,12 +202,13 @@ class _Draft:
     def _key(self, role: str, name: str) -> str:
         """Return a name for a table, unique within its role."""
         wish = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_").lower() or "x"
-        for number in count(1):
+        while True:
+            self._wished[role, wish] += 1
+            number = self._wished[role, wish]
             key = wish if number == 1 else f"{wish}_{number}"
             if (role, key) not in self._keys:
                 self._keys.add((role, key))
                 return key
-        raise AssertionError
 
 
 def _groups(variables: Iterable[VariableInfo]) -> list[list[VariableInfo]]:

@@ -54,6 +54,14 @@ class Solver(CVodeSolver):  # type: ignore[misc]
     ) -> None:
         self._failure: FMICallException | None = None
         self._open = True
+        nominals = functions["get_nominals"]
+
+        def get_nominals(values: Any, count: int) -> None:
+            nominals(values, count)
+            for index in range(count):
+                # Zero says nothing of a size, and CVODE takes no tolerance of zero for a state that is zero.
+                values[index] = abs(values[index]) or 1.0
+
         super().__init__(
             nx=states,
             nz=event_indicators,
@@ -62,7 +70,7 @@ class Solver(CVodeSolver):  # type: ignore[misc]
             maxStep=largest_step,
             relativeTolerance=tolerance,
             maxNumSteps=_MOST_INTERNAL_STEPS,
-            **functions,
+            **(functions | {"get_nominals": get_nominals}),
         )
 
     # An exception that leaves a ctypes callback is printed and forgotten, and CVODE goes on with rubbish.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -232,6 +233,20 @@ def test_fmi_2_model_exchange_with_state_events(foreign_fmu: Any, isolated: bool
         expected = [asset.step().values.tobytes() for _ in range(3)]
         asset.restore_state(saved)
         assert [asset.step().values.tobytes() for _ in range(3)] == expected
+
+
+def test_a_nominal_of_zero_counts_as_one_and_an_identifier_may_have_a_hyphen(
+    foreign_fmu: Any, tmp_path: Path
+) -> None:
+    fmu = tmp_path / "ball-2.fmu"
+    with zipfile.ZipFile(foreign_fmu("ball2", "NOMINAL=0.0")) as source, zipfile.ZipFile(fmu, "w") as target:
+        for entry in source.namelist():
+            content = source.read(entry).replace(b'modelIdentifier="ball2"', b'modelIdentifier="ball-2"')
+            target.writestr(entry.replace("ball2", "ball-2"), content)
+    with FmiAsset(fmu, binding(0.05, header={"tolerance": 1e-8}, **BALL), isolated=False) as asset:
+        history = asset.simulate(steps=8)
+    expected = [bounces(0.7, 9.81, time)[:2] for time in history.time]
+    np.testing.assert_allclose(history.values * [1e-3, 1.0], expected, rtol=1e-6)
 
 
 @BOTH

@@ -109,6 +109,21 @@ def test_paths_that_lead_outside(fmu: Path, tmp_path: Path, name: str) -> None:
         read_fmu(path)
 
 
+def test_an_entry_that_is_there_twice_is_harmless_where_both_are_equal(fmu: Path, tmp_path: Path) -> None:
+    """An official Reference FMU holds one of its files twice."""
+    path = tmp_path / "twice.fmu"
+    path.write_bytes(fmu.read_bytes())
+    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr("modelDescription.xml", archive.read("modelDescription.xml"))
+    described = read_fmu(path)
+    assert described.variables == read_fmu(fmu).variables
+    assert (extract_fmu(described) / "modelDescription.xml").is_file()
+    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr("modelDescription.xml", b"another")
+    with pytest.raises(FmuFileError, match=r"'modelDescription\.xml' twice with different content"):
+        read_fmu(path)
+
+
 def test_links_are_refused(fmu: Path, tmp_path: Path) -> None:
     path = tmp_path / "evil.fmu"
     path.write_bytes(fmu.read_bytes())

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import cProfile
 import dataclasses
+import itertools
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -97,6 +99,19 @@ def test_numbered_outputs_are_one_observation(first: int, count: int, form: str)
     drafted = parse_binding(tomllib.loads(draft_binding(fmu)))
     assert drafted.observation_variables == tuple(names)
     assert len(drafted.observation) == 1
+
+
+def test_a_draft_takes_twice_as_long_for_twice_as_many_variables() -> None:
+    """Names that differ in what a key cannot hold, such as those of another alphabet, as well."""
+    counts = []
+    for bits in (9, 10):
+        names = ["".join(letters) for letters in itertools.product("äö", repeat=bits)]
+        causalities = itertools.cycle(["input", "output", "parameter", "local"])
+        there = description(*map(variable, names, causalities))
+        profile = cProfile.Profile()
+        profile.runcall(draft_binding, there)
+        counts.append(sum(entry.callcount for entry in profile.getstats()))
+    assert counts[1] < 2.2 * counts[0]
 
 
 def test_other_units_are_another_observation() -> None:

@@ -15,6 +15,9 @@ HOOK int frame_get_state(Model *m, Model *copy) { *copy = *m; return OK; }
 HOOK int frame_set_state(Model *m, const Model *copy) { *m = *copy; return OK; }
 
 #define M ((Model *)c)
+#ifndef NOMINAL
+#define NOMINAL 1.0
+#endif
 static const fmi2CallbackFunctions *callbacks(Model *m) { return m->parts[0]; }
 
 void model_say(Model *m, int status, const char *text) {
@@ -133,6 +136,6 @@ fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real dx[], size_t n) { model_
 fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real z[], size_t n) { model_event_indicators(M, z); return fmi2OK; }
 fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real x[], size_t n) { memcpy(x, M->r, n * sizeof(double)); return fmi2OK; }
 fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real x[], size_t n) {
-    for (size_t k = 0; k < n; k++) x[k] = 1.0;
+    for (size_t k = 0; k < n; k++) x[k] = NOMINAL;
     return fmi2OK;
 }
