@@ -20,16 +20,14 @@ from fe.wing.parts import Modulus, Part
 from reporting.section import checked
 from reporting.toml_file import read_toml
 
+from .rosettes import LEAST_SINE, Vector, with_rosettes
+
 FloatArray = NDArray[np.float64]
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 """Units of length and their size [m]."""
-LEAST_SINE = 1e-3
-"""Two axes whose angle has a smaller sine do not span a plane."""
-
 Name = Annotated[str, Field(max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 SetName = Annotated[str, Field(min_length=1, max_length=200)]
-Vector = tuple[float, float, float]
 Poisson = Annotated[float, Field(gt=-1.0, lt=0.5)]
 Spring = Annotated[float, Field(ge=0.0, le=1e15, description="N/m")]
 
@@ -395,6 +393,7 @@ def parse_structure(content: dict[str, Any], source: str = "the structure") -> S
     InvalidDesignError
         One sentence that names `source`, the place, what came and what was expected.
     """
+    content = with_rosettes(content, source, InvalidDesignError)
     return checked(StructureDesign, content, source, InvalidDesignError, what="a structure")
 
 

@@ -51,7 +51,7 @@ def gauge_rows(
     """
     rows, places = [sparse.csr_array((0, mesh.unknowns))], []
     for number, gauge in enumerate(gauges, start=1):
-        where = f"gauge[{number}]"
+        where = f"gauge[{number}] ({gauge.name})"
         point = mesh.unit * np.asarray(gauge.point)
         found = locator.on_surface(point, f"{where}: the point {mesh.place(point)}")
         direction = _in_surface(np.asarray(gauge.direction), found.normal, where)

@@ -185,7 +185,7 @@ def test_the_file_without_a_fault_is_taken(make: Callable[[str], Path]) -> None:
         (
             "point = [10, 5, 10]",
             "point = [10, 5, 9]",
-            r"gauge\[1\]: the point \(10, 5, 9\) mm lies 1 mm off .* inside",
+            r"gauge\[1\] \(a\): the point \(10, 5, 9\) mm lies 1 mm off .* inside",
         ),
         (
             "point = [10, 5, 10]",
@@ -195,12 +195,12 @@ def test_the_file_without_a_fault_is_taken(make: Callable[[str], Path]) -> None:
         (
             "direction = [1, 0, 0]",
             "direction = [0, 1, 4]",
-            r"gauge\[1\]: its direction points 76 degrees out of",
+            r"gauge\[1\] \(a\): its direction points 76 degrees out of",
         ),
         (
             "direction = [1, 0, 0]",
             "direction = [1, 0, 0]\nlength = 25",
-            r"gauge\[1\]: 25 mm long, .* over the edge",
+            r"gauge\[1\] \(a\): 25 mm long, .* over the edge",
         ),
         (
             "point = [20, 5, 5]\nmass",
@@ -247,3 +247,23 @@ def test_parts_that_turn_on_a_hinge_cannot_be_solved(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text(text)
     with pytest.raises(SolutionError, match=r"some part of the structure is not held|hardly held"):
         static_responses(load_and_assemble(tmp_path / "s.toml"))
+
+
+def test_a_rosette_is_gauges_at_one_point(make: Callable[[str], Path]) -> None:
+    """Its strains are those of one plane strain state; beside gauges of their own they come last."""
+    rosette = '[[rosette]]\nname = "r"\npoint = [10, 5, 10]\naxes = [[1, 0, 0], [1, 2, 0]]\n'
+    structure = load_and_assemble(make(GOOD + rosette + "angles = [0, 45, 90, 60]\n"))
+    assert structure.gauges == ("a", "r_a", "r_b", "r_c", "r_d")
+    own, first, middle, last, fourth = structure.gauge_output.toarray()
+    np.testing.assert_array_equal(own, first)
+    half = 0.5 * (2.0 * middle - first - last)
+    wanted = 0.25 * first + 0.75 * last + half * np.sin(np.radians(120.0))
+    np.testing.assert_allclose(fourth, wanted, atol=1e-12 * np.abs(first).max())
+    for old, new, sentence in (
+        ("[1, 2, 0]]", "[2, 0, 0]]", r"rosette\[1\]: the two axes must point in two directions"),
+        ("axes", "axis", r"rosette\[1\]: 'axis' is not a key of a rosette"),
+        ("[1, 2, 0]]", "[0, 0, 1]]", r"gauge\[3\] \(r_b\): its direction points 45 degrees out of"),
+        ('"r"', '"a"\nangles = []', r"rosette\[1\]: angles: .* at least 2"),
+    ):
+        with pytest.raises(FiniteElementError, match=sentence):
+            load_and_assemble(make(GOOD + rosette.replace(old, new)))
