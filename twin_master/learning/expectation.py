@@ -5,7 +5,7 @@ of the damage in common stays in it. Moments are exact; quantiles take what a se
 the state.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from twin_master.learning.hypotheses import Hypotheses, quantiles_of, shown_by
 from twin_master.learning.learning_filter import LearningFilter
-from twin_master.network.estimator import Carried
+from twin_master.network.estimator import Carried, Learnt
 from twin_master.network.rewards import RewardModel
 
 __all__ = ["Expected", "LearntExpectation"]
@@ -79,6 +79,63 @@ class LearntExpectation:
     def predicted(self, carried: Sequence[Carried], horizon: int) -> Expected:
         """Return what is expected after each of T turns of the H turns to come."""
         return _stacked(self._ahead(turn, horizon) for turn in carried)
+
+    def of_marginals(
+        self, learnt: Mapping[str, Learnt], joint: Float, controls: slice, seen: Float | None
+    ) -> Expected:
+        """Return what is expected under B beliefs (B, S, U') where no more is known than what was learnt.
+
+        Each quantity is taken for independent of the others and of the state; the parameter stands a standard
+        deviation to either side of its mean, between the draws around it.
+
+        Parameters
+        ----------
+        learnt : dict of str to Learnt
+            Posterior of each quantity, as a turn tells it.
+        joint : (B, S, U')
+            Belief over states and controls.
+        controls : slice
+            Which of the controls the U' are.
+        seen : (G,) or None
+            What the sensors say, SI.
+        """
+        sensors, priors = self._value.shape[-1], self._learning.priors
+        share = self._learning.sensor_model.draw_weight
+        if (parameter := learnt.get(priors.parameter or "")) is not None:
+            draws = np.asarray(priors.draws, dtype=np.float64)
+            order = np.argsort(draws)
+            share = np.zeros(len(order))
+            for side in (-1.0, 1.0):
+                at = parameter.mean + side * parameter.standard_deviation
+                place = float(np.interp(at, draws[order], np.arange(len(order))))
+                low, part = int(place), place - int(place)
+                share[order[low]] += 0.5 * (1.0 - part)
+                share[order[min(low + 1, len(order) - 1)]] += 0.5 * part
+        draw = np.flatnonzero(share)
+
+        def of_sensors(name: str, otherwise: float) -> tuple[Float, Float]:
+            known = [learnt.get(f"{name}[{number}]") for number in range(1, sensors + 1)]
+            means = [otherwise if own is None else own.mean for own in known]
+            return np.array(means), np.array(
+                [0.0 if own is None else own.standard_deviation for own in known]
+            )
+
+        (gain, gain_spread), (offset, offset_spread), (scale, scale_spread) = (
+            of_sensors(name, otherwise)
+            for name, otherwise in (("gauge_gain", 0.0), ("gauge_offset", 0.0), ("noise_scale", 1.0))
+        )
+        spread = np.stack([offset_spread**2, np.zeros(sensors), gain_spread**2], axis=-1)
+        count = len(draw)
+        hypotheses = Hypotheses(
+            weight=np.empty(0),
+            draw=draw,
+            offset=np.tile(offset, (count, 1)),
+            gain=np.tile(gain, (count, 1)),
+            covariance=np.tile(spread, (count, 1, 1)),
+            scale2=np.tile(scale**2 + scale_spread**2, (count, 1)),
+        )
+        weight = share[draw][None, :, None, None] * joint[:, None]
+        return self._of(hypotheses, np.ascontiguousarray(weight), controls, seen)
 
     @cached_property
     def _closed_loop(self) -> Float:

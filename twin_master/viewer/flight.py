@@ -6,6 +6,7 @@ from them is computed here, as the run does it, so that every number is that of 
 
 from array import array
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.errors import RunFolderError
+from twin_master.learning.expectation import Expected, LearntExpectation
+from twin_master.learning.setup import learning_filter
 from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME, kept_knowledge
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.inference import known_control, predict
@@ -83,12 +86,21 @@ class Flight:
         config = read_config(folder)
         self.scenario: Scenario = parse_scenario(config["scenario"], str(folder))
         self._knowledge_of = self._kept_at()
-        self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
+        self._know()
         self._journal = GrowingJournal(folder)
         # Where in the journal stand belief and observation of each turn; in memory are those last read.
         self._believed, self._observed = array("q"), array("q")
         self._kept: OrderedDict[int, SeenTurn] = OrderedDict()
         self.number = 0
+
+    def _know(self) -> None:
+        """Read what the twin knows, and what it expects of sensors and rewards where it learns."""
+        self.knowledge: Knowledge = kept_knowledge(self.folder, self.scenario)
+        known = self.knowledge
+        learning = learning_filter(self.scenario, known.model, known.sensor_model, known.draws.values)
+        self._expectation = (
+            None if learning is None else LearntExpectation(learning, known.rewards, known.plan.policy)
+        )
 
     @property
     def turns(self) -> int:
@@ -109,7 +121,8 @@ class Flight:
             self._kept.clear()
             self.number += 1
         if (kept := self._kept_at()) != self._knowledge_of:  # a patched model was adopted
-            self._knowledge_of, self.knowledge = kept, kept_knowledge(self.folder, self.scenario)
+            self._knowledge_of = kept
+            self._know()
             self.number += 1
             changed = True
         news = self._journal.news(TURNS_AT_ONCE)
@@ -190,7 +203,15 @@ class Flight:
             len(self.knowledge.model.controls),
         )
         decided = np.array([turn.decision_probability for turn in turns])
-        return self._belief(joint, self.observed(first, end), decided)
+        observed = self.observed(first, end)
+        found = self._belief(joint, observed, decided)
+        if self._expectation is None or not turns:
+            return found
+        parts = []
+        for turn, own, seen in zip(turns, joint, observed, strict=True):
+            u = slice(turn.control_index, turn.control_index + 1)
+            parts.append(self._expectation.of_marginals(turn.learnt, own[None, :, u], u, seen))
+        return _as_learnt(found, parts)
 
     def predicted(self, turn: int) -> Belief:
         """Return what the twin expected after a turn of the H turns to come."""
@@ -203,7 +224,12 @@ class Flight:
             plan.policy,
             self.scenario.mission.prediction_steps,
         )
-        return self._belief(coming.joint, None, coming.control_probability)
+        found = self._belief(coming.joint, None, coming.control_probability)
+        if self._expectation is None:
+            return found
+        return _as_learnt(
+            found, [self._expectation.of_marginals(seen.learnt, coming.joint, slice(None), None)]
+        )
 
     def _belief(self, joint: Float, observed: Float | None, control_probability: Float) -> Belief:
         knowledge = self.knowledge
@@ -220,6 +246,18 @@ class Flight:
             np.hypot(spread, sensors.noise(joint)),
             control_probability,
         )
+
+
+def _as_learnt(belief: Belief, expected: Sequence[Expected]) -> Belief:
+    """Return a belief with sensors and rewards as they are expected by what was learnt."""
+    mean, spread, noise, reward, reward_spread = (
+        np.concatenate([getattr(part, name) for part in expected])
+        for name in ("mean", "standard_deviation", "noise", "reward_mean", "reward_standard_deviation")
+    )
+    return replace(
+        belief, sensor_mean=mean, sensor_deviation=np.hypot(spread, noise), reward_mean=reward,
+        reward_deviation=reward_spread,
+    )  # fmt: skip
 
 
 def is_prepared(folder: Path) -> bool:

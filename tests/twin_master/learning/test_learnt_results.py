@@ -20,6 +20,7 @@ from twin_master.report.learnt import learnt_figure, learnt_tables
 from twin_master.report.page import render_page
 from twin_master.report.reading import open_run, read_run
 from twin_master.scenario.reading import load_scenario
+from twin_master.viewer.flight import Flight
 from twin_master.watch.decision import gap_of
 from twin_master.workflow import resume_run
 from uav_twin.cli import app
@@ -164,6 +165,26 @@ def test_what_the_gauges_are_expected_to_show_is_what_was_learnt(
     assert (filtered["quantity_mean"] < filtered["quantity_upper"]).all()
     ahead = run["predicted"]["quantity_mean"].values[-1, 0] / filtered["quantity_mean"].values[-1]
     assert np.median(ahead) == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_view_shows_what_was_learnt(folder: Path, run: xr.DataTree) -> None:
+    """From the posterior of each quantity alone, which the journal tells."""
+    flight, filtered = Flight(folder), run["filtered"].to_dataset()
+    flight.update()
+    shown, noise = flight.believed(0, TURNS), filtered["noise_standard_deviation"].values
+    wide = np.hypot(noise, filtered["quantity_standard_deviation"].values)
+    np.testing.assert_allclose(shown.sensor_deviation, wide, rtol=0.1)
+    np.testing.assert_allclose(shown.reward_mean, filtered["reward_mean"].values, atol=0.03)
+    ahead = flight.predicted(TURNS - 1).sensor_mean - run["predicted"]["quantity_mean"].values[-1]
+    assert np.abs(ahead / noise[-1]).max() < 0.06
+
+    def off() -> float:
+        error = (flight.believed(0, TURNS).sensor_mean - filtered["quantity_mean"].values) / noise
+        return float(np.abs(error).max())
+
+    learnt = off()
+    flight._expectation = None
+    assert learnt < 0.06 < 0.3 < off()  # as calibrated
 
 
 def test_the_gap_of_a_model_is_that_of_what_was_learnt(scenario: Path, run: xr.DataTree) -> None:
