@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 import tomllib
@@ -22,6 +23,7 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.errors import MissionInputError
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.watch.folder import begin_watch
 from twin_master.workflow import new_run
 from uav_twin import cli
 
@@ -127,6 +129,11 @@ def test_the_twin_flies_with_it(calibrated: Path, tmp_path: Path) -> None:
     solution = Factorisation(full.stiffness({"e": found.mean("e")}, {})).solve(full.load("weight", 1.0))
     wanted = float(tree["observed"]["load_factor"][0]) * (full.gauge_output @ solution)
     np.testing.assert_allclose(tree["truth"]["strain"].values[0], wanted, rtol=5e-4)
+
+    said.clear()
+    own = Overrides(calibration=calibrated)
+    os.close(begin_watch(mission(), tmp_path / "watch", own, _Noted(said), replace_run=False)[1])
+    assert any("flown is the watched asset" in note and note.endswith(believed) for note in said)
 
     scenario = resolve_scenario(mission(draws=3), Overrides(calibration=calibrated))
     source = asset_source(scenario)
