@@ -17,17 +17,20 @@ class FmuError(Exception):
     ----------
     messages : tuple of str
         What the FMU itself had logged since the last call that succeeded, oldest first.
+    time : float or None
+        Where the FMU ended its simulation [s], if it did.
     """
 
-    def __init__(self, sentence: str, messages: Sequence[str] = ()) -> None:
+    def __init__(self, sentence: str, messages: Sequence[str] = (), time: float | None = None) -> None:
+        self.time = time
         self.messages = tuple(visible(message) for message in messages)
         self.sentence = sentence = visible(sentence)
         log = "".join(f"\n  the FMU says: {message}" for message in self.messages)
         super().__init__(sentence + log)
 
-    def __reduce__(self) -> "tuple[type[FmuError], tuple[str, tuple[str, ...]]]":
-        """Pickle as the sentence and the messages."""
-        return type(self), (self.sentence, self.messages)
+    def __reduce__(self) -> "tuple[type[FmuError], tuple[str, tuple[str, ...], float | None]]":
+        """Pickle as the sentence, the messages and the time."""
+        return type(self), (self.sentence, self.messages, self.time)
 
 
 class FmuBuildError(FmuError, ValueError):
@@ -72,6 +75,10 @@ class FmuInputError(FmuError, ValueError):
 
 class FmuCallError(FmuError, RuntimeError):
     """An FMI function did not return OK."""
+
+
+class FmuEndedError(FmuCallError):
+    """The FMU has ended its simulation by itself; its outputs of that moment can still be read."""
 
 
 class FmuOutputError(FmuError, RuntimeError):

@@ -43,4 +43,7 @@ def simulate(
     with asset:
         history = asset.simulate(**given.roles, steps=given.steps, progress=terminal.progress())
         write_history(out, asset, history)
-    terminal.say(f"{out}: {len(history.time)} steps to t = {history.time[-1]:g} s.")
+    end = history.time[-1] if len(history.time) else asset.time
+    terminal.say(f"{out}: {len(history.time)} steps to t = {end:g} s.")
+    if history.ended:
+        terminal.say(history.ended)

@@ -362,7 +362,8 @@ class CoupledAsset(SteppedAsset):
             self.reset()
 
     def _named(self, error: FmuError, index: int) -> FmuError:
-        return type(error)(f"component {self._layout.names[index]}: {error.sentence}", error.messages)
+        sentence = f"component {self._layout.names[index]}: {error.sentence}"
+        return type(error)(sentence, error.messages, error.time)
 
     def _open(self, isolated: bool, step_timeout: float | None) -> list[FmiAsset]:
         assets = []

@@ -301,6 +301,6 @@ class OpenedFmu(SteppedAsset):
             tool = what == "the start" and self._description.needs_tool
             hint = " It declares that it needs its authoring tool on this machine." if tool else ""
             raise type(error)(
-                f"{self._description.path}, {what}: {error.sentence}{hint}", error.messages
+                f"{self._description.path}, {what}: {error.sentence}{hint}", error.messages, error.time
             ) from error
         raise error

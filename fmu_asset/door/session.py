@@ -4,7 +4,7 @@ from typing import Self
 
 import numpy as np
 
-from fmu_asset.errors import FmuCallError, FmuError, FmuStateError
+from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError
 from fmu_asset.instances.series import Series
 from reporting.progress import Progress, SilentProgress, Stage
 
@@ -73,6 +73,8 @@ class FmiAsset(OpenedFmu):
             If a name is not in the binding.
         FmuCallError
             If the FMU refused the step (Discard) or failed.
+        FmuEndedError
+            If the FMU ended its simulation; `observe` still reads its outputs.
         FmuOutputError
             If an output is not finite.
         FmuWorkerError, FmuTimeoutError
@@ -108,7 +110,8 @@ class FmiAsset(OpenedFmu):
         """Make many communication steps under prescribed inputs, from where the asset is.
 
         The result is that of as many calls of `step`, to the bit. All inputs are checked before the first
-        step. If a step fails, the steps before it are made and the asset is where it was before that one.
+        step. If a step fails, the steps before it are made and the asset is where it was before that one. If
+        the FMU ends its simulation, the result ends there and says so in `ended`.
 
         Parameters
         ----------
@@ -136,12 +139,25 @@ class FmiAsset(OpenedFmu):
         rows[:, 0], rows[:, 1] = moments[:-1], self._step_size
         replies = np.full((len(rows), len(self._reply)), np.nan)
         with (progress or SilentProgress()).stage("Simulating", total=len(rows), unit="steps") as stage:
+            begin = self._index
             for series in blocks(rows, replies):
-                self._run(instance, series, stage)
-        return ObservationHistory.of(self._exchange.outputs, moments[1:], replies)
+                ended = self._run(instance, series, stage)
+                if ended is not None:
+                    made = self._index - begin
+                    if ended.time is not None and ended.time > moments[made]:
+                        # A part of the step was made, or all of it.
+                        moments[made + 1], made = ended.time, made + 1
+                        replies[made - 1] = np.frombuffer(self._outputs_now())
+                    moments, replies = moments[: made + 1], replies[:made]
+                    break
+        sentence = "" if ended is None else ended.sentence
+        return ObservationHistory.of(self._exchange.outputs, moments[1:], replies, sentence)
 
-    def _run(self, instance: Instance, series: Series, stage: Stage) -> None:
-        """Make a block of steps; whatever happens, the asset is where the last complete one has left it."""
+    def _run(self, instance: Instance, series: Series, stage: Stage) -> FmuEndedError | None:
+        """Make a block of steps; whatever happens, the asset is where the last complete one has left it.
+
+        Return how the FMU has ended its simulation, if it has.
+        """
         before, begin, shown = self._request.tobytes(), self._index, 0
         width = len(before)
 
@@ -161,6 +177,8 @@ class FmiAsset(OpenedFmu):
             self._request.cast("B")[:] = made[-width:] or before
             if self._recording:
                 self._record += [made[i + 16 : i + width] for i in range(0, len(made), width)]
+        if isinstance(failure, FmuEndedError):
+            return failure
         if failure is not None:
             self._fail(failure, f"step {self._index} from t = {self.time:g} s")
         end = series.done * series.reply_size
@@ -168,6 +186,7 @@ class FmiAsset(OpenedFmu):
         if self._reader.suspicious():
             self._refuse_not_finite(f" It was step {begin + series.done - 1}.")
         report()
+        return None
 
     def observe(self) -> Observation:
         """Return the observation of this moment without a step, such as the initial one."""

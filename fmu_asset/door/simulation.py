@@ -33,15 +33,23 @@ class ObservationHistory:
         The observations of the binding in their order and units.
     extra : dict of str to (N,) ndarray
         Monitors, recorded variables and outputs of ports.
+    ended : str
+        What the FMU did if it ended the simulation by itself: fewer steps were made then than were asked
+        for, and the last time is where it ended, within a step perhaps.
     """
 
     time: npt.NDArray[np.float64]
     values: npt.NDArray[np.float64]
     extra: dict[str, npt.NDArray[np.float64]]
+    ended: str = ""
 
     @classmethod
     def of(
-        cls, table: OutputTable, time: npt.NDArray[np.float64], replies: npt.NDArray[np.float64]
+        cls,
+        table: OutputTable,
+        time: npt.NDArray[np.float64],
+        replies: npt.NDArray[np.float64],
+        ended: str = "",
     ) -> "ObservationHistory":
         """Return what the reply blocks of N steps hold.
 
@@ -53,9 +61,11 @@ class ObservationHistory:
             Time at the end of each step [s].
         replies : (N, n_outputs) ndarray
             The reply blocks.
+        ended : str
+            What the FMU did if it ended the simulation by itself.
         """
         extra = np.ascontiguousarray(table.extra.of(replies).T)
-        return cls(time, table.observed.of(replies), dict(zip(table.extra_names, extra, strict=True)))
+        return cls(time, table.observed.of(replies), dict(zip(table.extra_names, extra, strict=True)), ended)
 
 
 def request_rows(

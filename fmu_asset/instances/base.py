@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 from fmpy.fmi1 import FMICallException
 
-from fmu_asset.errors import FmuCallError, FmuError, FmuStateError, FmuWorkerError
+from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError, FmuWorkerError
 
 from .block import Block
 from .messages import Mailbox, callbacks
@@ -62,6 +62,7 @@ class FmuInstance(ABC):
         self._substeps = plan.substeps
         self._mailbox = Mailbox(plan.instance_name)
         self._lost = False
+        self._ended: float | None = None
         self._phase = "instantiated"
         with _guarded_directory():
             try:
@@ -188,11 +189,18 @@ class FmuInstance(ABC):
         ------
         FmuCallError
             If a call returns Discard, Error or Fatal.
+        FmuEndedError
+            If the FMU ends its simulation, or has done so before.
         FmuWorkerError
             If the instance was lost to an earlier fatal error.
         """
         if self._lost:
             raise FmuWorkerError("The instance was lost to a fatal error; reset the asset to go on.")
+        if self._ended is not None:
+            raise FmuEndedError(
+                f"The FMU has ended its simulation at t = {self._ended:g} s; reset the asset to start anew.",
+                time=self._ended,
+            )
         self._send()
         if self._substeps == 1:
             self._advance()
@@ -206,6 +214,8 @@ class FmuInstance(ABC):
             self._begin.value = first + number * size
             try:
                 self._advance()
+            except FmuEndedError:
+                raise
             except FmuError as error:
                 if number == 0:
                     raise
@@ -253,6 +263,7 @@ class FmuInstance(ABC):
                 fmu.setFMUState(state)
             finally:
                 fmu.freeFMUState(state)
+        self._ended = None
         if self._mailbox.errors > errors:
             raise FmuStateError("The FMU refused the state.", self._texts())
 
@@ -262,7 +273,7 @@ class FmuInstance(ABC):
             if self._phase == "stepping":
                 self._fmu.terminate()
             self._fmu.reset()
-            self._phase = "instantiated"
+            self._phase, self._ended = "instantiated", None
 
     def take_log(self) -> list[tuple[int, str]]:
         """Return and forget the messages that the FMU has logged: status and text."""
@@ -313,6 +324,15 @@ class FmuInstance(ABC):
             status = call()
             if status not in ACCEPTED:
                 raise self._call_error(f"fmi{self._plan.fmi_version}{name}", status, "setting inputs")
+
+    def _end(self, time: float) -> FmuEndedError:
+        """Take note that the FMU has ended its simulation, and return the error that says so."""
+        self._ended = time
+        return FmuEndedError(
+            f"The FMU asked to end the simulation in {self._where()}, and ended at t = {time:g} s.",
+            self._texts(),
+            time,
+        )
 
     def _where(self) -> str:
         """Return which step is made, for an error."""

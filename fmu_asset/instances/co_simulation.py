@@ -10,10 +10,13 @@ from fmpy.fmi3 import FMU3Slave
 
 from fmu_asset.errors import FmuCallError
 
-from .base import ACCEPTED, FmuInstance
+from .base import ACCEPTED, DISCARD, OK, FmuInstance
 from .messages import Mailbox
 from .plan import Plan, Settings
 from .prepared import prepared
+
+_LAST_SUCCESSFUL_TIME, _TERMINATED = 2, 3
+"""Of the enumeration `fmi2StatusKind`."""
 
 
 class CoSimulation(FmuInstance):
@@ -22,6 +25,15 @@ class CoSimulation(FmuInstance):
     @abstractmethod
     def _further_arguments(self) -> tuple[Any, ...]:
         """Return the C values that follow communication point and step size in a call of DoStep."""
+
+    def _ended_at(self) -> float | None:
+        """Return where the FMU has ended its simulation by a step that it discarded; None if it has not."""
+        return None
+
+    def _within(self, time: float) -> float:
+        """Return a time that the FMU says to have reached, within the step."""
+        begin, size = self._begin.value, self._size.value
+        return min(max(time, begin), begin + size)
 
     def _instantiate(self, plan: Plan, mailbox: Mailbox) -> Any:
         fmu = super()._instantiate(plan, mailbox)
@@ -40,6 +52,8 @@ class CoSimulation(FmuInstance):
     def _advance(self) -> None:
         status = self._do_step()
         if status not in ACCEPTED:
+            if status == DISCARD and (reached := self._ended_at()) is not None:
+                raise self._end(reached)
             raise self._call_error(self._c_name("DoStep"), status, self._where())
 
 
@@ -73,6 +87,15 @@ class CoSimulation2(CoSimulation):
     def _further_arguments(self) -> tuple[Any, ...]:
         return (ctypes.c_int.from_param(1),)
 
+    def _ended_at(self) -> float | None:
+        ended, reached = ctypes.c_int(), ctypes.c_double()
+        component = self._component
+        status = self._function("GetBooleanStatus")(component, _TERMINATED, ctypes.byref(ended))
+        if status != OK or not ended.value:
+            return None
+        status = self._function("GetRealStatus")(component, _LAST_SUCCESSFUL_TIME, ctypes.byref(reached))
+        return self._within(reached.value if status == OK else self._begin.value)
+
 
 class CoSimulation3(CoSimulation):
     """FMI 3.0 co-simulation, without event mode and early return."""
@@ -88,9 +111,10 @@ class CoSimulation3(CoSimulation):
     def _advance(self) -> None:
         # Outputs of a call that an FMU need not set.
         self._terminate.value = self._early.value = False
+        self._reached.value = self._begin.value + self._size.value
         super()._advance()
         if self._terminate.value:
-            raise FmuCallError(f"The FMU asked to end the simulation in {self._where()}.", self._texts())
+            raise self._end(self._within(self._reached.value))
         if self._early.value:
             self._lost = True
             raise FmuCallError(

@@ -129,7 +129,7 @@ class ModelExchange(FmuInstance):
         self._fmu.setTime(time)
         if self._plan.completed_step:
             wanted, finished = self._completed_step()
-            self._refuse_end(finished, time)
+            self._heed_end(finished, time)
             event = event or wanted
         if event or (due is not None and time >= due - close):
             self._enter_event_mode()
@@ -141,7 +141,7 @@ class ModelExchange(FmuInstance):
         """Update the discrete states until they are settled, and go on in continuous time."""
         for _ in range(_MOST_EVENT_ITERATIONS):
             more, finished, following = self._update_once()
-            self._refuse_end(finished, time)
+            self._heed_end(finished, time)
             if not more:
                 break
         else:
@@ -154,13 +154,9 @@ class ModelExchange(FmuInstance):
         self._next_event = following if following is None or math.isfinite(following) else None
         self._enter_continuous_time_mode()
 
-    def _refuse_end(self, finished: bool, time: float) -> None:
+    def _heed_end(self, finished: bool, time: float) -> None:
         if finished:
-            self._lost = True
-            raise FmuCallError(
-                f"The FMU asked to end the simulation at t = {time:g} s; it cannot be flown further.",
-                self._texts(),
-            )
+            raise self._end(time)
 
     def _close_solver(self) -> None:
         if self._solver is not None:
@@ -192,7 +188,7 @@ class ModelExchange1(ModelExchange):
         converged, _, _, finished, due, time = self._fmu.initialize(
             toleranceControlled=b"\x00" if tolerance is None else b"\x01", relativeTolerance=tolerance or 0.0
         )
-        self._refuse_end(finished, start_time)
+        self._heed_end(finished, start_time)
         self._first: tuple[bool, float | None] | None = (not converged, time if due else None)
 
     def _update_once(self) -> tuple[bool, bool, float | None]:

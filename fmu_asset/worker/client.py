@@ -314,12 +314,13 @@ class WorkerInstance:
         self._fill(memoryview(content), what)
         self._busy = False
         try:
-            name, lost, sentence, *messages = separated(content)
+            name, lost, ended, sentence, *messages = separated(content)
+            time = float(ended) if ended else None
         except ValueError:
             raise self._died(what) from None
         self._lost = self._lost or bool(lost)
         self._logged = False
-        raise _ERRORS.get(name, FmuWorkerError)(sentence, messages)
+        raise _ERRORS.get(name, FmuWorkerError)(sentence, messages, time)
 
     def _died(self, what: str) -> FmuWorkerError:
         self._lost = True

@@ -117,7 +117,8 @@ def _answer_requests(incoming: int, outgoing: int) -> tuple[bool, FmuInstance | 
             HEADER.pack_into(reply_header, 0, RESULT, logged, number, len(payload))
         except FmuError as error:
             lost = instance is None or instance.lost
-            payload = joined(type(error).__name__, "lost" * lost, error.sentence, *error.messages)
+            time = "" if error.time is None else repr(error.time)
+            payload = joined(type(error).__name__, "lost" * lost, time, error.sentence, *error.messages)
             HEADER.pack_into(reply_header, 0, FAILURE, 0, number, len(payload))
         if os.getpid() != own_number:
             os._exit(0)  # a copy that the FMU has made of this process

@@ -16,6 +16,7 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import (
     BindingError,
     FmuCallError,
+    FmuEndedError,
     FmuFileError,
     FmuInputError,
     FmuUnsupportedError,
@@ -162,6 +163,7 @@ def test_fmi_3_co_simulation_with_arrays(foreign_fmu: Any, isolated: bool) -> No
             asset.step({"first": 11.0})
         with pytest.raises(FmuCallError, match="asked to end the simulation in the step"):
             asset.step(load={"offset": 99})
+        asset.reset()
         with pytest.raises(FmuCallError, match="returned early"):
             asset.step(load={"offset": 98})
 
@@ -247,6 +249,42 @@ def test_a_nominal_of_zero_counts_as_one_and_an_identifier_may_have_a_hyphen(
         history = asset.simulate(steps=8)
     expected = [bounces(0.7, 9.81, time)[:2] for time in history.time]
     np.testing.assert_allclose(history.values * [1e-3, 1.0], expected, rtol=1e-6)
+
+
+SECOND_BOUNCE = math.sqrt(2.0 / 9.81) * 2.4
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("model", "observed", "size", "end", "value"),
+    [
+        ("hostile2", "y", 1.0, 2.5, 2.5),
+        ("ball2", "h", 0.1, SECOND_BOUNCE, 0.0),
+        ("decay1", "x", 0.3, 1.0, math.exp(-1.0)),
+        ("swing3", "a", 0.3, 1.0, 1.0),
+    ],
+)
+def test_an_fmu_that_ends_its_simulation_leaves_what_was_simulated(
+    foreign_fmu: Any, isolated: bool, model: str, observed: str, size: float, end: float, value: float
+) -> None:
+    """Discard and `fmi2Terminated`; events of model exchange in FMI 2, 1 and 3."""
+    unit = {"y": "m", "h": "m", "x": "K"}.get(observed, "1")
+    sent = {"control": {"u": {"variable": "u", "unit": "m/s"}}} if model == "hostile2" else {}
+    described = binding(size, observation={"y": {"variables": observed, "unit": unit}}, **sent)
+    with FmiAsset(foreign_fmu(model, "ENDS"), described, isolated=isolated) as asset:
+        history = asset.simulate(steps=50)
+        assert f"ended at t = {end:g} s" in history.ended
+        whole = int(end / size)
+        np.testing.assert_allclose(history.time, [*(size * np.arange(1, whole + 1)), end], rtol=1e-6)
+        assert history.values[-1, 0] == pytest.approx(value, abs=1e-5)
+        with pytest.raises(FmuEndedError, match="has ended its simulation at t = "):
+            asset.step()
+        asset.reset()
+        assert [asset.step().values[0] for _ in range(whole)] == history.values[:whole, 0].tolist()
+        with pytest.raises(FmuEndedError, match="asked to end the simulation in the step") as caught:
+            asset.step()
+        assert caught.value.time == pytest.approx(end, rel=1e-6)
+        assert asset.observe().values[0] == history.values[-1, 0]
 
 
 @BOTH

@@ -9,5 +9,8 @@ void model_event(Model *m, int *due, double *time) {
         m->r[HEIGHT] = 1e-12;
         m->r[VELOCITY] *= -m->r[RESTITUTION];
         m->i[0]++;
+#ifdef ENDS
+        m->i[14] = m->i[0] == 2;
+#endif
     }
 }

@@ -90,6 +90,7 @@ static fmi1Status update(Model *m, fmi1EventInfo *info) {
     model_event(m, &due, &info->nextEventTime);
     info->upcomingTimeEvent = (fmi1Boolean)due;
     info->iterationConverged = 1;
+    info->terminateSimulation = m->i[14];
     return fmi1OK;
 }
 fmi1Status F(Initialize)(fmi1Component c, fmi1Boolean controlled, fmi1Real tolerance, fmi1EventInfo *info) { return update(M, info); }

@@ -149,6 +149,7 @@ fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *more, fmi3Boole
     *more = *end = *nominals = *values = false;
     model_event(M, &due, next);
     *defined = due;
+    *end = M->i[14];
     return fmi3OK;
 }
 fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) { return fmi3OK; }

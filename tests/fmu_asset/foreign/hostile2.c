@@ -82,7 +82,12 @@ int model_step(Model *m, double time, double size) {
 #endif
     if (m->stepped < AFTER) return OK;
     if (getenv("HOSTILE_FLAG") && access(getenv("HOSTILE_FLAG"), F_OK) != 0) return OK;
-#if defined SEGFAULT
+#if defined ENDS
+    m->r[Y] -= 0.5 * m->r[U] * size;
+    m->time = time + 0.5 * size;
+    m->i[14] = 1;
+    return DISCARD;
+#elif defined SEGFAULT
     crash();
 #elif defined ABORT
     abort();

@@ -8,7 +8,7 @@
 typedef struct {
     double time;
     double r[64]; /* reals: the continuous states first */
-    int i[16];
+    int i[16]; /* 14: the model ends the simulation */
     int b[16];
     int stepped; /* number of steps made */
     void *parts[4]; /* what a frame needs */

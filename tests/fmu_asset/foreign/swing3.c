@@ -16,4 +16,7 @@ void model_event(Model *m, int *due, double *time) {
     if (m->time >= 1.0 - 1e-12) m->r[5] = 1.0;
     *due = m->time < 1.0 - 1e-12;
     *time = 1.0;
+#ifdef ENDS
+    m->i[14] = !*due;
+#endif
 }
