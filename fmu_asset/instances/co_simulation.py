@@ -94,7 +94,9 @@ class CoSimulation2(CoSimulation):
         if status != OK or not ended.value:
             return None
         status = self._function("GetRealStatus")(component, _LAST_SUCCESSFUL_TIME, ctypes.byref(reached))
-        return self._within(reached.value if status == OK else self._begin.value)
+        # Exports of pythonfmu say of every step that they discard that they have ended where it began.
+        went = status == OK and reached.value > self._begin.value
+        return self._within(reached.value) if went else None
 
 
 class CoSimulation3(CoSimulation):
