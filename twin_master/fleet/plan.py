@@ -15,7 +15,7 @@ from twin_master.assets.resolution import Overrides, portable_scenario, resolve_
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Count, Name, NotNegative, Number, Probability, Section, Seed
+from twin_master.scenario.section import Count, Flag, Name, NotNegative, Number, Probability, Section, Seed
 from twin_master.seeds import generator
 
 __all__ = ["Fleet", "Group", "Member", "ensemble", "load_fleet", "seed_range"]
@@ -44,6 +44,9 @@ class GroupSection(Section):
     fmu: str | None = None
     binding: str | None = None
     calibration: str | None = None
+    in_process: Flag = False
+    """FMUs run in the process that flies the shard, without a worker of their own: faster, and a crash ends
+    that process."""
     learnt: str | None = None
     """A file of `uav-twin fleet learn`."""
     steps: Count | None = None
@@ -232,6 +235,7 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
         fmu=path(section.fmu),
         binding=path(section.binding),
         calibration=path(section.calibration),
+        in_process=section.in_process,
         learnt=path(section.learnt),
         learnt_group=section.name,
     )

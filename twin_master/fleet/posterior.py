@@ -19,6 +19,8 @@ BELOW = 13.0
 """A point counts whose log density is lower than the largest by no more: five deviations of a normal."""
 RESOLVED = 1.2
 """Spacing of a grid as a share of the standard deviation at which its sums are exact to 1e-6."""
+NOTHING = 1e-9
+"""Share of the largest weight below which the tails of an interval are cut."""
 FINE = 121
 """Points of an axis on which groups share a distribution."""
 
@@ -62,9 +64,12 @@ class Marginal:
         """Return the bounds of the central interval, by the cubic through the log density."""
         from scipy.interpolate import CubicSpline
 
-        fine = np.linspace(self.x[0], self.x[-1], 2001)
-        log_weight = np.log(np.maximum(self.weight, 1e-300))
-        density = np.exp(CubicSpline(self.x, log_weight)(fine) - log_weight.max())
+        # Where there is nothing, the logarithm would make the spline swing.
+        inside = np.flatnonzero(self.weight > NOTHING * self.weight.max())
+        part = slice(max(0, min(inside[0], len(self.x) - 4)), max(4, inside[-1] + 1))
+        fine = np.linspace(self.x[part][0], self.x[part][-1], 2001)
+        log_weight = np.log(np.maximum(self.weight[part], NOTHING * self.weight.max()))
+        density = np.exp(CubicSpline(self.x[part], log_weight)(fine) - log_weight.max())
         reached = np.cumsum(density) / density.sum()
         low, high = np.interp([0.5 - probability / 2.0, 0.5 + probability / 2.0], reached, fine)
         return float(logistic(np.array(low))), float(logistic(np.array(high)))

@@ -124,7 +124,7 @@ def groups_of(counts: list[tuple[int, int]]) -> list[Grid]:
 
 
 def test_groups_share_what_a_dense_sum_says() -> None:
-    from scipy.stats import betabinom
+    from scipy.stats import beta, betabinom
 
     counts = [(3, 47), (6, 44), (2, 48), (9, 41), (4, 46)]
     grids = groups_of(counts)
@@ -139,6 +139,9 @@ def test_groups_share_what_a_dense_sum_says() -> None:
     for (n, k), (marginal,) in zip(counts, found.groups, strict=True):
         exact = float((weight * (a + n) / (kappa + n + k)).sum())
         assert marginal.mean == pytest.approx(exact, rel=2e-3)
+        for bound, reached in zip(marginal.interval(), (0.025, 0.975), strict=True):
+            below = float((weight * beta.cdf(bound, a + n, b + k)).sum())
+            assert below == pytest.approx(reached, abs=4e-3)
     means = [marginal.mean for (marginal,) in found.groups]
     assert np.std(means) < 0.8 * np.std([n / (n + k) for n, k in counts])
 

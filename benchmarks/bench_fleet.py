@@ -1,0 +1,69 @@
+"""Twins side by side beside twins one by one, what storing adds, and what learning costs."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.measurement import Measurement
+from fe.reduction.model_cache import reduced_model
+from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.fleet.evidence import Worsening, scaled_likelihood, transition_evidence
+from twin_master.fleet.flight import fly_fleet
+from twin_master.fleet.plan import ensemble
+from twin_master.mission.preparation import prepare_knowledge
+from twin_master.mission.side_by_side import fly_one_by_one, fly_side_by_side
+from twin_master.scenario.reading import load_scenario
+
+TWINS, ALONE, POINTS = 256, 8, 49
+SCENARIO = "growing_damage"
+
+
+def run() -> list[Measurement]:
+    scenario = load_scenario(SCENARIO).scenario
+    source = ReducedModelSource(scenario, reduced_model())
+    knowledge, asset = prepare_knowledge(scenario, source, 0), source.open()
+    truths = [knowledge.truth(seed) for seed in range(TWINS)]
+    turns = TWINS * scenario.mission.steps
+    fly_one_by_one(knowledge, truths[:1], [asset])  # compiles
+    flown = fly_side_by_side(knowledge, truths, [asset] * TWINS)
+    together = cpu_seconds(lambda: fly_side_by_side(knowledge, truths, [asset] * TWINS)) / turns
+    alone = cpu_seconds(lambda: fly_one_by_one(knowledge, truths[:ALONE], [asset] * ALONE))
+    alone /= ALONE * scenario.mission.steps
+    seen = flown.observed, flown.control_index
+    sensors = knowledge.sensor_model
+    likelihood = cpu_seconds(lambda: scaled_likelihood(sensors, *seen)) / turns
+    worsening, scaled = Worsening.of(scenario), scaled_likelihood(sensors, *seen)[0]
+    points = np.full((POINTS, 2), 0.1)
+    transition_evidence(worsening, points[:1], scaled[:1], flown.control_index[:1])
+    learning = cpu_seconds(lambda: transition_evidence(worsening, points, scaled, flown.control_index))
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        fly_fleet(ensemble(SCENARIO, range(1)), folder / "start")
+        start = cpu_seconds(lambda: fly_fleet(ensemble(SCENARIO, range(1)), folder / "one"))
+        fleet = ensemble(SCENARIO, range(4 * TWINS))
+        whole = cpu_seconds(lambda: fly_fleet(fleet, folder / "many")) - start
+    to_ten_thousand = 10_000 / (4 * TWINS)
+    return [
+        Measurement("turn of a twin, side by side", 1e6 * together, "us", None, "alone", 1e6 * alone),
+        Measurement("likelihood of a turn in it", 1e6 * likelihood, "us", None, "all", 1e6 * together),
+        Measurement(
+            "10,000 twins stored, beside start-up (from 1,024)", to_ten_thousand * whole, "s", 8.0,
+            "likelihoods alone", likelihood * 500_000,
+        ),
+        Measurement(
+            "evidence of a turn at a point of a grid", 1e6 * learning / (turns * POINTS), "us", None,
+            "likelihood of a turn", 1e6 * likelihood,
+        ),
+    ]  # fmt: skip
+
+
+def cpu_seconds(function: Callable[[], object]) -> float:
+    """Return the processor time of a call in seconds."""
+    begin = time.process_time()
+    function()
+    return time.process_time() - begin
