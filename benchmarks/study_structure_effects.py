@@ -1,0 +1,190 @@
+"""Effects hidden in campaigns on the shipped bracket, made by its full finite element model.
+
+`python -m benchmarks.study_structure_effects` loads the bracket at its end in four cycles of load levels. The
+readings are those of the full model (981 unknowns), with noise of gauges and of a displacement, and an effect
+that nobody tells. The search knows the FMU of the reduced structure by the file that `uav-twin structure fmu
+--rig` writes. Young's modulus is off. Printed: the verdict on each campaign, and its time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
+from discrepancy.model_choice import load_model
+from discrepancy.models.second_order import SecondOrderSystem
+from discrepancy.verdict import Verdict, VerdictKind
+from discrepancy.workflow import investigate
+from fe.reduction.structure_cache import reduced_structure
+from fe.runtime.motion import laws_of
+from fe.runtime.patch import MicroSlip, ModelPatch, PowerStiffness, Primitive
+from fe.structure.design import load_structure
+from fe.structure.operators import load_and_assemble
+from fmu_asset.structures.build import build_structure_fmu
+from fmu_asset.structures.rig import rig_text
+from scenarios import structure_files
+
+FloatArray = NDArray[np.float64]
+
+PORT, PLACE = "sag", "[80, 20, 3]"
+PUSH = f"""
+[[control]]
+name = "push"
+unit = "N"
+nominal = 0.0
+minimum = -400.0
+maximum = 400.0
+
+[[load]]
+name = "pushed"
+control = "push"
+point = {PLACE}
+force = [0, 0, 1]
+"""
+NOISE = {Quantity.STRAIN: 1e-6, Quantity.DISPLACEMENT: 2e-6}
+ZERO = {Quantity.STRAIN: 1e-6}
+LEVELS = np.array([20.0, 40.0, 60.0, 80.0, 60.0, 40.0, 20.0])
+DAY = 4000.0  # s, of the campaign
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """An effect: of the catalogue, where, the laws at the port, and what becomes of readings and forces."""
+
+    identifier: str
+    place: str = ""
+    laws: tuple[Primitive, ...] = ()
+    readings: Callable[[str, FloatArray, FloatArray], FloatArray] = field(
+        default=lambda _name, _time, values: values
+    )
+    force: float = 1.0
+    tare: float = 0.0
+    """Of what the load cell shows, what truly acts; and what it lacks [N]."""
+
+
+HIDDEN = (
+    Hidden(""),
+    Hidden(
+        "gauge_gain", "heel",
+        readings=lambda name, _time, values: values * (1.06 if name == "heel" else 1.0),
+    ),
+    Hidden(
+        "gauge_zero_drift", "arm",
+        readings=lambda name, time, values: values + (3e-5 * time / DAY if name == "arm" else 0.0),
+    ),
+    Hidden("load_cell", force=1.05),
+    Hidden("load_cell", tare=4.0),
+    Hidden("cubic_stiffness", PORT, (PowerStiffness(PORT, 40.0, 3.0, 0, 1e-3),)),
+    Hidden("breathing_crack", PORT, (PowerStiffness(PORT, -8.0, 1.0, -1, 1e-3),)),
+    Hidden("joint_micro_slip", PORT, (MicroSlip(PORT, 8.0, 2e4, -0.5, 24),)),
+)  # fmt: skip
+
+
+def structure_file(folder: Path) -> Path:
+    """Write the bracket with a force at its end; return the file."""
+    shipped = structure_files()["bracket"]
+    shutil.copy(shipped.with_suffix(".inp"), folder)
+    file = folder / "bracket.toml"
+    file.write_text(shipped.read_text(encoding="utf-8") + PUSH, encoding="utf-8")
+    return file
+
+
+def rig(folder: Path) -> Path:
+    """Pack the bracket and write its model file; return the model file."""
+    file = structure_file(folder)
+    build_structure_fmu(reduced_structure(file), folder / "bracket.fmu", kind="compiled")
+    path = folder / "rig.toml"
+    path.write_text(rig_text(load_structure(file), "bracket.fmu"), encoding="utf-8")
+    return path
+
+
+def campaign(file: Path, hidden: Hidden, seed: int) -> Campaign:
+    """Return the campaign of a seed on the full bracket with a hidden effect."""
+    random = np.random.default_rng(seed)
+    structure = load_and_assemble(file)
+    stiffness = structure.stiffness({"e": 1.0 + 0.02 * random.standard_normal()}, {}).toarray()
+    mass = (structure.mass_terms[0] + 2.5 * structure.mass_terms[1]).toarray()
+    rows = np.vstack([part.toarray() for part in (structure.displacement_output, structure.gauge_output)])
+    names = (PORT, *structure.gauges)
+    quantities = [Quantity.DISPLACEMENT, *[Quantity.STRAIN] * len(structure.gauges)]
+    damping = structure.damping_alpha * mass + structure.damping_beta * stiffness
+    end = rows[0]
+    system = SecondOrderSystem(mass, damping, stiffness, {PORT: end}, 1)
+    laws = laws_of(ModelPatch(hidden.laws), system.ports)
+    channels = {
+        name: Channel(
+            name, quantity, name, NoiseRecord(NOISE[quantity], 200.0), 0.005, ZERO.get(quantity, 0.0)
+        )
+        for name, quantity in zip(names, quantities, strict=True)
+    }
+    trials = []
+    levels = np.concatenate([LEVELS, -LEVELS, LEVELS[:4]])
+    minutes = 60.0 * np.arange(1, len(levels) + 1)
+    for number, sign in enumerate((1.0, -1.0, 1.0, -1.0)):
+        time, force = 1100.0 * number + minutes, sign * levels
+        values = system.static(np.outer(hidden.force * force + hidden.tare, end), laws) @ rows.T
+        for column, (name, quantity) in enumerate(zip(names, quantities, strict=True)):
+            values[:, column] = hidden.readings(name, time, values[:, column])
+            values[:, column] += NOISE[quantity] * random.standard_normal(len(time))
+        zero = np.zeros(len(time))
+        trials.append(
+            Trial(
+                name=f"cycle_{number + 1}", kind=TrialKind.STATIC, channels=names, values=values,
+                used=np.ones(values.shape, bool), time=time, start=0.0, force=force, load_factor=zero,
+                load_place="tip_load", temperature=zero, run="A", health=np.zeros((len(time), 2)),
+                health_deviation=np.zeros((len(time), 2)),
+            )
+        )  # fmt: skip
+    return Campaign("Bracket", channels, tuple(trials), None, {}, "")
+
+
+def outcome(hidden: Hidden, verdict: Verdict) -> str:
+    """Return what became of a hidden effect."""
+    if not hidden.identifier:
+        return "none" if verdict.kind is VerdictKind.NOTHING_MISSING else f"wrong: {verdict.kind.value}"
+    if verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY):
+        names = [(effect.identifier, effect.place) for effect in verdict.effects]
+        right = [name for name, _ in names] == [hidden.identifier] and names[0][1].startswith(hidden.place)
+        return "named" if right else f"wrong: {names}"
+    if verdict.kind is VerdictKind.GROUP:
+        return "in the group" if hidden.identifier in verdict.group else f"wrong group: {verdict.group}"
+    return verdict.kind.value
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--first-seed", type=int, default=2021)
+    parser.add_argument("--only", help="identifiers of hidden effects, with commas")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        model = load_model(rig(folder))
+        for hidden in HIDDEN:
+            if given.only is not None and hidden.identifier not in given.only.split(","):
+                continue
+            for seed in range(given.first_seed, given.first_seed + given.seeds):
+                began = process_time()
+                made = campaign(folder / "bracket.toml", hidden, seed)
+                verdict = investigate(made, model, seed=seed, thorough=False).verdict
+                seconds = process_time() - began
+                print(
+                    f"{hidden.identifier or 'nothing'}, seed {seed}: {outcome(hidden, verdict)} "
+                    f"({seconds:.0f} s)",
+                    flush=True,
+                )
+                print(f"    {verdict.sentence}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
