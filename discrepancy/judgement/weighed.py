@@ -119,12 +119,14 @@ class Weighed:
     def join_relatives(self) -> None:
         """Compare the families of laws that are easily taken for the best one, where that leaves much.
 
-        A law of another family may explain the rest with a shape of its own where its usual one does not.
+        A law of another family may explain the rest with a shape of its own where its usual one does not; so
+        it may where the best one has left the shape that gives it its name.
         """
         best = self.found.best()
         if len(best.candidate.terms) != 1 or self._stands_in(best):
             return
-        if self.shares(best).summary().low > 1.0 - 0.5 * SEARCH.rival_share:
+        closed = self.shares(best).summary().low > 1.0 - 0.5 * SEARCH.rival_share
+        if closed and self._is_of_usual_shape(best):
             return
         (own,) = best.candidate.terms
         singles: dict[tuple[str, str], CandidateFit] = {}
@@ -141,6 +143,15 @@ class Weighed:
             if free is not None and self.found.score(free) > self.found.score(best):
                 joined[key_of(free.candidate)] = free
         self.found.judge(joined)
+
+    def _is_of_usual_shape(self, item: CandidateFit) -> bool:
+        """Whether the shape of a single law, if it is free, may be the one that the law is named for."""
+        free = self.free(item)
+        if free is None:
+            return True
+        (named,), (term,) = named_effects(self.problem, free), free.candidate.terms
+        usual = {shape.name: shape.canonical for shape in term.effect.shape}
+        return all(shape.low <= usual[shape.name] <= shape.high for shape in named.shape)
 
     def laws_of(self, item: CandidateFit) -> tuple[str, ...]:
         """Return the identifiers of a set without its stand-ins."""
