@@ -1,49 +1,171 @@
 """`uav-twin fmu simulate`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from reporting import terminal
 
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from fmu_asset.door.session import FmiAsset
+    from fmu_asset.door.simulation import ObservationHistory
+
+_MOST_PANELS, _MOST_LINES = 8, 10
+
 
 def simulate(
     file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)],
-    binding: Annotated[Path, typer.Option(help="Its binding file.", show_default=False)],
+    binding: Annotated[
+        Path | None, typer.Option(help="Its binding file; without one, all outputs in the FMU's units.")
+    ] = None,
     inputs: Annotated[
-        Path,
-        typer.Option(
-            help="CSV: `time` (s, where each step begins) and the inputs by the binding's names.",
-            show_default=False,
-        ),
-    ],
+        Path | None,
+        typer.Option(help="CSV: `time` (s, where each step begins) and the inputs by the binding's names."),
+    ] = None,
     out: Annotated[
-        Path, typer.Option(help="The file to write: CSV, or NetCDF (.nc) with units.", show_default=False)
-    ],
+        Path | None, typer.Option(help="The file to write: CSV, or NetCDF (.nc) with units.")
+    ] = None,
+    stop_time: Annotated[
+        float | None, typer.Option(help="End in seconds; the FMU's own by default, or 1 s after the start.")
+    ] = None,
+    step_size: Annotated[
+        float | None,
+        typer.Option(help="Communication step size in seconds; the FMU's own by default.", min=0.0),
+    ] = None,
+    values: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A parameter or input by its name in the FMU."),
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="A picture of the outputs to write: .png or .svg.")
+    ] = None,
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Faster, without protection from crashes and endless steps.")
     ] = False,
     step_timeout: Annotated[
         float | None, typer.Option(help="Wall-clock limit of a step in seconds.", min=0.0)
     ] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the files if they exist.")] = False,
 ) -> None:
-    """Simulate an FMU under input histories; inputs without a column keep their start values."""
+    """Simulate an FMU: its default experiment, or with --binding and --inputs under histories."""
+    from fmu_asset.archive.fmu_file import read_fmu
+    from fmu_asset.door.experiment import default_experiment, fly
     from fmu_asset.door.history_file import read_histories, write_history
     from fmu_asset.door.session import FmiAsset
     from fmu_asset.errors import FmuInputError
 
-    if out.suffix not in (".csv", ".nc"):
-        raise FmuInputError(f"{out} must end in .csv or .nc: choose another --out.")
-    if out.exists() and not replace:
-        raise FmuInputError(f"{out} exists: choose another --out or give --replace.")
-    asset = FmiAsset(file, binding, isolated=not in_process, step_timeout=step_timeout)
-    given = read_histories(inputs, asset.binding)
+    for path, suffixes, option in ((out, (".csv", ".nc"), "--out"), (plot, (".png", ".svg"), "--plot")):
+        if path is not None and path.suffix not in suffixes:
+            raise FmuInputError(f"{path} must end in {' or '.join(suffixes)}: choose another {option}.")
+        if path is not None and path.exists() and not replace:
+            raise FmuInputError(f"{path} exists: choose another {option} or give --replace.")
+    if (binding is None) != (inputs is None):
+        raise FmuInputError("--binding and --inputs go together: one names the columns of the other.")
+    if binding is not None and (stop_time is not None or step_size is not None or values):
+        raise FmuInputError(
+            "--stop-time, --step-size and --set are for a simulation without --binding, which says these itself."
+        )
+    if binding is not None and inputs is not None:
+        asset = FmiAsset(file, binding, isolated=not in_process, step_timeout=step_timeout)
+        given = read_histories(inputs, asset.binding)
+    else:
+        planned = default_experiment(
+            read_fmu(file), stop_time=stop_time, step_size=step_size, values=_values(values or [])
+        )
+        asset = FmiAsset(
+            file,
+            planned.binding,
+            isolated=not in_process,
+            step_timeout=step_timeout,
+            parameters=planned.parameters,
+        )
     with asset:
-        history = asset.simulate(**given.roles, steps=given.steps, progress=terminal.progress())
-        write_history(out, asset, history)
+        if inputs is not None:
+            history = asset.simulate(**given.roles, steps=given.steps, progress=terminal.progress())
+        else:
+            history = fly(asset, planned.steps, planned.inputs, terminal.progress())
+        if out is not None:
+            write_history(out, asset, history)
+        if plot is not None:
+            _plot(plot, asset, history)
+    _say(asset, history, [str(path) for path in (out, plot) if path is not None], from_start=inputs is None)
+
+
+def _values(texts: list[str]) -> dict[str, float | list[float]]:
+    """Return values by name: numbers, true and false, or for an array several with commas between."""
+    from fmu_asset.errors import FmuInputError
+
+    found: dict[str, float | list[float]] = {}
+    for text in texts:
+        name, sign, value = text.rpartition("=")
+        words = [{"true": "1", "false": "0"}.get(word.strip(), word) for word in value.split(",")]
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError:
+            numbers = []
+        if not (name and sign and numbers):
+            raise FmuInputError(
+                f"--set {text} is not understood; write NAME=NUMBER, such as --set mass=2.5, and for an array "
+                "NAME=1,2,3."
+            )
+        found[name] = numbers[0] if len(numbers) == 1 else numbers
+    return found
+
+
+def _say(asset: "FmiAsset", history: "ObservationHistory", written: list[str], *, from_start: bool) -> None:
+    """Say what was simulated; where nothing was written, what stands at the end."""
     end = history.time[-1] if len(history.time) else asset.time
-    terminal.say(f"{out}: {len(history.time)} steps to t = {end:g} s.")
+    where = ", ".join(written) or str(asset.description.path)
+    # Without histories the start is a row of its own.
+    steps = len(history.time) - from_start
+    terminal.say(f"{where}: {steps} steps to t = {end:g} s, every {asset.binding.interval:g} s.")
     if history.ended:
         terminal.say(history.ended)
+    if not written:
+        from uav_twin.console_table import console_table
+
+        rows = [
+            (name, *(f"{value:.6g}" for value in (v[0], v.min(), v.max(), v[-1])), unit)
+            for name, unit, v in _columns(asset, history)
+        ]
+        headings = ("output", "first", "least", "largest", "last", "unit")
+        console = terminal.console()
+        console.print(console_table(headings, rows, console.width))
+
+
+def _columns(
+    asset: "FmiAsset", history: "ObservationHistory"
+) -> "list[tuple[str, str, npt.NDArray[np.float64]]]":
+    """Return name, unit and values of every output."""
+    binding, units = asset.binding, asset.recorded_units
+    observed = [unit for vector in binding.observation.values() for unit in vector.units]
+    names = zip(binding.observation_variables, observed, history.values.T, strict=True)
+    return [*names, *((name, units[name], values) for name, values in history.extra.items())]
+
+
+def _plot(path: Path, asset: "FmiAsset", history: "ObservationHistory") -> None:
+    """Draw the outputs over time, those of one unit in one panel, and write the picture."""
+    from reporting.figures import FULL_WIDTH, new_figure, publication_style, to_png, to_svg
+    from reporting.files import atomic_write_bytes
+
+    panels: dict[str, list[tuple[str, npt.NDArray[np.float64]]]] = {}
+    for name, unit, values in _columns(asset, history):
+        panels.setdefault(unit, []).append((name, values))
+    shown = dict(list(panels.items())[:_MOST_PANELS])
+    with publication_style():
+        figure = new_figure(0.5 + 1.5 * len(shown), FULL_WIDTH)
+        axes = figure.subplots(len(shown), squeeze=False, sharex=True)[:, 0]
+        for panel, (unit, lines) in zip(axes, shown.items(), strict=True):
+            for name, values in lines[:_MOST_LINES]:
+                panel.plot(history.time, values, label=name)
+            more = f" and {len(lines) - _MOST_LINES} more" if len(lines) > _MOST_LINES else ""
+            panel.set_ylabel(lines[0][0] + f" [{unit}]" if len(lines) == 1 else f"[{unit}]")
+            if len(lines) > 1:
+                panel.legend(title=more or None, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        axes[-1].set_xlabel("time [s]")
+        figure.tight_layout()
+        atomic_write_bytes(path, to_svg(figure) if path.suffix == ".svg" else to_png(figure))

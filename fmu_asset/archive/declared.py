@@ -111,7 +111,7 @@ class FmuDescription:
         Whether it needs its authoring tool.
     once_per_process : bool
         Whether a process can make one instance only.
-    start_time, step_size, tolerance : float or None
+    start_time, stop_time, step_size, tolerance : float or None
         Of the default experiment.
     fixed_step : float or None
         Internal step size that FMI 3 declares [s].
@@ -143,6 +143,7 @@ class FmuDescription:
     start_time: float | None = None
     step_size: float | None = None
     tolerance: float | None = None
+    stop_time: float | None = None
     fixed_step: float | None = None
     states: int = 0
     event_indicators: int = 0
@@ -224,6 +225,7 @@ def read_declared(
         or root.find("Implementation/CoSimulation_Tool") is not None,
         once_per_process=bool(getattr(chosen, "canBeInstantiatedOnlyOncePerProcess", False)),
         start_time=of_experiment("startTime"),
+        stop_time=of_experiment("stopTime"),
         step_size=of_experiment("stepSize"),
         tolerance=of_experiment("tolerance"),
         fixed_step=None if fixed is None else float(fixed),

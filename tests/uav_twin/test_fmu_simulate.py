@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import os
 import subprocess
 import sys
@@ -13,10 +14,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import load_binding
+from fmu_asset.door.experiment import default_experiment, fly
 from fmu_asset.door.history_file import read_histories
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError
+from reporting.progress import SilentProgress
+from uav_twin import cli
 
 ROOT = Path(__file__).parents[2]
 ROOM = """
@@ -101,6 +106,56 @@ def test_bad_inputs_are_a_sentence_and_nothing_is_written(
         assert sentence in refused.stderr
         assert "Traceback" not in refused.stderr
         assert not out.exists()
+
+
+def flown(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """Run the command in this process and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["uav-twin", "fmu", "simulate", *map(str, arguments)])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    return int(caught.value.code or 0)
+
+
+def test_an_fmu_alone(
+    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A ball that is let go, against its closed form; its second bounce ends the simulation."""
+    out, plot, fmu = tmp_path / "ball.csv", tmp_path / "ball.png", foreign_fmu("ball2", "ENDS")
+    wanted = ("--stop-time", 3, "--step-size", 0.1, "--set", "e=0.8", "--set", "g=3.72", "--in-process")
+    assert flown(monkeypatch, fmu, *wanted, "--out", out, "--plot", plot) == 0
+    said = capsys.readouterr().out
+    end = math.sqrt(2.0 / 3.72) * (1.0 + 2.0 * 0.8)
+    assert f"20 steps to t = {end:g} s, every 0.1 s" in said
+    assert f"ended at t = {end:g} s" in said
+    rows = np.genfromtxt(out, delimiter=",", names=True)
+    falling = rows["time"] < math.sqrt(2.0 / 3.72)
+    np.testing.assert_allclose(rows["h"][falling], 1.0 - 1.86 * rows["time"][falling] ** 2, atol=1e-4)
+    assert rows[0].tolist()[:3] == (0.0, 1.0, 0.0)
+    assert rows["bounces"].tolist() == [0] * 8 + [1] * 12 + [2]
+    assert plot.read_bytes()[:4] == b"\x89PNG"
+    assert flown(monkeypatch, fmu, "--in-process", "--stop-time", 0.4) == 0
+    assert "500 steps to t = 0.4 s, every 0.0008 s" in capsys.readouterr().out
+    for wrong, sentence in (
+        (["--set", "mass=1"], "has no parameter or input 'mass' that takes numbers; it has e, g"),
+        (["--set", "e"], "--set e is not understood; write NAME=NUMBER"),
+        (["--stop-time", -1], "starts at 0 s and cannot end at -1 s"),
+        (["--set", "e=2"], "lies outside the range of 'e', 0.5 to 1"),
+        (["--binding", "b.toml"], "--binding and --inputs go together"),
+    ):
+        assert flown(monkeypatch, fmu, *wrong) != 0
+        assert sentence in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_default_experiment_is_that_of_the_fmu(foreign_fmu: Any) -> None:
+    text = '<DefaultExperiment startTime="2.0" stopTime="3.0" stepSize="0.25"/><ModelVariables>'
+    fmu = foreign_fmu.changed("ball2", "ball_with_experiment", ("<ModelVariables>", text))
+    planned = default_experiment(read_fmu(fmu))
+    assert (planned.binding.binding.start_time, planned.binding.step_size, planned.steps) == (2.0, 0.25, 4)
+    with FmiAsset(fmu, planned.binding, isolated=False) as asset:
+        history = fly(asset, planned.steps, planned.inputs, SilentProgress())
+    assert history.time.tolist() == [2.0, 2.25, 2.5, 2.75, 3.0]
+    assert history.values[0].tolist() == [1.0, 0.0]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,141 @@
+"""An FMU flown without a binding: its default experiment, and values set by the names of its variables."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from fmu_asset.archive.declared import FmuDescription
+from fmu_asset.errors import BindingError, FmuInputError
+from reporting.progress import Progress
+
+from .binding import INPUT_ROLES, Binding
+from .draft import trial_binding
+from .session import FmiAsset
+from .simulation import ObservationHistory
+
+_STEPS = 500
+_MOST_STEPS = 10_000_000
+
+Value = float | list[float]
+
+
+class Experiment(NamedTuple):
+    """What is simulated.
+
+    Attributes
+    ----------
+    binding : Binding
+        All outputs of the FMU, in its units.
+    steps : int
+        Number of communication steps.
+    parameters : dict of str to float or list
+        By the binding's names.
+    inputs : dict of str to dict of str to float or list
+        By role and name; held from the start to the end.
+    """
+
+    binding: Binding
+    steps: int
+    parameters: dict[str, Value]
+    inputs: dict[str, dict[str, Value]]
+
+
+def default_experiment(
+    description: FmuDescription,
+    *,
+    stop_time: float | None = None,
+    step_size: float | None = None,
+    values: Mapping[str, Value] | None = None,
+) -> Experiment:
+    """Return the default experiment of an FMU, or what is wanted instead.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU.
+    stop_time : float, optional
+        End [s]; the FMU's own, or one second after its start.
+    step_size : float, optional
+        Communication step size [s]; the FMU's own, or a 500th of the time to the end.
+    values : mapping of str to float or list, optional
+        Parameters and inputs by the names of the FMU's variables, in its units.
+
+    Raises
+    ------
+    BindingError
+        If the FMU has no number to observe, or no parameter or input of a name.
+    FmuInputError
+        If the end does not come after the start, or the steps are too many.
+    """
+    start = description.start_time or 0.0
+    end = next((time for time in (stop_time, description.stop_time) if time is not None), start + 1.0)
+    if not (math.isfinite(end) and end > start):
+        raise FmuInputError(
+            f"The simulation starts at {start:g} s and cannot end at {end:g} s; give a later end."
+        )
+    size = step_size or description.fixed_step or description.step_size or (end - start) / _STEPS
+    steps = max(1, round((end - start) / size))
+    if steps > _MOST_STEPS:
+        raise FmuInputError(
+            f"From {start:g} to {end:g} s there are {steps} steps of {size:g} s, more than {_MOST_STEPS}; give "
+            "another step size or end."
+        )
+    binding = trial_binding(description, step_size=size)
+    places = {item.variable: ("parameter", name) for name, item in binding.parameter.items()}
+    for role in INPUT_ROLES:
+        places |= {item.variable: (role, name) for name, item in binding.inputs(role).items()}
+    for name, port in binding.port.items():
+        places |= {v.variables[0]: ("port", f"{name}.{key}") for key, v in port.quantities.items()}
+    given: dict[str, dict[str, Value]] = {}
+    for variable, value in (values or {}).items():
+        if variable not in places:
+            some = ", ".join(list(places)[:20]) or "none"
+            raise BindingError(
+                f"{description.path} has no parameter or input {variable!r} that takes numbers; it has {some}"
+                f"{', ...' if len(places) > 20 else ''}."
+            )
+        role, name = places[variable]
+        given.setdefault(role, {})[name] = value
+    return Experiment(binding, steps, given.pop("parameter", {}), given)
+
+
+def fly(
+    asset: FmiAsset,
+    steps: int,
+    inputs: Mapping[str, Mapping[str, float | Sequence[float]]],
+    progress: Progress,
+) -> ObservationHistory:
+    """Start an asset, and return its start and what came out of the steps after it.
+
+    Parameters
+    ----------
+    asset : FmiAsset
+        The asset.
+    steps : int
+        Number of steps N.
+    inputs : mapping of str to mapping
+        By role and name; they hold already in the initialisation.
+    progress : Progress
+        Where progress is shown.
+
+    Returns
+    -------
+    ObservationHistory
+        N + 1 moments; fewer if the FMU ends the simulation by itself.
+
+    Raises
+    ------
+    FmuError
+        As `FmiAsset.simulate`.
+    """
+    asset.reset(**inputs)
+    first = asset.observe()
+    then = asset.simulate(steps=steps, progress=progress)
+    return ObservationHistory(
+        np.concatenate(([first.time], then.time)),
+        np.vstack((first.values, then.values)),
+        {name: np.concatenate(([first.extra[name]], values)) for name, values in then.extra.items()},
+        then.ended,
+    )
