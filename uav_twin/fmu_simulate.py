@@ -1,5 +1,6 @@
 """`uav-twin fmu simulate`."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -56,19 +57,9 @@ def simulate(
     from fmu_asset.door.experiment import default_experiment, fly
     from fmu_asset.door.history_file import read_histories, write_history
     from fmu_asset.door.session import FmiAsset
-    from fmu_asset.errors import FmuInputError
 
-    for path, suffixes, option in ((out, (".csv", ".nc"), "--out"), (plot, (".png", ".svg"), "--plot")):
-        if path is not None and path.suffix not in suffixes:
-            raise FmuInputError(f"{path} must end in {' or '.join(suffixes)}: choose another {option}.")
-        if path is not None and path.exists() and not replace:
-            raise FmuInputError(f"{path} exists: choose another {option} or give --replace.")
-    if (binding is None) != (inputs is None):
-        raise FmuInputError("--binding and --inputs go together: one names the columns of the other.")
-    if binding is not None and (stop_time is not None or step_size is not None or values):
-        raise FmuInputError(
-            "--stop-time, --step-size and --set are for a simulation without --binding, which says these itself."
-        )
+    _refuse_files(out, plot, replace=replace)
+    _refuse_mixture(binding, inputs, others=stop_time is not None or step_size is not None or bool(values))
     if binding is not None and inputs is not None:
         asset = FmiAsset(file, binding, isolated=not in_process, step_timeout=step_timeout)
         given = read_histories(inputs, asset.binding)
@@ -76,23 +67,41 @@ def simulate(
         planned = default_experiment(
             read_fmu(file), stop_time=stop_time, step_size=step_size, values=_values(values or [])
         )
-        asset = FmiAsset(
-            file,
-            planned.binding,
-            isolated=not in_process,
-            step_timeout=step_timeout,
-            parameters=planned.parameters,
-        )
-    with asset:
+        asset = FmiAsset(file, planned.binding, isolated=not in_process, step_timeout=step_timeout)
+    with closing(asset):
         if inputs is not None:
             history = asset.simulate(**given.roles, steps=given.steps, progress=terminal.progress())
         else:
-            history = fly(asset, planned.steps, planned.inputs, terminal.progress())
+            history = fly(asset, planned, terminal.progress())
         if out is not None:
             write_history(out, asset, history)
         if plot is not None:
             _plot(plot, asset, history)
     _say(asset, history, [str(path) for path in (out, plot) if path is not None], from_start=inputs is None)
+
+
+def _refuse_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
+    """Refuse files that cannot be written, before anything is simulated."""
+    from fmu_asset.errors import FmuInputError
+
+    for path, suffixes, option in ((out, (".csv", ".nc"), "--out"), (plot, (".png", ".svg"), "--plot")):
+        if path is not None and path.suffix not in suffixes:
+            raise FmuInputError(f"{path} must end in {' or '.join(suffixes)}: choose another {option}.")
+        if path is not None and path.exists() and not replace:
+            raise FmuInputError(f"{path} exists: choose another {option} or give --replace.")
+
+
+def _refuse_mixture(binding: Path | None, inputs: Path | None, *, others: bool) -> None:
+    """Refuse half of a simulation under histories, and one that is half without."""
+    from fmu_asset.errors import FmuInputError
+
+    if (binding is None) != (inputs is None):
+        raise FmuInputError("--binding and --inputs go together: one names the columns of the other.")
+    if binding is not None and others:
+        raise FmuInputError(
+            "--stop-time, --step-size and --set are for a simulation without --binding, which says these "
+            "itself."
+        )
 
 
 def _values(texts: list[str]) -> dict[str, float | list[float]]:
@@ -109,8 +118,8 @@ def _values(texts: list[str]) -> dict[str, float | list[float]]:
             numbers = []
         if not (name and sign and numbers):
             raise FmuInputError(
-                f"--set {text} is not understood; write NAME=NUMBER, such as --set mass=2.5, and for an array "
-                "NAME=1,2,3."
+                f"--set {text} is not understood; write NAME=NUMBER, such as --set mass=2.5, and for an "
+                "array NAME=1,2,3."
             )
         found[name] = numbers[0] if len(numbers) == 1 else numbers
     return found

@@ -1,7 +1,7 @@
 """An FMU flown without a binding: its default experiment, and values set by the names of its variables."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -79,8 +79,8 @@ def default_experiment(
     steps = max(1, round((end - start) / size))
     if steps > _MOST_STEPS:
         raise FmuInputError(
-            f"From {start:g} to {end:g} s there are {steps} steps of {size:g} s, more than {_MOST_STEPS}; give "
-            "another step size or end."
+            f"From {start:g} to {end:g} s there are {steps} steps of {size:g} s, more than {_MOST_STEPS}; "
+            "give another step size or end."
         )
     binding = trial_binding(description, step_size=size)
     places = {item.variable: ("parameter", name) for name, item in binding.parameter.items()}
@@ -101,22 +101,15 @@ def default_experiment(
     return Experiment(binding, steps, given.pop("parameter", {}), given)
 
 
-def fly(
-    asset: FmiAsset,
-    steps: int,
-    inputs: Mapping[str, Mapping[str, float | Sequence[float]]],
-    progress: Progress,
-) -> ObservationHistory:
+def fly(asset: FmiAsset, experiment: Experiment, progress: Progress) -> ObservationHistory:
     """Start an asset, and return its start and what came out of the steps after it.
 
     Parameters
     ----------
     asset : FmiAsset
         The asset.
-    steps : int
-        Number of steps N.
-    inputs : mapping of str to mapping
-        By role and name; they hold already in the initialisation.
+    experiment : Experiment
+        Steps, parameters and inputs, which hold already in the initialisation.
     progress : Progress
         Where progress is shown.
 
@@ -130,9 +123,9 @@ def fly(
     FmuError
         As `FmiAsset.simulate`.
     """
-    asset.reset(**inputs)
+    asset.reset(experiment.parameters, **experiment.inputs)
     first = asset.observe()
-    then = asset.simulate(steps=steps, progress=progress)
+    then = asset.simulate(steps=experiment.steps, progress=progress)
     return ObservationHistory(
         np.concatenate(([first.time], then.time)),
         np.vstack((first.values, then.values)),

@@ -153,7 +153,7 @@ def test_the_default_experiment_is_that_of_the_fmu(foreign_fmu: Any) -> None:
     planned = default_experiment(read_fmu(fmu))
     assert (planned.binding.binding.start_time, planned.binding.step_size, planned.steps) == (2.0, 0.25, 4)
     with FmiAsset(fmu, planned.binding, isolated=False) as asset:
-        history = fly(asset, planned.steps, planned.inputs, SilentProgress())
+        history = fly(asset, planned, SilentProgress())
     assert history.time.tolist() == [2.0, 2.25, 2.5, 2.75, 3.0]
     assert history.values[0].tolist() == [1.0, 0.0]
 
