@@ -51,11 +51,9 @@ def build(
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Pack a wing, a structure or a model script as an FMI 2.0 FMU; equal input gives equal bytes."""
-    if script is None and design is not None and is_structure(design):
-        if calibration is not None or patch is not None or activate:
-            raise typer.BadParameter(
-                "--calibration, --patch and --activate are for wings, and the design is a structure."
-            )
+    if script is None and calibration is None and design is not None and is_structure(design):
+        if patch is not None or activate:
+            raise typer.BadParameter("--patch and --activate are for wings, and the design is a structure.")
         build_structure(design, out, kind, None, None, replace, None)
         return
     out = out or Path("uav_wing.fmu")

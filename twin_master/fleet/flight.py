@@ -104,6 +104,8 @@ def fly_fleet(
     config = {"kind": KIND, "format": 1, "fleet": fleet.record()}
     _look_at(folder, config, fleet.seed, replace_old=replace_old)
     _check(fleet)
+    if replace_old and folder.is_dir():
+        _remove(folder)
     lock = _begun(folder, config, fleet.seed)
     try:
         store = FleetStore(folder, fleet)
@@ -127,7 +129,6 @@ def _look_at(folder: Path, config: Mapping[str, Any], seed: int, *, replace_old:
         return
     found = fleet_config(folder)
     if replace_old:
-        shutil.rmtree(folder)
         return
     if {key: found.get(key) for key in config} != json.loads(to_json(config)):
         raise RunFolderExistsError(
@@ -135,6 +136,17 @@ def _look_at(folder: Path, config: Mapping[str, Any], seed: int, *, replace_old:
             "--replace."
         )
     check_versions(folder, found, seed)
+
+
+def _remove(folder: Path) -> None:
+    """Remove the fleet that was flown before, unless it is being flown."""
+    lock = lock_folder(folder)
+    if lock is None:
+        raise FleetError(f"another process flies the fleet in {folder}: wait for it to end.")
+    try:
+        shutil.rmtree(folder)
+    finally:
+        os.close(lock)
 
 
 def fleet_config(folder: Path) -> dict[str, Any]:
@@ -204,6 +216,11 @@ def _check(fleet: Fleet) -> None:
 
 
 def _check_group(group: Group, scenario: Scenario) -> None:
+    if scenario.observation.role == "modes":
+        raise FleetError(
+            'a fleet keeps values alone, and `role = "modes"` observes each turn with its own covariance: '
+            "fly the scenario with `uav-twin run`."
+        )
     one_life = scenario.truth.kind == "asset" and not getattr(scenario.asset, "seeds", ())
     if one_life and len(group.scenarios) < len(group.members):
         raise FleetError(

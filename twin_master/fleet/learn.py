@@ -16,7 +16,7 @@ from twin_master.errors import FleetError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import GROUPS, fleet_config, source_of
 from twin_master.fleet.outcome import FLOWN
-from twin_master.fleet.posterior import Grid, Marginal, Shared, refined, shared
+from twin_master.fleet.posterior import POINTS, Grid, Marginal, Shared, refined, shared
 from twin_master.fleet.store import open_group
 from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.mission.preparation import Knowledge
@@ -30,6 +30,8 @@ Index = NDArray[np.int64]
 
 NOISE_TWINS = 100
 """Twins of a group from which the noise is learnt: they know it to one part in a few hundred."""
+FEWEST_TWINS = 5
+"""Of a group, to tell mean and spread of a parameter over its assets: fewer hardly tell a spread."""
 LARGEST_NOISE = 3.0
 """Factor on the assumed noise, and one over it, up to which is looked."""
 NODES, NODE_DEVIATIONS = 61, 6.0
@@ -178,6 +180,11 @@ def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
         pairs = zip(likelihoods, parts, strict=True)
         return [transition_evidence(worsening, points, own, part.control) for own, part in pairs]
 
+    if len(worsening.names) > max(POINTS):
+        raise FleetError(
+            f"group {record['name']} has {len(worsening.names)} probabilities to worsen, and {max(POINTS)} "
+            "are learnt together at most: fly fewer controls, or let factors share a probability."
+        )
     explained = [np.isfinite(own[:, 0]) for own in evidence(worsening.assumed.clip(1e-3, 0.9)[None])]
 
     def log_likelihood(points: Float) -> Float:
@@ -186,11 +193,16 @@ def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
 
     grid = refined(log_likelihood, len(worsening.names))
     learnt = np.array([marginal.mean for marginal in grid.marginals])
+    twins = sum(int(kept.sum()) for kept in explained)
+    if not twins:
+        raise FleetError(
+            f"no state of the twins explains what was observed in group {record['name']}: nothing can be "
+            "learnt of it; look at its model and its noise."
+        )
     own = None
-    if nodes is not None:
+    if nodes is not None and twins >= FEWEST_TWINS:
         spread, seen = models[0].total_standard_deviation, (parts[0].observed, parts[0].control)
         own = population(nodes.values, node_evidence(worsening, learnt, nodes.predicted, spread, *seen))
-    twins = sum(int(kept.sum()) for kept in explained)
     left_out = sum(len(kept) for kept in explained) - twins
     parameter = parts[0].knowledge.draws.name
     return GroupLessons(record["name"], twins, left_out, worsening, grid, noise, parameter, own)

@@ -22,7 +22,7 @@ RESOLVED = 1.2
 NOTHING = 1e-9
 """Share of the largest weight below which the tails of an interval are cut."""
 FINE = 121
-"""Points of an axis on which groups share a distribution."""
+"""Points of each axis of a group, and of the mean of the distribution that groups share."""
 
 
 def logit(p: Float) -> Float:
@@ -167,36 +167,46 @@ class Shared:
 def shared(grids: Sequence[Grid]) -> Shared:
     """Infer Beta(m kappa, (1 - m) kappa) of one or two probabilities over groups, and each group under it.
 
-    m is uniform in its log odds and kappa in its logarithm, from 3 to 3000, before the data.
+    m is uniform in its log odds between the bounds of a probability, and kappa in its logarithm, from 3 to
+    3000, before the data. Each group is summed over axes of its own: one that is known well is a thousand
+    times narrower than one of few twins.
+
+    Parameters
+    ----------
+    grids : sequence of Grid
+        Log likelihood of each group, of the same K = 1 or 2 probabilities.
     """
     from scipy.special import betaln
 
     count = len(grids[0].axes)
-    low = min(float(axis[0]) for grid in grids for axis in grid.axes)
-    high = max(float(axis[-1]) for grid in grids for axis in grid.axes)
-    x = np.linspace(low, high, FINE)
-    likelihoods = [_resampled(grid, x) for grid in grids]
-    m = logistic(np.linspace(low, high, 41))
+    axes = [tuple(np.linspace(axis[0], axis[-1], FINE) for axis in grid.axes) for grid in grids]
+    likelihoods = [_resampled(grid, own) for grid, own in zip(grids, axes, strict=True)]
+    low, high = (float(logit(np.array(bound))) for bound in (LOWEST, HIGHEST))
+    m = logistic(np.linspace(low, high, FINE))
     kappa = np.geomspace(3.0, 3000.0, 13)
     means, sizes = (array.ravel() for array in np.meshgrid(m, kappa, indexing="ij"))
     a, b = means * sizes, (1.0 - means) * sizes
-    p = logistic(x)
-    # Density in the log odds: that in p times p (1 - p).
-    prior = np.exp(a[:, None] * np.log(p) + b[:, None] * np.log1p(-p) - betaln(a, b)[:, None])
-    if count == 1:
-        evidence = [prior @ likelihood for likelihood in likelihoods]
-    else:
-        evidence = [prior @ likelihood @ prior.T for likelihood in likelihoods]
+
+    def density(x: Float) -> Float:
+        """In the log odds: that in p times p (1 - p). (hyperparameters, points)."""
+        p = logistic(x)
+        return np.asarray(np.exp(a[:, None] * np.log(p) + b[:, None] * np.log1p(-p) - betaln(a, b)[:, None]))
+
+    priors = [tuple(density(x) for x in own) for own in axes]
+    evidence = [
+        prior[0] @ likelihood if count == 1 else prior[0] @ likelihood @ prior[1].T
+        for prior, likelihood in zip(priors, likelihoods, strict=True)
+    ]
     total = np.sum([np.log(np.maximum(one, 1e-300)) for one in evidence], axis=0)
     weight = np.exp(total - total.max())
     weight /= weight.sum()
     groups = []
-    for likelihood, own in zip(likelihoods, evidence, strict=True):
-        share = weight / np.maximum(own, 1e-300)
-        joint = likelihood * (share @ prior if count == 1 else prior.T @ share @ prior)
+    for own, prior, likelihood, told in zip(axes, priors, likelihoods, evidence, strict=True):
+        share = weight / np.maximum(told, 1e-300)
+        joint = likelihood * (share @ prior[0] if count == 1 else prior[0].T @ share @ prior[1])
         joint /= joint.sum()
         sums = (joint,) if count == 1 else (joint.sum(axis=1), joint.sum(axis=0))
-        groups.append(tuple(Marginal(x, np.asarray(one)) for one in sums))
+        groups.append(tuple(Marginal(x, np.asarray(one)) for x, one in zip(own, sums, strict=True)))
     hyper = (weight,) if count == 1 else (weight.sum(axis=1), weight.sum(axis=0))
     return Shared(
         tuple(_moments(one, means) for one in hyper),
@@ -210,15 +220,12 @@ def _moments(weight: Float, values: Float) -> tuple[float, float]:
     return mean, float(np.sqrt(max(0.0, float(weight @ (values - mean) ** 2))))
 
 
-def _resampled(grid: Grid, x: Float) -> Float:
-    """Return the likelihood of a grid on common axes, zero outside of its own; the largest is one."""
+def _resampled(grid: Grid, axes: tuple[Float, ...]) -> Float:
+    """Return the likelihood of a grid on finer axes of the same range; the largest is one."""
     from scipy.interpolate import CubicSpline, RectBivariateSpline
 
     # Far below the largest there is nothing but what would make the spline swing.
     log_likelihood = np.maximum(grid.log_likelihood - grid.log_likelihood.max(), -60.0)
-    inside = [(x >= axis[0] - 1e-9) & (x <= axis[-1] + 1e-9) for axis in grid.axes]
-    if len(grid.axes) == 1:
-        found = np.exp(CubicSpline(grid.axes[0], log_likelihood)(x))
-        return np.asarray(np.where(inside[0], found, 0.0))
-    found = np.exp(RectBivariateSpline(*grid.axes, log_likelihood)(x, x))
-    return np.asarray(np.where(np.outer(*inside), found, 0.0))
+    if len(axes) == 1:
+        return np.asarray(np.exp(CubicSpline(grid.axes[0], log_likelihood)(axes[0])))
+    return np.asarray(np.exp(RectBivariateSpline(*grid.axes, log_likelihood)(*axes)))

@@ -15,7 +15,7 @@ from twin_master.fleet.flight import fly_fleet, group_folder
 from twin_master.fleet.learn import learn_fleet, population
 from twin_master.fleet.lessons import lessons_record, write_learnt
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
-from twin_master.fleet.posterior import Grid, logistic, logit, points_of, refined, shared
+from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, points_of, refined, shared
 from twin_master.fleet.report import attention, write_fleet_report
 from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.network.inference import filter_sequence
@@ -129,8 +129,10 @@ def test_groups_share_what_a_dense_sum_says() -> None:
     counts = [(3, 47), (6, 44), (2, 48), (9, 41), (4, 46)]
     grids = groups_of(counts)
     found = shared(grids)
-    low, high = min(g.axes[0][0] for g in grids), max(g.axes[0][-1] for g in grids)
-    m, kappa = np.meshgrid(logistic(np.linspace(low, high, 41)), np.geomspace(3.0, 3000.0, 13), indexing="ij")
+    low, high = logit(np.array([LOWEST, HIGHEST]))
+    m, kappa = np.meshgrid(
+        logistic(np.linspace(low, high, 121)), np.geomspace(3.0, 3000.0, 13), indexing="ij"
+    )
     a, b = m * kappa, (1.0 - m) * kappa
     weight = np.prod([betabinom.pmf(n, n + k, a, b) for n, k in counts], axis=0)
     weight /= weight.sum()
@@ -144,6 +146,17 @@ def test_groups_share_what_a_dense_sum_says() -> None:
             assert below == pytest.approx(reached, abs=4e-3)
     means = [marginal.mean for (marginal,) in found.groups]
     assert np.std(means) < 0.8 * np.std([n / (n + k) for n, k in counts])
+
+
+@pytest.mark.parametrize("few", [(1, 249), (13, 237)])
+def test_a_group_that_is_known_well_stays_so_beside_one_of_few_twins(few: tuple[int, int]) -> None:
+    many = (22_500, 427_500)
+    large, _ = shared(groups_of([many, few])).groups
+    p, n = many[0] / sum(many), sum(many)
+    deviation = np.sqrt(p * (1.0 - p) / n)
+    assert large[0].mean == pytest.approx(p, abs=0.1 * deviation)
+    low, high = large[0].interval()
+    assert (low, high) == pytest.approx((p - 1.96 * deviation, p + 1.96 * deviation), abs=0.1 * deviation)
 
 
 def test_groups_with_two_probabilities_are_those_of_one_where_they_do_not_meet() -> None:
