@@ -135,6 +135,11 @@ def _checked(acceleration: ArrayLike, rate: float, bands: ArrayLike) -> tuple[Fl
         raise ExperimentDataError(
             f"{LARGEST_ORDER // 2} modes are identified at most, and {len(limits)} are asked for."
         )
+    dead = np.flatnonzero(np.ptp(record, axis=0) == 0.0)
+    if dead.size:
+        raise ExperimentDataError(
+            f"accelerometer {dead[0] + 1} of the record shows one value throughout: leave it out, or mend it."
+        )
     return record - record.mean(axis=0), limits
 
 

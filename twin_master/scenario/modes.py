@@ -1,5 +1,6 @@
 """The tables of a scenario by which modes of a record of accelerations are what is observed in a turn."""
 
+from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -41,6 +42,9 @@ class ModesSection(Section):
     def _check(self) -> Self:
         if any(high <= low for low, high in self.bands):
             raise ValueError("each of `observation.modes.bands` is its least and then its largest frequency")
+        ordered = sorted(self.bands)
+        if any(after[0] < before[1] for before, after in pairwise(ordered)):
+            raise ValueError("`observation.modes.bands` overlap: a mode in both would be observed twice")
         if self.numbers and len(self.numbers) != len(self.bands):
             raise ValueError(
                 f"`observation.modes.numbers` gives {len(self.numbers)} modes, and there are "

@@ -85,9 +85,10 @@ def test_a_record_without_noise_is_told_to_all_digits() -> None:
     [
         (LONG, [[4.0, 6.0]], "a mode dies away in .* less than 10 times"),
         (np.full((5000, 2), np.nan), [[1.0, 2.0]], "finite numbers"),
-        (np.zeros((100, 1)), [[1.0, 2.0]], "has 100 samples"),
+        (np.linspace(0.0, 1.0, 100), [[1.0, 2.0]], "has 100 samples"),
         (np.zeros((5000, 1)), [[2.0, 1.0]], "its least and its largest"),
         (np.zeros((5000, 1)), [[40.0, 60.0]], "nothing above 50 Hz"),
+        (np.zeros((5000, 1)), [[1.0, 4.0]], "accelerometer 1 of the record shows one value"),
         (np.zeros((5000, 1)), [[1.0, 2.0]] * 13, "12 modes are identified at most"),
     ],
 )
