@@ -98,7 +98,8 @@ def _show_lessons(record: dict[str, Any]) -> None:
             parameter, told = group["population"]["parameter"], group["population"]
             rows += [(f"{parameter}, mean", "", told["mean"]), (f"{parameter}, spread", "", told["spread"])]
         for title, assumed, line in rows:
-            table.add_row("", title, assumed, f"{line['mean']:.5g} ± {line['standard_deviation']:.2g}", "")
+            interval = f"{line['lower_95']:.4g} to {line['upper_95']:.4g}"
+            table.add_row("", title, assumed, f"{line['mean']:.4g}", interval)
     for control, told in record.get("shared", {}).items():
         mean = f"{told['mean']:.4f} ± {told['standard_deviation']:.2g}"
         table.add_row("all groups", f"mean over groups, {control}", "", mean, "")

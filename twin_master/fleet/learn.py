@@ -60,6 +60,12 @@ class Line:
         """Standard deviation."""
         return float(np.sqrt(self.weight @ (self.values - self.mean) ** 2))
 
+    def interval(self, probability: float = 0.95) -> tuple[float, float]:
+        """Return the bounds of the central interval: half of a value's weight lies below it."""
+        below = np.cumsum(self.weight) - 0.5 * self.weight
+        low, high = np.interp([0.5 - probability / 2.0, 0.5 + probability / 2.0], below, self.values)
+        return float(low), float(high)
+
 
 @dataclass(frozen=True)
 class GroupLessons:

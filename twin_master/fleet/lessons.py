@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from reporting.files import atomic_write_text
-from twin_master.fleet.learn import FleetLessons, GroupLessons
+from twin_master.fleet.learn import FleetLessons, GroupLessons, Line
 from twin_master.fleet.posterior import Marginal
 
 __all__ = ["LESSONS_NAME", "lessons_record", "write_learnt"]
@@ -80,11 +80,11 @@ def lessons_record(lessons: FleetLessons) -> dict[str, Any]:
             )
         }
         found: dict[str, Any] = {"twins": group.twins, "left_out": group.unexplained, "probability": rates}
-        found["noise_factor"] = _line(group.noise)
+        found["noise_factor"] = _figures(group.noise)
         if group.population is not None:
             mean, spread = group.population
             found["population"] = {
-                "parameter": group.parameter, "mean": _line(mean), "spread": _line(spread)
+                "parameter": group.parameter, "mean": _figures(mean), "spread": _figures(spread)
             }  # fmt: skip
         groups[group.name] = found
     record: dict[str, Any] = {"source": lessons.source, "groups": groups}
@@ -103,11 +103,7 @@ def lessons_record(lessons: FleetLessons) -> dict[str, Any]:
     return record
 
 
-def _figures(marginal: Marginal) -> dict[str, float]:
+def _figures(marginal: Marginal | Line) -> dict[str, float]:
     low, high = marginal.interval()
     deviation = marginal.standard_deviation
     return {"mean": marginal.mean, "standard_deviation": deviation, "lower_95": low, "upper_95": high}
-
-
-def _line(line: Any) -> dict[str, float]:
-    return {"mean": line.mean, "standard_deviation": line.standard_deviation}

@@ -75,4 +75,7 @@ def shown(figure: Estimated | int | None) -> str:
     """Return a figure for people."""
     if figure is None:
         return ""
-    return str(figure) if isinstance(figure, int) else f"{figure.value:.4g} ± {figure.error:.2g}"
+    if isinstance(figure, int):
+        return str(figure)
+    error = f" ± {figure.error:.2g}" if np.isfinite(figure.error) else ""  # one twin has none
+    return f"{figure.value:.4g}{error}"

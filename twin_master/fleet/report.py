@@ -125,8 +125,8 @@ def _lessons(page: Page, record: dict[str, Any]) -> None:
             told = group["population"]
             lines += [(f"{told['parameter']}, {moment}", "", told[moment]) for moment in ("mean", "spread")]
         for title, assumed, line in lines:
-            low, high = (line["mean"] + sign * 1.96 * line["standard_deviation"] for sign in (-1.0, 1.0))
-            rows.append([name, title, assumed, f"{line['mean']:.5g}", f"{low:.5g} to {high:.5g}"])
+            interval = f"{line['lower_95']:.4g} to {line['upper_95']:.4g}"
+            rows.append([name, title, assumed, f"{line['mean']:.4g}", interval])
     heads = ("group", "learnt", "assumed", "mean", "95 % interval")
     columns = [Column(head, numeric=head in heads[2:]) for head in heads]
     caption = "Exact posteriors of all twins together; several groups share a distribution of their rates."
@@ -239,7 +239,9 @@ def _attention(
         pairs = zip(group["mean"].values[row, -1], group["standard_deviation"].values[row, -1], strict=True)
         states = [f"{scale * mean:.1f} ± {scale * deviation:.1f}" for mean, deviation in pairs]
         name = record["members"][row][0]
-        rows.append([name, *states, scenario.control_names[int(control[row])], f"{100.0 * chance[row]:.0f}"])
+        rows.append(
+            [name, *states, scenario.control_names[int(control[row])], f"{100.0 * max(chance[row], 0.0):.0f}"]
+        )
     columns = [Column("asset"), *(Column(factor.name, unit, numeric=True) for factor in scenario.state)]
     columns += [Column("control"), Column("change", "%", numeric=True)]
     steps = scenario.mission.prediction_steps

@@ -184,6 +184,9 @@ def test_a_population_is_that_of_normal_members() -> None:
     mean, spread = population(nodes, -0.5 * ((nodes - seen[:, None]) / blur) ** 2)
     assert mean.mean == pytest.approx(seen.mean(), abs=2e-5)
     assert mean.standard_deviation == pytest.approx(np.std(seen) / 20.0, rel=0.05)
+    half = 1.96 * mean.standard_deviation
+    assert mean.interval() == pytest.approx((mean.mean - half, mean.mean + half), abs=0.1 * half)
+    assert 0.0 < spread.interval()[0] < spread.mean < spread.interval()[1]
     assert spread.mean == pytest.approx(np.sqrt(np.var(seen) - blur**2), rel=0.02)
 
 
