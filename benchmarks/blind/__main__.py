@@ -52,6 +52,8 @@ def generate(arguments: argparse.Namespace) -> int:
         tuple(arguments.kinds),
         tuple(arguments.rigs),
     )
+    if arguments.effects:
+        wanted = [order for order in wanted if set(order.identifiers) & set(arguments.effects)]
     arguments.out.mkdir(parents=True, exist_ok=True)
     leave_out = {order.name: list(order.identifiers) for order in wanted if order.kind == "outside"}
     (arguments.out / "leave_out.json").write_text(json.dumps(leave_out, indent=1) + "\n", encoding="utf-8")
@@ -97,6 +99,7 @@ def main(arguments: list[str]) -> int:
     make.add_argument("--seed", type=int, default=1)
     make.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     make.add_argument("--rigs", nargs="+", choices=("wing", "lumped"), default=["wing", "lumped"])
+    make.add_argument("--effects", nargs="+", default=[], help="make only campaigns that hide one of these")
     make.add_argument("--jobs", type=int, default=2, help="processes")
     make.add_argument("--cache", type=Path, default=None, help="where the projected wing is kept")
     make.set_defaults(run=generate)
