@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.optimize import minimize_scalar
 
 from calibration.errors import ExperimentDataError, MassConstraintError, OutsideValidityError
 from fe.runtime.damping import rayleigh_coefficients
@@ -23,9 +23,6 @@ from .trials import PUBLISHED_DAMPING_RATIOS, PUBLISHED_FREQUENCIES
 
 TOTAL_MASS = 0.472
 """Weighed mass of two servos and the pitot tube [kg] (Kapteyn et al. 2021, eqs. (19) and (20))."""
-
-SERVO_MASS_START = 0.169
-"""Start of the search, as in the authors' script [kg]."""
 
 FLAPWISE = ("first", "second")
 """The two flapwise bending modes."""
@@ -154,10 +151,10 @@ def fit_masses(
     total_mass: float = TOTAL_MASS,
     source: str = "model",
 ) -> DynamicCalibration:
-    """Find masses by Nelder-Mead under the weighed total, then damping, for each sample of e.
+    """Find masses under the weighed total, then damping, for each sample of e.
 
-    One mass is free: the pitot tube has what two servos leave of the total. The search ends at 1 microgram;
-    the authors' ends at 1 g.
+    One mass is free: the pitot tube has what two servos leave of the total. The search, of Brent, ends at
+    1 microgram; the authors', of Nelder and Mead, ends at 1 g.
 
     Parameters
     ----------
@@ -188,25 +185,17 @@ def fit_masses(
     if factors.ndim != 1 or factors.size == 0 or not np.all(np.isfinite(factors)):
         raise ExperimentDataError(f"{source}: at least one sample of e is needed, and each must be finite.")
     lower, upper = _servo_range(masses, total_mass)
-    start = min(max(SERVO_MASS_START, lower), upper)
     servo = np.empty(factors.size)
     frequency = np.empty((factors.size, 2))
     damping = np.empty((factors.size, 2))
     for place, factor in enumerate(factors.tolist()):
 
-        def error(unknown: NDArray[np.float64], factor: float = factor) -> float:
-            mass = float(unknown[0])
+        def error(mass: float, factor: float = factor) -> float:
             first, second = frequencies(factor, mass, total_mass - 2.0 * mass)
             return 0.5 * (abs(first / targets.frequency[0] - 1.0) + abs(second / targets.frequency[1] - 1.0))
 
-        found = minimize(
-            error,
-            [start],
-            method="Nelder-Mead",
-            bounds=[(lower, upper)],
-            options={"xatol": 1e-9, "fatol": 1e-12, "maxiter": 400},
-        )
-        servo[place] = found.x[0]
+        found = minimize_scalar(error, bounds=(lower, upper), method="bounded", options={"xatol": 1e-9})
+        servo[place] = found.x
         if min(servo[place] - lower, upper - servo[place]) < 1e-6:
             raise MassConstraintError(
                 f"at e = {factor:g} the masses nearest to {targets.frequency[0]:.4g} and "

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import qmc
 
 from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.static.stiffness_curve import StiffnessCurve, stiffness_curve_of
@@ -110,6 +109,8 @@ def tabulate_frequencies(model: ReducedModel, tolerance: float = TOLERANCE) -> F
     """
     limits = np.array([model.validity[name] for name in _NAMES])
     centre, half = limits.mean(axis=1), 0.5 * np.diff(limits, axis=1)[:, 0]
+    from scipy.stats import qmc  # takes a second to load
+
     checks = 2.0 * qmc.Halton(3, scramble=False).random(_CHECKS + 1)[1:] - 1.0
     exact = np.array([_frequencies(model, centre + half * point) for point in checks])
     error = np.inf

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calibration.dynamics.damped_cosine import DampedCosines, NaturalMode, natural_mode
 from calibration.dynamics.ringdown import Frequencies, RingDownFit
@@ -143,7 +143,7 @@ def _mean(values: Sequence[float], errors: Sequence[float]) -> tuple[float, floa
     mean = math.fsum(values) / count
     expected = math.fsum(error**2 for error in errors) / count
     found = math.fsum((value - mean) ** 2 for value in values)  # (count - 1) times the variance
-    if count > 1 and found > expected * float(chi2.ppf(_SIGNIFICANT_SCATTER, count - 1)):
+    if count > 1 and found > expected * float(chdtri(count - 1, 1.0 - _SIGNIFICANT_SCATTER)):
         # The variance of Student's t with n - 1 degrees; up to three trials it has none, take three's twice.
         widening = (count - 1) / (count - 3) if count > 3 else 4.0
         return mean, math.sqrt(widening * found / (count - 1) / count)

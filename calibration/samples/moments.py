@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import gaussian_kde
 
 from calibration.samples.record import SampledCalibration, SampleTable
 
@@ -68,5 +67,7 @@ def density(values: NDArray[np.float64]) -> dict[str, list[float]]:
     spread = float(values.std())
     if spread <= 1e-12 * abs(float(values.mean())):
         return {}
+    from scipy.stats import gaussian_kde  # takes a second to load
+
     grid = np.linspace(values.min() - spread, values.max() + spread, _GRID_POINTS)
     return {"grid": grid.tolist(), "density": gaussian_kde(values)(grid).tolist()}

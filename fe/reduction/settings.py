@@ -6,7 +6,6 @@ from math import prod
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import qmc
 
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced_arrays import MOST_ANCHORS
@@ -132,6 +131,8 @@ def training_set(settings: ReductionSettings, regions: int) -> list[tuple[float,
     corners = [
         (float(e), *loss) for e in (low, high) for loss in itertools.product(map(float, span), repeat=regions)
     ]
+    from scipy.stats import qmc  # takes a second to load
+
     points = qmc.Halton(regions + 1, scramble=False).random(CHOSEN_STATES)
     inside = np.column_stack((low + (high - low) * points[:, 0], loss_at(points[:, 1:])))
     return [*corners, *(tuple(state) for state in inside.tolist())]

@@ -260,8 +260,6 @@ class CoupledSource(SeveralSource):
 
     def _packed(self, component: ComponentSection, progress: Progress) -> Path:
         """Return the FMU of a component in the run folder; packed if it is not there."""
-        from calibration.wing.result_file import load_calibration
-        from calibration.wing.wing_record import tailoring
         from fe.wing.design import load_design
         from fmu_asset.packing.wing_packing import pack_wing
 
@@ -271,6 +269,9 @@ class CoupledSource(SeveralSource):
         if component.design is None:
             return _given_fmu(component, target.parent)
         if component.design == CALIBRATED_DESIGN_NAME:
+            from calibration.wing.result_file import load_calibration
+            from calibration.wing.wing_record import tailoring
+
             wing = load_calibration(Path(self._scenario.calibration.file or ""))
             pack_wing(wing.design, target, tailoring=tailoring(wing), replace=True, progress=progress)
         else:

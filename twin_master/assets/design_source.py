@@ -219,7 +219,6 @@ class WingFmuSource(FmuSource):
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the design and pack the FMU."""
-        from calibration.wing.wing_record import tailoring
         from fe.reduction.model_cache import reduced_model
         from fmu_asset.packing.patch_file import load_patch
         from fmu_asset.packing.wing_packing import pack_wing
@@ -228,11 +227,16 @@ class WingFmuSource(FmuSource):
         calibration, patch = self._of.calibration(), self._of.patch_path
         self._design = self._of.design()
         self._wing = reduced_model(self._design, progress=progress)
+        tailored = None
+        if calibration is not None:
+            from calibration.wing.wing_record import tailoring  # takes a second to load
+
+            tailored = tailoring(calibration)
         with progress.stage("Packing the FMU"):
             pack_wing(
                 self._design,
                 self.fmu_path(),
-                tailoring=None if calibration is None else tailoring(calibration),
+                tailoring=tailored,
                 patch=None if patch is None else load_patch(patch),
                 activate=True,
                 replace=True,

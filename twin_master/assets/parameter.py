@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,8 @@ from twin_master.seeds import generator, seed_sequence
 
 if TYPE_CHECKING:
     from calibration.parameters.result import ParameterCalibration
-    from calibration.static.stiffness_curve import StiffnessCurve, TipStiffnessModel
+    from calibration.static.record import StaticCalibration
+    from calibration.static.stiffness_curve import TipStiffnessModel
 
 Float = NDArray[np.float64]
 
@@ -102,28 +104,46 @@ def draw_parameter(
             calibration.standard_deviation,
             "normal distribution of the scenario",
         )
-    # A scenario can be read without any of this, and it takes seconds to load.
-    from calibration.static.stiffness import PUBLISHED_LINE, calibrate_static, stiffness_curve_of
-
-    curve: StiffnessCurve = PUBLISHED_LINE
+    table: tuple[str, bytes, bytes, float] | None = None
     if calibration.curve == "design":
         if model is None:
             raise MissingObservationModelError(
                 "`calibration.curve` asks for the stiffness curve of a design, and the asset has none: "
                 "let the twin believe a `design`, or set `calibration.curve` to `published`."
             )
+        from calibration.static.stiffness_curve import stiffness_curve_of
+
         curve = stiffness_curve_of(model)
+        table = (curve.name, curve.factors.tobytes(), curve.stiffnesses.tobytes(), curve.table_error)
     sequence = seed_sequence(seed, "calibration")
-    found = calibrate_static(curve, seed=int(sequence.generate_state(1)[0]))
+    found = _static_test(table, int(sequence.generate_state(1)[0]))
     posterior = found.exact if calibration.method == "exact" else found.particle.posterior
     return ParameterDraws(
         name=calibration.parameter,
         values=posterior.samples(sequence, calibration.draws, stratified=True),
         mean=posterior.mean,
         standard_deviation=posterior.standard_deviation,
-        source=f"static test of the wing, {calibration.method.replace('_', ' ')}, {curve.name}",
+        source=f"static test of the wing, {calibration.method.replace('_', ' ')}, {found.curve.name}",
         record=found.to_dict(),
     )
+
+
+@lru_cache(maxsize=2)
+def _static_test(table: tuple[str, bytes, bytes, float] | None, seed: int) -> "StaticCalibration":
+    """Return the calibration by the published static test, once for a curve and a seed.
+
+    `table` is a curve's name, its nodes and its error; None for the published line. A million particles take
+    seconds, and missions of one seed that follow each other in a process share them.
+    """
+    # A scenario can be read without any of this, and it takes seconds to load.
+    from calibration.static.stiffness import calibrate_static
+    from calibration.static.stiffness_curve import PUBLISHED_LINE, TabulatedStiffnessCurve
+
+    if table is None:
+        return calibrate_static(PUBLISHED_LINE, seed=seed)
+    name, factors, stiffnesses, error = table
+    nodes = (np.frombuffer(factors), np.frombuffer(stiffnesses))
+    return calibrate_static(TabulatedStiffnessCurve(*nodes, name=name, table_error=error), seed=seed)
 
 
 def _draws_of_file(calibration: Calibration, seed: int) -> ParameterDraws:
@@ -152,10 +172,11 @@ def read_calibration(calibration: Calibration) -> None:
     CalibrationRecordError
         It is damaged or of another kind, or has no samples of the parameter.
     """
+    if calibration.file is None:
+        return
     from calibration.reading import load_calibration
 
-    if calibration.file is not None:
-        load_calibration(Path(calibration.file)).draws_of(calibration.parameter)
+    load_calibration(Path(calibration.file)).draws_of(calibration.parameter)
 
 
 def check_calibration(
@@ -238,10 +259,10 @@ def calibrated_means(calibration: Calibration) -> dict[str, float]:
 
 def _parameters_in(calibration: Calibration) -> "ParameterCalibration | None":
     """Return the calibration from a campaign that a scenario names; None if it names none."""
+    if calibration.file is None:
+        return None
     from calibration.parameters.result import ParameterCalibration
     from calibration.reading import load_calibration
 
-    if calibration.file is None:
-        return None
     found = load_calibration(Path(calibration.file))
     return found if isinstance(found, ParameterCalibration) else None
