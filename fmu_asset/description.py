@@ -84,10 +84,12 @@ def model_description(
         canSerializeFMUstate="true",
     )
     if source_files:
+        interface.set("providesDirectionalDerivative", "true")
         listed = SubElement(interface, "SourceFiles")
         for name in source_files:
             SubElement(listed, "File", name=name)
-    _add_definitions(root, units, enumerations)
+    add_units(root, units)
+    _add_types(root, enumerations)
     categories = SubElement(root, "LogCategories")
     for name, text in LOG_CATEGORIES.items():
         SubElement(categories, "Category", name=name, description=text)
@@ -100,13 +102,17 @@ def model_description(
     return bytes(tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
 
 
-def _add_definitions(root: Element, units: Sequence[Unit], enumerations: Sequence[EnumerationType]) -> None:
+def add_units(root: Element, units: Sequence[Unit]) -> None:
+    """Add the unit definitions to a model description of FMI 2 or 3."""
     defined = SubElement(root, "UnitDefinitions")
     for unit in units:
         element = SubElement(defined, "Unit", name=unit.name)
         SubElement(element, "BaseUnit", {symbol: str(power) for symbol, power in unit.exponents})
         for name, factor in unit.displays:
             SubElement(element, "DisplayUnit", name=name, factor=number(factor))
+
+
+def _add_types(root: Element, enumerations: Sequence[EnumerationType]) -> None:
     types = SubElement(root, "TypeDefinitions")
     for enumeration in enumerations:
         simple = SubElement(types, "SimpleType", name=enumeration.name, description=enumeration.description)
@@ -175,6 +181,7 @@ def documentation_page(
     model_name: str = "uav_wing",
     enumerations: Sequence[EnumerationType] = ENUMERATIONS,
     host: str = "It runs in a Python host that has NumPy.",
+    fmi: int = 2,
 ) -> bytes:
     """Return documentation/index.html: what the FMU is and its variables, as UTF-8 without any request."""
     rows = []
@@ -197,8 +204,8 @@ def documentation_page(
 <style>body{{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}}
 td,th{{text-align:left;padding:.2em .8em .2em 0;border-bottom:1px solid #ddd}}</style></head><body>
 <h1>{model_name}</h1><p>{escape(description)}</p>
-<p>FMI 2.0 co-simulation. {escape(host)} A call that is refused logs why, sets
-<code>status</code> and leaves state and outputs as they were; a refused step returns fmi2Discard.</p>
+<p>FMI {fmi}.0 co-simulation. {escape(host)} A call that is refused logs why, sets
+<code>status</code> and leaves state and outputs as they were; a refused step returns fmi{fmi}Discard.</p>
 <table><tr><th>variable</th><th>causality</th><th>unit</th><th>range</th><th>start</th><th>meaning</th></tr>
 {body}
 </table><h2>Enumerations</h2><ul>{statuses}</ul></body></html>

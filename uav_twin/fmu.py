@@ -33,6 +33,7 @@ def build(
         Literal["python", "compiled", "source"],
         typer.Option(help="Run by Python, compiled C, or C sources to be compiled elsewhere."),
     ] = "python",
+    fmi: Annotated[int, typer.Option(min=2, max=3, help="Version of FMI: 3 for compiled and source.")] = 2,
     calibration: Annotated[
         Path | None,
         typer.Option(help="Tailor it to a wing: the calibration.nc of `uav-twin calibrate`."),
@@ -50,25 +51,30 @@ def build(
     ] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
-    """Pack a wing, a structure or a model script as an FMI 2.0 FMU; equal input gives equal bytes."""
+    """Pack a wing, a structure or a model script as an FMU; equal input gives equal bytes."""
     if script is None and calibration is None and design is not None and is_structure(design):
         if patch is not None or activate:
             raise typer.BadParameter("--patch and --activate are for wings, and the design is a structure.")
-        build_structure(design, out, kind, None, None, replace, None)
+        build_structure(design, out, kind, fmi, None, None, replace, None)
         return
     out = out or Path("uav_wing.fmu")
     _refuse_contradictions(out, design, calibration, patch, activate=activate, replace=replace)
     if script is not None:
-        for_the_wing = design is not None or calibration is not None or kind != "python" or patch is not None
+        for_the_wing = (
+            design is not None or calibration is not None or kind != "python" or patch is not None or fmi != 2
+        )
         _build_script(script, out, replace=replace, other=for_the_wing)
         return
-    _build_wing(out, design, kind, calibration, patch, activate=activate, replace=replace)
+    _build_wing(
+        out, design, kind, 3 if fmi == 3 else 2, calibration, patch, activate=activate, replace=replace
+    )
 
 
 def _build_wing(
     out: Path,
     design: Path | None,
     kind: Literal["python", "compiled", "source"],
+    fmi: Literal[2, 3],
     calibration: Path | None,
     patch: Path | None,
     *,
@@ -79,9 +85,10 @@ def _build_wing(
     from fe.wing.design import load_design
     from fmu_asset.compiled.compiler import find_compiler
     from fmu_asset.packing.patch_file import load_patch
-    from fmu_asset.packing.wing_fmu import check_kind
+    from fmu_asset.packing.wing_fmu import check_kind, check_version
     from fmu_asset.packing.wing_packing import pack_wing
 
+    check_version(kind, fmi)
     effects = None if patch is None else load_patch(patch)
     if effects is not None:
         check_kind(kind)
@@ -103,6 +110,7 @@ def _build_wing(
         kind=kind,
         patch=effects,
         activate=activate,
+        fmi=fmi,
         replace=replace,
         progress=terminal.progress(),
     )
@@ -138,7 +146,7 @@ def _build_script(script: str, out: Path, *, replace: bool, other: bool) -> None
 
     if other:
         raise typer.BadParameter(
-            "--design, --calibration, --patch and --kind are for the wing.", param_hint="--script"
+            "--design, --calibration, --patch, --kind and --fmi are for the wing.", param_hint="--script"
         )
     built = build_script_fmu(asset_scripts().get(script, Path(script)), out, replace=replace)
     terminal.say(f"{built.path}: {built.size / 1024:.0f} KiB, GUID {built.guid}")

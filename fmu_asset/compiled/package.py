@@ -1,9 +1,11 @@
 """What goes into the compiled FMU: description, sources, FMI headers, data file."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import distribution, version
 from importlib.resources import files
 from pathlib import Path
+from typing import Literal
 
 from fe.runtime.reduced_arrays import ReducedArrays
 from fe.runtime.structure_arrays import StructureArrays
@@ -12,14 +14,39 @@ from fmu_asset.description import documentation_page, model_description
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
+from .arrays import arrays_of
 from .compiler import PLATFORM, compile_library
 from .data_file import data_file_bytes
+from .description3 import build_description, model_description3
 from .variable_header import Roles, variable_sources
 
 DATA_FILE = "resources/reduced_model.bin"
 
-FMI_HEADERS = ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h")
-"""The headers of FMI 2.0 as fmpy ships them, with their licence (2-clause BSD) in them."""
+FmiVersion = Literal[2, 3]
+"""Versions of FMI that a compiled FMU can be of."""
+
+FMI_HEADERS: Mapping[FmiVersion, tuple[str, ...]] = {
+    2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
+    3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
+}
+"""The headers of FMI as fmpy ships them, with their licence (2-clause BSD) in them."""
+
+_PLATFORM_FOLDERS: Mapping[FmiVersion, str] = {2: PLATFORM, 3: "x86_64-linux"}
+
+_TIME = FmuVariable(
+    name="time",
+    reference=0,
+    kind="Real",
+    causality="independent",
+    variability="continuous",
+    description="Time",
+    unit="s",
+    display_unit=None,
+    minimum=None,
+    maximum=None,
+    start=None,
+    enumeration=None,
+)
 
 HOST = "It is compiled C and needs nothing but the C library; its sources are inside."
 
@@ -35,6 +62,7 @@ def compiled_members(
     guid: str,
     content_tag: str,
     description: str,
+    fmi: FmiVersion = 2,
 ) -> dict[str, bytes]:
     """Return the files of a compiled FMU, all but its binary.
 
@@ -54,6 +82,9 @@ def compiled_members(
         GUID, and the mark of saved states; placeholders, as long as the content is not known.
     description : str
         One sentence for people.
+    fmi : {2, 3}
+        Version of FMI: the same sources but for its functions. In 3 numbered variables, and inputs and
+        outputs such as `health.z1`, pass as arrays.
 
     Returns
     -------
@@ -68,12 +99,28 @@ def compiled_members(
     sources = {
         entry.name: entry.read_bytes()
         for entry in (files("fmu_asset.compiled") / "sources").iterdir()
-        if entry.name.endswith((".c", ".h"))
+        if entry.name.endswith((".c", ".h")) and entry.name != f"structure_fmi{5 - fmi}.c"
     }
-    made = variable_sources(table, roles, guid=guid, content_tag=content_tag)
+    if fmi == 3:
+        table = (*table, replace(_TIME, reference=len(table)))
+    arrays = arrays_of(table) if fmi == 3 else ()
+    made = variable_sources(table, roles, guid=guid, content_tag=content_tag, arrays=arrays)
     sources |= {name: text.encode() for name, text in made.items()}
-    return {
-        "modelDescription.xml": model_description(
+    listed = sorted(name for name in sources if name.endswith(".c"))
+    if fmi == 3:
+        sources["buildDescription.xml"] = build_description(identifier, listed)
+        model_description_text = model_description3(
+            model_name=model_name,
+            identifier=identifier,
+            guid=guid,
+            table=table,
+            arrays=arrays,
+            units=units,
+            description=description,
+            version=version("uav-twin"),
+        )
+    else:
+        model_description_text = model_description(
             model_name=model_name,
             identifier=identifier,
             guid=guid,
@@ -82,18 +129,20 @@ def compiled_members(
             description=description,
             version=version("uav-twin"),
             generation_tool="uav-twin",
-            source_files=sorted(name for name in sources if name.endswith(".c")),
-        ),
-        "documentation/index.html": documentation_page(table, description, host=HOST),
+            source_files=listed,
+        )
+    return {
+        "modelDescription.xml": model_description_text,
+        "documentation/index.html": documentation_page(table, description, host=HOST, fmi=fmi),
         DATA_FILE: data_file_bytes(model),
         f"resources/{DESIGN_RECORD}": design_record(model.design_hash),
         **{f"sources/{name}": content for name, content in sources.items()},
-        **{f"sources/{name}": content for name, content in fmi_headers().items()},
+        **{f"sources/{name}": content for name, content in fmi_headers(fmi).items()},
     }
 
 
-def fmi_headers() -> dict[str, bytes]:
-    """Return the headers of FMI 2.0 by name, from the installed fmpy.
+def fmi_headers(fmi: FmiVersion = 2) -> dict[str, bytes]:
+    """Return the headers of a version of FMI by name, from the installed fmpy.
 
     Raises
     ------
@@ -102,14 +151,14 @@ def fmi_headers() -> dict[str, bytes]:
     """
     folder = Path(str(distribution("fmpy").locate_file("fmpy"))) / "c-code"
     try:
-        return {name: (folder / name).read_bytes() for name in FMI_HEADERS}
+        return {name: (folder / name).read_bytes() for name in FMI_HEADERS[fmi]}
     except OSError as error:
         raise FmuBuildError(
             f"The FMI header {error.filename} is missing from the installation of fmpy; install it again."
         ) from error
 
 
-def binary_of(members: Mapping[str, bytes], identifier: str) -> dict[str, bytes]:
+def binary_of(members: Mapping[str, bytes], identifier: str, fmi: FmiVersion = 2) -> dict[str, bytes]:
     """Return the binary of a compiled FMU, made of the sources among its files.
 
     Parameters
@@ -118,6 +167,8 @@ def binary_of(members: Mapping[str, bytes], identifier: str) -> dict[str, bytes]
         The files of the FMU.
     identifier : str
         Model identifier.
+    fmi : {2, 3}
+        Version of FMI.
 
     Returns
     -------
@@ -134,4 +185,4 @@ def binary_of(members: Mapping[str, bytes], identifier: str) -> dict[str, bytes]
         for name, content in members.items()
         if name.startswith("sources/")
     }
-    return {f"binaries/{PLATFORM}/{identifier}.so": compile_library(sources)}
+    return {f"binaries/{_PLATFORM_FOLDERS[fmi]}/{identifier}.so": compile_library(sources)}

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from fmu_asset.description import LOG_CATEGORIES
 from fmu_asset.slaves.variables import ENUMERATIONS, FmuVariable
 
+from .arrays import ArrayVariable
+
 _NOTE = "/* Made by the build of the FMU from its table of variables; a change here is lost. */\n"
 
 _DECLARATIONS = """#if defined(__GNUC__) && !defined(_WIN32)
@@ -15,6 +17,7 @@ _DECLARATIONS = """#if defined(__GNUC__) && !defined(_WIN32)
 
 typedef struct {
     const char *name;
+    size_t length; /* of an array its values, zero for its further elements; else 1 */
     const char *unit; /* for messages; empty where there is none */
     bool enumeration;
     double minimum;
@@ -32,6 +35,7 @@ extern const unsigned int structure_chosen_places[STRUCTURE_CHOSEN_COUNT];
 extern const unsigned int structure_displacement_bound_place;
 extern const unsigned int structure_release_place;
 extern const unsigned int structure_load_point_place;
+extern const unsigned int structure_time_place;
 
 #if defined(__GNUC__) && !defined(_WIN32)
 #pragma GCC visibility pop
@@ -68,7 +72,12 @@ class Roles:
 
 
 def variable_sources(
-    table: Sequence[FmuVariable], roles: Roles, *, guid: str, content_tag: str
+    table: Sequence[FmuVariable],
+    roles: Roles,
+    *,
+    guid: str,
+    content_tag: str,
+    arrays: Sequence[ArrayVariable] = (),
 ) -> dict[str, str]:
     """Return the C sources that say what the variables are.
 
@@ -82,6 +91,8 @@ def variable_sources(
         The GUID that `fmi2Instantiate` asks for.
     content_tag : str
         What marks a saved state as one of this FMU, at most 16 letters.
+    arrays : sequence of ArrayVariable
+        Which rows of the table pass together, in FMI 3.
 
     Returns
     -------
@@ -90,7 +101,7 @@ def variable_sources(
     """
     return {
         "structure_variables.h": _header(table, roles, guid, content_tag),
-        "structure_variables.c": _source(table, roles),
+        "structure_variables.c": _source(table, roles, arrays),
     }
 
 
@@ -130,6 +141,7 @@ def _header(table: Sequence[FmuVariable], roles: Roles, guid: str, content_tag: 
 #define STRUCTURE_VARIABLES_H
 
 #include <stdbool.h>
+#include <stddef.h>
 
 #define STRUCTURE_GUID "{guid}"
 #define STRUCTURE_CONTENT_TAG "{content_tag}"
@@ -144,7 +156,7 @@ def _header(table: Sequence[FmuVariable], roles: Roles, guid: str, content_tag: 
 {_DECLARATIONS}"""
 
 
-def _source(table: Sequence[FmuVariable], roles: Roles) -> str:
+def _source(table: Sequence[FmuVariable], roles: Roles, arrays: Sequence[ArrayVariable]) -> str:
     """Return `structure_variables.c`: the table, and which of it is what."""
     place = _places(table)
     chosen = "".join(f"    {place[name]},\n" for name in roles.chosen)
@@ -154,9 +166,14 @@ def _source(table: Sequence[FmuVariable], roles: Roles) -> str:
             ("displacement_bound", roles.displacement_bound),
             ("release", roles.release),
             ("load_point", roles.load_point),
+            ("time", "time" if "time" in place else None),
         )
     )
-    rows = "".join(f"    {{{_row(row)}}},\n" for row in table)
+    named = {row.reference: (row.name, 1) for row in table}
+    for array in arrays:
+        for index, row in enumerate(array.rows):
+            named[row.reference] = (f"{array.name}[{index + 1}]", len(array.rows) if index == 0 else 0)
+    rows = "".join(f"    {{{_row(row, *named[row.reference])}}},\n" for row in table)
     names = "".join(f'    "{name}",\n' for name in LOG_CATEGORIES)
     return f"""{_NOTE}#include "structure_variables.h"
 
@@ -174,7 +191,7 @@ const unsigned int structure_chosen_places[STRUCTURE_CHOSEN_COUNT] = {{
 {others}"""
 
 
-def _row(row: FmuVariable) -> str:
+def _row(row: FmuVariable, name: str, length: int) -> str:
     unit = "" if row.unit in (None, "1") else row.unit
     numbers = (
         -math.inf if row.minimum is None else row.minimum,
@@ -182,7 +199,7 @@ def _row(row: FmuVariable) -> str:
         row.start or 0.0,
     )
     enumeration = "true" if row.enumeration is not None else "false"
-    return ", ".join((_text(row.name), _text(unit or ""), enumeration, *map(_number, numbers)))
+    return ", ".join((_text(name), str(length), _text(unit or ""), enumeration, *map(_number, numbers)))
 
 
 def _text(text: str) -> str:

@@ -29,8 +29,8 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 _TEXT_SUFFIXES = (".py", ".xml", ".txt", ".html", ".json", ".c", ".h")
 # Where the GUID itself stands, between these two; elsewhere the placeholder stands for the tag.
 _GUID_PLACES = {
-    "modelDescription.xml": 'guid="{}"',
-    "sources/structure_variables.h": 'STRUCTURE_GUID "{}"',
+    "modelDescription.xml": ('guid="{}"', 'instantiationToken="{}"'),
+    "sources/structure_variables.h": ('STRUCTURE_GUID "{}"',),
 }
 
 
@@ -242,8 +242,7 @@ def _exchanged(name: str, data: bytes, guids: tuple[str, str], tags: tuple[str, 
     """Return a text with the first GUID and tag replaced by the second ones; binaries as they are."""
     if not name.endswith(_TEXT_SUFFIXES):
         return data
-    place = _GUID_PLACES.get(name)
-    if place is not None:
+    for place in _GUID_PLACES.get(name, ()):
         data = data.replace(place.format(guids[0]).encode(), place.format(guids[1]).encode())
     return data.replace(tags[0].encode(), tags[1].encode())
 

@@ -1,4 +1,4 @@
-"""Packing a reduced model as the wing FMU: FMI 2.0 co-simulation, reproducible to the byte.
+"""Packing a reduced model as the wing FMU: FMI 2.0 or 3.0 co-simulation, reproducible to the byte.
 
 What goes into the compiled kind is in `compiled`. Of the Python kind, slave base class and binaries are
 pythonfmu's; the archive is packed here and not by its builder, which stamps times, a random GUID and module
@@ -7,6 +7,7 @@ names that two FMUs in one process would share.
 
 import json
 import os
+import re
 import zipfile
 from collections.abc import Mapping
 from typing import Literal
@@ -14,7 +15,7 @@ from typing import Literal
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
-from fmu_asset.compiled.package import DATA_FILE, binary_of, compiled_members
+from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binary_of, compiled_members
 from fmu_asset.compiled.variable_header import Roles
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.slaves.effect_variables import effect_rows, switch_of, units_of
@@ -62,6 +63,7 @@ def build_fmu(
     patch: PatchFile | None = None,
     activate: bool = False,
     arrays: PatchArrays | None = None,
+    fmi: FmiVersion = 2,
     replace: bool = False,
 ) -> FmuInfo:
     """Pack a reduced model as an FMU; equal input gives equal bytes.
@@ -88,6 +90,8 @@ def build_fmu(
     arrays : PatchArrays, optional
         The wing in the basis for patches (`fe.reduction.patch_cache.patch_arrays`); needed where an effect
         changes structure or loads, or turns a gauge.
+    fmi : {2, 3}
+        Version of FMI; 3 for the kinds in C.
     replace : bool
         Whether an existing file may be replaced.
 
@@ -95,14 +99,22 @@ def build_fmu(
     ------
     FmuBuildError
         If the file exists, the suffix is wrong, a start value lies outside the model's validity box, a
-        resource would take the place of another file, the wrong pythonfmu is installed, or there is no C
-        compiler for a compiled one.
+        resource would take the place of another file, the kind is not of that version of FMI, the wrong
+        pythonfmu is installed, or there is no C compiler for a compiled one.
     PatchFileError
         If the FMU cannot carry an effect of the patch.
     """
     target = checked_target(path, replace=replace)
     content, content_hash = fmu_bytes(
-        model, state, kind, note=note, resources=resources, patch=patch, activate=activate, arrays=arrays
+        model,
+        state,
+        kind,
+        note=note,
+        resources=resources,
+        patch=patch,
+        activate=activate,
+        arrays=arrays,
+        fmi=fmi,
     )
     return write_fmu(target, content, content_hash, "uav_wing", model.design_hash)
 
@@ -117,8 +129,10 @@ def fmu_bytes(
     patch: PatchFile | None = None,
     activate: bool = False,
     arrays: PatchArrays | None = None,
+    fmi: FmiVersion = 2,
 ) -> tuple[bytes, str]:
     """Return the archive and its content hash; see `build_fmu`."""
+    check_version(kind, fmi)
     start = start_values(model, state or DigitalState())
     mode_count = min(MODE_COUNT, model.mode_count)
     table = _table_of(model, mode_count, start)
@@ -156,15 +170,21 @@ def fmu_bytes(
             guid=PLACEHOLDER,
             content_tag=PLACEHOLDER,
             description=description,
+            fmi=fmi,
         )
     for name, content in (resources or {}).items():
         if f"resources/{name}" in template or "/" in name or not name:
             raise FmuBuildError(f"A resource of an FMU cannot have the name {name!r}; choose another one.")
         template[f"resources/{name}"] = content
+    return packed(template, "uav_wing", kind, fmi)
+
+
+def packed(template: Mapping[str, bytes], stem: str, kind: FmuKind, fmi: FmiVersion) -> tuple[bytes, str]:
+    """Return the archive of the files with their placeholders, compiled where the kind is, and their hash."""
     content_hash = content_hash_of(template)
     members = filled(template, content_hash)
     if kind == "compiled":
-        members |= binary_of(members, f"uav_wing_{tag_of(content_hash)}")
+        members |= binary_of(members, f"{stem}_{tag_of(content_hash)}", fmi)
     return archive_bytes(members), content_hash
 
 
@@ -202,6 +222,15 @@ def check_kind(kind: FmuKind) -> None:
         )
 
 
+def check_version(kind: FmuKind, fmi: FmiVersion) -> None:
+    """Refuse a version of FMI that a kind of FMU cannot be of; raises `FmuBuildError`."""
+    if kind == "python" and fmi != 2:
+        raise FmuBuildError(
+            f"The FMU of the kind 'python' is of FMI 2.0, but FMI {fmi}.0 was asked for: build the kind "
+            "'compiled' or 'source'."
+        )
+
+
 def start_values(model: ReducedModel, state: DigitalState) -> dict[str, float]:
     """Return the start values of the FMU's variables that a digital state gives, by variable name."""
     losses = zip(model.regions, model.losses(state.stiffness_loss), strict=True)
@@ -235,5 +264,6 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
         tag = root.split('modelIdentifier="', 1)[1].split('"', 1)[0][-len(PLACEHOLDER) :]
     else:
         tag = members["resources/slavemodule.txt"].decode("ascii").strip()[-len(PLACEHOLDER) :]
-    declared = root.split('guid="', 1)[1].split('"', 1)[0]
+    found = re.search(r'(?:guid|instantiationToken)="([^"]*)"', root)
+    declared = "" if found is None else found[1]
     return declared, guid_of(content_hash_of(emptied(members, tag, declared)))

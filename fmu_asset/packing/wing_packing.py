@@ -9,6 +9,7 @@ from fe.reduction.patch_cache import patch_arrays
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
+from fmu_asset.compiled.package import FmiVersion
 from reporting.progress import Progress, SilentProgress
 
 from .contents import FmuInfo
@@ -40,6 +41,7 @@ def pack_wing(
     kind: FmuKind = "python",
     patch: PatchFile | None = None,
     activate: bool = False,
+    fmi: FmiVersion = 2,
     replace: bool = False,
     progress: Progress | None = None,
 ) -> FmuInfo:
@@ -53,7 +55,7 @@ def pack_wing(
         Where to write, with the suffix .fmu.
     tailoring : Tailoring, optional
         The calibration: the FMU starts at its means and carries its record.
-    kind, patch, activate, replace
+    kind, patch, activate, fmi, replace
         See `fmu_asset.packing.wing_fmu.build_fmu`.
     progress : Progress, optional
         Shows what takes long.
@@ -76,6 +78,7 @@ def pack_wing(
         patch=patch,
         activate=activate,
         arrays=arrays_for(design, patch, progress),
+        fmi=fmi,
         replace=replace,
     )
 

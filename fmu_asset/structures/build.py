@@ -8,23 +8,19 @@ from importlib.resources import files
 
 from fe.runtime.structure_model import StructureModel
 from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
-from fmu_asset.compiled.package import binary_of, compiled_members
+from fmu_asset.compiled.package import FmiVersion, compiled_members
 from fmu_asset.compiled.variable_header import Roles
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.contents import (
     PLACEHOLDER,
     FmuInfo,
-    archive_bytes,
     check_start,
     checked_target,
-    content_hash_of,
-    filled,
     room_members,
-    tag_of,
     write_fmu,
 )
 from fmu_asset.packing.python_fmu import python_members
-from fmu_asset.packing.wing_fmu import FmuKind
+from fmu_asset.packing.wing_fmu import FmuKind, check_version, packed
 from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
 from .table import structure_table
@@ -43,9 +39,10 @@ def build_structure_fmu(
     *,
     kind: FmuKind = "python",
     start: Mapping[str, float] | None = None,
+    fmi: FmiVersion = 2,
     replace: bool = False,
 ) -> FmuInfo:
-    """Pack a reduced structure as an FMI 2.0 co-simulation FMU.
+    """Pack a reduced structure as an FMI co-simulation FMU.
 
     Parameters
     ----------
@@ -57,6 +54,8 @@ def build_structure_fmu(
         What evaluates the model: Python in the host, C compiled now, or C to be compiled elsewhere.
     start : mapping of str to float, optional
         Start values by variable name that take the place of the nominal ones.
+    fmi : {2, 3}
+        Version of FMI; 3 for the kinds in C.
     replace : bool
         Whether an existing file may be replaced.
 
@@ -67,7 +66,7 @@ def build_structure_fmu(
         is wrong, the wrong pythonfmu is installed, or there is no C compiler for a compiled one.
     """
     target = checked_target(path, replace=replace)
-    content, content_hash = structure_fmu_bytes(model, start, kind)
+    content, content_hash = structure_fmu_bytes(model, start, kind, fmi)
     return write_fmu(target, content, content_hash, stem_of(model), model.design_hash)
 
 
@@ -78,9 +77,13 @@ def stem_of(model: StructureModel) -> str:
 
 
 def structure_fmu_bytes(
-    model: StructureModel, start: Mapping[str, float] | None = None, kind: FmuKind = "python"
+    model: StructureModel,
+    start: Mapping[str, float] | None = None,
+    kind: FmuKind = "python",
+    fmi: FmiVersion = 2,
 ) -> tuple[bytes, str]:
     """Return the archive and its content hash; see `build_structure_fmu`."""
+    check_version(kind, fmi)
     given = {name: float(value) for name, value in (start or {}).items()}
     try:
         table = structure_table(model, given)
@@ -105,12 +108,9 @@ def structure_fmu_bytes(
             guid=PLACEHOLDER,
             content_tag=PLACEHOLDER,
             description=description,
+            fmi=fmi,
         )
-    content_hash = content_hash_of(template)
-    members = filled(template, content_hash)
-    if kind == "compiled":
-        members |= binary_of(members, f"{name}_{tag_of(content_hash)}")
-    return archive_bytes(members), content_hash
+    return packed(template, name, kind, fmi)
 
 
 def _python_template(

@@ -17,7 +17,10 @@ def test_what_is_shipped() -> None:
     wings = {"level_turns", "growing_damage", "failing_gauges", "model_mismatch", "three_fmus"}
     wings |= {"level_turns_learning", "three_regions"}
     assert set(scenario_files()) == {*wings, "pump_wear", "watched_wing", "bracket", "stiffened_panel"}
-    assert set(binding_files()) == {"gear_pump", "three_fmus", "uav_wing", "uav_wing_laboratory"}
+    assert set(binding_files()) == {
+        *("gear_pump", "three_fmus", "uav_wing", "uav_wing_fmi3"),
+        "uav_wing_laboratory",
+    }
     assert set(asset_scripts()) == {"gear_pump"}
     assert load_scenario("watched_wing").scenario.watch.recording == recording_files()["watched_wing"]
 

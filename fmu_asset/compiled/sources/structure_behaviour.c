@@ -166,6 +166,29 @@ bool structure_behaviour_load_point(structure_behaviour *behaviour, size_t point
     return true;
 }
 
+bool structure_behaviour_derivative(structure_behaviour *behaviour, size_t which, size_t point, double *output,
+                                    double *load_point, structure_problem *problem) {
+    const structure_model *model = behaviour->model;
+    structure_integrator *integrator = &behaviour->integrators[behaviour->integrator];
+    if (!is_started(behaviour, problem)) {
+        return false;
+    }
+    if (behaviour->moving) {
+        structure_integrator_derivative(integrator, behaviour->chosen, which, point, output, load_point);
+        return true;
+    }
+    if (!structure_static_prepare(&integrator->steady, behaviour->chosen, problem)) {
+        return false;
+    }
+    structure_load_coefficients(model, behaviour->chosen, behaviour->load);
+    structure_static_derivative(&integrator->steady, behaviour->chosen, behaviour->load, which, point, output,
+                                load_point);
+    for (size_t i = model->output_count; i < model->modal_outputs; ++i) {
+        output[i] = 0.0; /* accelerations */
+    }
+    return true;
+}
+
 bool structure_behaviour_modal_data(structure_behaviour *behaviour, size_t count, double *frequency,
                                     double *damping_ratio, structure_problem *problem) {
     structure_integrator *integrator = &behaviour->integrators[behaviour->integrator];

@@ -59,6 +59,11 @@ bool structure_behaviour_error_bounds(structure_behaviour *behaviour, structure_
 bool structure_behaviour_load_point(structure_behaviour *behaviour, size_t point, double *displacement,
                                     structure_problem *problem);
 
+/* Derivatives of the outputs, and of the displacement along the load of index `point`, with respect to one of what
+   can be chosen: at equilibrium; in motion to one control of the loads. */
+bool structure_behaviour_derivative(structure_behaviour *behaviour, size_t which, size_t point, double *output,
+                                    double *load_point, structure_problem *problem);
+
 /* Natural frequencies [Hz] and damping ratios [1] of the first `count` modes under the last inputs. */
 bool structure_behaviour_modal_data(structure_behaviour *behaviour, size_t count, double *frequency,
                                     double *damping_ratio, structure_problem *problem);

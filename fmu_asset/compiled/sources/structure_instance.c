@@ -6,32 +6,18 @@
 #include <stdlib.h>
 #include <string.h>
 
+#define DATA_FILE "reduced_model.bin"
+
 /* phase, time and three flags, then the values, then the behaviour */
 #define SAVED_HEAD 5
 
-static const char *category_of(fmi2Status status) {
-    return structure_log_categories[status == fmi2Discard ? STRUCTURE_LOG_DISCARD : STRUCTURE_LOG_ERROR];
+void structure_log(const structure_host *host, const char *name, structure_result result, const char *sentence) {
+    host->log(host, name, result,
+              structure_log_categories[result == STRUCTURE_DISCARD ? STRUCTURE_LOG_DISCARD : STRUCTURE_LOG_ERROR],
+              sentence);
 }
 
-void structure_log(fmi2CallbackLogger logger, fmi2ComponentEnvironment environment, const char *name,
-              fmi2Status status, const char *sentence) {
-    /* Some hosts take the message for the text, others for a format: with every % doubled it is both, but for
-       paths that hold one. */
-    char format[2 * sizeof(((structure_problem *)0)->text)];
-    size_t at = 0;
-    for (; *sentence != '\0' && at + 3 < sizeof format; ++sentence) {
-        if (*sentence == '%') {
-            format[at++] = '%';
-        }
-        format[at++] = *sentence;
-    }
-    format[at] = '\0';
-    if (logger != NULL) {
-        logger(environment, name, status, category_of(status), format);
-    }
-}
-
-structure_instance *structure_instance_make(const char *name, const char *data_file, structure_problem *problem) {
+static structure_instance *make(const char *name, const char *data_file, structure_problem *problem) {
     structure_instance *instance = calloc(1, sizeof *instance);
     char *kept_name = malloc(strlen(name) + 1);
     if (instance == NULL || kept_name == NULL) {
@@ -61,6 +47,48 @@ structure_instance *structure_instance_make(const char *name, const char *data_f
     return instance;
 }
 
+structure_instance *structure_instance_open(const structure_host *host, const char *name, const char *token,
+                                            const char *folder) {
+    structure_problem problem;
+    structure_instance *instance = NULL;
+    if (name == NULL || *name == '\0') {
+        (void)structure_fail(&problem, "an instance needs a name");
+    } else if (token == NULL || strcmp(token, STRUCTURE_GUID) != 0) {
+        (void)structure_fail(&problem, "the GUID %.60s was given, but this is " STRUCTURE_GUID,
+                             token == NULL ? "(none)" : token);
+    } else if (folder == NULL) {
+        (void)structure_fail(&problem, "the location of the resources was not given");
+    } else {
+        const char *parts[] = {folder, "/" DATA_FILE};
+        char *path = malloc(strlen(parts[0]) + strlen(parts[1]) + 1);
+        if (path == NULL) {
+            (void)structure_fail(&problem, "there is no memory for an instance");
+        } else {
+            strcat(strcpy(path, parts[0]), parts[1]);
+            instance = make(name, path, &problem);
+            free(path);
+        }
+    }
+    if (instance == NULL) {
+        structure_log(host, name == NULL ? "" : name, STRUCTURE_ERROR, problem.text);
+        return NULL;
+    }
+    instance->host = *host;
+    return instance;
+}
+
+void structure_instance_log(structure_instance *instance, bool on, size_t count, const char *const *categories) {
+    for (size_t i = 0; i < STRUCTURE_LOG_CATEGORIES; ++i) {
+        bool named = count == 0;
+        for (size_t k = 0; k < count; ++k) {
+            named = named || strcmp(categories[k], structure_log_categories[i]) == 0;
+        }
+        if (named) {
+            instance->logged[i] = on;
+        }
+    }
+}
+
 void structure_instance_free(structure_instance *instance) {
     if (instance != NULL) {
         structure_behaviour_free(&instance->behaviour);
@@ -70,18 +98,26 @@ void structure_instance_free(structure_instance *instance) {
     }
 }
 
+/* Time is a variable in FMI 3 only. */
+static void set_time(structure_instance *instance, double time) {
+    instance->time = time;
+    if (structure_time_place < STRUCTURE_VARIABLE_COUNT) {
+        instance->values[structure_time_place] = time;
+    }
+}
+
 void structure_instance_reset(structure_instance *instance) {
     structure_behaviour_reset(&instance->behaviour);
     instance->phase = STRUCTURE_INSTANTIATED;
-    instance->time = 0.0;
     instance->discarded = false;
     for (size_t i = 0; i < STRUCTURE_VARIABLE_COUNT; ++i) {
         instance->values[i] = structure_variables[i].start;
     }
+    set_time(instance, 0.0);
     instance->stale_response = instance->stale_bound = instance->stale_modal = true;
 }
 
-fmi2Status structure_refuse(structure_instance *instance, int status, const char *format, ...) {
+structure_result structure_refuse(structure_instance *instance, int status, const char *format, ...) {
     structure_problem problem;
     va_list arguments;
     va_start(arguments, format);
@@ -89,16 +125,16 @@ fmi2Status structure_refuse(structure_instance *instance, int status, const char
     va_end(arguments);
     instance->values[STRUCTURE_STATUS] = status;
     const bool discard = instance->phase == STRUCTURE_READY && status != STRUCTURE_STATUS_BAD_STATE;
-    const fmi2Status level = discard ? fmi2Discard : fmi2Error;
+    const structure_result level = discard ? STRUCTURE_DISCARD : STRUCTURE_ERROR;
     if (instance->logged[discard ? STRUCTURE_LOG_DISCARD : STRUCTURE_LOG_ERROR] || instance->logged[STRUCTURE_LOG_ALL]) {
-        structure_log(instance->logger, instance->environment, instance->name, level, problem.text);
+        structure_log(&instance->host, instance->name, level, problem.text);
     }
     return level;
 }
 
 /* ---------------------------------------------------------------- ranges and parameters */
 
-static fmi2Status check_range(structure_instance *instance, size_t first, size_t last, const char *consequence) {
+static structure_result check_range(structure_instance *instance, size_t first, size_t last, const char *consequence) {
     for (size_t i = first; i < last; ++i) {
         const structure_variable *variable = &structure_variables[i];
         const double value = instance->values[i];
@@ -113,7 +149,7 @@ static fmi2Status check_range(structure_instance *instance, size_t first, size_t
                                variable->unit, consequence);
         }
     }
-    return fmi2OK;
+    return STRUCTURE_DONE;
 }
 
 static structure_parameters parameters_of(const double *values) {
@@ -144,27 +180,27 @@ static void accept_outputs(structure_instance *instance) {
 
 /* ---------------------------------------------------------------- life of an instance */
 
-fmi2Status structure_setup(structure_instance *instance, double start_time) {
+structure_result structure_setup(structure_instance *instance, double start_time) {
     if (!isfinite(start_time)) {
         return structure_refuse(instance, STRUCTURE_STATUS_NOT_FINITE, "the start time is %g; it must be finite",
                            start_time);
     }
-    instance->time = start_time;
-    return fmi2OK;
+    set_time(instance, start_time);
+    return STRUCTURE_DONE;
 }
 
-fmi2Status structure_enter_initialisation(structure_instance *instance) {
+structure_result structure_enter_initialisation(structure_instance *instance) {
     if (instance->phase != STRUCTURE_INSTANTIATED && instance->phase != STRUCTURE_REFUSED) {
         return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL,
                            "initialisation was entered a second time; reset the FMU first");
     }
     instance->phase = STRUCTURE_INITIALISING;
-    return fmi2OK;
+    return STRUCTURE_DONE;
 }
 
-static fmi2Status initialise(structure_instance *instance) {
-    const fmi2Status range = check_range(instance, 0, STRUCTURE_FIRST_OUTPUT, "the initialisation was refused");
-    if (range != fmi2OK) {
+static structure_result initialise(structure_instance *instance) {
+    const structure_result range = check_range(instance, 0, STRUCTURE_FIRST_OUTPUT, "the initialisation was refused");
+    if (range != STRUCTURE_DONE) {
         return range;
     }
     const structure_parameters parameters = parameters_of(instance->values);
@@ -174,16 +210,16 @@ static fmi2Status initialise(structure_instance *instance) {
         return structure_refuse(instance, STRUCTURE_STATUS_INTERNAL, "the initialisation failed: %s", problem.text);
     }
     accept_outputs(instance);
-    return fmi2OK;
+    return STRUCTURE_DONE;
 }
 
-fmi2Status structure_exit_initialisation(structure_instance *instance) {
+structure_result structure_exit_initialisation(structure_instance *instance) {
     if (instance->phase != STRUCTURE_INITIALISING) {
         return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL,
                            "initialisation was left without having been entered");
     }
-    const fmi2Status status = initialise(instance);
-    instance->phase = status == fmi2OK ? STRUCTURE_READY : STRUCTURE_REFUSED;
+    const structure_result status = initialise(instance);
+    instance->phase = status == STRUCTURE_DONE ? STRUCTURE_READY : STRUCTURE_REFUSED;
     return status;
 }
 
@@ -203,7 +239,7 @@ static const char *phase_name(structure_phase phase) {
     return "";
 }
 
-fmi2Status structure_step(structure_instance *instance, double time, double step_size) {
+structure_result structure_step(structure_instance *instance, double time, double step_size) {
     instance->discarded = true; /* until it is done */
     if (instance->phase != STRUCTURE_READY) {
         return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL, "a step was asked for %s", phase_name(instance->phase));
@@ -219,9 +255,9 @@ fmi2Status structure_step(structure_instance *instance, double time, double step
                            "the step from t = %.17g s was refused: the FMU stands at t = %.17g s", time,
                            instance->time);
     }
-    const fmi2Status range =
+    const structure_result range =
         check_range(instance, 0, STRUCTURE_INPUT_COUNT, "the step was refused and the state is as it was");
-    if (range != fmi2OK) {
+    if (range != STRUCTURE_DONE) {
         return range;
     }
     structure_problem problem;
@@ -230,42 +266,67 @@ fmi2Status structure_step(structure_instance *instance, double time, double step
         return structure_refuse(instance, STRUCTURE_STATUS_INTERNAL, "the step from t = %g s failed: %s", time,
                            problem.text);
     }
-    instance->time = time + step_size;
+    set_time(instance, time + step_size);
     instance->discarded = false;
     accept_outputs(instance);
-    return fmi2OK;
+    return STRUCTURE_DONE;
 }
 
 /* ---------------------------------------------------------------- values */
 
-fmi2Status structure_set(structure_instance *instance, unsigned int reference, double value, bool enumeration) {
-    if (reference >= STRUCTURE_VARIABLE_COUNT || reference >= STRUCTURE_FIRST_OUTPUT ||
-        structure_variables[reference].enumeration != enumeration) {
-        return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL, "%s (value reference %u) cannot be set%s",
-                           reference < STRUCTURE_VARIABLE_COUNT ? structure_variables[reference].name
-                                                           : "an unknown variable",
-                           reference, enumeration ? " as an integer" : "");
-    }
-    if (reference >= STRUCTURE_INPUT_COUNT && (instance->phase == STRUCTURE_READY || instance->phase == STRUCTURE_TERMINATED)) {
-        return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL,
-                           "%s is a fixed parameter and can be set only before the first step",
-                           structure_variables[reference].name);
-    }
-    instance->values[reference] = value;
-    instance->stale_response = true;
-    return fmi2OK;
-}
-
-const structure_variable *structure_readable(structure_instance *instance, unsigned int reference, bool enumeration) {
-    if (reference < STRUCTURE_VARIABLE_COUNT && structure_variables[reference].enumeration == enumeration) {
-        return &structure_variables[reference];
+size_t structure_length(structure_instance *instance, unsigned int reference, bool enumeration) {
+    if (reference < STRUCTURE_VARIABLE_COUNT && structure_variables[reference].length > 0 &&
+        structure_variables[reference].enumeration == enumeration) {
+        return structure_variables[reference].length;
     }
     (void)structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL, "there is no %s variable with value reference %u",
-                      enumeration ? "enumeration" : "real", reference);
-    return NULL;
+                           enumeration ? "enumeration" : "real", reference);
+    return 0;
 }
 
-fmi2Status structure_update(structure_instance *instance, const unsigned int *references, size_t count) {
+static structure_result set_one(structure_instance *instance, unsigned int reference, const double *values,
+                                size_t length) {
+    const char *name = structure_variables[reference].name;
+    if (reference >= STRUCTURE_FIRST_OUTPUT) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL,
+                                "%s (value reference %u) is an output and cannot be set", name, reference);
+    }
+    if (reference >= STRUCTURE_INPUT_COUNT &&
+        (instance->phase == STRUCTURE_READY || instance->phase == STRUCTURE_TERMINATED)) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL,
+                                "%s is a fixed parameter and can be set only before the first step", name);
+    }
+    memcpy(instance->values + reference, values, length * sizeof *values);
+    instance->stale_response = true;
+    return STRUCTURE_DONE;
+}
+
+static structure_result wrong_count(structure_instance *instance, size_t count) {
+    return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL,
+                            "%lu values were given or asked for, which is not the number that the variables have",
+                            (unsigned long)count);
+}
+
+structure_result structure_set(structure_instance *instance, const unsigned int *references, size_t count,
+                               const double *values, size_t value_count, bool enumeration) {
+    structure_result worst = STRUCTURE_DONE;
+    size_t at = 0;
+    for (size_t i = 0; i < count; ++i) {
+        const size_t length = structure_length(instance, references[i], enumeration);
+        if (length == 0) {
+            return instance->phase == STRUCTURE_READY ? STRUCTURE_DISCARD : STRUCTURE_ERROR;
+        }
+        if (at + length > value_count) {
+            return wrong_count(instance, value_count);
+        }
+        const structure_result result = set_one(instance, references[i], values + at, length);
+        worst = result > worst ? result : worst;
+        at += length;
+    }
+    return at == value_count ? worst : wrong_count(instance, value_count);
+}
+
+structure_result structure_update(structure_instance *instance, const unsigned int *references, size_t count) {
     unsigned int highest = 0;
     bool bound = false, load_point = false, modal = false;
     for (size_t i = 0; i < count; ++i) {
@@ -280,16 +341,16 @@ fmi2Status structure_update(structure_instance *instance, const unsigned int *re
                           reference < STRUCTURE_FIRST_FREQUENCY + 2 * STRUCTURE_OUTPUT_MODES);
     }
     if (highest < STRUCTURE_FIRST_OUTPUT) {
-        return fmi2OK;
+        return STRUCTURE_DONE;
     }
     if (instance->stale_response && instance->phase == STRUCTURE_INITIALISING) {
-        const fmi2Status status = initialise(instance);
-        if (status != fmi2OK) {
+        const structure_result status = initialise(instance);
+        if (status != STRUCTURE_DONE) {
             return status;
         }
     }
     if (instance->phase == STRUCTURE_INSTANTIATED || instance->phase == STRUCTURE_REFUSED) {
-        return fmi2OK;
+        return STRUCTURE_DONE;
     }
     structure_problem problem;
     if (bound && instance->stale_bound) {
@@ -315,7 +376,27 @@ fmi2Status structure_update(structure_instance *instance, const unsigned int *re
         }
         instance->stale_modal = false;
     }
-    return fmi2OK;
+    return STRUCTURE_DONE;
+}
+
+structure_result structure_get(structure_instance *instance, const unsigned int *references, size_t count,
+                               double *values, size_t value_count, bool enumeration) {
+    structure_result worst = structure_update(instance, references, count);
+    size_t at = 0;
+    for (size_t i = 0; i < count; ++i) {
+        const size_t length = structure_length(instance, references[i], enumeration);
+        if (at + (length == 0 ? 1 : length) > value_count) {
+            return wrong_count(instance, value_count);
+        }
+        if (length == 0) {
+            values[at++] = NAN;
+            worst = STRUCTURE_ERROR;
+            continue;
+        }
+        memcpy(values + at, instance->values + references[i], length * sizeof *values);
+        at += length;
+    }
+    return at == value_count ? worst : wrong_count(instance, value_count);
 }
 
 /* ---------------------------------------------------------------- state */
@@ -338,7 +419,7 @@ bool structure_save(const structure_instance *instance, structure_saved_state *s
     return true;
 }
 
-fmi2Status structure_restore(structure_instance *instance, const structure_saved_state *saved) {
+structure_result structure_restore(structure_instance *instance, const structure_saved_state *saved) {
     const double *body = saved->body;
     structure_problem problem;
     if (saved->count <= SAVED_HEAD + STRUCTURE_VARIABLE_COUNT || !(body[0] >= 0.0 && body[0] <= STRUCTURE_TERMINATED) ||
@@ -358,5 +439,5 @@ fmi2Status structure_restore(structure_instance *instance, const structure_saved
     instance->stale_bound = body[3] != 0.0;
     instance->stale_modal = body[4] != 0.0;
     memcpy(instance->values, values, sizeof instance->values);
-    return fmi2OK;
+    return STRUCTURE_DONE;
 }

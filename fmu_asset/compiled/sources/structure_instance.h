@@ -4,7 +4,6 @@
 #ifndef STRUCTURE_INSTANCE_H
 #define STRUCTURE_INSTANCE_H
 
-#include "fmi2FunctionTypes.h"
 #include "structure_behaviour.h"
 #include "structure_variables.h"
 
@@ -20,10 +19,20 @@ typedef enum {
     STRUCTURE_TERMINATED
 } structure_phase;
 
+/* What became of a call; the numbers are those of the statuses of FMI 2 and 3. */
+typedef enum { STRUCTURE_DONE = 0, STRUCTURE_DISCARD = 2, STRUCTURE_ERROR = 3 } structure_result;
+
+/* The host's logger, of which every version of FMI has its own. */
+typedef struct structure_host {
+    void (*log)(const struct structure_host *host, const char *name, structure_result result, const char *category,
+                const char *sentence);
+    void (*callback)(void);
+    void *environment;
+} structure_host;
+
 typedef struct {
     char *name;
-    fmi2CallbackLogger logger;
-    fmi2ComponentEnvironment environment;
+    structure_host host;
     bool logged[STRUCTURE_LOG_CATEGORIES];
     structure_model model;
     structure_behaviour behaviour;
@@ -45,35 +54,44 @@ typedef struct {
 } structure_saved_state;
 
 /* Log through a host's logger without an instance. */
-void structure_log(fmi2CallbackLogger logger, fmi2ComponentEnvironment environment, const char *name,
-              fmi2Status status, const char *sentence);
+void structure_log(const structure_host *host, const char *name, structure_result result, const char *sentence);
 
-/* Make an instance from a data file; NULL with the problem. The caller frees it with `structure_instance_free`. */
-structure_instance *structure_instance_make(const char *name, const char *data_file, structure_problem *problem);
+/* Make an instance of the data file in a folder, if the token is that of this FMU; NULL, logged, if not. The caller
+   frees it with `structure_instance_free`. */
+structure_instance *structure_instance_open(const structure_host *host, const char *name, const char *token,
+                                            const char *folder);
 void structure_instance_free(structure_instance *instance);
+
+/* Switch categories of log messages; all of them where none is named. */
+void structure_instance_log(structure_instance *instance, bool on, size_t count, const char *const *categories);
 
 /* Bring the instance back to the moment after it was made. */
 void structure_instance_reset(structure_instance *instance);
 
 /* Refuse a call: log the sentence, set `status`, and return Discard while stepping, Error otherwise. */
-fmi2Status structure_refuse(structure_instance *instance, int status, const char *format, ...);
+structure_result structure_refuse(structure_instance *instance, int status, const char *format, ...);
 
-fmi2Status structure_setup(structure_instance *instance, double start_time);
-fmi2Status structure_enter_initialisation(structure_instance *instance);
-fmi2Status structure_exit_initialisation(structure_instance *instance);
-fmi2Status structure_step(structure_instance *instance, double time, double step_size);
+structure_result structure_setup(structure_instance *instance, double start_time);
+structure_result structure_enter_initialisation(structure_instance *instance);
+structure_result structure_exit_initialisation(structure_instance *instance);
+structure_result structure_step(structure_instance *instance, double time, double step_size);
 
-fmi2Status structure_set(structure_instance *instance, unsigned int reference, double value, bool enumeration);
+/* Set or read the values that references stand for, one after another; of an array all of them. A reading brings
+   up to date what it concerns. */
+structure_result structure_set(structure_instance *instance, const unsigned int *references, size_t count,
+                               const double *values, size_t value_count, bool enumeration);
+structure_result structure_get(structure_instance *instance, const unsigned int *references, size_t count,
+                               double *values, size_t value_count, bool enumeration);
+
+/* How many values a reference stands for, or zero, refused, if it is of no variable of that kind. */
+size_t structure_length(structure_instance *instance, unsigned int reference, bool enumeration);
 
 /* Bring the outputs that a reading concerns up to date. */
-fmi2Status structure_update(structure_instance *instance, const unsigned int *references, size_t count);
-
-/* Return the variable of a reference, if it is of that kind; NULL, refused, if not. */
-const structure_variable *structure_readable(structure_instance *instance, unsigned int reference, bool enumeration);
+structure_result structure_update(structure_instance *instance, const unsigned int *references, size_t count);
 
 /* The state as numbers, to be freed by the caller; false without memory. */
 bool structure_save(const structure_instance *instance, structure_saved_state *saved);
-fmi2Status structure_restore(structure_instance *instance, const structure_saved_state *saved);
+structure_result structure_restore(structure_instance *instance, const structure_saved_state *saved);
 
 #if defined(__GNUC__) && !defined(_WIN32)
 #pragma GCC visibility pop

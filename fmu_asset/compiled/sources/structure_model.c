@@ -273,6 +273,21 @@ void structure_load_coefficients(const structure_model *model, const double *cho
     }
 }
 
+double structure_stiffness_derivative(const structure_model *model, size_t term, const double *chosen, size_t which) {
+    const structure_factors *factors = &model->stiffness_factors[term];
+    const double left = factors->second == 0 ? 1.0 : 1.0 - chosen[factors->second - 1];
+    return (factors->first == which + 1 ? left : 0.0) -
+           (factors->second == which + 1 ? value_at(chosen, factors->first) : 0.0);
+}
+
+double structure_load_derivative(const structure_model *model, size_t load, const double *chosen, size_t which) {
+    const structure_factors *factors = &model->load_factors[load];
+    return (factors->first == which + 1 ? value_at(chosen, factors->second) : 0.0) +
+           (factors->second == which + 1 ? value_at(chosen, factors->first) : 0.0);
+}
+
+bool structure_is_control(const structure_model *model, size_t which) { return which >= model->key; }
+
 bool structure_model_read(structure_model *model, const char *path, structure_problem *problem) {
     memset(model, 0, sizeof *model);
     if (!structure_data_read(&model->data, path, problem)) {

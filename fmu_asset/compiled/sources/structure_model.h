@@ -76,6 +76,13 @@ void structure_stiffness_coefficients(const structure_model *model, const double
 void structure_mass_coefficients(const structure_model *model, const double *chosen, double *theta);
 void structure_load_coefficients(const structure_model *model, const double *chosen, double *load);
 
+/* Derivatives of the coefficient of one term or load with respect to one of what can be chosen. */
+double structure_stiffness_derivative(const structure_model *model, size_t term, const double *chosen, size_t which);
+double structure_load_derivative(const structure_model *model, size_t load, const double *chosen, size_t which);
+
+/* Whether one of what can be chosen is a control of the loads. */
+bool structure_is_control(const structure_model *model, size_t which);
+
 #if defined(__GNUC__) && !defined(_WIN32)
 #pragma GCC visibility pop
 #endif

@@ -93,6 +93,34 @@ bool structure_modes_find(structure_modes *modes, const double *chosen, structur
     return true;
 }
 
+/* x' A x */
+static double quadratic(const double *matrix, size_t size, const double *x) {
+    double sum = 0.0;
+    for (size_t i = 0; i < size; ++i) {
+        sum += x[i] * structure_dot(matrix + i * size, x, size);
+    }
+    return sum;
+}
+
+double structure_modes_square_derivative(const structure_modes *modes, size_t mode, const double *chosen, size_t which) {
+    const structure_model *model = modes->model;
+    const size_t size = model->modal_size;
+    const double *shape = modes->shape + mode * size;
+    const double omega = modes->angular_frequency[mode];
+    double sum = 0.0;
+    for (size_t t = 0; t < model->terms; ++t) {
+        const double factor = structure_stiffness_derivative(model, t, chosen, which);
+        if (factor != 0.0) {
+            sum += factor * quadratic(model->modal_stiffness + t * size * size, size, shape);
+        }
+    }
+    if (which >= model->health && which < model->key) { /* a mass */
+        const size_t term = which - model->health + 1;
+        sum -= omega * omega * quadratic(model->modal_mass + term * size * size, size, shape);
+    }
+    return sum;
+}
+
 void structure_modes_project(const structure_modes *modes, const double *modal, const double *static_part, double *result,
                         double *work) {
     const structure_model *model = modes->model;

@@ -28,6 +28,10 @@ void structure_modes_lay_out(structure_modes *modes, const structure_model *mode
 /* Find the modes; does nothing if parameters, losses and masses are those of the last call. */
 bool structure_modes_find(structure_modes *modes, const double *chosen, structure_problem *problem);
 
+/* Derivative of the square of the angular frequency of a mode with respect to one of what can be chosen, of which
+   `chosen` holds the values: x' (dK - omega^2 dM) x. */
+double structure_modes_square_derivative(const structure_modes *modes, size_t mode, const double *chosen, size_t which);
+
 /* result (M) = shape' M u for displacements u = modal (Nm) in the modal plus static (N) in the static basis;
    `work` has room for Nm doubles. */
 void structure_modes_project(const structure_modes *modes, const double *modal, const double *static_part, double *result,

@@ -124,6 +124,32 @@ void structure_static_response(structure_static *steady, const double *load, dou
     superpose(output, steady->model->output_count, steady->model, load, steady->output);
 }
 
+void structure_static_derivative(structure_static *steady, const double *chosen, const double *load, size_t which,
+                                 size_t point, double *output, double *load_point) {
+    const structure_model *model = steady->model;
+    const size_t n = model->static_size, outputs = model->output_count;
+    double *change = steady->work;
+    solve_needed(steady, load);
+    superpose(steady->whole_coordinates, n, model, load, steady->coordinates);
+    /* K x = f: K dx = df - dK x */
+    memset(change, 0, n * sizeof *change);
+    for (size_t k = 0; k < model->loads; ++k) {
+        structure_add(change, n, structure_load_derivative(model, k, chosen, which), model->static_load + k * n);
+    }
+    for (size_t i = 0; i < model->terms; ++i) {
+        const double factor = structure_stiffness_derivative(model, model->order[i], chosen, which);
+        for (size_t row = 0; row < n && factor != 0.0; ++row) {
+            change[row] -=
+                factor * structure_dot(model->stiffness_terms + (i * n + row) * n, steady->whole_coordinates, n);
+        }
+    }
+    structure_solve_lower(steady->factor, n, change);
+    structure_solve_upper(steady->factor, n, change);
+    memset(output, 0, outputs * sizeof *output);
+    structure_add_columns(output, outputs, model->output_columns, outputs, n, change);
+    *load_point = structure_dot(model->static_load + point * n, change, n);
+}
+
 /* Index of the approximate dual solution of one region: how many splits its loss has reached. */
 static size_t anchor_index(const structure_model *model, size_t region, double loss) {
     size_t index = 0;

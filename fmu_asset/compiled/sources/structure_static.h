@@ -57,6 +57,11 @@ double structure_static_load_point(structure_static *steady, size_t point, size_
 /* Write strains and displacements (O) under loads (L). */
 void structure_static_response(structure_static *steady, const double *load, double *output);
 
+/* Write the derivatives of strains and displacements (O) under loads (L), and of the displacement along the load of
+   index `point`, with respect to one of what can be chosen. */
+void structure_static_derivative(structure_static *steady, const double *chosen, const double *load, size_t which,
+                                 size_t point, double *output, double *load_point);
+
 /* Return the certified bounds under these loads. */
 structure_bounds structure_static_error_bounds(structure_static *steady, const double *load);
 

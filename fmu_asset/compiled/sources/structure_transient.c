@@ -168,6 +168,38 @@ void structure_integrator_output(const structure_integrator *integrator, const s
     }
 }
 
+/* What the modes that are not kept contribute to the displacement of a point, per unit of a load. */
+static double point_correction(structure_integrator *integrator, size_t point, size_t load) {
+    const size_t count = integrator->model->mode_count, loads = integrator->model->loads;
+    const double *modal_static = integrator->modal_static + load * count;
+    double correction = structure_static_load_point(&integrator->steady, point, load);
+    for (size_t i = 0; i < count; ++i) {
+        correction -= integrator->modes.participation[i * loads + point] * modal_static[i];
+    }
+    return correction;
+}
+
+void structure_integrator_derivative(structure_integrator *integrator, const double *chosen, size_t which, size_t point,
+                                     double *output, double *load_point) {
+    const structure_model *model = integrator->model;
+    const structure_modes *modes = &integrator->modes;
+    const size_t outputs = model->output_count, all = model->modal_outputs, count = model->mode_count;
+    memset(output, 0, all * sizeof *output);
+    *load_point = 0.0;
+    for (size_t k = 0; k < model->loads; ++k) {
+        const double factor = structure_load_derivative(model, k, chosen, which);
+        if (factor == 0.0) {
+            continue;
+        }
+        structure_add(output, outputs, factor, integrator->correction + k * outputs);
+        *load_point += factor * point_correction(integrator, point, k);
+        for (size_t i = 0; i < count; ++i) { /* accelerations */
+            structure_add(output + outputs, all - outputs, factor * modes->participation[i * model->loads + k],
+                          modes->output + i * all + outputs);
+        }
+    }
+}
+
 double structure_integrator_load_point(structure_integrator *integrator, size_t point,
                                        const structure_motion *motion) {
     const structure_model *model = integrator->model;
@@ -179,12 +211,7 @@ double structure_integrator_load_point(structure_integrator *integrator, size_t 
         sum += participation[i * loads + point] * motion->displacement[i];
     }
     for (size_t load = 0; load < loads; ++load) {
-        const double *modal_static = integrator->modal_static + load * count;
-        double correction = structure_static_load_point(&integrator->steady, point, load);
-        for (size_t i = 0; i < count; ++i) {
-            correction -= participation[i * loads + point] * modal_static[i];
-        }
-        sum += correction * motion->load[load];
+        sum += point_correction(integrator, point, load) * motion->load[load];
     }
     return sum;
 }

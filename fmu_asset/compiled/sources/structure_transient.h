@@ -57,6 +57,11 @@ void structure_integrator_take_over(structure_integrator *integrator, structure_
 /* Write strains and displacements (O), then the accelerations of the kept modes. */
 void structure_integrator_output(const structure_integrator *integrator, const structure_motion *motion, double *output);
 
+/* Write the derivatives of the outputs with respect to one control of the loads, the motion of the modes being given,
+   and of the displacement along the load of index `point`. */
+void structure_integrator_derivative(structure_integrator *integrator, const double *chosen, size_t which, size_t point,
+                                     double *output, double *load_point);
+
 /* Displacement along the load of index `point` at its point [m]. */
 double structure_integrator_load_point(structure_integrator *integrator, size_t point,
                                        const structure_motion *motion);
