@@ -40,6 +40,9 @@ SHARED = ("coarse_reduction", "coarse_patch_arrays", "virtual_model", "beam_redu
 LARGEST, COMPILED = "wing", "discrepancy"
 """The group of tests that takes longest, and the folder of those that need loops which a minute compiles."""
 
+COMPILING = "tests/discrepancy/catalogue/test_lumped.py"
+"""The group that compiles these loops while the other workers do what does not need them."""
+
 LONG = "takes minutes of processor time; set UAV_TWIN_LONG_TESTS to run it"
 
 
@@ -71,6 +74,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items.sort(
         key=lambda item: (
             group[item.path] != LARGEST,
+            group[item.path] != COMPILING,
             group[item.path] not in slow,
             group[item.path] == LARGEST and COMPILED in item.path.parts,
         )

@@ -88,6 +88,7 @@ def test_structural_damping_has_the_same_decrement_at_every_amplitude() -> None:
     np.testing.assert_allclose(tops[1:] / tops[:-1], wanted, rtol=2e-3)
 
 
+@pytest.mark.long
 def test_drag_follows_the_energy_balance_of_a_half_swing() -> None:
     drag = 3.0
     mass = STIFFNESS / W**2
@@ -125,6 +126,7 @@ def _period(values: np.ndarray) -> float:
     return float((crossing[-1] - crossing[0]) / (len(crossing) - 1))
 
 
+@pytest.mark.long
 def test_breathing_crack_has_half_a_period_of_each_spring() -> None:
     values = motion(Law("x", POWER, (-0.4 * STIFFNESS, 1.0, -1.0)), seconds=4.0)
     period = np.pi / W * (1.0 + 1.0 / np.sqrt(0.6))

@@ -153,19 +153,30 @@ def test_a_calibration_repeats_to_the_byte_and_another_wing_is_not_overwritten(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    made, out = wings["soft"], tmp_path / "out"
+    shutil.copytree(made.out, out)
+    before = (out / "calibration.nc").read_bytes()
+    assert call(monkeypatch, "calibrate", "--out", out, "--asset", "other") == 1
+    assert "is the calibration of soft, not of other: choose another --out" in capsys.readouterr().err
+    assert (out / "calibration.nc").read_bytes() == before
+    old = (out / "calibration.nc").stat().st_ino
+    arguments = ["calibrate", "--data", made.lab, "--asset", "soft", "--fitted", "--no-report"]
+    assert call(monkeypatch, *arguments, "--out", out) == 0
+    assert {path.name for path in out.iterdir()} == {"calibration.nc", "table_1.csv"}
+    assert (out / "calibration.nc").stat().st_ino != old  # it was written anew
+    assert (out / "calibration.nc").read_bytes() == before
+    assert (out / "table_1.csv").read_bytes() == (made.out / "table_1.csv").read_bytes()
+
+
+@pytest.mark.long
+def test_a_report_of_a_calibration_repeats_to_the_byte(
+    wings: dict[str, Tailored], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = wings["soft"]
     arguments = ["calibrate", "--data", made.lab, "--asset", "soft", "--fitted"]
     assert call(monkeypatch, *arguments, "--out", tmp_path) == 0
     for name in ("calibration.nc", "report.html", "table_1.csv", "figures/posterior.svg"):
         assert (tmp_path / name).read_bytes() == (made.out / name).read_bytes(), name
-    before = (tmp_path / "calibration.nc").read_bytes()
-    capsys.readouterr()
-    assert call(monkeypatch, "calibrate", "--out", tmp_path, "--asset", "other") == 1
-    assert "is the calibration of soft, not of other: choose another --out" in capsys.readouterr().err
-    assert (tmp_path / "calibration.nc").read_bytes() == before
-    assert call(monkeypatch, *arguments, "--out", tmp_path, "--no-report") == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"calibration.nc", "table_1.csv"}
-    assert (tmp_path / "calibration.nc").read_bytes() == before
 
 
 def test_two_wings_are_two_fmus(

@@ -93,7 +93,7 @@ def test_lines_are_found_where_they_are_and_taken_out() -> None:
     assert without_lines(samples, INTERVAL)[1] == (400.0,)
 
 
-@pytest.mark.parametrize("coefficients", [(), (0.9,)])
+@pytest.mark.parametrize("coefficients", [pytest.param((), marks=pytest.mark.long), (0.9,)])
 def test_lines_are_not_found_in_noise(coefficients: tuple[float, ...]) -> None:
     """Level 1e-4 a line against a level known from 20 neighbours: (1 + 9.2 / 20)^-20 = 5e-4, three lines."""
     generator = np.random.default_rng(7)
@@ -124,7 +124,7 @@ def test_records_that_say_little() -> None:
     assert not short.autoregression.size
 
 
-@pytest.mark.parametrize("coefficient", [0.9, 0.99])
+@pytest.mark.parametrize("coefficient", [pytest.param(0.9, marks=pytest.mark.long), 0.99])
 def test_the_first_whitened_samples_weigh_what_they_are_worth(kit, coefficient: float) -> None:  # type: ignore[no-untyped-def]
     """Without a history the first sample has the process's variance, 1 / (1 - a^2) of the innovation's: 50 at
     0.99. Counted as one innovation it would be an outlier in every record."""

@@ -140,7 +140,14 @@ def test_local_loss_between_mesh_lines_is_softer_cells(
     assert frequency[1] == pytest.approx(wanted[1], rel=1e-3)
 
 
-@pytest.mark.parametrize(("start", "end", "loss"), [(0.2, 0.45, 0.4), (0.75, 1.15, 0.3), (0.5, 0.6, 0.5)])
+@pytest.mark.parametrize(
+    ("start", "end", "loss"),
+    [
+        pytest.param(0.2, 0.45, 0.4, marks=pytest.mark.long),
+        pytest.param(0.75, 1.15, 0.3, marks=pytest.mark.long),
+        (0.5, 0.6, 0.5),
+    ],
+)
 def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(
     coarse_patched_wing: PatchedWing, coarse_design: WingDesign, start: float, end: float, loss: float
 ) -> None:

@@ -192,7 +192,7 @@ def test_a_mission_with_a_hidden_drift(mission: Any, tmp_path: Path) -> None:
     assert (outcome.folder / "run.nc").read_bytes() == before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xdist_group("wing")
 def test_a_twin_that_knows_the_effect_has_no_misfit(mission: Any, tmp_path: Path) -> None:
     (tmp_path / "scenario").mkdir()
