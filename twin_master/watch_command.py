@@ -223,9 +223,9 @@ def _check_source(observations: str, follow: bool, ca_file: Path | None) -> None
     """Find slips of the pen before a model is built and a folder made."""
     from twin_master.errors import MissionInputError
     from twin_master.watch.feeds import check_file
-    from twin_master.watch.mqtt import broker_of
+    from twin_master.watch.mqtt import broker_of, is_broker
 
-    if _is_broker(observations):
+    if is_broker(observations):
         broker_of(observations, ca_file)
     elif observations != "-":
         check_file(Path(observations), follow=follow)
@@ -233,19 +233,15 @@ def _check_source(observations: str, follow: bool, ca_file: Path | None) -> None
         raise MissionInputError("--follow belongs to a CSV file; standard input is read to its end anyway.")
 
 
-def _is_broker(observations: str) -> bool:
-    return observations.startswith(("mqtt://", "mqtts://"))
-
-
 def _feed(
     observations: str, watched: "Watch", follow: bool, ca_file: Path | None
 ) -> "tuple[Feed, Decide, Callable[[], None]]":
     """Return where observations come from, who is told the decisions, and what ends both."""
     from twin_master.watch.feeds import JsonLinesFeed, file_feed
-    from twin_master.watch.mqtt import MqttFeed, broker_of
+    from twin_master.watch.mqtt import MqttFeed, broker_of, is_broker
 
     scenario = watched.scenario
-    if _is_broker(observations):
+    if is_broker(observations):
         broker = broker_of(observations, ca_file)
         mqtt = MqttFeed(broker, scenario, watched.folder, lambda text: typer.echo(text, err=True))
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
+from twin_master.fleet.watch_command import watch
 
 if TYPE_CHECKING:
     from twin_master.assets.resolution import Overrides
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from twin_master.study import Estimated
 
 fleet_app = typer.Typer(no_args_is_help=True, help="Fly fleets of assets, and learn across them.")
+fleet_app.command("watch")(watch)
 
 SHOWN = 10
 """Failures that are printed; the others stand in `fleet.json`."""

@@ -2,7 +2,7 @@
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -17,6 +17,8 @@ from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Count, Flag, Name, NotNegative, Number, Probability, Section, Seed
 from twin_master.seeds import generator
+from twin_master.watch.folder import file_record
+from twin_master.watch.mqtt import is_broker
 
 __all__ = ["Fleet", "Group", "Member", "ensemble", "load_fleet", "seed_range"]
 
@@ -41,6 +43,8 @@ class GroupSection(Section):
     """A pattern of files: one asset for each FMU."""
     calibrations: str | None = None
     """A pattern of files: one asset for each calibration."""
+    observations: str | None = None
+    """A pattern of recordings, or `mqtt://HOST/TOPIC/+`: one real asset for each file, or for each topic."""
     fmu: str | None = None
     binding: str | None = None
     calibration: str | None = None
@@ -56,10 +60,11 @@ class GroupSection(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if sum(given is not None for given in (self.count, self.fmus, self.calibrations)) != 1:
+        kinds = self.count, self.fmus, self.calibrations, self.observations
+        if sum(given is not None for given in kinds) != 1:
             raise ValueError(
-                f"the group `{self.name}` needs one of `count`, `fmus` and `calibrations`, which say how "
-                "many assets it has"
+                f"the group `{self.name}` needs one of `count`, `fmus`, `calibrations` and `observations`, "
+                "which say how many assets it has"
             )
         return self
 
@@ -123,6 +128,10 @@ class Group:
     members : tuple of Member
     files : tuple of str
         Name of the file that sets each asset apart; empty where they share all of them.
+    observations : str
+        Where those of real assets come from, a pattern of files or an address; empty where assets are flown.
+    file : dict of str to str
+        Name and hash of the file of the scenario of real assets.
     """
 
     name: str
@@ -130,6 +139,8 @@ class Group:
     spreads: Mapping[str, Spread]
     members: tuple[Member, ...]
     files: tuple[str, ...] = ()
+    observations: str = ""
+    file: Mapping[str, str] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """Return the group for `config.json`."""
@@ -239,6 +250,11 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
         learnt=path(section.learnt),
         learnt_group=section.name,
     )
+    if section.observations is not None:
+        address = section.observations
+        where = address if is_broker(address) else str(folder / address)
+        watched = _of_group(section, resolve_scenario(loaded, common))
+        return Group(section.name, (watched,), {}, (), observations=where, file=file_record(loaded))
     if section.count is not None:
         scenarios: list[Scenario] = [resolve_scenario(loaded, common)]
         names = [f"{section.name}-{number}" for number in range(section.count)]

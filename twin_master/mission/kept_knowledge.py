@@ -5,6 +5,7 @@ still goes on: a view of it costs the flight nothing.
 """
 
 import io
+import os
 import zipfile
 from pathlib import Path
 
@@ -38,6 +39,16 @@ def keep_knowledge(folder: Path, knowledge: Knowledge) -> None:
         policy=knowledge.plan.policy,
     )
     atomic_write_bytes(folder / KNOWLEDGE_NAME, content.getvalue())
+
+
+def share_knowledge(folder: Path, other: Path) -> None:
+    """Keep what a twin knows in another folder, too, on the same bytes of the disk where it has links."""
+    if (other / KNOWLEDGE_NAME).exists():
+        return
+    try:
+        os.link(folder / KNOWLEDGE_NAME, other / KNOWLEDGE_NAME)
+    except OSError:
+        atomic_write_bytes(other / KNOWLEDGE_NAME, (folder / KNOWLEDGE_NAME).read_bytes())
 
 
 def kept_knowledge(folder: Path, scenario: Scenario) -> Knowledge:

@@ -4,7 +4,6 @@ import csv
 import math
 import os
 import sys
-import time
 from collections.abc import Iterator, Mapping
 from hashlib import sha256
 from itertools import islice
@@ -22,10 +21,9 @@ from twin_master.scenario.schema import Scenario
 from twin_master.watch.intake import MISSING
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 
-Fed = tuple[Message | Refused, str]
+Fed = tuple[Message | Refused | None, str]
+"""A message with the begin of its text; None where nothing more has come yet."""
 
-POLL_SECONDS = 0.05
-"""Between two looks at a file that grows."""
 _LOST = ("", "nan", "null", "none")
 _TURN_COLUMNS = ("turn", "step")
 _OTHERS = ("turn", "time", "control")
@@ -40,7 +38,7 @@ class CsvFeed:
     scenario : Scenario
         What its columns may be called.
     follow : bool
-        Wait at its end for more, without end.
+        Its end is not the last: more may come.
 
     Raises
     ------
@@ -83,9 +81,14 @@ class CsvFeed:
     def messages(self, after: int) -> Iterator[Fed]:
         """Return the rows behind the first `after` of them."""
         with self._path.open("rb") as file:
-            for number, line in enumerate(_lines(file, follow=self._follow)):
+            number = 0
+            for line in _lines(file, follow=self._follow):
+                if line is None:
+                    yield None, ""
+                    continue
                 if number > after:
                     yield self._message(line), shown(line)
+                number += 1
 
     def _message(self, line: bytes | Refused) -> Message | Refused:
         if isinstance(line, Refused):
@@ -233,7 +236,8 @@ class JsonLinesFeed:
     def messages(self, after: int) -> Iterator[Fed]:
         """Return what comes."""
         for line in _lines(self._stream or sys.stdin.buffer):
-            yield parsed(self._reader, line), shown(line)
+            if line is not None:
+                yield parsed(self._reader, line), shown(line)
 
 
 def parsed(reader: MessageReader, content: bytes | Refused) -> Message | Refused:
@@ -280,15 +284,18 @@ def _is_netcdf(path: Path) -> bool:
     return path.suffix.lower() == ".nc"
 
 
-def _lines(file: IO[bytes], *, follow: bool = False) -> Iterator[bytes | Refused]:
-    """Return whole lines; one that is too long is skipped in pieces, and the rest of a file is a line."""
+def _lines(file: IO[bytes], *, follow: bool = False) -> Iterator[bytes | Refused | None]:
+    """Return whole lines; one that is too long is skipped in pieces, and the rest of a file is a line.
+
+    A file that is followed has no last line: None stands for nothing new, each time that it is asked.
+    """
     part = b""
     too_long = False
     while True:
         piece = file.readline(LARGEST_MESSAGE + 1)
         if not piece:
             if follow:
-                time.sleep(POLL_SECONDS)
+                yield None
                 continue
             if part and not too_long:
                 yield part
@@ -319,7 +326,7 @@ def _hash_of_lines(path: Path, count: int) -> str:
     found = sha256()
     with path.open("rb") as file:
         for line in islice(_lines(file), count):
-            found.update(b"" if isinstance(line, Refused) else line)
+            found.update(line if isinstance(line, bytes) else b"")
     return found.hexdigest()
 
 

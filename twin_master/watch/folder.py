@@ -3,7 +3,8 @@
 import base64
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,8 @@ from twin_master.mission.journal import (
     read_records,
     records_backwards,
 )
-from twin_master.mission.kept_knowledge import keep_knowledge
-from twin_master.mission.loop import operate
+from twin_master.mission.kept_knowledge import keep_knowledge, share_knowledge
+from twin_master.mission.loop import Source, operate
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
@@ -83,28 +84,43 @@ class Watch:
         Located in the folder.
     progress : Progress
         Shows stages and notes.
+    like : Watch, optional
+        A watch of the same scenario, whose model and plan this one shares.
     """
 
-    def __init__(self, folder: Path, config: dict[str, Any], scenario: Scenario, progress: Progress) -> None:
+    def __init__(
+        self, folder: Path, config: dict[str, Any], scenario: Scenario, progress: Progress,
+        like: "Watch | None" = None,
+    ) -> None:  # fmt: skip
         self.folder, self.scenario, self._progress = folder, scenario, progress
         tidy(folder)
-        source = believed_source(scenario)
-        self._source = source
-        hashes = dict(source.prepare(folder, progress))
-        self._config = with_inputs(folder, config, hashes)
-        with progress.stage("Calibrating and planning"):
-            knowledge = prepare_knowledge(scenario, source, scenario.mission.seed)
-        told = calibrated_with(knowledge.draws.record or {}, WATCHED, source.origin.model, hashes)
-        if told is not None:
-            progress.note(told)
-        self.models = [BelievedModel(0, knowledge)]
+        if like is None:
+            self._source = believed_source(scenario)
+            self._inputs = dict(self._source.prepare(folder, progress))
+        else:
+            self._source, self._inputs = like._source, like._inputs
+        self._config = with_inputs(folder, config, self._inputs)
+        self.models: list[BelievedModel] = [self._prepared() if like is None else like.models[0]]
         own = getattr(scenario.belief, "patch", None)
         self._patches: list[Path | None] = [Path(own) if own else None]  # of these models
         self._path = folder / JOURNAL_NAME
         self._hash = hash_record(self._config)
         self._adopted: tuple[dict[str, Any], ...] = ()
         self._take_up()
-        keep_knowledge(folder, self.models[-1].knowledge)
+        if like is not None and len(self.models) == len(like.models) == 1:
+            share_knowledge(like.folder, folder)
+        else:
+            keep_knowledge(folder, self.models[-1].knowledge)
+
+    def _prepared(self) -> BelievedModel:
+        """Calibrate and plan."""
+        with self._progress.stage("Calibrating and planning"):
+            knowledge = prepare_knowledge(self.scenario, self._source, self.scenario.mission.seed)
+        origin = self._source.origin.model
+        told = calibrated_with(knowledge.draws.record or {}, WATCHED, origin, self._inputs)
+        if told is not None:
+            self._progress.note(told)
+        return BelievedModel(0, knowledge)
 
     def _take_up(self) -> None:
         """Believe the patches that were adopted, as the journal says."""
@@ -135,6 +151,21 @@ class Watch:
         search : Search, optional
             Looks for the cause of an alarm, so that the twin is taught.
         """
+        with self.begun(feed, patched) as (journal, keep):
+            source = Stopping(keep.intake, turns)
+            if search is not None:
+                keep.tutor = self._tutor(journal, keep, search, source, wait=feed.replayable)
+            with source.listening():
+                try:
+                    self._operate(source, keep, decide)
+                finally:
+                    if keep.tutor is not None:
+                        keep.tutor.end()
+        return keep.intake.counts
+
+    @contextmanager
+    def begun(self, feed: Feed, patched: Patched | None = None) -> Iterator[tuple[JournalFile, Keeper]]:
+        """Give the open journal, and what keeps the turns of the twin as it stands after it; see `run`."""
         rejected = RejectedFile(self.folder / REJECTED_NAME)
         intake = Intake(self.scenario, feed, rejected)
         with open_journal(self.folder, self._hash, FLUSH_SECONDS if feed.replayable else 0.0) as journal:
@@ -146,29 +177,22 @@ class Watch:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
-            source = Stopping(intake, turns)
-            keep = Keeper(journal, intake, found.twin)
-            if search is not None:
-                keep.tutor = self._tutor(journal, keep, search, source, wait=feed.replayable)
-            with source.listening():
-                try:
-                    self._operate(found.twin, source, keep, decide)
-                finally:
-                    if keep.tutor is not None:
-                        keep.tutor.end()
-        return intake.counts
+            yield journal, Keeper(journal, intake, found.twin)
 
-    def _operate(
-        self, twin: Twin, source: Stopping, keep: "Keeper", decide: Callable[[Mapping[str, Any]], None]
-    ) -> None:
+    def decisions(self, source: Source, keep: Keeper) -> Iterator[dict[str, Any]]:
+        """Yield what the operator is told of each turn, once it is written down, until the source ends."""
+        twin = keep.twin
+        for reading, turn, _ in operate(twin, source, keep):
+            decision = decision_of(self.scenario, self.models[-1].knowledge.model, twin, reading, turn)
+            yield decision | {"notices": [*decision["notices"], *keep.told]}
+
+    def _operate(self, source: Stopping, keep: Keeper, decide: Callable[[Mapping[str, Any]], None]) -> None:
         """Watch with one twin after the other: where it is taught, another one goes on."""
         while True:
-            keep.twin = twin
-            if keep.tutor is not None and keep.tutor.act():
-                twin = keep.twin
-            for reading, turn, _ in operate(twin, source, keep):
-                decision = decision_of(self.scenario, self.models[-1].knowledge.model, twin, reading, turn)
-                decide(decision | {"notices": [*decision["notices"], *keep.told]})
+            if keep.tutor is not None:
+                keep.tutor.act()
+            for decision in self.decisions(source, keep):
+                decide(decision)
                 if keep.tutor is not None and keep.tutor.due:
                     break
             else:
@@ -259,7 +283,7 @@ class Watch:
         first = max(0, turns - last)
         found = self._replayed(first, lag=False)
         flight = found.beliefs.flight(found.twin, None, first_turn=found.first_turn)
-        flight = replace(flight, notices=self._told(first))
+        flight = replace(flight, notices=self.told(first))
         knowledge, mission = self.models[-1].knowledge, self.scenario.mission
         result = MissionResult(
             scenario=self.scenario, model=knowledge.model, sensor_model=knowledge.sensor_model,
@@ -308,7 +332,7 @@ class Watch:
             with self._progress.stage("Writing the report"):
                 write_report(self.folder)
 
-    def _told(self, first: int) -> tuple[tuple[int, Notice], ...]:
+    def told(self, first: int) -> tuple[tuple[int, Notice], ...]:
         """Return what the operator was told in the turns from `first` on, each sentence once."""
         told: dict[str, tuple[int, Notice]] = {}
         for record, _ in read_records(self._path, self._hash):
@@ -356,6 +380,19 @@ def begin_watch(
         With one clear sentence.
     """
     resolved = resolve_scenario(loaded, overrides)
+    return begin_resolved(resolved, file_record(loaded), folder, progress, replace_run=replace_run)
+
+
+def file_record(loaded: LoadedScenario) -> dict[str, str]:
+    """Return name and hash of the file of a scenario, by which a watch of it is known."""
+    return {"name": loaded.path.name, "sha256": loaded.content_hash}
+
+
+def begin_resolved(
+    resolved: Scenario, file: Mapping[str, str], folder: Path, progress: Progress, *,
+    replace_run: bool = False, like: Watch | None = None,
+) -> tuple[Watch, int]:  # fmt: skip
+    """Make the folder of a watch of a resolved scenario, see `begin_watch` and `Watch`."""
     source = believed_source(resolved)
     source.check()
     config = {
@@ -363,18 +400,21 @@ def begin_watch(
         "format": 1,
         "watched": True,
         "scenario": portable_scenario(resolved).to_dict(),
-        "scenario_file": {"name": loaded.path.name, "sha256": loaded.content_hash},
+        "scenario_file": dict(file),
         "provenance": collect_provenance(resolved.mission.seed).as_dict(),
     }
     lock = create_run_folder(folder, config, dict(source.files()), replace=replace_run)
     try:
-        return Watch(folder, config, located_scenario(portable_scenario(resolved), folder), progress), lock
+        located = located_scenario(portable_scenario(resolved), folder)
+        return Watch(folder, config, located, progress, like), lock
     except BaseException:
         os.close(lock)
         raise
 
 
-def resume_watch(folder: Path, loaded: LoadedScenario | None, progress: Progress) -> tuple[Watch, int]:
+def resume_watch(
+    folder: Path, loaded: LoadedScenario | None, progress: Progress, like: Watch | None = None
+) -> tuple[Watch, int]:
     """Take up the watch in a folder; return it and the file descriptor that holds the folder.
 
     Raises
@@ -394,7 +434,7 @@ def resume_watch(folder: Path, loaded: LoadedScenario | None, progress: Progress
     lock = lock_run_folder(folder)
     try:
         check_versions(folder, config, scenario.mission.seed)
-        return Watch(folder, config, located_scenario(scenario, folder), progress), lock
+        return Watch(folder, config, located_scenario(scenario, folder), progress, like), lock
     except NotResumableError as error:
         os.close(lock)
         error.add_note(

@@ -39,8 +39,11 @@ class Feed(Protocol):
     def beginning(self, count: int) -> str:
         """Return what tells its first `count` messages from those of another source."""
 
-    def messages(self, after: int) -> Iterator[tuple[Message | Refused, str]]:
-        """Return the messages behind the first `after` of them, each with the begin of its text."""
+    def messages(self, after: int) -> Iterator[tuple[Message | Refused | None, str]]:
+        """Return the messages behind the first `after` of them, each with the begin of its text.
+
+        None in the place of a message: nothing more has come yet.
+        """
 
 
 @dataclass
@@ -121,6 +124,8 @@ class Intake:
         What came so far, up to the last reading.
     observation_turn : int
         The turn of the last reading.
+    ended : bool
+        Whether the feed has ended; if not, more may come after `read` has returned None.
     """
 
     def __init__(self, scenario: Scenario, feed: Feed, rejected: RejectedFile) -> None:
@@ -128,7 +133,7 @@ class Intake:
         self._width = scenario.observation.width
         self._feed = feed
         self._rejected = rejected
-        self._messages: Iterator[tuple[Message | Refused, str]] | None = None
+        self._messages: Iterator[tuple[Message | Refused | None, str]] | None = None
         self._read = 0  # messages of this feed, in this process and before
         self._beginning = (0, "")
         self._pending: deque[tuple[int, Reading, int]] = deque()
@@ -139,6 +144,7 @@ class Intake:
         self._before: Float = np.empty(0)
         self.counts = Counts()
         self.observation_turn = -1
+        self.ended = False
 
     def state(self) -> dict[str, Any]:
         """Return what is needed to go on, as JSON."""
@@ -171,11 +177,13 @@ class Intake:
         self._rejected.go_back(self.counts.received if again else LARGEST_SEED)
 
     def read(self, twin: Twin) -> Reading | None:
-        """Return the next reading, see `Source.read`."""
+        """Return the next reading, see `Source.read`; None also where nothing has come yet."""
         if self._messages is None:
             self._messages = self._feed.messages(self._read)
         while not self._pending:
-            message, self._text = next(self._messages, (None, ""))
+            came = next(self._messages, None)
+            self.ended = came is None
+            message, self._text = came or (None, "")
             if message is None:
                 return None
             self.counts.received += 1

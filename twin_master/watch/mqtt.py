@@ -56,8 +56,15 @@ class Broker:
     authority: Path | None = None
 
 
-def broker_of(address: str, authority: Path | None = None) -> Broker:
+def is_broker(observations: str) -> bool:
+    """Return whether observations come from a broker, and not from a file."""
+    return observations.startswith(("mqtt://", "mqtts://"))
+
+
+def broker_of(address: str, authority: Path | None = None, *, many: bool = False) -> Broker:
     """Return the broker of `mqtt://[USER@]HOST[:PORT]/TOPIC`, or `mqtts://` with TLS.
+
+    Of many assets the topic ends with `/+`, which stands for the name of each.
 
     Raises
     ------
@@ -75,7 +82,9 @@ def broker_of(address: str, authority: Path | None = None) -> Broker:
         raise MissionInputError(
             f"every user of this machine sees a password in an address: put it into {PASSWORD_VARIABLE}."
         )
-    if "#" in address or "+" in topic:
+    if many and (not topic.endswith("/+") or "+" in topic[:-1] or "#" in address):
+        raise MissionInputError(f"{address}: a topic of many assets is expected, such as wings/+.")
+    if not many and ("#" in address or "+" in topic):
         raise MissionInputError(f"{address}: a topic of one asset is expected, without `#` and `+`.")
     tls, user = parts.scheme == "mqtts", None if parts.username is None else unquote(parts.username)
     if authority is not None and not (tls and authority.is_file()):
@@ -83,15 +92,16 @@ def broker_of(address: str, authority: Path | None = None) -> Broker:
     return Broker(parts.hostname, port or (8883 if tls else 1883), topic, user, tls, authority)
 
 
-class MqttFeed:
-    """The observations of a topic, with a session that the broker keeps while the watch is away.
+class Session:
+    """What comes from a topic; the broker keeps it while the watch is away.
 
     Parameters
     ----------
     broker : Broker
-    scenario : Scenario
+    name : str
+        Of the mission.
     folder : Path
-        Of the watch: its name makes the session its own.
+        Of the watch: with the name of the mission it makes the session its own.
     note : callable
         Told when the broker is lost and found.
 
@@ -101,9 +111,7 @@ class MqttFeed:
         paho-mqtt is not installed, or the authority's file holds no certificate.
     """
 
-    replayable = False
-
-    def __init__(self, broker: Broker, scenario: Scenario, folder: Path, note: Callable[[str], None]) -> None:
+    def __init__(self, broker: Broker, name: str, folder: Path, note: Callable[[str], None]) -> None:
         try:
             from paho.mqtt import client as paho
             from paho.mqtt.enums import CallbackAPIVersion
@@ -114,14 +122,13 @@ class MqttFeed:
                 "observations over MQTT need paho-mqtt: pip install 'uav-twin[mqtt]'."
             ) from None
         self._broker = broker
-        self._reader = MessageReader(scenario)
         self._note = note
         self._came: deque[Any] = deque()
         self._untold: set[int] = set()
         self._refusal: str | None = None
-        name = f"uav-twin-{scenario.mission.name}-{sha256(str(folder.resolve()).encode()).hexdigest()[:12]}"
+        own = f"uav-twin-{name}-{sha256(str(folder.resolve()).encode()).hexdigest()[:12]}"
         self._client = paho.Client(
-            CallbackAPIVersion.VERSION2, client_id=name, protocol=paho.MQTTv5, manual_ack=True
+            CallbackAPIVersion.VERSION2, client_id=own, protocol=paho.MQTTv5, manual_ack=True
         )
         self._properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
         self._properties.SessionExpiryInterval = _SESSION_SECONDS
@@ -137,6 +144,7 @@ class MqttFeed:
         self._client.max_queued_messages_set(_DECISIONS_WAITING)
         self._client.on_message = self._on_message
         self._client.on_connect = self._on_connect
+        self._client.on_subscribe = self._on_subscribe
         self._client.on_publish = self._on_publish
 
     def _on_message(self, _client: Any, _data: Any, message: Any) -> None:
@@ -149,8 +157,10 @@ class MqttFeed:
         if reason.is_failure:
             self._refusal = str(reason)
             return
-        self._note(f"Connected to {self._broker.host}:{self._broker.port}.")
         client.subscribe(self._broker.topic, qos=1)
+
+    def _on_subscribe(self, _client: Any, _data: Any, _number: int, _reasons: Any, _properties: Any) -> None:
+        self._note(f"Connected to {self._broker.host}:{self._broker.port}.")
 
     def _connect(self, *, first: bool) -> None:
         """Connect, and again until it works; the first time a broker that refuses the user ends the watch."""
@@ -174,19 +184,18 @@ class MqttFeed:
                 time.sleep(wait)
                 wait = min(2.0 * wait, longest)
 
-    def beginning(self, count: int) -> str:
-        """Return nothing: the broker knows what was acknowledged."""
-        return ""
+    def messages(self, wait: float) -> Iterator[Any | None]:
+        """Return what comes, without end, as paho-mqtt has it; None when nothing came for so many seconds.
 
-    def messages(self, after: int) -> Iterator[Fed]:
-        """Return what comes, without end; a message is acknowledged when the next one is asked for."""
+        A message is acknowledged when the next one is asked for.
+        """
         self._connect(first=True)
         while True:
             while self._came:
                 message = self._came.popleft()
-                yield self._placed(parsed(self._reader, message.payload)), shown(message.payload)
+                yield message
                 self._client.ack(message.mid, message.qos)
-            failed = self._client.loop(0.1)
+            failed = self._client.loop(wait)
             if self._refusal is not None:
                 raise MissionInputError(
                     f"the broker at {self._broker.host}:{self._broker.port} refuses the twin: "
@@ -195,16 +204,12 @@ class MqttFeed:
             if failed:
                 self._came.clear()  # not acknowledged, so the broker sends them again
                 self._connect(first=False)
+            elif not self._came:
+                yield None
 
-    @staticmethod
-    def _placed(message: Message | Refused) -> Message | Refused:
-        if isinstance(message, Message) and message.turn is None and message.time is None:
-            return Refused("a broker may deliver it twice: `turn` or `time` is needed over MQTT")
-        return message
-
-    def decide(self, decision: Mapping[str, Any]) -> None:
-        """Publish a decision."""
-        told = self._client.publish(f"{self._broker.topic}/decision", json.dumps(decision), qos=1)
+    def publish(self, topic: str, decision: Mapping[str, Any]) -> None:
+        """Publish a decision about the asset of a topic."""
+        told = self._client.publish(f"{topic}/decision", json.dumps(decision), qos=1)
         if len(self._untold) < _DECISIONS_WAITING:
             self._untold.add(told.mid)
         self._client.loop_write()
@@ -215,3 +220,37 @@ class MqttFeed:
         while self._untold and time.monotonic() < end and not self._client.loop(0.1):
             pass
         self._client.disconnect()
+
+
+class MqttFeed:
+    """The observations of the topic of one asset; see `Session` for the parameters, and for errors."""
+
+    replayable = False
+
+    def __init__(self, broker: Broker, scenario: Scenario, folder: Path, note: Callable[[str], None]) -> None:
+        self._topic = broker.topic
+        self._reader = MessageReader(scenario)
+        self._session = Session(broker, scenario.mission.name, folder, note)
+        self.close = self._session.close
+
+    def beginning(self, count: int) -> str:
+        """Return nothing: the broker knows what was acknowledged."""
+        return ""
+
+    def messages(self, after: int) -> Iterator[Fed]:
+        """Return what comes, without end; a message is acknowledged when the next one is asked for."""
+        for message in self._session.messages(0.1):
+            if message is not None:
+                yield placed(self._reader, message.payload)
+
+    def decide(self, decision: Mapping[str, Any]) -> None:
+        """Publish a decision."""
+        self._session.publish(self._topic, decision)
+
+
+def placed(reader: MessageReader, payload: bytes) -> Fed:
+    """Return the observation in the payload of a message, which must name its turn or time."""
+    message = parsed(reader, payload)
+    if isinstance(message, Message) and message.turn is None and message.time is None:
+        message = Refused("a broker may deliver it twice: `turn` or `time` is needed over MQTT")
+    return message, shown(payload)

@@ -2,6 +2,7 @@
 
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -10,6 +11,9 @@ from twin_master.errors import ImpossibleObservation
 from twin_master.mission.loop import Reading
 from twin_master.network.twin import Twin
 from twin_master.watch.intake import Intake
+
+POLL_SECONDS = 0.05
+"""Between two looks at a feed that may go on."""
 
 
 class Stopping:
@@ -25,7 +29,9 @@ class Stopping:
             return None
         self._waiting = True
         try:
-            return self._intake.read(twin)
+            while (reading := self._intake.read(twin)) is None and not self._intake.ended:
+                time.sleep(POLL_SECONDS)
+            return reading
         except _Asked:
             return None
         finally:

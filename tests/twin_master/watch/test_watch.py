@@ -510,9 +510,7 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
     assert "named. It is so. The patch is tried" in said[1]
     assert "is believed from turn" in said[2]
     assert len(said) == 3
-    assert [
-        notice.sentence for _, notice in watch._told(0)
-    ] == said  # in the report too, though filtered anew
+    assert [notice.sentence for _, notice in watch.told(0)] == said  # in the report too, though filtered anew
     # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
     last = records[-1]["filtered"]
     assert np.abs(np.array(last) - mission.filtered[-1]).max() < 0.2

@@ -1,0 +1,197 @@
+"""Many real assets under watch: files that grow, topics of a broker, kills, and what is lost alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from reporting.progress import SilentProgress
+from scenarios import scenario_files
+from tests.twin_master.watch.test_watch import PASSWORD, Mosquitto, write_csv
+from twin_master.assets.resolution import Overrides
+from twin_master.errors import FleetError, RunFolderExistsError
+from twin_master.fleet.plan import load_fleet
+from twin_master.fleet.watching import FleetWatch, WatchedAsset
+from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.scenario.reading import load_scenario
+from twin_master.watch.feeds import file_feed
+from twin_master.watch.folder import begin_watch
+from uav_twin.cli import app
+
+TURNS = 6
+
+
+@pytest.fixture
+def fleet_file(library_file: Path, tmp_path: Path) -> Path:
+    """A fleet of three wings with a recording each; one line of one of them is garbage, one turn is late."""
+    library = f'kind = "strain_library"\nfile = "{library_file}"\n'
+    scenario = scenario_files()["growing_damage"].read_text()
+    begin, end = scenario.index("[asset]"), scenario.index("[calibration]")
+    (tmp_path / "wing.toml").write_text(
+        scenario[:begin] + f'[asset]\n{library}\n[belief]\nkind = "asset"\n\n' + scenario[end:]
+    )
+    (tmp_path / "logs").mkdir()
+    noise = np.random.default_rng(3).normal(1e-3, 1e-4, (3, TURNS, 24))
+    for number, rows in enumerate(noise):
+        path = write_csv(
+            tmp_path / "logs" / f"wing-{number}.csv", rows, np.ones(TURNS, dtype=int), number == 1
+        )
+        if number == 2:
+            lines = path.read_text().splitlines()
+            lines[3], lines[4] = lines[4], lines[3]
+            path.write_text("\n".join(lines) + "\n")
+    return fleet_of(tmp_path, "logs/*.csv")
+
+
+def fleet_of(folder: Path, observations: str) -> Path:
+    path = folder / "fleet.toml"
+    group = f'[[group]]\nname = "north"\nscenario = "wing.toml"\nobservations = "{observations}"\n'
+    path.write_text(f'format = 1\n[fleet]\nname = "real"\nseed = 7\n{group}')
+    return path
+
+
+def single(fleet_file: Path, log: Path, folder: Path) -> bytes:
+    """Return the journal of a watch of one asset alone."""
+    loaded = load_scenario(fleet_file.parent / "wing.toml")
+    watch, lock = begin_watch(loaded, folder, Overrides(seed=7), SilentProgress(), replace_run=False)
+    watch.run(file_feed(log, watch.scenario), lambda _decision: None)
+    os.close(lock)
+    return (folder / JOURNAL_NAME).read_bytes()
+
+
+def journals(folder: Path) -> list[bytes]:
+    return [path.read_bytes() for path in sorted((folder / "north").glob(f"*/{JOURNAL_NAME}"))]
+
+
+@pytest.fixture
+def alone(fleet_file: Path, tmp_path: Path) -> list[bytes]:
+    logs = sorted((tmp_path / "logs").glob("*.csv"))
+    return [single(fleet_file, log, tmp_path / "alone" / log.stem) for log in logs]
+
+
+def watched(fleet_file: Path, out: Path, stop_after: int | None = None, **given: Any) -> FleetWatch:
+    """Return a fleet that was watched; where it is to stop, in the middle of it."""
+    told: list[str] = []
+
+    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+        told.append(asset.name)
+        fleet.asked = len(told) == stop_after
+
+    fleet = FleetWatch(load_fleet(fleet_file), out, tell, told.append, **given)
+    fleet.run()
+    return fleet
+
+
+def test_each_asset_has_the_journal_of_a_watch_alone(
+    fleet_file: Path, alone: list[bytes], tmp_path: Path
+) -> None:
+    assert watched(fleet_file, tmp_path / "once").failures == {}
+    assert journals(tmp_path / "once") == alone
+    for stop in (2, 9, None):  # in the middle of assets; the last time to the end
+        watched(fleet_file, tmp_path / "again", stop)
+    assert journals(tmp_path / "again") == alone
+    state = json.loads((tmp_path / "again" / "watched.json").read_text())["assets"]
+    assert [state[f"north/wing-{number}"]["turn"] for number in range(3)] == [TURNS - 1] * 3
+    with pytest.raises(RunFolderExistsError, match="another fleet"):
+        FleetWatch(load_fleet(fleet_file, seed=8), tmp_path / "again", print, print)
+
+
+def test_files_that_grow(
+    fleet_file: Path, alone: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
+    (tmp_path / "growing").mkdir()
+    pieces = [(path.name, path.read_bytes()) for path in sorted((tmp_path / "logs").glob("*.csv"))]
+    cuts = [0.0, 0.02, 0.4, 0.77, 1.0]  # within the header, and within lines
+
+    def grow() -> None:
+        step = len(looks)
+        looks.append(step)
+        for name, content in pieces[: step + 1]:  # they come one after the other
+            (tmp_path / "growing" / name).write_bytes(content[: int(cuts[min(step, 4)] * len(content))])
+        fleet.asked = step == 8
+
+    looks: list[int] = []
+    fleet = FleetWatch(
+        load_fleet(fleet_of(tmp_path, "growing/*.csv")), tmp_path / "out", lambda *_: None, print, follow=True
+    )
+    fleet.run(grow)
+    assert journals(tmp_path / "out") == alone
+
+
+def test_an_asset_is_lost_alone(fleet_file: Path, alone: list[bytes], tmp_path: Path) -> None:
+    (tmp_path / "logs" / "wing-0.csv").write_text("turn,colour\n0,red\n")
+    (tmp_path / "logs" / "not a name!.csv").write_text("turn\n")
+    fleet = watched(fleet_file, tmp_path / "out")
+    assert set(fleet.failures) == {"north/wing-0", "north/not a name!"}
+    assert "colour" in fleet.failures["north/wing-0"]
+    assert journals(tmp_path / "out") == alone[1:]
+    fleet_file.write_text(fleet_file.read_text().replace('observations = "logs/*.csv"', "count = 2"))
+    with pytest.raises(FleetError, match="north has none"):
+        FleetWatch(load_fleet(fleet_file), tmp_path / "flown", print, print)
+
+
+@pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
+def test_a_topic_for_each_asset(
+    fleet_file: Path, alone: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
+    broker = Mosquitto(tmp_path)
+    fleet_of(tmp_path, f"mqtt://wing@127.0.0.1:{broker.port}/wings/+")
+    heard: list[tuple[str, int]] = []
+    listener = broker.client("listener")
+    listener.on_message = lambda _client, _data, message: heard.append(
+        (message.topic, json.loads(message.payload)["turn"])
+    )
+    listener.subscribe("wings/+/decision", qos=1)
+    sent: list[int] = []
+
+    def send() -> None:
+        """Publish once the twin is connected: a kill in between, whose messages the broker keeps."""
+        if notes and not sent:
+            sent.append(1)
+            for number in range(2):
+                rows = (tmp_path / "logs" / f"wing-{2 * number}.csv").read_text().splitlines()[1:]
+                for row in rows:
+                    turn, control, *cells = row.split(",")
+                    record = {"turn": int(turn), "control": control, "strain": [float(c) for c in cells]}
+                    publisher.publish(f"wings/wing-{2 * number}", json.dumps(record), qos=1)
+
+    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+        told.append(decision["turn"])
+        fleet.asked = len(told) in (4, 2 * TURNS + 1)
+
+    publisher = broker.client("publisher")
+    told: list[int] = []
+    for _ in range(2):  # asked to end after four turns; one more decision for the late message
+        notes: list[str] = []
+        fleet = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append)
+        fleet.run(send)
+    broker.stop()
+    kept = [[line[65:] for line in own.splitlines()[1:]] for own in journals(tmp_path / "out")]
+    for ours, theirs in zip(kept, (alone[0], alone[2]), strict=True):
+        wanted = [json.loads(line[65:]) for line in theirs.splitlines()[1:]]
+        found = [json.loads(line) for line in ours]
+        for records in (wanted, found):
+            for record in records:  # the broker sent again what the end left unacknowledged
+                del record["intake"]
+        assert found == wanted
+    assert {topic for topic, _ in heard} == {"wings/wing-0/decision", "wings/wing-2/decision"}
+
+
+def test_the_command(fleet_file: Path, tmp_path: Path) -> None:
+    words = ["fleet", "watch", str(fleet_file), "--out", str(tmp_path / "out"), "--turns", "3"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    decisions = [json.loads(line) for line in result.stdout.splitlines()]
+    last = {decision["asset"]: decision["turn"] for decision in decisions}
+    assert last == {f"north/wing-{number}": 2 for number in range(3)}
+    assert "3 assets, 9 turns, 0 alarms" in result.stderr

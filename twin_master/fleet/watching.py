@@ -1,0 +1,402 @@
+"""Real assets, many of them: each is watched as `uav-twin watch` watches one, and leaves the same folder."""
+
+import json
+import os
+import re
+import resource
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from reporting.files import atomic_write_text
+from reporting.folders import lock_folder
+from reporting.json_file import read_json
+from reporting.progress import SilentProgress
+from reporting.provenance import collect_provenance
+from twin_master.assets.resolution import portable_scenario
+from twin_master.errors import FleetError, RunFolderExistsError
+from twin_master.fleet.plan import Fleet, Group
+from twin_master.fleet.store import written
+from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.side_by_side import IN_FLIGHT
+from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
+from twin_master.scenario.schema import Scenario
+from twin_master.watch.decision import last_decision
+from twin_master.watch.feeds import Fed, file_feed
+from twin_master.watch.folder import Watch, begin_resolved, resume_watch
+from twin_master.watch.intake import Feed
+from twin_master.watch.keeping import Keeper
+from twin_master.watch.message import MessageReader
+from twin_master.watch.mqtt import Session, broker_of, is_broker, placed
+
+__all__ = ["KIND", "STATE_NAME", "FleetWatch", "WatchedAsset"]
+
+KIND = "uav-twin fleet watch"
+STATE_NAME = "watched.json"
+"""In the folder of a fleet that is watched: its assets as they stood a moment ago, for its view."""
+TURNS_AT_ONCE = 64
+"""Turns of one asset before the next one is looked at."""
+SEARCH_SECONDS, STATE_SECONDS = 2.0, 2.0
+"""Between two searches for new files, and between two writings of the state."""
+IDLE_SECONDS, BUSY_SHARE = 0.05, 0.2
+"""Shortest pause where nothing came, and share of a processor that looking in vain may take."""
+LARGEST_FLEET = 100_000
+"""Assets; a broker could name more of them without end."""
+_NAME = re.compile(r"\w[\w.-]{0,63}")
+
+
+class WatchedAsset:
+    """An asset under watch.
+
+    Attributes
+    ----------
+    name : str
+        Of its group and its own: GROUP/NAME, which is its folder, too.
+    watch : Watch
+    keep : Keeper
+        Holds twin and intake.
+    tell : callable
+        Told each decision.
+    decision : dict or None
+        The last one.
+    alarms : set of str
+        What the operator was told, each sentence once.
+    """
+
+    def __init__(
+        self, name: str, watch: Watch, keep: Keeper, tell: Callable[[Mapping[str, Any]], None]
+    ) -> None:
+        self.name, self.watch, self.keep, self.tell = name, watch, keep, tell
+        model = watch.models[-1].knowledge.model
+        self.decision = last_decision(watch.folder / JOURNAL_NAME, watch.scenario, model)
+        self.alarms = {notice.sentence for _, notice in watch.told(0)} if self.decision else set()
+
+    def record(self) -> dict[str, Any]:
+        """Return how it stands, for the view."""
+        told = self.decision or {}
+        known = {key: told.get(key) for key in ("turn", "control", "next_control", "probability", "health")}
+        return known | {"alarms": len(self.alarms)}
+
+
+class FleetWatch:
+    """A fleet under watch, by this process.
+
+    Parameters
+    ----------
+    fleet : Fleet
+        Its groups have `observations`.
+    folder : Path
+        With a folder of a watch for each asset; a fleet that was watched there before is gone on with.
+    tell : callable
+        Told the asset and each decision, once it is written down.
+    note : callable
+        Told of assets that are lost, and of brokers.
+    follow : bool
+        Files grow, and new ones come.
+    turns : int, optional
+        Turns of each asset after which it is left alone.
+    authority : Path, optional
+        Certificate of the authority of a broker.
+
+    Raises
+    ------
+    FleetError, MissionInputError
+        A group is flown and not watched; an address is wrong.
+    RunFolderExistsError, NotResumableError
+        The folder holds something else, or was begun with another version.
+
+    Attributes
+    ----------
+    assets : dict of str to WatchedAsset
+    failures : dict of str to str
+        What ended the watch of an asset; the others go on.
+    asked : bool
+        Set it to end between two turns.
+    """
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        folder: Path,
+        tell: Callable[[WatchedAsset, Mapping[str, Any]], None],
+        note: Callable[[str], None],
+        *,
+        follow: bool = False,
+        turns: int | None = None,
+        authority: Path | None = None,
+    ) -> None:
+        self.folder, self.assets, self.asked = folder, dict[str, WatchedAsset](), False
+        self.failures: dict[str, str] = {}
+        self.note, self.closing = note, ExitStack()
+        self._tell, self._turns = tell, turns
+        self._like: dict[str, Watch] = {}
+        flown = [group.name for group in fleet.groups if not group.observations]
+        if flown:
+            raise FleetError(f"a watched group has `observations`, and {', '.join(flown)} has none.")
+        self._sources: list[_Files | _Topics] = []
+        for group in fleet.groups:
+            if is_broker(group.observations):
+                self._sources.append(_Topics(self, group, authority))
+            else:
+                self._sources.append(_Files(self, group, follow))
+        self.closing.callback(os.close, _held(fleet, folder))
+        known = folder / STATE_NAME
+        self._told_before: dict[str, Any] = (
+            read_json(known, RunFolderExistsError)["assets"] if known.is_file() else {}
+        )
+        limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (limits[1], limits[1]))  # three files for each asset
+
+    def run(self, looked: Callable[[], None] = lambda: None) -> None:
+        """Watch until all files are read to their end, or until it is asked to end.
+
+        Parameters
+        ----------
+        looked : callable
+            Called now and then.
+
+        Raises
+        ------
+        FileNotWrittenError
+            The disk is full or the folder cannot be written; what was observed is kept.
+        MissionInputError
+            A broker does not answer, or refuses the twin.
+        """
+        state = 0.0
+        with self.closing:
+            try:
+                while not self.asked:
+                    begin = time.monotonic()
+                    turns = sum(source.look() for source in self._sources)
+                    if begin - state > STATE_SECONDS:
+                        self._write_state()
+                        state = begin
+                    looked()
+                    if not turns:
+                        if all(source.ended for source in self._sources):
+                            return
+                        looking = time.monotonic() - begin
+                        time.sleep(min(max(IDLE_SECONDS, looking / BUSY_SHARE), 1.0))
+            finally:
+                self._write_state()
+
+    def take_up(
+        self, group: Group, name: str, feed: Callable[[Scenario], Feed],
+        publish: Callable[[Mapping[str, Any]], None] | None = None,
+    ) -> WatchedAsset | None:  # fmt: skip
+        """Begin the watch of an asset, or go on with it; None where that cannot be."""
+        key, folder = f"{group.name}/{name}", self.folder / group.name / name
+        with ExitStack() as closing:
+            try:
+                if not _NAME.fullmatch(name):
+                    raise FleetError(f"letters, digits, dots and hyphens name an asset, and {name!r} came.")
+                if key in self.assets:
+                    raise FleetError("another file has the same name.")
+                if len(self.assets) == LARGEST_FLEET:
+                    raise FleetError(f"a process watches {LARGEST_FLEET} assets at most.")
+                source, like = feed(group.scenarios[0]), self._like.get(group.name)
+                if (folder / CONFIG_NAME).is_file():
+                    watch, lock = resume_watch(folder, None, SilentProgress(), like)
+                else:
+                    with written(folder):
+                        folder.parent.mkdir(exist_ok=True)
+                    watch, lock = begin_resolved(
+                        group.scenarios[0], group.file, folder, SilentProgress(), like=like
+                    )
+                closing.callback(os.close, lock)
+                _, keep = closing.enter_context(watch.begun(source))
+                asset = WatchedAsset(key, watch, keep, publish or (lambda _decision: None))
+            except IN_FLIGHT as error:
+                self._lost(key, error)
+                return None
+            self.closing.push(closing.pop_all())
+        self._like.setdefault(group.name, watch)
+        self.assets[key] = asset
+        last = asset.decision
+        told = self._told_before.get(key, {}).get("turn")
+        if last is not None and (told is None or told < last["turn"]):  # a kill may have left it untold
+            self._decided(asset, last)
+        return asset
+
+    def _decided(self, asset: WatchedAsset, decision: dict[str, Any]) -> None:
+        asset.decision = decision
+        self._tell(asset, decision)
+        asset.tell(decision)
+        asset.alarms |= {notice["sentence"] for notice in decision["notices"]}
+
+    def advance(self, asset: WatchedAsset) -> int:
+        """Take in what has come of an asset; return the number of turns."""
+        count = 0
+        if self.done(asset):
+            return count
+        try:
+            for decision in asset.watch.decisions(asset.keep.intake, asset.keep):
+                self._decided(asset, decision)
+                count += 1
+                if count == TURNS_AT_ONCE or self.done(asset) or self.asked:
+                    break
+        except IN_FLIGHT as error:
+            self._lost(asset.name, error)
+        return count
+
+    def done(self, asset: WatchedAsset) -> bool:
+        """Return whether an asset is left alone: it is lost, or has the turns that were wanted."""
+        enough = self._turns is not None and asset.keep.twin.turns >= self._turns
+        return enough or asset.name in self.failures
+
+    def _lost(self, name: str, error: Exception) -> None:
+        if name not in self.failures and len(self.failures) < LARGEST_FLEET:
+            self.failures[name] = str(error)
+            self.note(f"{name} is not watched: {error}")
+
+    def _write_state(self) -> None:
+        assets = {name: asset.record() for name, asset in sorted(self.assets.items())}
+        record = {"assets": {**self._told_before, **assets}, "failures": self.failures}
+        atomic_write_text(self.folder / STATE_NAME, json.dumps(record, allow_nan=False) + "\n")
+
+
+def _held(fleet: Fleet, folder: Path) -> int:
+    """Make the folder of a fleet, or see that it holds the same; return what holds it for this process."""
+    groups = [
+        {"name": group.name, "scenarios": [portable_scenario(group.scenarios[0]).to_dict()]}
+        for group in fleet.groups
+    ]
+    heading = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "groups": groups}
+    config = {"kind": KIND, "format": 1, "fleet": heading}
+    path = folder / CONFIG_NAME
+    with written(folder):
+        taken = folder.exists() and not (folder.is_dir() and (path.is_file() or not any(folder.iterdir())))
+    if taken:
+        raise RunFolderExistsError(
+            f"{folder} holds something else than a watched fleet: choose another --out."
+        )
+    if path.is_file():
+        found = read_json(path, RunFolderExistsError)
+        if not isinstance(found, dict) or {key: found.get(key) for key in config} != json.loads(
+            to_json(config)
+        ):
+            raise RunFolderExistsError(f"{folder} holds another fleet or scenario: choose another --out.")
+        check_versions(folder, found, fleet.seed)
+    with written(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = lock_folder(folder)
+    if lock is None:
+        raise FleetError(f"another process watches the fleet in {folder}: wait for it to end.")
+    if not path.is_file():
+        provenance = collect_provenance(fleet.seed).as_dict()
+        atomic_write_text(path, to_json({**config, "provenance": provenance}))
+    return lock
+
+
+class _Files:
+    """A file for each asset, whose name is its name."""
+
+    def __init__(self, fleet: FleetWatch, group: Group, follow: bool) -> None:
+        self._fleet, self._group, self._follow = fleet, group, follow
+        self._assets: dict[Path, WatchedAsset | None] = {}
+        self._searched = -SEARCH_SECONDS
+
+    @property
+    def ended(self) -> bool:
+        done = self._fleet.done
+        here = [asset for asset in self._assets.values() if asset is not None]
+        return all(asset.keep.intake.ended or done(asset) for asset in here) and not self._follow
+
+    def look(self) -> int:
+        """Take in what is new; return the number of turns."""
+        if time.monotonic() - self._searched >= SEARCH_SECONDS:
+            self._searched = time.monotonic()
+            for path in recordings(self._group):
+                if path not in self._assets and not self._fleet.asked and self._begun(path):
+                    feed = partial(self._feed, path)
+                    self._assets[path] = self._fleet.take_up(self._group, asset_name(path), feed)
+        turns = 0
+        for asset in self._assets.values():
+            if self._fleet.asked:
+                break
+            if asset is not None:
+                turns += self._fleet.advance(asset)
+        return turns
+
+    def _feed(self, path: Path, scenario: Scenario) -> Feed:
+        return file_feed(path, scenario, follow=self._follow)
+
+    def _begun(self, path: Path) -> bool:
+        """Return whether the header of a file that grows is whole."""
+        if not self._follow:
+            return True
+        try:
+            with path.open("rb") as file:
+                return file.readline(100_000)[-1:] == b"\n"
+        except OSError:
+            return False
+
+
+def recordings(group: Group) -> list[Path]:
+    """Return the files of a group, in their order."""
+    pattern = Path(group.observations)
+    found = sorted(pattern.parent.glob(pattern.name))
+    return [path for path in found if not path.name.startswith(".")]
+
+
+def asset_name(path: Path) -> str:
+    """Return the name of the asset of a recording."""
+    return path.name if path.is_dir() else path.stem
+
+
+class _Inbox:
+    """What a broker sent of one asset."""
+
+    replayable = False
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._reader = MessageReader(scenario)
+        self.came: deque[bytes] = deque()
+
+    def beginning(self, count: int) -> str:
+        return ""
+
+    def messages(self, after: int) -> Iterator[Fed]:
+        while True:
+            yield placed(self._reader, self.came.popleft()) if self.came else (None, "")
+
+
+class _Topics:
+    """A topic for each asset, whose last level is its name."""
+
+    ended = False
+
+    def __init__(self, fleet: FleetWatch, group: Group, authority: Path | None) -> None:
+        broker = broker_of(group.observations, authority, many=True)
+        self._fleet, self._group = fleet, group
+        self._session = Session(broker, group.name, fleet.folder, fleet.note)
+        fleet.closing.callback(self._session.close)
+        self._messages = self._session.messages(0.0)
+        self._assets: dict[str, WatchedAsset] = {}
+        self._inboxes: dict[str, _Inbox] = {}
+
+    def look(self) -> int:
+        """Take in what the broker has sent; return the number of turns."""
+        turns = 0
+        while not self._fleet.asked and (message := next(self._messages)) is not None:
+            inbox = self._inboxes.get(message.topic) or self._begun(message.topic)
+            if inbox is not None:
+                inbox.came.append(message.payload)
+                turns += self._fleet.advance(self._assets[message.topic])
+        return turns
+
+    def _begun(self, topic: str) -> _Inbox | None:
+        inbox, name = _Inbox(self._group.scenarios[0]), topic.rpartition("/")[2]
+
+        def publish(decision: Mapping[str, Any]) -> None:
+            self._session.publish(topic, decision)
+
+        asset = self._fleet.take_up(self._group, name, lambda _scenario: inbox, publish)
+        if asset is None:
+            return None
+        self._assets[topic], self._inboxes[topic] = asset, inbox
+        return inbox
