@@ -29,7 +29,7 @@ from twin_master.mission.journal import JOURNAL_NAME, read_records
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch import teaching, trial
 from twin_master.watch.feeds import file_feed
-from twin_master.watch.folder import begin_watch
+from twin_master.watch.opening import begin_watch
 
 HIDDEN: dict[str, tuple[Primitive, ...]] = {
     "nothing": (),

@@ -178,7 +178,7 @@ def _opened(
     """Return the watch, begun or taken up, and what holds its folder."""
     from twin_master.assets.resolution import Overrides
     from twin_master.errors import MissionInputError
-    from twin_master.watch.folder import begin_watch, resume_watch
+    from twin_master.watch.opening import begin_watch, resume_watch
 
     if resume and (replace or overrides != Overrides()):
         raise typer.BadParameter(

@@ -27,11 +27,12 @@ from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.decision import last_decision
 from twin_master.watch.feeds import Fed, file_feed
-from twin_master.watch.folder import Watch, begin_resolved, resume_watch
+from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Feed
 from twin_master.watch.keeping import Keeper
 from twin_master.watch.message import MessageReader
 from twin_master.watch.mqtt import Session, broker_of, is_broker, placed
+from twin_master.watch.opening import begin_resolved, resume_watch
 
 __all__ = ["KIND", "STATE_NAME", "FleetWatch", "WatchedAsset"]
 

@@ -23,7 +23,7 @@ from twin_master.fleet.watching import FleetWatch, WatchedAsset
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import file_feed
-from twin_master.watch.folder import begin_watch
+from twin_master.watch.opening import begin_watch
 from uav_twin.cli import app
 
 TURNS = 6

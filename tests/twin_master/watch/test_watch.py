@@ -38,9 +38,10 @@ from twin_master.scenario.notice import Noticing
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.watch.decision import last_decision
 from twin_master.watch.feeds import CsvFeed, FolderFeed, file_feed
-from twin_master.watch.folder import Patched, Watch, begin_watch, resume_watch
+from twin_master.watch.folder import Patched, Watch
 from twin_master.watch.message import Message
 from twin_master.watch.mqtt import PASSWORD_VARIABLE, MqttFeed, broker_of
+from twin_master.watch.opening import begin_watch, resume_watch
 from twin_master.watch.replay import BelievedModel
 from twin_master.watch.snapshot import flown
 from twin_master.watch.teaching import Question, Search, Teaching, both_patches
