@@ -43,8 +43,8 @@ ROOMS = {
     ),
     "twin_master": (
         "errors", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library", "mission",
-        "store", "report", "viewer", "workflow", "watch", "scenario_check", "study", "fleet", "command",
-        "watch_command", "__main__",
+        "store", "report", "viewer", "workflow", "watch", "scenario_check", "study", "fleet", "environment",
+        "command", "watch_command", "__main__",
     ),
     "discrepancy": (
         "errors", "campaign", "models", "lumped_models", "location", "catalogue", "document_types", "verdict",

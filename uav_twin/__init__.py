@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from fmu_asset.door.session import FmiAsset
     from fmu_asset.packing.wing_fmu import build_fmu
     from scenarios import structure_files
+    from twin_master.environment import ScenarioEnvironment
     from twin_master.learning.monitor import WatchfulEstimator
     from twin_master.mission.preparation import prepare_twin
     from twin_master.network.estimator import Carried, Estimate, ExactFilter
@@ -47,6 +48,7 @@ __all__ = [
     "FmiAsset",
     "GaussianSensorModel",
     "GraphicalModel",
+    "ScenarioEnvironment",
     "Twin",
     "WatchfulEstimator",
     "assemble",
@@ -85,6 +87,7 @@ _HOMES = {
     "FmiAsset": "fmu_asset.door.session",
     "GaussianSensorModel": "twin_master.network.sensor_model",
     "GraphicalModel": "twin_master.network.graphical_model",
+    "ScenarioEnvironment": "twin_master.environment",
     "Twin": "twin_master.network.twin",
     "WatchfulEstimator": "twin_master.learning.monitor",
     "assemble": "fe.full.operators",

@@ -1,0 +1,80 @@
+"""A scenario as an environment of gymnasium: its checker, and the mission that our own policy flies in it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from twin_master.assets.resolution import asset_source
+from twin_master.environment import ScenarioEnvironment
+from twin_master.errors import MissionInputError
+from twin_master.mission.loop import fly
+
+
+@pytest.fixture(params=["level_turns", "growing_damage", "failing_gauges"])
+def environment(request: pytest.FixtureRequest, library_file: Path) -> Iterator[ScenarioEnvironment]:
+    made = ScenarioEnvironment(request.param, {"strain_library": library_file})
+    yield made
+    made.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*Box observation space:UserWarning", "ignore:.*render:UserWarning")
+def test_it_passes_the_checker_of_gymnasium(environment: ScenarioEnvironment) -> None:
+    check_env(environment)
+
+
+def test_our_policy_flies_the_mission_of_the_loop(environment: ScenarioEnvironment) -> None:
+    """To the last bit, with the seed of the mission; rewards by enumeration."""
+    scenario, knowledge = environment.scenario, environment.knowledge
+    plant = knowledge.plant(knowledge.truth(3), asset_source(scenario).open())
+    flight = fly(scenario, knowledge.twin(), plant)
+    for seed in (4, 3):  # an episode leaves nothing to the next one
+        twin, (observation, info) = knowledge.twin(), environment.reset(seed=seed)
+        observed, controls, rewards, truncated = [info["observed"]], [info["control"]], [], False
+        while not truncated:
+            action = twin.turn(info["observed"], info["control"]).next_control
+            observation, reward, terminated, truncated, info = environment.step(action)
+            assert not terminated
+            np.testing.assert_array_equal(
+                observation, np.where(np.isnan(info["observed"]), 0, info["observed"])
+            )
+            observed.append(info["observed"])
+            controls.append(info["control"])
+            rewards.append(reward)
+    np.testing.assert_array_equal(observed, flight.observed)
+    np.testing.assert_array_equal(controls, flight.control_index)
+    assert info["state"] == dict(zip(scenario.state_names, flight.happened.state[-1], strict=True))
+    section = scenario.rewards
+    worst = (flight.happened.observation / section.health_limit).max(axis=1)
+    worth = np.array([section.control[scenario.control_names[u]] for u in controls])
+    expected = section.health_weight * (1 - worst) + section.control_weight * worth
+    np.testing.assert_allclose(rewards, expected[1:], rtol=1e-14)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
+        environment.step(0)
+
+
+def test_wrong_use_is_refused(library_file: Path) -> None:
+    environment = ScenarioEnvironment("level_turns", {"strain_library": library_file})
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        environment.step(0)
+    environment.reset(seed=1)
+    with pytest.raises(gymnasium.error.InvalidAction, match="controls 2g, 3g, got 2"):
+        environment.step(2)
+    environment.close()
+    environment.close()
+    with pytest.raises(MissionInputError, match="is closed"):
+        environment.reset()
+
+
+def test_without_gymnasium_there_is_a_sentence() -> None:
+    program = "import sys; sys.modules['gymnasium'] = None; import uav_twin; uav_twin.ScenarioEnvironment"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert done.stderr.strip().endswith("needs gymnasium: pip install 'uav-twin[gym]'.")

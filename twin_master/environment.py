@@ -1,0 +1,173 @@
+"""A scenario as an environment of gymnasium (extra `uav-twin[gym]`): for policies that others learn.
+
+An action is a control of the scenario, an observation what its sensors say, the reward that of the scenario
+for what really happened, eqs. (9) and (10) of Kapteyn et al. 2021 with its weights.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reporting.progress import Progress, SilentProgress
+from twin_master.assets.interface import Asset
+from twin_master.assets.resolution import Overrides, given_overrides, resolve_scenario
+from twin_master.errors import MissionInputError
+from twin_master.fleet.flight import source_of
+from twin_master.mission.plant import Plant
+from twin_master.mission.preparation import prepare_knowledge
+from twin_master.network.rewards import health_reward
+from twin_master.scenario.reading import LoadedScenario, load_scenario
+
+try:
+    import gymnasium
+except ImportError:
+    raise MissionInputError("a ScenarioEnvironment needs gymnasium: pip install 'uav-twin[gym]'.") from None
+
+Float = NDArray[np.float64]
+
+
+class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
+    """The asset of a scenario, its damage and its sensors, step by step.
+
+    The first step of the mission is flown by `reset` under the scenario's first control. An episode has as
+    many steps as the mission, and then is truncated. A lost sensor shows zero; `info` holds NaN for it.
+
+    Parameters
+    ----------
+    scenario : LoadedScenario, str or Path
+        The scenario, its shipped name, or its file.
+    overrides : Overrides or mapping, optional
+        What differs from the file, as `fly` takes it.
+    progress : Progress, optional
+        Where the modelling reports.
+
+    Attributes
+    ----------
+    knowledge : Knowledge
+        What a twin of the scenario knows; `knowledge.twin()` is one, whose decisions are our own policy.
+    action_space : Discrete(U)
+        Index of a control.
+    observation_space : Box (G,)
+        What the sensors say, SI, without bounds.
+
+    Raises
+    ------
+    MissionInputError
+        gymnasium is not installed, or the scenario observes modes.
+    TwinMasterError, FmuError, FiniteElementError, CalibrationError
+        With one clear sentence.
+
+    Notes
+    -----
+    `info` of a step holds `observed` (G,), NaN where lost; `control`, its index; `step`; `seed`, that of the
+    mission: `reset(seed=s)` meets the noise and damage of `uav-twin run --seed s`; `state`, the true state by
+    name, SI; `reward_health` and `reward_control`, unweighted.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as the base class has it
+
+    def __init__(
+        self,
+        scenario: LoadedScenario | str | Path,
+        overrides: Overrides | Mapping[str, Any] | None = None,
+        *,
+        progress: Progress | None = None,
+    ) -> None:
+        loaded = scenario if isinstance(scenario, LoadedScenario) else load_scenario(scenario)
+        self.scenario = resolve_scenario(loaded, given_overrides(overrides))
+        if self.scenario.observation.role == "modes":
+            raise MissionInputError(
+                f"the scenario {self.scenario.mission.name} observes modes with a covariance, which are no "
+                "vector of sensors: take a scenario that observes sensors."
+            )
+        source = source_of(self.scenario)
+        source.check()
+        self._folder = TemporaryDirectory(prefix="uav_twin_")  # holds what is packed as long as it is flown
+        self._asset: Asset | None = None
+        try:
+            source.prepare(Path(self._folder.name), progress or SilentProgress())
+            self.knowledge = prepare_knowledge(self.scenario, source, self.scenario.mission.seed)
+            self._asset = source.open()
+        except BaseException:
+            self._folder.cleanup()
+            raise
+        self._start = self._asset.save_state()
+        self._plant: Plant | None = None
+        self._step, self._seed, self._control = 0, 0, 0
+        sensors = self.scenario.observation.count
+        self.action_space = gymnasium.spaces.Discrete(len(self.scenario.control))
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (sensors,), np.float64)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float, dict[str, Any]]:
+        """Begin a mission, and fly its first step under the first control of the scenario.
+
+        Parameters
+        ----------
+        seed : int, optional
+            Seed of the mission; without it, it is drawn from the generator that the last seed began.
+        options : dict, optional
+            Not used.
+        """
+        super().reset(seed=seed)
+        if self._asset is None:
+            raise MissionInputError("the environment is closed: make a new one.")
+        self._seed = int(self.np_random.integers(2**31)) if seed is None else seed
+        self._asset.restore_state(self._start)
+        self._plant = self.knowledge.plant(self.knowledge.truth(self._seed), self._asset)
+        self._step = 0
+        observation, _, info = self._fly(self.knowledge.twin().proposed_control, None)
+        return observation, info
+
+    def step(self, action: np.int64 | int) -> tuple[Float, float, bool, bool, dict[str, Any]]:
+        """Fly one step under a control: observation, reward, False, whether it was the last one, info.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            The mission has not begun, or is over.
+        gymnasium.error.InvalidAction
+            There is no such control.
+        """
+        if self._plant is None or self._step >= self.scenario.mission.steps:
+            raise gymnasium.error.ResetNeeded("the mission is over or has not begun: call reset().")
+        if not self.action_space.contains(action):
+            raise gymnasium.error.InvalidAction(
+                f"expected the index of one of the controls {', '.join(self.scenario.control_names)}, "
+                f"got {action!r}"
+            )
+        observation, reward, info = self._fly(int(action), self._control)
+        return observation, reward, False, self._step >= self.scenario.mission.steps, info
+
+    def close(self) -> None:
+        """Let go of the asset and what was packed for it."""
+        if self._asset is not None:
+            self._asset.close()
+            self._folder.cleanup()
+        self._asset = self._plant = None
+
+    def _fly(self, control: int, before: int | None) -> tuple[Float, float, dict[str, Any]]:
+        assert self._plant is not None
+        sensed = self._plant.turn(control, before)
+        state, shown, _ = self._plant.latest()
+        settings, weights = self.knowledge.rewards.settings, self.scenario.rewards
+        chosen = slice(None) if settings.health_sensors is None else list(settings.health_sensors)
+        health = float(health_reward(shown[chosen], settings.limit))
+        worth = settings.control_reward[control]
+        reward = weights.health_weight * health + weights.control_weight * worth
+        info = {
+            "observed": sensed,
+            "control": control,
+            "step": self._step,
+            "seed": self._seed,
+            "state": dict(zip(self.scenario.state_names, state.tolist(), strict=True)),
+            "reward_health": health,
+            "reward_control": worth,
+        }
+        self._control, self._step = control, self._step + 1
+        return np.nan_to_num(sensed, nan=0.0), reward, info
