@@ -5,7 +5,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine, Piece, flown
 from twin_master.fleet.outcome import FAILED, sizes_of
 from twin_master.fleet.plan import Fleet, Group
+from twin_master.fleet.recorded import read_recording
 from twin_master.fleet.shard import Kit, ShardResult, with_parameters
 from twin_master.fleet.store import FleetStore, written
 from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME, keep_knowledge
@@ -30,6 +31,7 @@ from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
 from twin_master.scenario.schema import Scenario
+from twin_master.watch.feeds import file_feed
 
 KIND = "uav-twin fleet"
 RESULT_NAME = "fleet.json"
@@ -188,9 +190,9 @@ def flies_model(scenario: Scenario) -> bool:
     return same and getattr(asset, "design", None) == getattr(belief, "design", None)
 
 
-def source_of(scenario: Scenario) -> AssetSource:
-    """Return what flies in a fleet, and what its twin believes."""
-    return believed_source(scenario) if flies_model(scenario) else asset_source(scenario)
+def source_of(scenario: Scenario, *, real: bool = False) -> AssetSource:
+    """Return what flies in a fleet, and what its twin believes; the latter alone where assets are real."""
+    return believed_source(scenario) if real or flies_model(scenario) else asset_source(scenario)
 
 
 def _check(fleet: Fleet) -> None:
@@ -208,9 +210,14 @@ def _check(fleet: Fleet) -> None:
         for name, scenario in zip(names, group.scenarios, strict=True):
             try:
                 _check_group(group, scenario)
-                source_of(with_parameters(scenario, means)).check()
+                source_of(with_parameters(scenario, means), real=bool(group.observations)).check()
             except IN_FLIGHT as error:
                 wrong.append(f"{group.name} {name}".rstrip() + f": {error}")
+        for path in group.recordings:
+            try:
+                file_feed(path, group.scenarios[0])
+            except IN_FLIGHT as error:
+                wrong.append(f"{group.name}: {error}")
     if wrong:
         raise FleetError("\n".join([f"{len(wrong)} of the assets cannot fly, so none did:", *wrong]))
 
@@ -221,6 +228,15 @@ def _check_group(group: Group, scenario: Scenario) -> None:
             'a fleet keeps values alone, and `role = "modes"` observes each turn with its own covariance: '
             "fly the scenario with `uav-twin run`."
         )
+    if group.observations:
+        names = {member.name for member in group.members}
+        if not names:
+            raise FleetError(
+                f"no recording fits {group.observations}; what is still to come is watched by `fleet watch`."
+            )
+        if len(names) < len(group.members):
+            raise FleetError("two recordings have the same name, and it names the asset.")
+        return
     one_life = scenario.truth.kind == "asset" and not getattr(scenario.asset, "seeds", ())
     if one_life and len(group.scenarios) < len(group.members):
         raise FleetError(
@@ -237,17 +253,17 @@ def _check_group(group: Group, scenario: Scenario) -> None:
         raise FleetError("it has other states or sensors than the first asset of its group.")
 
 
-def prepared(scenario: Scenario, folder: Path, progress: Progress) -> bytes:
+def prepared(scenario: Scenario, folder: Path, progress: Progress, *, real: bool = False) -> bytes:
     """Return the packed `Kit` of a scenario, what belongs to it made in a folder."""
     located = located_scenario(portable_scenario(scenario), folder)
-    for name, content in source_of(scenario).files().items():
+    for name, content in source_of(scenario, real=real).files().items():
         if not (folder / name).exists():
             atomic_write_bytes(folder / name, content)
-    source = source_of(located)
+    source = source_of(located, real=real)
     source.prepare(folder, progress)
     if not (folder / KNOWLEDGE_NAME).is_file():
         keep_knowledge(folder, prepare_knowledge(located, source, scenario.mission.seed))
-    wing = getattr(source, "wing", None) if flies_model(scenario) else None
+    wing = getattr(source, "wing", None) if flies_model(scenario) and not real else None
     files = {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
@@ -277,12 +293,14 @@ def _fly(fleet: Fleet, folder: Path, engine: Engine, store: FleetStore, progress
     @lru_cache(maxsize=2)
     def kit(number: int, place: int) -> bytes:
         group = fleet.groups[number]
-        return prepared(group.scenarios[place], group_folder(folder, group, place), SilentProgress())
+        own = group_folder(folder, group, place)
+        real = bool(group.observations)
+        return prepared(group.scenarios[place], own, SilentProgress(), real=real)
 
     def pieces() -> Iterator[Piece]:
         for piece in whole:
             if piece.shard not in store.done:
-                yield piece
+                yield _recorded(fleet.groups[piece.group], piece)
 
     whole = list(_shards(fleet, kit))
     left = {piece.shard: _Left(len(piece.members)) for piece in whole}
@@ -305,6 +323,18 @@ def _fly(fleet: Fleet, folder: Path, engine: Engine, store: FleetStore, progress
             if not told.twins:
                 store.finish(piece.shard, {"failures": told.failures, "seconds": told.seconds})
             stage.advance(len(piece.members))
+
+
+def _recorded(group: Group, piece: Piece) -> Piece:
+    """Return a piece with what its real assets have shown: workers need no files."""
+    if not group.recordings:
+        return piece
+    scenario = group.scenarios[0]
+    members = (
+        replace(member, recording=read_recording(group.recordings[member.row], scenario))
+        for member in piece.members
+    )
+    return replace(piece, members=tuple(members))
 
 
 def _shards(fleet: Fleet, kit: Callable[[int, int], bytes]) -> Iterator[Piece]:

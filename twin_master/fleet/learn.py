@@ -166,6 +166,7 @@ class _Seen:
     observed: Float
     control: Index
     folder: Path
+    real: bool
 
 
 def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
@@ -221,7 +222,8 @@ def _seen(folder: Path, record: dict[str, Any]) -> Iterator[_Seen]:
     if not len(flown):
         return
     observed = group["observed"].values[flown].astype(np.float64)
-    control = group["control_index"].values[flown].astype(np.int64)
+    # Behind the end of a recording nothing is observed, so that any control says the same.
+    control = np.maximum(group["control_index"].values[flown], 0).astype(np.int64)
     for place, table in enumerate(record["scenarios"]):
         own = folder / GROUPS / record["name"]
         mine = np.arange(len(flown))
@@ -229,7 +231,8 @@ def _seen(folder: Path, record: dict[str, Any]) -> Iterator[_Seen]:
             own, mine = own / str(place), np.flatnonzero(flown == place)
         if len(mine):
             scenario = located_scenario(Scenario.model_validate(table), own)
-            yield _Seen(kept_knowledge(own, scenario), observed[mine], control[mine], own)
+            known = kept_knowledge(own, scenario)
+            yield _Seen(known, observed[mine], control[mine], own, "recordings" in record)
 
 
 @dataclass(frozen=True)
@@ -249,7 +252,7 @@ def _nodes(parts: list[_Seen]) -> _Nodes | None:
     deviations = np.linspace(-NODE_DEVIATIONS, NODE_DEVIATIONS, NODES)
     values = draws.mean + draws.standard_deviation * deviations
     prior = np.exp(-0.5 * deviations**2)
-    source = source_of(parts[0].knowledge.scenario)
+    source = source_of(parts[0].knowledge.scenario, real=parts[0].real)
     source.prepare(parts[0].folder, SilentProgress())
     given = ParameterDraws(draws.name, values, draws.mean, draws.standard_deviation, "nodes")
     predicted = source.observation_table(given, model)

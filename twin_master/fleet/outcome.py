@@ -73,6 +73,8 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
     inside = in_credible_set(model, flights.filtered.reshape(rows[0]), flights.state.reshape(rows[1]))
     failed = np.array([bool(text) for text in flights.failure])
     delay, early = _fallbacks(knowledge, flights)
+    unknown = np.isnan(flights.state[:, 0]).any(axis=1)  # of a real asset
+    ended = (flights.control_index >= 0).sum(axis=1)  # a recording may end early
     found: dict[str, Any] = {
         "status": np.where(failed, FAILED, FLOWN),
         "seed": np.array([member.seed for member in members]),
@@ -82,10 +84,10 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
         "mean": mean,
         "standard_deviation": np.sqrt(np.maximum(variance, 0.0)),
         "log_evidence": flights.log_evidence,
-        "belief": flights.filtered[:, -1],
+        "belief": flights.filtered[np.arange(len(failed)), np.where(failed, steps, ended) - 1],
         "delay": np.where(failed, np.nan, delay),
         "early": early & ~failed,
-        "credible": np.where(failed, np.nan, inside.reshape(-1, steps).mean(axis=1)),
+        "credible": np.where(failed | unknown, np.nan, inside.reshape(-1, steps).mean(axis=1)),
     }
     found = {name: np.ascontiguousarray(values, VARIABLES[name].type) for name, values in found.items()}
     for name in members[0].parameters:
@@ -100,6 +102,8 @@ def _fallbacks(knowledge: Knowledge, flights: Flights) -> tuple[NDArray[np.float
     delay = np.full(len(flights.state), np.nan)
     early = np.zeros(len(delay), dtype=bool)
     for twin, (control, state) in enumerate(zip(flights.control_index, flights.state, strict=True)):
+        if np.isnan(state[0]).any():
+            continue
         fallback = find_fallback(knowledge.model, plan.control_index, first, control, state)
         early[twin] = fallback.early_step is not None
         if fallback.called_for_step is not None:

@@ -9,14 +9,17 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from reporting.provenance import hash_file
 from reporting.section import checked
 from reporting.toml_file import read_toml
 from twin_master.assets.resolution import Overrides, portable_scenario, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
+from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Count, Flag, Name, NotNegative, Number, Probability, Section, Seed
 from twin_master.seeds import generator
+from twin_master.watch.feeds import Fed
 from twin_master.watch.mqtt import is_broker
 from twin_master.watch.opening import file_record
 
@@ -106,12 +109,15 @@ class Member:
         What happens to it; the same mission flies with ``uav-twin run --seed``.
     parameters : dict of str to float
         Its true parameters, where the group spreads them, SI.
+    recording : tuple or None
+        Of a real asset: what was observed, as it goes to a worker.
     """
 
     row: int
     name: str
     seed: int
     parameters: Mapping[str, float]
+    recording: tuple[Fed, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -130,6 +136,8 @@ class Group:
         Name of the file that sets each asset apart; empty where they share all of them.
     observations : str
         Where those of real assets come from, a pattern of files or an address; empty where assets are flown.
+    recordings : tuple of Path
+        The files among them, one for each member.
     file : dict of str to str
         Name and hash of the file of the scenario of real assets.
     """
@@ -140,17 +148,22 @@ class Group:
     members: tuple[Member, ...]
     files: tuple[str, ...] = ()
     observations: str = ""
+    recordings: tuple[Path, ...] = ()
     file: Mapping[str, str] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """Return the group for `config.json`."""
-        return {
+        found = {
             "name": self.name,
             "scenarios": [portable_scenario(scenario).to_dict() for scenario in self.scenarios],
             "parameters": {name: spread.model_dump() for name, spread in self.spreads.items()},
             "members": [[member.name, member.seed] for member in self.members],
             "files": list(self.files),
         }
+        if self.observations:
+            whole = (path / JOURNAL_NAME if path.is_dir() else path for path in self.recordings)
+            found["recordings"] = [hash_file(path) for path in whole]
+        return found
 
 
 @dataclass(frozen=True)
@@ -254,7 +267,12 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
         address = section.observations
         where = address if is_broker(address) else str(folder / address)
         watched = _of_group(section, resolve_scenario(loaded, common))
-        return Group(section.name, (watched,), {}, (), observations=where, file=file_record(loaded))
+        paths = () if is_broker(address) else tuple(recordings(where))
+        members = tuple(Member(row, asset_name(path), seed, {}) for row, path in enumerate(paths))
+        return Group(
+            section.name, (watched,), {}, members, observations=where, recordings=paths,
+            file=file_record(loaded),
+        )  # fmt: skip
     if section.count is not None:
         scenarios: list[Scenario] = [resolve_scenario(loaded, common)]
         names = [f"{section.name}-{number}" for number in range(section.count)]
@@ -280,6 +298,17 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
     scenarios = [_of_group(section, scenario) for scenario in scenarios]
     members = tuple(_member(section, seed, row, name) for row, name in enumerate(names))
     return Group(section.name, tuple(scenarios), section.parameters, members, tuple(files))
+
+
+def recordings(pattern: str) -> list[Path]:
+    """Return the files of real assets that fit a pattern, in their order."""
+    found = sorted(Path(pattern).parent.glob(Path(pattern).name))
+    return [path for path in found if not path.name.startswith(".")]
+
+
+def asset_name(path: Path) -> str:
+    """Return the name of the asset of a recording."""
+    return path.name if path.is_dir() else path.stem
 
 
 def _of_group(section: GroupSection, scenario: Scenario) -> Scenario:

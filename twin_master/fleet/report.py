@@ -21,7 +21,7 @@ from twin_master.errors import TwinMasterError
 from twin_master.fleet.flight import GROUPS, RESULT_NAME, fleet_config
 from twin_master.fleet.lessons import LESSONS_NAME
 from twin_master.fleet.outcome import FAILED, FLOWN
-from twin_master.fleet.reading import group_figures, shown
+from twin_master.fleet.reading import group_figures, last_turns, shown
 from twin_master.fleet.store import open_group
 from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.mission.preparation import Knowledge
@@ -142,9 +142,10 @@ def _group(page: Page, folder: Path, record: dict[str, Any], group: "xr.Dataset"
     scale, unit = _scale(scenario)
     mean = scale * group["mean"].values[flown]  # (B, T, F)
     failed = int(np.sum(group["status"].values == FAILED))
+    last = mean[np.arange(len(flown)), last_turns(group)[flown]]
     with style.publication_style():
         page.add_figure(
-            style.to_svg(_map_figure(scenario, mean[:, -1], failed, unit)),
+            style.to_svg(_map_figure(scenario, last, failed, unit)),
             f"Filtered mean after the last {scenario.mission.step_name}, one cell for each asset, "
             f"the worst first by the sum of its states. Grey: {failed} that failed in flight.",
             title="The assets by health",
@@ -152,7 +153,7 @@ def _group(page: Page, folder: Path, record: dict[str, Any], group: "xr.Dataset"
         page.add_figure(
             style.to_svg(_course_figure(scenario, mean, scale * group["state"].values[flown], unit)),
             "Bands hold 90 and 50 % of the assets; the line is the median of the filtered means, "
-            "the dash-dotted one that of the true states.",
+            "the dash-dotted one that of the true states, where they are known.",
             title="Health over time",
         )
     _attention(page, folder, record, group, flown)
@@ -198,10 +199,11 @@ def _map_figure(scenario: Scenario, last: Float, failed: int, unit: str) -> Figu
 
 def _course_figure(scenario: Scenario, mean: Float, state: Float, unit: str) -> Figure:
     figure = style.new_figure(2.4)
-    steps = np.arange(mean.shape[1])
+    seen = ~np.isnan(mean).all(axis=(0, 2))
+    mean, state, steps = mean[:, seen], state[:, seen], np.flatnonzero(seen)
     for number, factor in enumerate(scenario.state):
         axes = figure.add_subplot(1, len(scenario.state), number + 1)
-        low, quarter, middle, three, top = np.quantile(
+        low, quarter, middle, three, top = np.nanquantile(
             mean[:, :, number], [0.05, 0.25, 0.5, 0.75, 0.95], axis=0
         )
         for below, above in ((low, top), (quarter, three)):
@@ -228,7 +230,8 @@ def _attention(
         page.add_paragraph(f"Who needs attention next is not known: {error}")
         return
     belief = group["belief"].values.astype(np.float64)
-    control = group["control_index"].values[:, -1]
+    last = last_turns(group)
+    control = group["control_index"].values[np.arange(len(last)), last]
     chance = np.zeros(len(belief))
     for index in np.unique(control[flown]):
         mine = flown[control[flown] == index]
@@ -236,7 +239,8 @@ def _attention(
     scale, unit = _scale(scenario)
     rows = []
     for row in flown[np.argsort(-chance[flown], kind="stable")][:NEXT].tolist():
-        pairs = zip(group["mean"].values[row, -1], group["standard_deviation"].values[row, -1], strict=True)
+        moments = (group[name].values[row, last[row]] for name in ("mean", "standard_deviation"))
+        pairs = zip(*moments, strict=True)
         states = [f"{scale * mean:.1f} ± {scale * deviation:.1f}" for mean, deviation in pairs]
         name = record["members"][row][0]
         rows.append(

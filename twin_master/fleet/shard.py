@@ -28,6 +28,7 @@ from twin_master.assets.interface import Asset, StatelessAsset
 from twin_master.assets.resolution import located_scenario
 from twin_master.fleet.outcome import outcomes_of
 from twin_master.fleet.plan import Member
+from twin_master.fleet.recorded import assimilated
 from twin_master.mission.kept_knowledge import kept_knowledge
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one, fly_side_by_side
@@ -165,16 +166,21 @@ def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:
         _kept.clear()
         _kept[packed] = _Unpacked(packed)
     kit = _kept[packed]
+    recorded = [member.recording for member in members if member.recording is not None]
+    flights = assimilated(kit.knowledge, recorded) if recorded else _flown(kit, members)
+    failures = {m.row: text for m, text in zip(members, flights.failure, strict=True) if text}
+    arrays = outcomes_of(kit.knowledge, flights, members)
+    return ShardResult(arrays, failures, time.process_time() - begin, program_version())
+
+
+def _flown(kit: _Unpacked, members: Sequence[Member]) -> Flights:
+    """Fly twins with their assets."""
     truths = [kit.knowledge.truth(member.seed) for member in members]
     learns = kit.scenario.learning is not None or kit.scenario.notice is not None
     fly = fly_one_by_one if learns else fly_side_by_side
     if kit.flies_model:
-        flights = fly(kit.knowledge, truths, [kit.model(member.parameters) for member in members])
-    else:
-        flights = _fly_each(kit, truths, members, fly)
-    failures = {m.row: text for m, text in zip(members, flights.failure, strict=True) if text}
-    arrays = outcomes_of(kit.knowledge, flights, members)
-    return ShardResult(arrays, failures, time.process_time() - begin, program_version())
+        return fly(kit.knowledge, truths, [kit.model(member.parameters) for member in members])
+    return _fly_each(kit, truths, members, fly)
 
 
 def _fly_each(

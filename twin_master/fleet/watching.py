@@ -19,7 +19,7 @@ from reporting.progress import SilentProgress
 from reporting.provenance import collect_provenance
 from twin_master.assets.resolution import portable_scenario
 from twin_master.errors import FleetError, RunFolderExistsError
-from twin_master.fleet.plan import Fleet, Group
+from twin_master.fleet.plan import Fleet, Group, asset_name, recordings
 from twin_master.fleet.store import written
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.side_by_side import IN_FLIGHT
@@ -311,7 +311,7 @@ class _Files:
         """Take in what is new; return the number of turns."""
         if time.monotonic() - self._searched >= SEARCH_SECONDS:
             self._searched = time.monotonic()
-            for path in recordings(self._group):
+            for path in recordings(self._group.observations):
                 if path not in self._assets and not self._fleet.asked and self._begun(path):
                     feed = partial(self._feed, path)
                     self._assets[path] = self._fleet.take_up(self._group, asset_name(path), feed)
@@ -335,18 +335,6 @@ class _Files:
                 return file.readline(100_000)[-1:] == b"\n"
         except OSError:
             return False
-
-
-def recordings(group: Group) -> list[Path]:
-    """Return the files of a group, in their order."""
-    pattern = Path(group.observations)
-    found = sorted(pattern.parent.glob(pattern.name))
-    return [path for path in found if not path.name.startswith(".")]
-
-
-def asset_name(path: Path) -> str:
-    """Return the name of the asset of a recording."""
-    return path.name if path.is_dir() else path.stem
 
 
 class _Inbox:

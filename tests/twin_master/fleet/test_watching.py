@@ -18,7 +18,12 @@ from scenarios import scenario_files
 from tests.twin_master.watch.test_watch import PASSWORD, Mosquitto, write_csv
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, RunFolderExistsError
-from twin_master.fleet.plan import load_fleet
+from twin_master.fleet.engine import Engine
+from twin_master.fleet.flight import fly_fleet
+from twin_master.fleet.learn import learn_fleet
+from twin_master.fleet.plan import ensemble, load_fleet
+from twin_master.fleet.reading import fleet_groups, group_figures
+from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.watching import FleetWatch, WatchedAsset
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import load_scenario
@@ -195,3 +200,48 @@ def test_the_command(fleet_file: Path, tmp_path: Path) -> None:
     last = {decision["asset"]: decision["turn"] for decision in decisions}
     assert last == {f"north/wing-{number}": 2 for number in range(3)}
     assert "3 assets, 9 turns, 0 alarms" in result.stderr
+
+
+def test_recordings_are_flown_as_a_fleet(fleet_file: Path, alone: list[bytes], tmp_path: Path) -> None:
+    (tmp_path / "logs" / "wing-0.csv").write_text(
+        "".join((tmp_path / "logs" / "wing-0.csv").read_text().splitlines(keepends=True)[:4])
+    )
+    with fleet_file.open("a") as file:
+        file.write(f"steps = {TURNS}\n")
+    outcome = fly_fleet(load_fleet(fleet_file), tmp_path / "flown", Engine(0))
+    group = fleet_groups(outcome.folder)["north"]
+    for row, (journal, turns) in enumerate(zip(alone, (3, TURNS, TURNS), strict=True)):
+        last: dict[int, dict[str, Any]] = {}
+        for line in journal.splitlines()[1:]:
+            record = json.loads(line[65:])
+            last[record["turn"]] = record
+        assert group["control_index"].values[row].tolist() == [1] * turns + [-1] * (TURNS - turns)
+        assert np.isnan(group["log_evidence"].values[row, turns:]).all()
+        wanted = np.array(last[turns - 1]["filtered"], np.float32)
+        assert np.array_equal(group["belief"].values[row], wanted)
+        for turn in range(turns):
+            evidence = group["log_evidence"].values[row, turn]
+            late = row == 2 and turn in (2, 3)  # written down before the late message came
+            assert late or evidence == np.float32(last[turn]["log_evidence"])
+    assert group_figures(group)["flown"] == 3
+    assert "early fallback" not in group_figures(group)
+    write_fleet_report(outcome.folder)
+    with fleet_file.open("a") as file:
+        file.write('[[group]]\nname = "south"\nscenario = "wing.toml"\nobservations = "none/*.csv"\n')
+    with pytest.raises(FleetError, match="no recording fits"):
+        fly_fleet(load_fleet(fleet_file), tmp_path / "other", Engine(0))
+
+
+def test_recordings_teach_what_the_flights_taught(fleet_file: Path, tmp_path: Path) -> None:
+    flown = ensemble(str(tmp_path / "wing.toml"), range(4))
+    fly_fleet(flown, tmp_path / "flown", Engine(0))
+    group = fleet_groups(tmp_path / "flown")["growing_damage"]
+    for row in range(4):
+        observed = group["observed"].values[row].astype(np.float64)
+        write_csv(tmp_path / "logs" / f"wing-{row}.csv", observed, group["control_index"].values[row])
+    fly_fleet(load_fleet(fleet_file), tmp_path / "recorded", Engine(0))
+    again = fleet_groups(tmp_path / "recorded")["north"]
+    assert np.array_equal(again["observed"].values, group["observed"].values)
+    np.testing.assert_allclose(again["mean"].values, group["mean"].values, atol=1e-4)
+    first, second = (learn_fleet(tmp_path / name).groups[0].grid.marginals for name in ("flown", "recorded"))
+    assert [m.mean for m in first] == [m.mean for m in second]
