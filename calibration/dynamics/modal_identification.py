@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
+from scipy.special import chdtri
 
 from calibration.errors import ExperimentDataError
 
@@ -33,11 +34,14 @@ LARGEST_RATIO = 0.3
 """A mode with more damping is none of a structure."""
 _MOST_LAGS = 40
 _SMALLEST_SHARE = 1e-2  # of the strongest mode, from which one is fitted to a free decay
+_FALSE_MODE = 1e-3
+"""Probability that noise alone is taken for a mode, over all frequencies where one could have been found."""
+_MOST_EVALUATIONS = 300  # of the least squares, for each unknown
 
 
 @dataclass(frozen=True)
 class IdentifiedModes:
-    """M modes at A accelerometers; NaN where no mode was found in a band.
+    """M modes at A accelerometers; NaN where a band shows no mode that noise alone would not show.
 
     Attributes
     ----------
@@ -95,7 +99,7 @@ def identify_modes(
     ------
     ExperimentDataError
         If the record holds values that are not finite or is too short, a band is none, or above half the
-        sampling rate.
+        sampling rate, or overlaps another.
     """
     record, limits = _checked(acceleration, sampling_rate, bands)
     lags = int(
@@ -135,6 +139,9 @@ def _checked(acceleration: ArrayLike, rate: float, bands: ArrayLike) -> tuple[Fl
         raise ExperimentDataError(
             f"{LARGEST_ORDER // 2} modes are identified at most, and {len(limits)} are asked for."
         )
+    rising = limits[np.argsort(limits[:, 0])]
+    if np.any(rising[1:, 0] < rising[:-1, 1]):
+        raise ExperimentDataError("bands overlap, and one mode could be found in two: part them.")
     dead = np.flatnonzero(np.ptp(record, axis=0) == 0.0)
     if dead.size:
         raise ExperimentDataError(
@@ -145,11 +152,15 @@ def _checked(acceleration: ArrayLike, rate: float, bands: ArrayLike) -> tuple[Fl
 
 @dataclass(frozen=True)
 class _Poles:
-    """Poles of an identified system with positive frequency: s [1/s] (P,), shapes (P, A), shares (P,)."""
+    """Poles of an identified system with positive frequency: s [1/s] (P,), shapes (P, A), shares (P,).
+
+    `seen` (P,) is what each takes off the sum of squares over the scatter, which is a chi-square of noise.
+    """
 
     pole: ComplexArray
     shape: ComplexArray
     share: FloatArray
+    seen: FloatArray
 
     def values(self, chosen: int) -> FloatArray:
         """Return frequency, damping ratio and relative shape of a pole."""
@@ -157,11 +168,19 @@ class _Poles:
         relative = (self.shape[chosen, 1:] / self.shape[chosen, 0]).real
         return np.array([abs(s) / (2.0 * np.pi), -s.real / abs(s), *relative])
 
-    def strongest(self, low: float, high: float) -> int | None:
-        """Return the pole in a band that the record shows most of; None without any."""
+    def strongest(self, low: float, high: float, places: int) -> int | None:
+        """Return the pole in a band that the record shows most of; None without one beyond noise."""
         frequency, ratio = np.abs(self.pole) / (2.0 * np.pi), -self.pole.real / np.abs(self.pole)
         inside = (frequency >= low) & (frequency <= high) & (ratio > 0.0) & (ratio < LARGEST_RATIO)
-        return int(np.argmax(np.where(inside, self.share, -1.0))) if inside.any() else None
+        if not inside.any():
+            return None
+        best = int(np.argmax(np.where(inside, self.share, -1.0)))
+        return best if self.beyond_noise(places)[best] else None
+
+    def beyond_noise(self, places: int) -> NDArray[np.bool_]:
+        """Return whether noise alone would hardly show so much at any of `places` frequencies (P,)."""
+        freedom = 2 + 4 * self.shape.shape[1]
+        return np.asarray(self.seen > chdtri(freedom, _FALSE_MODE / places))
 
     def nearest(self, pole: complex) -> int:
         """Return the pole that is nearest to a given one."""
@@ -190,8 +209,12 @@ class _Subspace:
         eigenvalue, vector = np.linalg.eig(transition.astype(np.complex128))
         return eigenvalue, vector, observability[:count] @ vector
 
-    def poles(self, order: int) -> tuple[_Poles, FloatArray]:
-        """Return the poles of the system of an order, and the correlations that it has."""
+    def poles(self, order: int, variance: FloatArray | None = None) -> tuple[_Poles, float]:
+        """Return the poles of the system of an order, and its mean square misfit over the variance.
+
+        `variance` (2 L, C, C) is that of the correlations; without it the misfit and what each pole takes
+        off it are NaN.
+        """
         eigenvalue, vector, shape = self._modal(self._left[:, :order])
         count = self._correlation.shape[1]
         control = np.sqrt(self._singular[:order])[:, None] * self._right[:count, :order].T
@@ -200,11 +223,14 @@ class _Subspace:
         model = np.asarray(np.einsum("cn,ln,nd->lcd", shape, powers, part).real)
         share = np.linalg.norm(shape, axis=0) * np.linalg.norm(part, axis=1) * np.linalg.norm(powers, axis=0)
         inside = eigenvalue.imag > 0.0
-        return _Poles(
-            np.asarray(np.log(eigenvalue[inside]) * self._rate, dtype=np.complex128),
-            shape.T[inside],
-            share[inside],
-        ), model
+        seen, misfit = np.full(inside.sum(), np.nan), np.nan
+        if variance is not None:
+            left = self._correlation - model
+            misfit = float(np.mean(left**2 / variance))
+            alone = 2.0 * np.einsum("cn,ln,nd->nlcd", shape[:, inside], powers[:, inside], part[inside]).real
+            seen = np.sum(((left + alone) ** 2 - left**2) / variance, axis=(1, 2, 3))
+        pole = np.asarray(np.log(eigenvalue[inside]) * self._rate, dtype=np.complex128)
+        return _Poles(pole, shape.T[inside], share[inside], seen), misfit
 
     def changed(self, change: FloatArray, order: int, step: float) -> _Poles:
         """Return the poles under a small change of the correlations; singular vectors to first order."""
@@ -217,7 +243,7 @@ class _Subspace:
         return _Poles(
             np.asarray(np.log(eigenvalue[inside]) * self._rate, dtype=np.complex128),
             shape.T[inside],
-            np.ones(inside.sum()),
+            *np.ones((2, inside.sum())),
         )
 
 
@@ -236,13 +262,13 @@ def _ambient(record: FloatArray, rate: float, bands: FloatArray, lags: int) -> I
     variance = each.var(axis=0, ddof=1) / BLOCKS
     subspace = _Subspace(whole, rate)
     for order in range(2 * len(bands), LARGEST_ORDER + 1, 2):
-        found, model = subspace.poles(order)
-        if np.mean((whole - model) ** 2 / variance) < 1.0:
+        found, misfit = subspace.poles(order, variance)
+        if misfit < 1.0:
             break
     width = 1 + record.shape[1]
     value = np.full((len(bands), width), np.nan)
     covariance = np.full((len(bands), width, width), np.nan)
-    chosen = [found.strongest(low, high) for low, high in bands]
+    chosen = [found.strongest(low, high, 2 * lags) for low, high in bands]
     each = _long_blocks(each, length / rate, [found.pole[pole] for pole in chosen if pole is not None])
     changed = [subspace.changed(one - whole, order, _STEP) for one in each]
     for mode, pole in enumerate(chosen):
@@ -276,29 +302,65 @@ def _decay(record: FloatArray, rate: float, bands: FloatArray, lags: int) -> Ide
     real = (ratio > 0.0) & (ratio < LARGEST_RATIO) & (start.share > _SMALLEST_SHARE * start.share.max())
     poles = start.pole[real]
     time = np.arange(len(record)) / rate
-    if not poles.size:
-        shape = (len(bands), 1 + record.shape[1])
-        return IdentifiedModes(np.full(shape, np.nan), np.full((*shape, shape[1]), np.nan))
+    # Most poles of noise are seen at once to be such; those that are left spoil the covariance of the others.
+    poles = poles[_at_poles(record, time, poles)[0].beyond_noise(len(record))]
+    while poles.size:
+        found, basis, left = _at_poles(record, time, _moved(record, time, poles))
+        ratio = -found.pole.real / np.abs(found.pole)
+        real = (ratio > 0.0) & (ratio < LARGEST_RATIO) & found.beyond_noise(len(record))
+        if real.all():
+            covariance = _decay_covariance(time, basis, found.pole, found.shape, left)
+            return _of_decay(found, covariance, bands, len(record))
+        poles = found.pole[real]
+    shape = (len(bands), 1 + record.shape[1])
+    return IdentifiedModes(np.full(shape, np.nan), np.full((*shape, shape[1]), np.nan))
+
+
+def _waves(pole: ComplexArray, time: FloatArray) -> FloatArray:
+    """Return the real and imaginary waves of P poles and an offset, (N, 2 P + 1)."""
+    wave = np.exp(np.minimum(pole.real, 0.0) * time[:, None] + 1j * pole.imag * time[:, None])
+    return np.hstack([wave.real, -wave.imag, np.ones((len(time), 1))])
+
+
+def _moved(record: FloatArray, time: FloatArray, poles: ComplexArray) -> ComplexArray:
+    """Return the poles whose waves fit best, begun at `poles`."""
     scale = np.abs(poles)
 
-    def waves(unknown: FloatArray) -> FloatArray:
-        pole = scale * (unknown[: poles.size] + 1j * unknown[poles.size :])
-        wave = np.exp(np.minimum(pole.real, 0.0) * time[:, None] + 1j * pole.imag * time[:, None])
-        return np.hstack([wave.real, -wave.imag, np.ones((len(time), 1))])  # an offset of each channel
+    def pole_of(unknown: FloatArray) -> ComplexArray:
+        return np.asarray(scale * (unknown[: poles.size] + 1j * unknown[poles.size :]))
 
     def residual(unknown: FloatArray) -> FloatArray:
-        orthogonal = np.linalg.qr(waves(unknown))[0]
+        orthogonal = np.linalg.qr(_waves(pole_of(unknown), time))[0]
         return np.asarray(record - orthogonal @ (orthogonal.T @ record)).ravel()
 
     first = np.concatenate([poles.real / scale, poles.imag / scale])
-    best = least_squares(residual, first, method="lm", xtol=1e-10, ftol=1e-10).x
-    basis = waves(best)
+    most = _MOST_EVALUATIONS * len(first)
+    return pole_of(least_squares(residual, first, method="lm", xtol=1e-10, ftol=1e-10, max_nfev=most).x)
+
+
+def _at_poles(
+    record: FloatArray, time: FloatArray, poles: ComplexArray
+) -> tuple[_Poles, FloatArray, FloatArray]:
+    """Return poles with the amplitudes (P, A) that fit best, their waves, and what is left (N, A)."""
+    basis = _waves(poles, time)
     coefficient = np.linalg.lstsq(basis, record, rcond=None)[0]
-    amplitude = coefficient[: poles.size] + 1j * coefficient[poles.size : -1]  # (P, A)
-    fitted = scale * (best[: poles.size] + 1j * best[poles.size :])
-    covariance = _decay_covariance(time, basis, fitted, amplitude, record - basis @ coefficient)
-    found = _Poles(fitted, amplitude, np.linalg.norm(amplitude, axis=1))
-    return _of_decay(found, covariance, bands)
+    amplitude = coefficient[: poles.size] + 1j * coefficient[poles.size : -1]
+    left = record - basis @ coefficient
+    seen = _seen_in_decay(basis, coefficient, left)
+    return _Poles(poles, amplitude, np.linalg.norm(amplitude, axis=1), seen), basis, left
+
+
+def _seen_in_decay(basis: FloatArray, coefficient: FloatArray, left: FloatArray) -> FloatArray:
+    """Return the squared amplitudes of each pole over their covariance, summed over the channels (P,)."""
+    count = len(coefficient) // 2
+    spread = np.linalg.pinv(basis.T @ basis)
+    variance = np.sum(left**2, axis=0) / (len(left) - len(coefficient))
+    seen = np.zeros(count)
+    for pole in range(count):
+        rows = [pole, count + pole]
+        weight = np.linalg.pinv(spread[np.ix_(rows, rows)])
+        seen[pole] = np.sum(np.einsum("ic,ij,jc->c", coefficient[rows], weight, coefficient[rows]) / variance)
+    return seen
 
 
 def _decay_covariance(
@@ -319,12 +381,12 @@ def _decay_covariance(
     return np.asarray(np.linalg.pinv(information / np.outer(size, size)) / np.outer(size, size))
 
 
-def _of_decay(found: _Poles, covariance: FloatArray, bands: FloatArray) -> IdentifiedModes:
+def _of_decay(found: _Poles, covariance: FloatArray, bands: FloatArray, samples: int) -> IdentifiedModes:
     count, channels = found.shape.shape
     value = np.full((len(bands), 1 + channels), np.nan)
     result = np.full((len(bands), 1 + channels, 1 + channels), np.nan)
     for mode, (low, high) in enumerate(bands):
-        pole = found.strongest(low, high)
+        pole = found.strongest(low, high, samples)
         if pole is None:
             continue
         s, amplitude = found.pole[pole], found.shape[pole]

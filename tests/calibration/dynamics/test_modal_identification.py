@@ -21,7 +21,7 @@ RATIO = np.array([0.01, 0.012, 0.015])
 SQUARES, SHAPES = np.linalg.eigh(STIFFNESS)
 OMEGA = np.sqrt(SQUARES)
 FREQUENCY = OMEGA / (2.0 * np.pi)
-BANDS = np.outer(FREQUENCY, (0.8, 1.2))
+BANDS = np.outer(FREQUENCY, (0.85, 1.15))
 TRUE = np.column_stack([FREQUENCY, RATIO, (SHAPES[1:] / SHAPES[0]).T])
 
 POLE = np.exp((-0.0003 + 1j) * 2.0 * np.pi * 5.0 / RATE)
@@ -67,6 +67,32 @@ def test_errors_are_those_of_the_records(kind: str, count: int) -> None:
     assert 0.6 < np.mean(np.square(white)) < 1.6
 
 
+@pytest.mark.parametrize(("kind", "samples"), [("ambient", 8000), ("decay", 1500)])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_noise_alone_has_no_mode(kind: str, samples: int, channels: int) -> None:
+    """At 1e-3 over all frequencies: 200 records of each gave none."""
+    for seed in range(8):
+        noise = np.random.default_rng([seed, channels]).standard_normal((samples, channels))
+        found = identify_modes(noise, RATE, BANDS, kind)  # type: ignore[arg-type]
+        assert np.isnan(found.value).all(), seed
+
+
+@pytest.mark.parametrize("kind", ["ambient", "decay"])
+def test_a_band_without_a_mode_stays_empty_beside_one_with(kind: str) -> None:
+    pole = np.exp((-0.01 + 1j) * OMEGA[0] / RATE)
+    for seed in range(4):
+        random = np.random.default_rng(seed)
+        if kind == "ambient":
+            moved = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], random.standard_normal(20_000))
+        else:
+            moved = (pole ** np.arange(1500)).real
+        seen = moved[:, None] * [1.0, 0.8, 0.5]
+        seen += 0.2 * seen.std() * random.standard_normal(seen.shape)
+        found = identify_modes(seen, RATE, BANDS, kind)  # type: ignore[arg-type]
+        assert np.isfinite(found.value[0]).all()
+        assert np.isnan(found.value[1:]).all()
+
+
 def test_a_record_without_noise_is_told_to_all_digits() -> None:
     """A free decay of one channel, sampled from its closed form."""
     time = np.arange(400) / RATE
@@ -90,6 +116,7 @@ def test_a_record_without_noise_is_told_to_all_digits() -> None:
         (np.zeros((5000, 1)), [[40.0, 60.0]], "nothing above 50 Hz"),
         (np.zeros((5000, 1)), [[1.0, 4.0]], "accelerometer 1 of the record shows one value"),
         (np.zeros((5000, 1)), [[1.0, 2.0]] * 13, "12 modes are identified at most"),
+        (np.ones((5000, 1)), [[1.0, 2.0], [1.9, 3.0]], "bands overlap"),
     ],
 )
 def test_what_cannot_be_told_is_refused(record_of: Float, bands: Any, sentence: str) -> None:
