@@ -343,7 +343,7 @@ def _at_poles(
 ) -> tuple[_Poles, FloatArray, FloatArray]:
     """Return poles with the amplitudes (P, A) that fit best, their waves, and what is left (N, A)."""
     basis = _waves(poles, time)
-    coefficient: FloatArray = np.linalg.lstsq(basis, record, rcond=None)[0]
+    coefficient = np.asarray(np.linalg.lstsq(basis, record, rcond=None)[0], dtype=np.float64)
     amplitude = coefficient[: poles.size] + 1j * coefficient[poles.size : -1]
     left = record - basis @ coefficient
     seen = _seen_in_decay(basis, coefficient, left)
