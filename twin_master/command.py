@@ -101,7 +101,8 @@ def run(
         run_ensemble(chosen, seeds, out, overrides, engine, replace=replace, report=report, json=json)
         return
     if workers is not None or cluster is not None:
-        raise typer.BadParameter("belongs to --seeds: one mission flies alone.", param_hint="--workers")
+        given = "--workers" if cluster is None else "--cluster"
+        raise typer.BadParameter("belongs to --seeds: one mission flies alone.", param_hint=given)
     if resume is not None:
         if out is not None or replace or overrides != Overrides():
             raise typer.BadParameter(

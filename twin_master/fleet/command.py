@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
+from reporting.words import counted
 from twin_master.fleet.watch_command import watch
 
 if TYPE_CHECKING:
@@ -89,11 +90,13 @@ def _show_lessons(record: dict[str, Any]) -> None:
 
     table = Table("group", "learnt", "assumed", "mean", "95 % interval", box=box.SIMPLE_HEAD)
     for name, group in record["groups"].items():
-        heading = f"{name}, {group['twins']} twins"
+        heading = f"{name}, {counted(group['twins'], 'twin')}"
         for control, rate in group["probability"].items():
-            interval = f"{rate['lower_95']:.4f} to {rate['upper_95']:.4f}"
+            mean, interval = f"{rate['mean']:.4f}", f"{rate['lower_95']:.4f} to {rate['upper_95']:.4f}"
+            if not rate["flown"]:
+                mean, interval = "", "not flown"
             learnt = f"probability to worsen, {control}"
-            table.add_row(heading, learnt, f"{rate['assumed']:.4f}", f"{rate['mean']:.4f}", interval)
+            table.add_row(heading, learnt, f"{rate['assumed']:.4f}", mean, interval)
             heading = ""
         rows = [("noise over the assumed", "1", group["noise_factor"])]
         if "population" in group:
@@ -221,8 +224,8 @@ def _table(figures: Figures) -> None:
 def _show(outcome: "FleetOutcome", figures: Figures) -> None:
     console = terminal.console()
     _table(figures)
-    kept = f", {outcome.shards_kept} shards were there" if outcome.shards_kept else ""
-    rate = f"{outcome.twins} twins in {outcome.seconds:.3g} s{kept}"
+    kept = f", {counted(outcome.shards_kept, 'shard')} there before" if outcome.shards_kept else ""
+    rate = f"{counted(outcome.twins, 'twin')} in {outcome.seconds:.3g} s{kept}"
     console.print(f"{rate}; {outcome.failed} failed in flight.", soft_wrap=True)
     for name, sentence in list(outcome.failures.items())[:SHOWN]:
         console.print(f"  {name}: {sentence}", soft_wrap=True, style="yellow")

@@ -29,6 +29,8 @@ from twin_master.fleet.store import FleetStore, written
 from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME, keep_knowledge
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
+from twin_master.mission.truth import Truth
+from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
@@ -162,7 +164,9 @@ def fleet_config(folder: Path) -> dict[str, Any]:
     path = folder / CONFIG_NAME
     found = read_json(path, RunFolderExistsError) if path.is_file() else None
     if not isinstance(found, dict) or found.get("kind") != KIND or not isinstance(found.get("fleet"), dict):
-        raise RunFolderExistsError(f"{folder} is not the folder of a fleet, so it is not touched.")
+        raise RunFolderExistsError(
+            f"{folder} is not the folder of a fleet." if folder.exists() else f"there is no folder {folder}."
+        )
     return found
 
 
@@ -249,8 +253,35 @@ def _check_group(group: Group, scenario: Scenario) -> None:
             f"`parameters` names {', '.join(unknown)}, and the model of a wing knows only "
             "young_modulus_factor."
         )
+    if flies_model(scenario):
+        _check_truth(group, scenario)
     if sizes_of(scenario) != sizes_of(group.scenarios[0]):
         raise FleetError("it has other states or sensors than the first asset of its group.")
+
+
+def _check_truth(group: Group, scenario: Scenario) -> None:
+    """Check that the model holds where the true assets are."""
+    from fe.reduction.settings import ReductionSettings
+
+    ranges, name = ReductionSettings(), "young_modulus_factor"
+    own = scenario.asset.true_parameters.get(name, 1.0)
+    e = np.array([member.parameters.get(name, own) for member in group.members])
+    states = np.zeros((1, len(scenario.state)))
+    if scenario.truth.kind == "scripted":
+        truth = Truth(scenario, build_graphical_model(scenario), group.members[0].seed)
+        states = np.array([truth.state(step, None, None) for step in range(scenario.mission.steps)])
+    found = [(name, e, ranges.young_modulus_factor, "assets")]
+    found += [
+        (factor.name, states[:, place], ranges.stiffness_loss, f"{scenario.mission.step_name}s")
+        for place, factor in enumerate(scenario.state)
+    ]
+    for what, values, (low, high), of in found:
+        outside = values[(values < low - 1e-12) | (values > high + 1e-12)]
+        if len(outside):
+            raise FleetError(
+                f"the true {what} of {len(outside)} of {len(values)} {of} is outside of {low:g} to {high:g}, "
+                f"where the model holds, such as {outside[0]:.4g}: let it vary less, or fly FMUs."
+            )
 
 
 def prepared(scenario: Scenario, folder: Path, progress: Progress, *, real: bool = False) -> bytes:
@@ -299,29 +330,41 @@ def _fly(fleet: Fleet, folder: Path, engine: Engine, store: FleetStore, progress
 
     def pieces() -> Iterator[Piece]:
         for piece in whole:
-            if piece.shard not in store.done:
-                yield _recorded(fleet.groups[piece.group], piece)
+            if piece.shard in store.done:
+                continue
+            group = fleet.groups[piece.group]
+            try:
+                if group.files:
+                    piece.kit()
+                ready = _recorded(group, piece)
+            except IN_FLIGHT as error:
+                if not group.files:
+                    raise
+                keep(piece, str(error))  # of one asset with a file of its own
+                continue
+            yield ready
+
+    def keep(piece: Piece, result: ShardResult | str) -> None:
+        group = fleet.groups[piece.group]
+        rows = slice(piece.members[0].row, piece.members[-1].row + 1)
+        if isinstance(result, str):
+            seed = np.array([piece.members[0].seed])
+            result = ShardResult({"status": np.array([FAILED]), "seed": seed}, {rows.start: result}, 0.0, "")
+        store.write(group.name, rows, result.arrays)
+        told = left[piece.shard]
+        told.twins -= len(piece.members)
+        told.seconds += result.seconds
+        names = {row: f"{group.name}/{group.members[row].name}" for row in result.failures}
+        told.failures |= {names[row]: sentence for row, sentence in result.failures.items()}
+        if not told.twins:
+            store.finish(piece.shard, {"failures": told.failures, "seconds": told.seconds})
 
     whole = list(_shards(fleet, kit))
     left = {piece.shard: _Left(len(piece.members)) for piece in whole}
     with progress.stage("Flying", total=fleet.size, unit="twins") as stage:
         stage.advance(sum(len(piece.members) for piece in whole if piece.shard in store.done))
         for piece, result in flown(engine, pieces(), progress):
-            group = fleet.groups[piece.group]
-            rows = slice(piece.members[0].row, piece.members[-1].row + 1)
-            if isinstance(result, str):
-                seed = np.array([piece.members[0].seed])
-                result = ShardResult(
-                    {"status": np.array([FAILED]), "seed": seed}, {rows.start: result}, 0.0, ""
-                )
-            store.write(group.name, rows, result.arrays)
-            told = left[piece.shard]
-            told.twins -= len(piece.members)
-            told.seconds += result.seconds
-            names = {row: f"{group.name}/{group.members[row].name}" for row in result.failures}
-            told.failures |= {names[row]: sentence for row, sentence in result.failures.items()}
-            if not told.twins:
-                store.finish(piece.shard, {"failures": told.failures, "seconds": told.seconds})
+            keep(piece, result)
             stage.advance(len(piece.members))
 
 

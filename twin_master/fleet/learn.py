@@ -16,6 +16,7 @@ from twin_master.errors import FleetError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import GROUPS, fleet_config, source_of
 from twin_master.fleet.outcome import FLOWN
+from twin_master.fleet.population import Line, population
 from twin_master.fleet.posterior import POINTS, Grid, Marginal, Shared, refined, shared
 from twin_master.fleet.store import open_group
 from twin_master.mission.kept_knowledge import kept_knowledge
@@ -30,41 +31,10 @@ Index = NDArray[np.int64]
 
 NOISE_TWINS = 100
 """Twins of a group from which the noise is learnt: they know it to one part in a few hundred."""
-FEWEST_TWINS = 5
-"""Of a group, to tell mean and spread of a parameter over its assets: fewer hardly tell a spread."""
 LARGEST_NOISE = 3.0
 """Factor on the assumed noise, and one over it, up to which is looked."""
 NODES, NODE_DEVIATIONS = 61, 6.0
 """Values of the parameter, and how many deviations of its calibration they reach to either side."""
-
-
-@dataclass(frozen=True)
-class Line:
-    """Posterior of one figure on equally spaced values.
-
-    Attributes
-    ----------
-    values, weight : (n,)
-    """
-
-    values: Float
-    weight: Float
-
-    @property
-    def mean(self) -> float:
-        """Mean."""
-        return float(self.weight @ self.values)
-
-    @property
-    def standard_deviation(self) -> float:
-        """Standard deviation."""
-        return float(np.sqrt(self.weight @ (self.values - self.mean) ** 2))
-
-    def interval(self, probability: float = 0.95) -> tuple[float, float]:
-        """Return the bounds of the central interval: half of a value's weight lies below it."""
-        below = np.cumsum(self.weight) - 0.5 * self.weight
-        low, high = np.interp([0.5 - probability / 2.0, 0.5 + probability / 2.0], below, self.values)
-        return float(low), float(high)
 
 
 @dataclass(frozen=True)
@@ -86,6 +56,8 @@ class GroupLessons:
         That is calibrated.
     population : tuple of Line or None
         Mean and spread of it over the assets, SI; None where its calibration is fixed.
+    flown : frozenset of str
+        The controls under which a turn was followed by another.
     """
 
     name: str
@@ -96,6 +68,7 @@ class GroupLessons:
     noise: Line
     parameter: str
     population: tuple[Line, Line] | None
+    flown: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -121,6 +94,13 @@ class FleetLessons:
     def probabilities(self, group: int) -> tuple[Marginal, ...]:
         """Return the posterior of each probability of a group, under what the groups share."""
         return self.groups[group].grid.marginals if self.shared is None else self.shared.groups[group]
+
+    def flown(self, group: int) -> tuple[bool, ...]:
+        """Return whether anything can be learnt of each probability of a group."""
+        own = self.groups[group]
+        sharing = [own] if self.shared is None else self.groups
+        known = frozenset[str]().union(*(each.flown for each in sharing))
+        return tuple(control in known for control, _ in own.worsening.keys)
 
 
 def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> FleetLessons:
@@ -167,6 +147,7 @@ class _Seen:
     control: Index
     folder: Path
     real: bool
+    controls: frozenset[str]
 
 
 def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
@@ -207,12 +188,14 @@ def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
             "learnt of it; look at its model and its noise."
         )
     own = None
-    if nodes is not None and twins >= FEWEST_TWINS:
+    if nodes is not None:
         spread, seen = models[0].total_standard_deviation, (parts[0].observed, parts[0].control)
-        own = population(nodes.values, node_evidence(worsening, learnt, nodes.predicted, spread, *seen))
+        each = node_evidence(worsening, learnt, nodes.predicted, spread, *seen)
+        own = population(nodes.values, each, parts[0].knowledge.draws.standard_deviation)
     left_out = sum(len(kept) for kept in explained) - twins
     parameter = parts[0].knowledge.draws.name
-    return GroupLessons(record["name"], twins, left_out, worsening, grid, noise, parameter, own)
+    flown = frozenset[str]().union(*(part.controls for part in parts))
+    return GroupLessons(record["name"], twins, left_out, worsening, grid, noise, parameter, own, flown)
 
 
 def _seen(folder: Path, record: dict[str, Any]) -> Iterator[_Seen]:
@@ -223,7 +206,8 @@ def _seen(folder: Path, record: dict[str, Any]) -> Iterator[_Seen]:
         return
     observed = group["observed"].values[flown].astype(np.float64)
     # Behind the end of a recording nothing is observed, so that any control says the same.
-    control = np.maximum(group["control_index"].values[flown], 0).astype(np.int64)
+    given = group["control_index"].values[flown].astype(np.int64)
+    control = np.maximum(given, 0)
     for place, table in enumerate(record["scenarios"]):
         own = folder / GROUPS / record["name"]
         mine = np.arange(len(flown))
@@ -232,7 +216,9 @@ def _seen(folder: Path, record: dict[str, Any]) -> Iterator[_Seen]:
         if len(mine):
             scenario = located_scenario(Scenario.model_validate(table), own)
             known = kept_knowledge(own, scenario)
-            yield _Seen(known, observed[mine], control[mine], own, "recordings" in record)
+            followed = np.unique(given[mine][:, :-1][given[mine][:, 1:] >= 0])
+            controls = frozenset(scenario.control_names[index] for index in followed)
+            yield _Seen(known, observed[mine], control[mine], own, "recordings" in record, controls)
 
 
 @dataclass(frozen=True)
@@ -307,35 +293,3 @@ def _line(log_likelihood: Callable[[float], float], low: float, high: float) -> 
             return Line(np.exp(x), weight)
         step = x[1] - x[0]
         low, high = x[inside[0]] - step, x[inside[-1]] + step
-
-
-def population(nodes: Float, log_evidence: Float) -> tuple[Line, Line]:
-    """Return the posterior of mean and spread of a normal population.
-
-    Parameters
-    ----------
-    nodes : (E,)
-        Equally spaced values of the parameter.
-    log_evidence : (B, E)
-        Of each of B members at each value.
-    """
-    from scipy.interpolate import CubicSpline
-
-    reach = nodes[-1] - nodes[0]
-    fine = np.linspace(nodes[0], nodes[-1], 8 * (len(nodes) - 1) + 1)
-    known = log_evidence[np.isfinite(log_evidence).all(axis=1)]
-    known = np.maximum(known - known.max(axis=1, keepdims=True), -700.0)
-    likelihood = np.exp(CubicSpline(nodes, known, axis=1)(fine))
-    likelihood /= likelihood.sum(axis=1, keepdims=True)
-    best = likelihood @ fine
-    middle, wide = float(best.mean()), float(best.std())
-    reach_of_mean = max(6.0 * (wide + (fine[1] - fine[0])) / np.sqrt(len(known)), 3.0 * (fine[1] - fine[0]))
-    means = np.linspace(middle - reach_of_mean, middle + reach_of_mean, 41)
-    spreads = np.linspace(1.5 * (fine[1] - fine[0]), max(2.5 * wide, reach / 20.0), 41)
-    density = np.empty((len(means), len(spreads)))
-    for column, spread in enumerate(spreads):
-        weight = np.exp(-0.5 * ((fine[:, None] - means) / spread) ** 2) / spread
-        density[:, column] = np.log(np.maximum(likelihood @ weight, 1e-300)).sum(axis=0)
-    joint = np.exp(density - density.max())
-    joint /= joint.sum()
-    return Line(means, joint.sum(axis=1)), Line(spreads, joint.sum(axis=0))

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from reporting.files import atomic_write_text
-from twin_master.fleet.learn import FleetLessons, GroupLessons, Line
+from twin_master.fleet.learn import FleetLessons
+from twin_master.fleet.population import Line
 from twin_master.fleet.posterior import Marginal
 
 __all__ = ["LESSONS_NAME", "lessons_record", "write_learnt"]
@@ -33,17 +34,21 @@ def write_learnt(path: Path, lessons: FleetLessons) -> Path:
     means = [marginal.mean for marginal in lessons.probabilities(largest)]
     if lessons.shared is not None:
         means = [mean for mean, _ in lessons.shared.mean]
-    lines += _tables(lessons, lessons.groups[largest], means, "")
+    lines += _tables(lessons, largest, means, "")
     if len(lessons.groups) > 1:
         for number, group in enumerate(lessons.groups):
             own = [marginal.mean for marginal in lessons.probabilities(number)]
-            lines += _tables(lessons, group, own, f"group.{group.name}.")
+            lines += _tables(lessons, number, own, f"group.{group.name}.")
     return atomic_write_text(path, "\n".join(lines))
 
 
-def _tables(lessons: FleetLessons, group: GroupLessons, means: list[float], prefix: str) -> list[str]:
+def _tables(lessons: FleetLessons, number: int, means: list[float], prefix: str) -> list[str]:
+    group = lessons.groups[number]
     probability: dict[str, Any] = {}
-    for (control, factor), mean in zip(group.worsening.keys, means, strict=True):
+    assumptions = group.worsening.assumed.tolist()
+    told = zip(group.worsening.keys, means, assumptions, lessons.flown(number), strict=True)
+    for (control, factor), learnt, assumed, flown in told:
+        mean = learnt if flown else assumed  # of a control that never flew nothing was learnt
         if factor is None:
             probability[control] = mean
         else:
@@ -54,7 +59,7 @@ def _tables(lessons: FleetLessons, group: GroupLessons, means: list[float], pref
     lines += [f"[{prefix}observation]", f"standard_deviation = {json.dumps(noise)}", ""]
     if group.population is not None:
         middle, spread = group.population
-        total = float(np.hypot(spread.mean, middle.standard_deviation))
+        total = float(np.hypot(np.hypot(spread.mean, spread.standard_deviation), middle.standard_deviation))
         lines += [f"[{prefix}calibration]", f"parameter = {json.dumps(group.parameter)}"]
         lines += [f"mean = {middle.mean!r}", f"standard_deviation = {total!r}", ""]
     return lines
@@ -74,9 +79,13 @@ def lessons_record(lessons: FleetLessons) -> dict[str, Any]:
     groups = {}
     for number, group in enumerate(lessons.groups):
         rates = {
-            name: {"assumed": float(assumed), **_figures(marginal)}
-            for name, assumed, marginal in zip(
-                group.worsening.names, group.worsening.assumed, lessons.probabilities(number), strict=True
+            name: {"assumed": float(assumed), "flown": flown, **_figures(marginal)}
+            for name, assumed, flown, marginal in zip(
+                group.worsening.names,
+                group.worsening.assumed,
+                lessons.flown(number),
+                lessons.probabilities(number),
+                strict=True,
             )
         }
         found: dict[str, Any] = {"twins": group.twins, "left_out": group.unexplained, "probability": rates}

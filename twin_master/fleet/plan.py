@@ -29,6 +29,10 @@ SHARD = 256
 """Twins that are flown in one piece, unless the file says otherwise."""
 
 
+LARGEST = 1_000_000
+"""Twins of a group, or of an ensemble."""
+
+
 class Spread(Section):
     """A parameter of the true assets: normally distributed over the group."""
 
@@ -41,7 +45,7 @@ class GroupSection(Section):
 
     name: Name
     scenario: Annotated[str, Field(min_length=1)]
-    count: Count | None = None
+    count: Annotated[int, Field(strict=True, ge=1, le=LARGEST)] | None = None
     fmus: str | None = None
     """A pattern of files: one asset for each FMU."""
     calibrations: str | None = None
@@ -243,7 +247,10 @@ def seed_range(text: str) -> range:
     first, colon, end = text.partition(":")
     if not (colon and first.isdecimal() and end.isdecimal() and int(first) < int(end)):
         raise FleetError(f"--seeds is FIRST:END, as in 0:1000 for the seeds 0 to 999, and `{text}` came.")
-    return range(int(first), int(end))
+    found = range(int(first), int(end))
+    if len(found) > LARGEST:
+        raise FleetError(f"--seeds has {len(found)} seeds, and a fleet {LARGEST} twins at most: fly several.")
+    return found
 
 
 def _group(section: GroupSection, folder: Path, seed: int) -> Group:

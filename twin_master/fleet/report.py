@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from reporting import figures as style
 from reporting.files import atomic_write_text
 from reporting.page import Column, Page, Table
+from reporting.words import counted
 from twin_master.errors import TwinMasterError
 from twin_master.fleet.flight import GROUPS, RESULT_NAME, fleet_config
 from twin_master.fleet.lessons import LESSONS_NAME
@@ -75,7 +76,7 @@ def write_fleet_report(folder: Path | str) -> Path:
     twins = sum(group.sizes["twin"] for group in groups.values())
     page = Page(
         fleet["title"] or fleet["name"],
-        f"{twins} assets in {len(groups)} group{'s' if len(groups) > 1 else ''}, seed {fleet['seed']}",
+        f"{counted(twins, 'asset')} in {counted(len(groups), 'group')}, seed {fleet['seed']}",
     )
     page.add_section("The fleet")
     _figures(page, groups)
@@ -117,6 +118,11 @@ def _lessons(page: Page, record: dict[str, Any]) -> None:
     for name, group in record["groups"].items():
         for control, rate in group["probability"].items():
             interval = f"{rate['lower_95']:.4f} to {rate['upper_95']:.4f}"
+            if not rate["flown"]:
+                rows.append(
+                    [name, f"probability to worsen, {control}", f"{rate['assumed']:.4f}", "", "not flown"]
+                )
+                continue
             off = not rate["lower_95"] <= rate["assumed"] <= rate["upper_95"]
             assumed = f"{rate['assumed']:.4f}{' (outside)' if off else ''}"
             rows.append([name, f"probability to worsen, {control}", assumed, f"{rate['mean']:.4f}", interval])

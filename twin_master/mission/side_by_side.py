@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.errors import CalibrationError
 from fe.runtime.errors import FiniteElementError
 from fmu_asset.errors import FmuError
 from twin_master.assets.interface import Asset, StatelessAsset
@@ -26,7 +27,7 @@ __all__ = ["Flights", "fly_one_by_one", "fly_side_by_side"]
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-IN_FLIGHT = (TwinMasterError, FmuError, FiniteElementError, OSError)
+IN_FLIGHT = (TwinMasterError, FmuError, FiniteElementError, CalibrationError, OSError)
 """What may end the flight of one asset, and not that of the others."""
 
 

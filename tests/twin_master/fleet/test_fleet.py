@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from calibration.errors import PosteriorError
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, NotResumableError, RunFolderExistsError
 from twin_master.fleet.engine import Engine
@@ -109,6 +110,8 @@ def test_a_folder_keeps_what_it_holds(library_file: Path, tmp_path: Path) -> Non
         fly_fleet(fleet, tmp_path / "fleet")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.txt").touch()
+    with pytest.raises(RunFolderExistsError, match="there is no folder"):
+        fleet_groups(tmp_path / "nowhere")
     with pytest.raises(RunFolderExistsError, match="not the folder of a fleet"):
         fly_fleet(fleet, tmp_path / "other", replace_old=True)
     assert fly_fleet(growing(library_file, count=3), tmp_path / "fleet", replace_old=True).twins == 3
@@ -185,10 +188,48 @@ def test_all_assets_that_cannot_fly_are_in_one_list(fleet_file: Path) -> None:
     assert not (fleet_file.parent / "out").exists()
 
 
-@pytest.mark.parametrize("text", ["7", "3:3", "5:1", "a:b", "-1:4", "1:2:3"])
+@pytest.mark.parametrize("text", ["7", "3:3", "5:1", "a:b", "-1:4", "1:2:3", "0:1000000000000"])
 def test_seeds_are_a_range(text: str) -> None:
-    with pytest.raises(FleetError, match="FIRST:END"):
+    with pytest.raises(FleetError, match=r"FIRST:END|1000000 twins at most"):
         seed_range(text)
+
+
+def test_a_truth_beyond_the_model_is_refused(fleet_file: Path) -> None:
+    fleet_file.write_text(FLEET.replace("mean = 1.0,", "mean = 1.3,"))
+    with pytest.raises(FleetError, match=r"south: the true young_modulus_factor of 2 of 2 assets is outside"):
+        fly_fleet(load_fleet(fleet_file), fleet_file.parent / "out")
+    loss = '[[truth.gains]]\nstate = "z1"\nfirst_step = 0\nlast_step = 49\ngain_percent = 5\n\n[truth.noise]'
+    north = fleet_file.parent / "north.toml"
+    text = north.read_text().replace('kind = "random_growth"', 'kind = "scripted"')
+    north.write_text(text.replace("[truth.noise]", loss))
+    fleet_file.write_text(FLEET)
+    with pytest.raises(FleetError, match=r"north: the true z1 of 3\d of 50 .* is outside of 0 to 0.8"):
+        fly_fleet(load_fleet(fleet_file), fleet_file.parent / "out")
+    assert not (fleet_file.parent / "out").exists()
+
+
+def test_one_calibration_that_fails_costs_its_own_asset(
+    fleet_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from twin_master.fleet import flight
+
+    for name in ("a", "b"):
+        (fleet_file.parent / f"{name}.fmu").write_bytes(b"for its name alone")
+    north = FLEET.split('[[group]]\nname = "south"')[0]
+    fleet_file.write_text(north.replace("count = 3", 'fmus = "*.fmu"'))
+    flown = []
+
+    def preparing(scenario: Any, folder: Path, *args: Any, **given: Any) -> bytes:
+        flown.append(folder.name)
+        if folder.name == "0":
+            raise PosteriorError("no posterior.")
+        return b"kit"
+
+    monkeypatch.setattr(flight, "prepared", preparing)
+    monkeypatch.setattr(flight, "_check", lambda _fleet: None)
+    monkeypatch.setattr("twin_master.fleet.engine.fly_shard", lambda _kit, members: "it was flown")
+    outcome = fly_fleet(load_fleet(fleet_file), fleet_file.parent / "out", Engine(0))
+    assert outcome.failures == {"north/a": "no posterior.", "north/b": "it was flown"}
 
 
 def test_nobody_answers(library_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

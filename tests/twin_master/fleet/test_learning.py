@@ -12,9 +12,10 @@ from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import fly_fleet, group_folder
-from twin_master.fleet.learn import learn_fleet, population
+from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.lessons import lessons_record, write_learnt
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
+from twin_master.fleet.population import population
 from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, points_of, refined, shared
 from twin_master.fleet.report import attention, write_fleet_report
 from twin_master.mission.kept_knowledge import kept_knowledge
@@ -181,13 +182,29 @@ def test_a_population_is_that_of_normal_members() -> None:
     nodes = np.linspace(0.94, 1.06, 61)
     own, blur = 1.01 + 0.01 * generator.standard_normal(400), 0.004
     seen = own + blur * generator.standard_normal(400)
-    mean, spread = population(nodes, -0.5 * ((nodes - seen[:, None]) / blur) ** 2)
+    mean, spread = population(nodes, -0.5 * ((nodes - seen[:, None]) / blur) ** 2, 0.01)
     assert mean.mean == pytest.approx(seen.mean(), abs=2e-5)
     assert mean.standard_deviation == pytest.approx(np.std(seen) / 20.0, rel=0.05)
     half = 1.96 * mean.standard_deviation
     assert mean.interval() == pytest.approx((mean.mean - half, mean.mean + half), abs=0.1 * half)
     assert 0.0 < spread.interval()[0] < spread.mean < spread.interval()[1]
     assert spread.mean == pytest.approx(np.sqrt(np.var(seen) - blur**2), rel=0.02)
+
+
+@pytest.mark.parametrize("members", [2, 5])
+def test_a_population_of_few_is_told_with_its_doubt(members: int) -> None:
+    """95 % intervals hold the truth, for spreads from nothing to more than expected."""
+    generator = np.random.default_rng(members)
+    nodes, blur, scale, fleets = np.linspace(0.94, 1.06, 31), 0.004, 0.01, 80
+    held = np.zeros(2)
+    for _ in range(fleets):
+        truth = 1.0 + 0.01 * generator.uniform(-1.0, 1.0), scale * abs(generator.standard_t(4))
+        own = truth[0] + truth[1] * generator.standard_normal(members)
+        seen = own + blur * generator.standard_normal(members)
+        for which, line in enumerate(population(nodes, -0.5 * ((nodes - seen[:, None]) / blur) ** 2, scale)):
+            low, high = line.interval()
+            held[which] += low <= truth[which] <= high
+    assert (held >= 71).all(), held  # 76 expected, with a deviation of 1.9
 
 
 def test_points_are_those_of_the_axes() -> None:

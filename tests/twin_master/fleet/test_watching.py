@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.learn import learn_fleet
+from twin_master.fleet.lessons import lessons_record, write_learnt
 from twin_master.fleet.plan import ensemble, load_fleet
 from twin_master.fleet.reading import fleet_groups, group_figures
 from twin_master.fleet.report import write_fleet_report
@@ -225,6 +227,12 @@ def test_recordings_are_flown_as_a_fleet(fleet_file: Path, alone: list[bytes], t
             assert late or evidence == np.float32(last[turn]["log_evidence"])
     assert group_figures(group)["flown"] == 3
     assert "early fallback" not in group_figures(group)
+    lessons = learn_fleet(outcome.folder)
+    assert lessons_record(lessons)["groups"]["north"]["probability"]["2g"]["flown"] is False
+    write_learnt(tmp_path / "learnt.toml", lessons)
+    probability = tomllib.loads((tmp_path / "learnt.toml").read_text())["transition"]["probability"]
+    assert probability["2g"] == 0.05  # as it was assumed
+    assert probability["3g"] != 0.10
     write_fleet_report(outcome.folder)
     with fleet_file.open("a") as file:
         file.write('[[group]]\nname = "south"\nscenario = "wing.toml"\nobservations = "none/*.csv"\n')
