@@ -34,7 +34,7 @@ def model_description(
     enumerations: Sequence[EnumerationType] = ENUMERATIONS,
     dependencies: Mapping[str, Sequence[str]] | None = None,
 ) -> bytes:
-    """Return modelDescription.xml of an FMI 2.0 co-simulation FMU.
+    """Return modelDescription.xml of an FMI 2.0 FMU: for co-simulation, or with states for model exchange.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def model_description(
     guid : str
         Globally unique identifier, here a hash of the content.
     table : sequence of FmuVariable
-        The variables, in order of their value reference.
+        The variables, in order of their value reference. Local ones are states, and then as many derivatives.
     description, version, generation_tool : str
         Attributes of the root element. There is no generation date: equal content gives equal bytes.
     source_files : sequence of str
@@ -71,23 +71,9 @@ def model_description(
         variableNamingConvention="structured",
         numberOfEventIndicators="0",
     )
-    interface = SubElement(
-        root,
-        "CoSimulation",
-        modelIdentifier=identifier,
-        needsExecutionTool="false" if source_files else "true",
-        canHandleVariableCommunicationStepSize="true",
-        canInterpolateInputs="false",
-        canBeInstantiatedOnlyOncePerProcess="false",
-        canNotUseMemoryManagementFunctions="true",
-        canGetAndSetFMUstate="true",
-        canSerializeFMUstate="true",
-    )
-    if source_files:
-        interface.set("providesDirectionalDerivative", "true")
-        listed = SubElement(interface, "SourceFiles")
-        for name in source_files:
-            SubElement(listed, "File", name=name)
+    local = [row for row in table if row.causality == "local"]
+    derivatives = local[len(local) // 2 :]
+    _add_interface(root, identifier, source_files, exchange=bool(local))
     add_units(root, units)
     _add_types(root, enumerations)
     categories = SubElement(root, "LogCategories")
@@ -96,10 +82,36 @@ def model_description(
     SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="50.0", stepSize="1.0")
     variables = SubElement(root, "ModelVariables")
     for row in table:
-        variables.append(_scalar_variable(row))
-    _add_structure(root, table, dependencies)
+        element = _scalar_variable(row)
+        if row in derivatives:
+            element[0].set("derivative", str(row.reference + 1 - len(derivatives)))
+        variables.append(element)
+    _add_structure(root, table, dependencies, derivatives)
     indent(root)
     return bytes(tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
+
+
+def _add_interface(root: Element, identifier: str, source_files: Sequence[str], *, exchange: bool) -> None:
+    own = {"completedIntegratorStepNotNeeded": "true"}
+    if not exchange:
+        own = {"canHandleVariableCommunicationStepSize": "true", "canInterpolateInputs": "false"}
+    interface = SubElement(
+        root,
+        "ModelExchange" if exchange else "CoSimulation",
+        modelIdentifier=identifier,
+        needsExecutionTool="false" if source_files else "true",
+        canBeInstantiatedOnlyOncePerProcess="false",
+        canNotUseMemoryManagementFunctions="true",
+        canGetAndSetFMUstate="true",
+        canSerializeFMUstate="true",
+    )
+    for attribute, value in own.items():
+        interface.set(attribute, value)
+    if source_files:
+        interface.set("providesDirectionalDerivative", "true")
+        listed = SubElement(interface, "SourceFiles")
+        for name in source_files:
+            SubElement(listed, "File", name=name)
 
 
 def add_units(root: Element, units: Sequence[Unit]) -> None:
@@ -122,18 +134,28 @@ def _add_types(root: Element, enumerations: Sequence[EnumerationType]) -> None:
 
 
 def _add_structure(
-    root: Element, table: Sequence[FmuVariable], dependencies: Mapping[str, Sequence[str]] | None
+    root: Element,
+    table: Sequence[FmuVariable],
+    dependencies: Mapping[str, Sequence[str]] | None,
+    derivatives: Sequence[FmuVariable],
 ) -> None:
     structure = SubElement(root, "ModelStructure")
     index = {row.name: row.reference + 1 for row in table}
-    for name in ("Outputs", "InitialUnknowns"):
+    outputs = [row for row in table if row.causality == "output"]
+    unknown_rows = {
+        "Outputs": outputs,
+        "Derivatives": derivatives,
+        "InitialUnknowns": [row for row in table if row.causality in ("output", "local")],
+    }
+    for name, rows in unknown_rows.items():
+        if not rows:
+            continue
         unknowns = SubElement(structure, name)
-        for row in table:
-            if row.causality == "output":
-                unknown = SubElement(unknowns, "Unknown", index=str(index[row.name]))
-                if name == "Outputs" and dependencies is not None and row.name in dependencies:
-                    inputs = sorted(index[source] for source in dependencies[row.name])
-                    unknown.set("dependencies", " ".join(map(str, inputs)))
+        for row in rows:
+            unknown = SubElement(unknowns, "Unknown", index=str(index[row.name]))
+            if name == "Outputs" and dependencies is not None and row.name in dependencies:
+                inputs = sorted(index[source] for source in dependencies[row.name])
+                unknown.set("dependencies", " ".join(map(str, inputs)))
 
 
 _WRITERS: Mapping[str, Callable[[float], str]] = {
@@ -182,6 +204,7 @@ def documentation_page(
     enumerations: Sequence[EnumerationType] = ENUMERATIONS,
     host: str = "It runs in a Python host that has NumPy.",
     fmi: int = 2,
+    interface: str = "co-simulation",
 ) -> bytes:
     """Return documentation/index.html: what the FMU is and its variables, as UTF-8 without any request."""
     rows = []
@@ -204,7 +227,7 @@ def documentation_page(
 <style>body{{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}}
 td,th{{text-align:left;padding:.2em .8em .2em 0;border-bottom:1px solid #ddd}}</style></head><body>
 <h1>{model_name}</h1><p>{escape(description)}</p>
-<p>FMI {fmi}.0 co-simulation. {escape(host)} A call that is refused logs why, sets
+<p>FMI {fmi}.0 {interface}. {escape(host)} A call that is refused logs why, sets
 <code>status</code> and leaves state and outputs as they were; a refused step returns fmi{fmi}Discard.</p>
 <table><tr><th>variable</th><th>causality</th><th>unit</th><th>range</th><th>start</th><th>meaning</th></tr>
 {body}

@@ -16,6 +16,11 @@ from uav_twin.structure_fmu import fmu as build_structure
 _SWITCH = re.compile(r"effect\.[A-Za-z0-9_]+\.active")
 """The switch of a missing effect among the variables of an FMU."""
 
+_Form = tuple[
+    Literal["python", "compiled", "source"], Literal[2, 3], Literal["co-simulation", "model-exchange"]
+]
+"""Kind, version of FMI and interface."""
+
 fmu_app = typer.Typer(no_args_is_help=True, help="Build, describe, bind, check and simulate FMUs.")
 
 
@@ -34,6 +39,10 @@ def build(
         typer.Option(help="Run by Python, compiled C, or C sources to be compiled elsewhere."),
     ] = "python",
     fmi: Annotated[int, typer.Option(min=2, max=3, help="Version of FMI: 3 for compiled and source.")] = 2,
+    interface: Annotated[
+        Literal["co-simulation", "model-exchange"],
+        typer.Option(help="How it is run; in model exchange a compiled wing has its modes as states."),
+    ] = "co-simulation",
     calibration: Annotated[
         Path | None,
         typer.Option(help="Tailor it to a wing: the calibration.nc of `uav-twin calibrate`."),
@@ -53,28 +62,27 @@ def build(
 ) -> None:
     """Pack a wing, a structure or a model script as an FMU; equal input gives equal bytes."""
     if script is None and calibration is None and design is not None and is_structure(design):
-        if patch is not None or activate:
-            raise typer.BadParameter("--patch and --activate are for wings, and the design is a structure.")
+        if patch is not None or activate or interface != "co-simulation":
+            raise typer.BadParameter(
+                "--patch, --activate and --interface are for wings, and the design is a structure."
+            )
         build_structure(design, out, kind, fmi, None, None, replace, None)
         return
     out = out or Path("uav_wing.fmu")
     _refuse_contradictions(out, design, calibration, patch, activate=activate, replace=replace)
     if script is not None:
-        for_the_wing = (
-            design is not None or calibration is not None or kind != "python" or patch is not None or fmi != 2
-        )
+        plain = (kind, fmi, interface) == ("python", 2, "co-simulation")
+        for_the_wing = design is not None or calibration is not None or patch is not None or not plain
         _build_script(script, out, replace=replace, other=for_the_wing)
         return
-    _build_wing(
-        out, design, kind, 3 if fmi == 3 else 2, calibration, patch, activate=activate, replace=replace
-    )
+    form: _Form = (kind, 3 if fmi == 3 else 2, interface)
+    _build_wing(out, design, form, calibration, patch, activate=activate, replace=replace)
 
 
 def _build_wing(
     out: Path,
     design: Path | None,
-    kind: Literal["python", "compiled", "source"],
-    fmi: Literal[2, 3],
+    form: _Form,
     calibration: Path | None,
     patch: Path | None,
     *,
@@ -88,7 +96,8 @@ def _build_wing(
     from fmu_asset.packing.wing_fmu import check_kind, check_version
     from fmu_asset.packing.wing_packing import pack_wing
 
-    check_version(kind, fmi)
+    kind, fmi, interface = form
+    check_version(kind, fmi, interface)
     effects = None if patch is None else load_patch(patch)
     if effects is not None:
         check_kind(kind)
@@ -111,6 +120,7 @@ def _build_wing(
         patch=effects,
         activate=activate,
         fmi=fmi,
+        interface=interface,
         replace=replace,
         progress=terminal.progress(),
     )
@@ -146,7 +156,8 @@ def _build_script(script: str, out: Path, *, replace: bool, other: bool) -> None
 
     if other:
         raise typer.BadParameter(
-            "--design, --calibration, --patch, --kind and --fmi are for the wing.", param_hint="--script"
+            "--design, --calibration, --patch, --kind, --fmi and --interface are for the wing.",
+            param_hint="--script",
         )
     built = build_script_fmu(asset_scripts().get(script, Path(script)), out, replace=replace)
     terminal.say(f"{built.path}: {built.size / 1024:.0f} KiB, GUID {built.guid}")

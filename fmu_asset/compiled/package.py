@@ -12,12 +12,14 @@ from fe.runtime.structure_arrays import StructureArrays
 from fmu_asset.archive.design_record import DESIGN_RECORD, design_record
 from fmu_asset.description import documentation_page, model_description
 from fmu_asset.errors import FmuBuildError
+from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
 from .arrays import arrays_of
 from .compiler import PLATFORM, compile_library
 from .data_file import data_file_bytes
 from .description3 import build_description, model_description3
+from .exchange import exchange_table
 from .variable_header import Roles, variable_sources
 
 DATA_FILE = "resources/reduced_model.bin"
@@ -63,6 +65,7 @@ def compiled_members(
     content_tag: str,
     description: str,
     fmi: FmiVersion = 2,
+    interface: Interface = "co-simulation",
 ) -> dict[str, bytes]:
     """Return the files of a compiled FMU, all but its binary.
 
@@ -85,6 +88,8 @@ def compiled_members(
     fmi : {2, 3}
         Version of FMI: the same sources but for its functions. In 3 numbered variables, and inputs and
         outputs such as `health.z1`, pass as arrays.
+    interface : {"co-simulation", "model-exchange"}
+        How it is run; model exchange in FMI 2.
 
     Returns
     -------
@@ -96,11 +101,9 @@ def compiled_members(
     FmuBuildError
         If fmpy's headers are missing.
     """
-    sources = {
-        entry.name: entry.read_bytes()
-        for entry in (files("fmu_asset.compiled") / "sources").iterdir()
-        if entry.name.endswith((".c", ".h")) and entry.name != f"structure_fmi{5 - fmi}.c"
-    }
+    sources = _sources(fmi)
+    if interface == "model-exchange":
+        table = exchange_table(table, model.mode_count)
     if fmi == 3:
         table = (*table, replace(_TIME, reference=len(table)))
     arrays = arrays_of(table) if fmi == 3 else ()
@@ -133,11 +136,22 @@ def compiled_members(
         )
     return {
         "modelDescription.xml": model_description_text,
-        "documentation/index.html": documentation_page(table, description, host=HOST, fmi=fmi),
+        "documentation/index.html": documentation_page(
+            table, description, host=HOST, fmi=fmi, interface=interface
+        ),
         DATA_FILE: data_file_bytes(model),
         f"resources/{DESIGN_RECORD}": design_record(model.design_hash),
         **{f"sources/{name}": content for name, content in sources.items()},
         **{f"sources/{name}": content for name, content in fmi_headers(fmi).items()},
+    }
+
+
+def _sources(fmi: FmiVersion) -> dict[str, bytes]:
+    """Return the C files that every compiled FMU of a version of FMI has, by name."""
+    return {
+        entry.name: entry.read_bytes()
+        for entry in (files("fmu_asset.compiled") / "sources").iterdir()
+        if entry.name.endswith((".c", ".h")) and entry.name != f"structure_fmi{5 - fmi}.c"
     }
 
 

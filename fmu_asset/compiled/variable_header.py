@@ -118,6 +118,9 @@ def _header(table: Sequence[FmuVariable], roles: Roles, guid: str, content_tag: 
         "CHOSEN_COUNT": len(roles.chosen),
         "POINT_LOAD": roles.point_load,
         "LOG_CATEGORIES": len(LOG_CATEGORIES),
+        # Of model exchange: states, and then as many rates.
+        "FIRST_STATE": min((row.reference for row in table if row.causality == "local"), default=len(table)),
+        "STATE_COUNT": sum(row.causality == "local" for row in table) // 2,
     }
     defines = _defines(counts.items())
     references = _defines(

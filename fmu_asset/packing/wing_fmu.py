@@ -18,6 +18,7 @@ from fe.runtime.state import DigitalState
 from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binary_of, compiled_members
 from fmu_asset.compiled.variable_header import Roles
 from fmu_asset.errors import FmuBuildError, PatchFileError
+from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.effect_variables import effect_rows, switch_of, units_of
 from fmu_asset.slaves.variables import UNITS, FmuVariable, variable_table
 
@@ -64,6 +65,7 @@ def build_fmu(
     activate: bool = False,
     arrays: PatchArrays | None = None,
     fmi: FmiVersion = 2,
+    interface: Interface = "co-simulation",
     replace: bool = False,
 ) -> FmuInfo:
     """Pack a reduced model as an FMU; equal input gives equal bytes.
@@ -92,6 +94,8 @@ def build_fmu(
         changes structure or loads, or turns a gauge.
     fmi : {2, 3}
         Version of FMI; 3 for the kinds in C.
+    interface : {"co-simulation", "model-exchange"}
+        How it is run; model exchange (the modes as states) for the kinds in C, in FMI 2.
     replace : bool
         Whether an existing file may be replaced.
 
@@ -115,6 +119,7 @@ def build_fmu(
         activate=activate,
         arrays=arrays,
         fmi=fmi,
+        interface=interface,
     )
     return write_fmu(target, content, content_hash, "uav_wing", model.design_hash)
 
@@ -130,9 +135,10 @@ def fmu_bytes(
     activate: bool = False,
     arrays: PatchArrays | None = None,
     fmi: FmiVersion = 2,
+    interface: Interface = "co-simulation",
 ) -> tuple[bytes, str]:
     """Return the archive and its content hash; see `build_fmu`."""
-    check_version(kind, fmi)
+    check_version(kind, fmi, interface)
     start = start_values(model, state or DigitalState())
     mode_count = min(MODE_COUNT, model.mode_count)
     table = _table_of(model, mode_count, start)
@@ -171,6 +177,7 @@ def fmu_bytes(
             content_tag=PLACEHOLDER,
             description=description,
             fmi=fmi,
+            interface=interface,
         )
     for name, content in (resources or {}).items():
         if f"resources/{name}" in template or "/" in name or not name:
@@ -222,13 +229,15 @@ def check_kind(kind: FmuKind) -> None:
         )
 
 
-def check_version(kind: FmuKind, fmi: FmiVersion) -> None:
-    """Refuse a version of FMI that a kind of FMU cannot be of; raises `FmuBuildError`."""
-    if kind == "python" and fmi != 2:
+def check_version(kind: FmuKind, fmi: FmiVersion, interface: Interface = "co-simulation") -> None:
+    """Refuse what a kind of FMU cannot be; raises `FmuBuildError`."""
+    if kind == "python" and (fmi, interface) != (2, "co-simulation"):
         raise FmuBuildError(
-            f"The FMU of the kind 'python' is of FMI 2.0, but FMI {fmi}.0 was asked for: build the kind "
-            "'compiled' or 'source'."
+            f"The FMU of the kind 'python' is of FMI 2.0 for co-simulation, but FMI {fmi}.0 for {interface} "
+            "was asked for: build the kind 'compiled' or 'source'."
         )
+    if fmi == 3 and interface == "model-exchange":
+        raise FmuBuildError("Model exchange is offered in FMI 2.0 only: build it with --fmi 2.")
 
 
 def start_values(model: ReducedModel, state: DigitalState) -> dict[str, float]:

@@ -10,6 +10,7 @@ from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from fmu_asset.compiled.package import FmiVersion
+from fmu_asset.instances.plan import Interface
 from reporting.progress import Progress, SilentProgress
 
 from .contents import FmuInfo
@@ -42,6 +43,7 @@ def pack_wing(
     patch: PatchFile | None = None,
     activate: bool = False,
     fmi: FmiVersion = 2,
+    interface: Interface = "co-simulation",
     replace: bool = False,
     progress: Progress | None = None,
 ) -> FmuInfo:
@@ -55,7 +57,7 @@ def pack_wing(
         Where to write, with the suffix .fmu.
     tailoring : Tailoring, optional
         The calibration: the FMU starts at its means and carries its record.
-    kind, patch, activate, fmi, replace
+    kind, patch, activate, fmi, interface, replace
         See `fmu_asset.packing.wing_fmu.build_fmu`.
     progress : Progress, optional
         Shows what takes long.
@@ -79,6 +81,7 @@ def pack_wing(
         activate=activate,
         arrays=arrays_for(design, patch, progress),
         fmi=fmi,
+        interface=interface,
         replace=replace,
     )
 

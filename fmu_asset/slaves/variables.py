@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Kind = Literal["Real", "Integer", "Boolean", "Enumeration"]
-Causality = Literal["input", "parameter", "output", "independent"]
+Causality = Literal["input", "parameter", "output", "local", "independent"]
 Variability = Literal["continuous", "discrete", "fixed", "tunable"]
 
 QUASI_STATIC = 1

@@ -12,6 +12,7 @@ static size_t motion_size(const structure_model *model) { return 2 * model->mode
 static void lay_out(structure_behaviour *behaviour, structure_arena *arena) {
     behaviour->chosen = structure_take(arena, behaviour->model->chosen);
     behaviour->load = structure_take(arena, behaviour->model->loads);
+    behaviour->rates = structure_take(arena, 2 * behaviour->model->mode_count);
     for (size_t i = 0; i < 2; ++i) {
         structure_integrator_lay_out(&behaviour->integrators[i], behaviour->model, arena);
         structure_motion_lay_out(&behaviour->motions[i], behaviour->model, arena);
@@ -97,6 +98,23 @@ static bool is_started(const structure_behaviour *behaviour, structure_problem *
     return behaviour->started || structure_fail(problem, "the structure was not initialised");
 }
 
+/* Find the modes of another health and express the motion in them; after a failure all is as it was. */
+static bool take_over(structure_behaviour *behaviour, const double *chosen, structure_problem *problem) {
+    structure_integrator *next = &behaviour->integrators[1 - behaviour->integrator];
+    if (!prepare(next, &behaviour->parameters, chosen, problem)) {
+        return false;
+    }
+    structure_integrator_take_over(next, &behaviour->integrators[behaviour->integrator],
+                                   &behaviour->motions[behaviour->motion], &behaviour->motions[1 - behaviour->motion]);
+    behaviour->integrator = 1 - behaviour->integrator;
+    behaviour->motion = 1 - behaviour->motion;
+    return true;
+}
+
+static bool modes_differ(const structure_behaviour *behaviour, const double *chosen) {
+    return memcmp(chosen, behaviour->chosen, behaviour->model->key * sizeof *chosen) != 0;
+}
+
 bool structure_behaviour_advance(structure_behaviour *behaviour, const double *chosen, double duration,
                                  double *output, structure_problem *problem) {
     if (!is_started(behaviour, problem)) {
@@ -107,29 +125,70 @@ bool structure_behaviour_advance(structure_behaviour *behaviour, const double *c
             return false;
         }
     } else {
-        structure_integrator *integrator = &behaviour->integrators[behaviour->integrator];
-        structure_motion *motion = &behaviour->motions[behaviour->motion],
-                         *other = &behaviour->motions[1 - behaviour->motion];
-        structure_load_coefficients(behaviour->model, chosen, behaviour->load);
-        if (memcmp(chosen, behaviour->chosen, behaviour->model->key * sizeof *chosen) != 0) {
-            structure_integrator *next = &behaviour->integrators[1 - behaviour->integrator];
-            if (!prepare(next, &behaviour->parameters, chosen, problem)) {
-                return false;
-            }
-            /* The former motion is not needed again, because nothing after this can fail. */
-            structure_integrator_take_over(next, integrator, motion, other);
-            behaviour->integrator = 1 - behaviour->integrator;
-            integrator = next;
-            structure_integrator_advance(integrator, other, duration, behaviour->load, motion);
-        } else {
-            structure_integrator_advance(integrator, motion, duration, behaviour->load, other);
-            behaviour->motion = 1 - behaviour->motion;
-            motion = other;
+        if (modes_differ(behaviour, chosen) && !take_over(behaviour, chosen, problem)) {
+            return false;
         }
-        structure_integrator_output(integrator, motion, output);
+        structure_integrator *integrator = &behaviour->integrators[behaviour->integrator];
+        structure_motion *after = &behaviour->motions[1 - behaviour->motion];
+        structure_load_coefficients(behaviour->model, chosen, behaviour->load);
+        structure_integrator_advance(integrator, &behaviour->motions[behaviour->motion], duration, behaviour->load,
+                                     after);
+        behaviour->motion = 1 - behaviour->motion;
+        structure_integrator_output(integrator, after, output);
     }
     keep(behaviour, chosen);
     return true;
+}
+
+bool structure_behaviour_evaluate(structure_behaviour *behaviour, const double *chosen, double *output, bool *taken_over,
+                                  structure_problem *problem) {
+    *taken_over = false;
+    if (!is_started(behaviour, problem)) {
+        return false;
+    }
+    if (!behaviour->moving) {
+        if (!find_equilibrium(behaviour, chosen, output, problem)) {
+            return false;
+        }
+    } else {
+        if (modes_differ(behaviour, chosen)) {
+            if (!take_over(behaviour, chosen, problem)) {
+                return false;
+            }
+            *taken_over = true;
+        }
+        structure_motion *motion = &behaviour->motions[behaviour->motion];
+        structure_load_coefficients(behaviour->model, chosen, motion->load);
+        structure_integrator_output(&behaviour->integrators[behaviour->integrator], motion, output);
+    }
+    keep(behaviour, chosen);
+    return true;
+}
+
+void structure_behaviour_states(const structure_behaviour *behaviour, double *states) {
+    const size_t count = behaviour->model->mode_count;
+    const structure_motion *motion = &behaviour->motions[behaviour->motion];
+    for (size_t i = 0; i < count; ++i) {
+        states[i] = behaviour->moving ? motion->displacement[i] : 0.0;
+        states[count + i] = behaviour->moving ? motion->velocity[i] : 0.0;
+    }
+}
+
+void structure_behaviour_set_states(structure_behaviour *behaviour, const double *states) {
+    const size_t count = behaviour->model->mode_count;
+    structure_motion *motion = &behaviour->motions[behaviour->motion];
+    memcpy(motion->displacement, states, count * sizeof *states);
+    memcpy(motion->velocity, states + count, count * sizeof *states);
+}
+
+void structure_behaviour_rates(const structure_behaviour *behaviour, double *rates) {
+    const size_t count = behaviour->model->mode_count;
+    const structure_motion *motion = &behaviour->motions[behaviour->motion];
+    const structure_integrator *integrator = &behaviour->integrators[behaviour->integrator];
+    for (size_t i = 0; i < count; ++i) {
+        rates[i] = behaviour->moving ? motion->velocity[i] : 0.0;
+        rates[count + i] = behaviour->moving ? structure_integrator_acceleration(integrator, motion, i) : 0.0;
+    }
 }
 
 bool structure_behaviour_error_bounds(structure_behaviour *behaviour, structure_bounds *bounds,
@@ -167,14 +226,14 @@ bool structure_behaviour_load_point(structure_behaviour *behaviour, size_t point
 }
 
 bool structure_behaviour_derivative(structure_behaviour *behaviour, size_t which, size_t point, double *output,
-                                    double *load_point, structure_problem *problem) {
+                                    double *load_point, double *rates, structure_problem *problem) {
     const structure_model *model = behaviour->model;
     structure_integrator *integrator = &behaviour->integrators[behaviour->integrator];
     if (!is_started(behaviour, problem)) {
         return false;
     }
     if (behaviour->moving) {
-        structure_integrator_derivative(integrator, behaviour->chosen, which, point, output, load_point);
+        structure_integrator_derivative(integrator, behaviour->chosen, which, point, output, load_point, rates);
         return true;
     }
     if (!structure_static_prepare(&integrator->steady, behaviour->chosen, problem)) {
@@ -186,7 +245,20 @@ bool structure_behaviour_derivative(structure_behaviour *behaviour, size_t which
     for (size_t i = model->output_count; i < model->modal_outputs; ++i) {
         output[i] = 0.0; /* accelerations */
     }
+    memset(rates, 0, 2 * model->mode_count * sizeof *rates);
     return true;
+}
+
+void structure_behaviour_state_derivative(const structure_behaviour *behaviour, size_t state, size_t point,
+                                          double *output, double *load_point, double *rates) {
+    if (behaviour->moving) {
+        structure_integrator_state_derivative(&behaviour->integrators[behaviour->integrator], state, point, output,
+                                              load_point, rates);
+        return;
+    }
+    memset(output, 0, behaviour->model->modal_outputs * sizeof *output);
+    memset(rates, 0, 2 * behaviour->model->mode_count * sizeof *rates);
+    *load_point = 0.0;
 }
 
 bool structure_behaviour_modal_data(structure_behaviour *behaviour, size_t count, double *frequency,

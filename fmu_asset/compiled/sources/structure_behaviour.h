@@ -31,6 +31,7 @@ typedef struct {
     structure_motion motions[2];
     size_t integrator;
     size_t motion;
+    double *rates; /* (2 M) derivatives of the rates, of the call at hand */
     double *memory;
 } structure_behaviour;
 
@@ -51,6 +52,17 @@ bool structure_behaviour_start(structure_behaviour *behaviour, const structure_p
 bool structure_behaviour_advance(structure_behaviour *behaviour, const double *chosen, double duration,
                                  double *output, structure_problem *problem);
 
+/* For model exchange: the outputs under what is chosen and the motion at hand. Another health takes the motion over
+   into its modes, and says so. */
+bool structure_behaviour_evaluate(structure_behaviour *behaviour, const double *chosen, double *output, bool *taken_over,
+                                  structure_problem *problem);
+
+/* Displacements and velocities of the modes (M each), of which the motion consists, and their rates; zero at
+   equilibrium. */
+void structure_behaviour_states(const structure_behaviour *behaviour, double *states);
+void structure_behaviour_set_states(structure_behaviour *behaviour, const double *states);
+void structure_behaviour_rates(const structure_behaviour *behaviour, double *rates);
+
 /* Certified bounds of the static response under the last inputs. */
 bool structure_behaviour_error_bounds(structure_behaviour *behaviour, structure_bounds *bounds,
                                       structure_problem *problem);
@@ -59,10 +71,14 @@ bool structure_behaviour_error_bounds(structure_behaviour *behaviour, structure_
 bool structure_behaviour_load_point(structure_behaviour *behaviour, size_t point, double *displacement,
                                     structure_problem *problem);
 
-/* Derivatives of the outputs, and of the displacement along the load of index `point`, with respect to one of what
-   can be chosen: at equilibrium; in motion to one control of the loads. */
+/* Derivatives of the outputs, of the displacement along the load of index `point`, and of the rates (2 M) with respect
+   to one of what can be chosen: at equilibrium; in motion to one control of the loads. */
 bool structure_behaviour_derivative(structure_behaviour *behaviour, size_t which, size_t point, double *output,
-                                    double *load_point, structure_problem *problem);
+                                    double *load_point, double *rates, structure_problem *problem);
+
+/* The same with respect to one state; zero at equilibrium. */
+void structure_behaviour_state_derivative(const structure_behaviour *behaviour, size_t state, size_t point,
+                                          double *output, double *load_point, double *rates);
 
 /* Natural frequencies [Hz] and damping ratios [1] of the first `count` modes under the last inputs. */
 bool structure_behaviour_modal_data(structure_behaviour *behaviour, size_t count, double *frequency,

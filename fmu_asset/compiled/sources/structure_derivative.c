@@ -3,14 +3,17 @@
 #include <math.h>
 #include <string.h>
 
-/* What can be chosen, and after it the two numbers of damping; the last is none of them. */
-enum { ALPHA = STRUCTURE_CHOSEN_COUNT, BETA, NOTHING };
+/* What can be chosen, after it the two numbers of damping, then the states; the last is none of them. */
+enum { ALPHA = STRUCTURE_CHOSEN_COUNT, BETA, STATE, NOTHING = STATE + STRUCTURE_STATE_COUNT };
 
 static size_t quantity_of(unsigned int place) {
     for (size_t i = 0; i < STRUCTURE_CHOSEN_COUNT; ++i) {
         if (structure_chosen_places[i] == place) {
             return i;
         }
+    }
+    if (place >= STRUCTURE_FIRST_STATE && place < STRUCTURE_FIRST_STATE + STRUCTURE_STATE_COUNT) {
+        return STATE + (place - STRUCTURE_FIRST_STATE);
     }
     return place == STRUCTURE_DAMPING_ALPHA ? ALPHA : place == STRUCTURE_DAMPING_BETA ? BETA : NOTHING;
 }
@@ -46,16 +49,27 @@ static bool find_column(structure_instance *instance, size_t quantity, bool moda
     for (size_t i = 0; i < STRUCTURE_VARIABLE_COUNT; ++i) {
         column[i] = NAN;
     }
-    double load_point = NAN, *output = column + STRUCTURE_FIRST_OUTPUT;
+    double load_point = NAN, *output = column + STRUCTURE_FIRST_OUTPUT, *rates = behaviour->rates;
+    const size_t states = 2 * behaviour->model->mode_count;
     const bool of_motion = behaviour->moving;
+    for (size_t i = 0; i < states; ++i) {
+        rates[i] = NAN;
+    }
     if (quantity < STRUCTURE_CHOSEN_COUNT &&
         (!of_motion || structure_is_control(behaviour->model, quantity))) {
-        if (!structure_behaviour_derivative(behaviour, quantity, STRUCTURE_POINT_LOAD, output, &load_point, problem)) {
+        if (!structure_behaviour_derivative(behaviour, quantity, STRUCTURE_POINT_LOAD, output, &load_point, rates,
+                                            problem)) {
             return false;
         }
-    } else if (quantity < NOTHING && !of_motion) { /* damping, at rest */
+    } else if (quantity >= STATE && quantity < NOTHING) {
+        structure_behaviour_state_derivative(behaviour, quantity - STATE, STRUCTURE_POINT_LOAD, output, &load_point,
+                                             rates);
+    } else if (quantity < STATE && !of_motion) { /* damping, at rest */
         memset(output, 0, STRUCTURE_OUTPUT_COUNT * sizeof *output);
         load_point = 0.0;
+    }
+    if (STRUCTURE_STATE_COUNT > 0) {
+        memcpy(column + STRUCTURE_FIRST_STATE + STRUCTURE_STATE_COUNT, rates, states * sizeof *rates);
     }
     if (structure_load_point_place < STRUCTURE_VARIABLE_COUNT) {
         column[structure_load_point_place] = load_point;

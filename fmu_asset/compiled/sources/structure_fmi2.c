@@ -1,4 +1,4 @@
-/* The functions of FMI 2.0 for co-simulation, on top of structure_instance. */
+/* The functions of FMI 2.0 for co-simulation or model exchange, on top of structure_instance. */
 #include "fmi2Functions.h"
 
 #include <math.h>
@@ -93,9 +93,10 @@ fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2Str
         return NULL;
     }
     const structure_host host = {log_message, (void (*)(void))functions->logger, functions->componentEnvironment};
-    if (fmuType != fmi2CoSimulation) {
+    if (fmuType != (STRUCTURE_STATE_COUNT > 0 ? fmi2ModelExchange : fmi2CoSimulation)) {
         structure_log(&host, instanceName == NULL ? "" : instanceName, STRUCTURE_ERROR,
-                      "this FMU is for co-simulation only");
+                      STRUCTURE_STATE_COUNT > 0 ? "this FMU is for model exchange only"
+                                                : "this FMU is for co-simulation only");
         return NULL;
     }
     char *folder = fmuResourceLocation == NULL ? NULL : path_of(fmuResourceLocation);
@@ -248,6 +249,63 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
                                         const fmi2Real dvKnown[], fmi2Real dvUnknown[]) {
     const structure_pairs pairs = {vUnknown_ref, nUnknown, vKnown_ref, nKnown};
     return status_of(structure_directional_derivative(instance_of(c), &pairs, dvKnown, nKnown, dvUnknown, nUnknown));
+}
+
+/* ---------------------------------------------------------------- model exchange */
+
+fmi2Status fmi2EnterEventMode(fmi2Component c) {
+    instance_of(c)->event_mode = true;
+    return fmi2OK;
+}
+
+fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *eventInfo) {
+    bool states_changed = false;
+    const structure_result result = structure_event(instance_of(c), &states_changed);
+    const fmi2EventInfo none = {0};
+    *eventInfo = none;
+    eventInfo->valuesOfContinuousStatesChanged = states_changed ? fmi2True : fmi2False;
+    return status_of(result);
+}
+
+fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) {
+    instance_of(c)->event_mode = false;
+    return fmi2OK;
+}
+
+fmi2Status fmi2CompletedIntegratorStep(fmi2Component c, fmi2Boolean noSetFMUStatePriorToCurrentPoint,
+                                       fmi2Boolean *enterEventMode, fmi2Boolean *terminateSimulation) {
+    (void)c;
+    (void)noSetFMUStatePriorToCurrentPoint;
+    *enterEventMode = *terminateSimulation = fmi2False;
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetTime(fmi2Component c, fmi2Real time) { return status_of(structure_setup(instance_of(c), time)); }
+
+fmi2Status fmi2SetContinuousStates(fmi2Component c, const fmi2Real x[], size_t nx) {
+    return status_of(structure_set_states(instance_of(c), x, nx));
+}
+
+fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real x[], size_t nx) {
+    return status_of(structure_get_states(instance_of(c), x, nx));
+}
+
+fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real derivatives[], size_t nx) {
+    return status_of(structure_get_rates(instance_of(c), derivatives, nx));
+}
+
+fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real eventIndicators[], size_t ni) {
+    (void)c;
+    (void)eventIndicators;
+    return ni == 0 ? fmi2OK : fmi2Error;
+}
+
+fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real x_nominal[], size_t nx) {
+    (void)c;
+    for (size_t i = 0; i < nx; ++i) { /* a wing tip that moves by centimetres, at a few hertz */
+        x_nominal[i] = 2 * i < nx ? 0.01 : 1.0;
+    }
+    return fmi2OK;
 }
 
 /* ---------------------------------------------------------------- what this FMU does not offer */

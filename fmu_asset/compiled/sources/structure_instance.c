@@ -8,8 +8,8 @@
 
 #define DATA_FILE "reduced_model.bin"
 
-/* phase, time and three flags, then the values, then the behaviour */
-#define SAVED_HEAD 5
+/* phase, time and five flags, then the values, then the behaviour */
+#define SAVED_HEAD 7
 
 void structure_log(const structure_host *host, const char *name, structure_result result, const char *sentence) {
     host->log(host, name, result,
@@ -33,7 +33,8 @@ static structure_instance *make(const char *name, const char *data_file, structu
     bool made = structure_model_read(&instance->model, data_file, problem);
     if (made && (instance->model.modal_outputs != STRUCTURE_OUTPUT_COUNT ||
                  instance->model.mode_count < STRUCTURE_OUTPUT_MODES ||
-                 instance->model.chosen != STRUCTURE_CHOSEN_COUNT)) {
+                 instance->model.chosen != STRUCTURE_CHOSEN_COUNT ||
+                 (STRUCTURE_STATE_COUNT > 0 && 2 * instance->model.mode_count != STRUCTURE_STATE_COUNT))) {
         made = structure_fail(problem,
                               "%s belongs to another FMU: %lu outputs, %lu modes, %lu quantities that can be chosen",
                               data_file, (unsigned long)instance->model.modal_outputs,
@@ -173,6 +174,11 @@ static const double *chosen_of(structure_instance *instance) {
 
 static void accept_outputs(structure_instance *instance) {
     memcpy(instance->values + STRUCTURE_FIRST_OUTPUT, instance->outputs, sizeof instance->outputs);
+    if (STRUCTURE_STATE_COUNT > 0) {
+        structure_behaviour_states(&instance->behaviour, instance->values + STRUCTURE_FIRST_STATE);
+        structure_behaviour_rates(&instance->behaviour,
+                                  instance->values + STRUCTURE_FIRST_STATE + STRUCTURE_STATE_COUNT);
+    }
     instance->values[STRUCTURE_STATUS] = STRUCTURE_STATUS_OK;
     instance->stale_response = false;
     instance->stale_bound = instance->stale_modal = true;
@@ -220,6 +226,8 @@ structure_result structure_exit_initialisation(structure_instance *instance) {
     }
     const structure_result status = initialise(instance);
     instance->phase = status == STRUCTURE_DONE ? STRUCTURE_READY : STRUCTURE_REFUSED;
+    instance->event_mode = true;
+    instance->states_changed = false;
     return status;
 }
 
@@ -241,6 +249,9 @@ static const char *phase_name(structure_phase phase) {
 
 structure_result structure_step(structure_instance *instance, double time, double step_size) {
     instance->discarded = true; /* until it is done */
+    if (STRUCTURE_STATE_COUNT > 0) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL, "this FMU is for model exchange only");
+    }
     if (instance->phase != STRUCTURE_READY) {
         return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL, "a step was asked for %s", phase_name(instance->phase));
     }
@@ -272,6 +283,72 @@ structure_result structure_step(structure_instance *instance, double time, doubl
     return STRUCTURE_DONE;
 }
 
+/* ---------------------------------------------------------------- model exchange */
+
+/* Bring the outputs, states and rates up to date under the inputs and states at hand. */
+static structure_result evaluate(structure_instance *instance) {
+    if (!instance->stale_response || instance->phase != STRUCTURE_READY) {
+        return STRUCTURE_DONE;
+    }
+    const structure_result range =
+        check_range(instance, 0, STRUCTURE_INPUT_COUNT, "nothing was computed and the state is as it was");
+    if (range != STRUCTURE_DONE) {
+        return range;
+    }
+    structure_problem problem;
+    bool taken_over = false;
+    if (!structure_behaviour_evaluate(&instance->behaviour, chosen_of(instance), instance->outputs, &taken_over,
+                                      &problem)) {
+        return structure_refuse(instance, STRUCTURE_STATUS_INTERNAL, "the model at t = %g s failed: %s",
+                                instance->time, problem.text);
+    }
+    instance->states_changed = instance->states_changed || taken_over;
+    accept_outputs(instance);
+    return STRUCTURE_DONE;
+}
+
+static structure_result check_states(structure_instance *instance, size_t count) {
+    if (count != STRUCTURE_STATE_COUNT || (instance->phase != STRUCTURE_READY && count > 0)) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL,
+                                "%lu states were given or asked for %s; this FMU has %d, after its initialisation",
+                                (unsigned long)count, phase_name(instance->phase), STRUCTURE_STATE_COUNT);
+    }
+    return STRUCTURE_DONE;
+}
+
+structure_result structure_event(structure_instance *instance, bool *states_changed) {
+    const structure_result result = evaluate(instance);
+    *states_changed = instance->states_changed;
+    instance->states_changed = false;
+    return result;
+}
+
+structure_result structure_set_states(structure_instance *instance, const double *states, size_t count) {
+    const structure_result result = check_states(instance, count);
+    if (result == STRUCTURE_DONE && count > 0) {
+        structure_behaviour_set_states(&instance->behaviour, states);
+        instance->stale_response = true;
+    }
+    return result;
+}
+
+structure_result structure_get_states(structure_instance *instance, double *states, size_t count) {
+    const structure_result result = check_states(instance, count);
+    if (result == STRUCTURE_DONE && count > 0) {
+        structure_behaviour_states(&instance->behaviour, states);
+    }
+    return result;
+}
+
+structure_result structure_get_rates(structure_instance *instance, double *rates, size_t count) {
+    structure_result result = check_states(instance, count);
+    if (result == STRUCTURE_DONE && count > 0) {
+        result = evaluate(instance);
+        structure_behaviour_rates(&instance->behaviour, rates);
+    }
+    return result;
+}
+
 /* ---------------------------------------------------------------- values */
 
 size_t structure_length(structure_instance *instance, unsigned int reference, bool enumeration) {
@@ -282,6 +359,16 @@ size_t structure_length(structure_instance *instance, unsigned int reference, bo
     (void)structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL, "there is no %s variable with value reference %u",
                            enumeration ? "enumeration" : "real", reference);
     return 0;
+}
+
+/* Whether a variable changes the modes, which in model exchange is an event. */
+static bool changes_modes(const structure_instance *instance, unsigned int reference) {
+    for (size_t i = 0; i < instance->model.key; ++i) {
+        if (structure_chosen_places[i] == reference) {
+            return true;
+        }
+    }
+    return false;
 }
 
 static structure_result set_one(structure_instance *instance, unsigned int reference, const double *values,
@@ -295,6 +382,11 @@ static structure_result set_one(structure_instance *instance, unsigned int refer
         (instance->phase == STRUCTURE_READY || instance->phase == STRUCTURE_TERMINATED)) {
         return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL,
                                 "%s is a fixed parameter and can be set only before the first step", name);
+    }
+    if (STRUCTURE_STATE_COUNT > 0 && instance->phase == STRUCTURE_READY && !instance->event_mode &&
+        changes_modes(instance, reference)) {
+        return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL, "%s is discrete and can be set in event mode only",
+                                name);
     }
     memcpy(instance->values + reference, values, length * sizeof *values);
     instance->stale_response = true;
@@ -351,6 +443,10 @@ structure_result structure_update(structure_instance *instance, const unsigned i
     }
     if (instance->phase == STRUCTURE_INSTANTIATED || instance->phase == STRUCTURE_REFUSED) {
         return STRUCTURE_DONE;
+    }
+    const structure_result current = STRUCTURE_STATE_COUNT > 0 ? evaluate(instance) : STRUCTURE_DONE;
+    if (current != STRUCTURE_DONE) {
+        return current;
     }
     structure_problem problem;
     if (bound && instance->stale_bound) {
@@ -412,6 +508,8 @@ bool structure_save(const structure_instance *instance, structure_saved_state *s
     body[2] = instance->stale_response ? 1.0 : 0.0;
     body[3] = instance->stale_bound ? 1.0 : 0.0;
     body[4] = instance->stale_modal ? 1.0 : 0.0;
+    body[5] = instance->event_mode ? 1.0 : 0.0;
+    body[6] = instance->states_changed ? 1.0 : 0.0;
     memcpy(body + SAVED_HEAD, instance->values, sizeof instance->values);
     saved->body = body;
     saved->count = SAVED_HEAD + STRUCTURE_VARIABLE_COUNT +
@@ -438,6 +536,8 @@ structure_result structure_restore(structure_instance *instance, const structure
     instance->stale_response = body[2] != 0.0;
     instance->stale_bound = body[3] != 0.0;
     instance->stale_modal = body[4] != 0.0;
+    instance->event_mode = body[5] != 0.0;
+    instance->states_changed = body[6] != 0.0;
     memcpy(instance->values, values, sizeof instance->values);
     return STRUCTURE_DONE;
 }

@@ -46,6 +46,9 @@ typedef struct {
     bool stale_response;
     bool stale_bound;
     bool stale_modal;
+    /* Of model exchange: whether it is in event mode, and whether an event has changed the states since it was told. */
+    bool event_mode;
+    bool states_changed;
 } structure_instance;
 
 typedef struct {
@@ -88,6 +91,13 @@ size_t structure_length(structure_instance *instance, unsigned int reference, bo
 
 /* Bring the outputs that a reading concerns up to date. */
 structure_result structure_update(structure_instance *instance, const unsigned int *references, size_t count);
+
+/* Model exchange. Health is discrete: it can be set in event mode, and `structure_event` then expresses the motion in
+   its modes. States are the modal coordinates and their rates, which can be set where there are as many. */
+structure_result structure_event(structure_instance *instance, bool *states_changed);
+structure_result structure_set_states(structure_instance *instance, const double *states, size_t count);
+structure_result structure_get_states(structure_instance *instance, double *states, size_t count);
+structure_result structure_get_rates(structure_instance *instance, double *rates, size_t count);
 
 /* The state as numbers, to be freed by the caller; false without memory. */
 bool structure_save(const structure_instance *instance, structure_saved_state *saved);

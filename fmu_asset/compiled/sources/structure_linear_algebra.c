@@ -53,7 +53,8 @@ void structure_add_columns(double *restrict sum, size_t size, const double *rest
     add_columns(sum, size, columns, stride, count, coefficients); /* the clones themselves would be exported */
 }
 
-double structure_dot(const double *first, const double *second, size_t size) {
+STRUCTURE_WIDE
+static double dot(const double *first, const double *second, size_t size) {
     /* Four sums that do not wait for each other. */
     double a = 0.0, b = 0.0, c = 0.0, d = 0.0;
     size_t i = 0;
@@ -68,6 +69,8 @@ double structure_dot(const double *first, const double *second, size_t size) {
     }
     return (a + b) + (c + d);
 }
+
+double structure_dot(const double *first, const double *second, size_t size) { return dot(first, second, size); }
 
 double structure_norm(const double *vector, size_t size) { return sqrt(structure_dot(vector, vector, size)); }
 
@@ -119,7 +122,8 @@ void structure_solve_upper(const double *restrict factor, size_t size, double *r
     }
 }
 
-void structure_solve_lower_columns(const double *restrict factor, size_t size, double *restrict right) {
+STRUCTURE_WIDE
+static void solve_lower_columns(const double *restrict factor, size_t size, double *restrict right) {
     for (size_t k = 0; k < size; ++k) {
         const double *row = factor + k * size;
         const double scale = row[k];
@@ -128,13 +132,21 @@ void structure_solve_lower_columns(const double *restrict factor, size_t size, d
             solved[j] *= scale;
         }
         for (size_t i = k + 1; i < size; ++i) {
-            structure_add(right + i * size, size, -row[i], solved);
+            double *restrict below = right + i * size;
+            for (size_t j = 0; j < size; ++j) {
+                below[j] -= row[i] * solved[j];
+            }
         }
     }
 }
 
+void structure_solve_lower_columns(const double *restrict factor, size_t size, double *restrict right) {
+    solve_lower_columns(factor, size, right);
+}
+
 /* Bring a symmetric matrix to tridiagonal form by Householder reflections H = I - factor v v' (Golub & Van Loan,
    Matrix Computations, section 8.3.1). Row k of the matrix then holds v from column k + 1 on. */
+STRUCTURE_WIDE
 static void tridiagonalise(double *restrict matrix, size_t size, double *restrict diagonal,
                            double *restrict off_diagonal, double *restrict factors, double *restrict work) {
     for (size_t k = 0; k + 1 < size; ++k) {
@@ -169,6 +181,7 @@ static void tridiagonalise(double *restrict matrix, size_t size, double *restric
 
 /* One implicit QR step with Wilkinson's shift on the block from `low` to `high` (ibid., algorithm 8.3.2), the
    rotations applied to the rows of `vectors` as well. */
+STRUCTURE_WIDE
 static void qr_step(double *restrict d, double *restrict e, size_t low, size_t high,
                     double *restrict vectors, size_t size) {
     const double gap = 0.5 * (d[high - 1] - d[high]), last = e[high - 1];

@@ -149,6 +149,22 @@ void structure_integrator_take_over(structure_integrator *integrator, structure_
     memcpy(after->load, before->load, model->loads * sizeof *after->load);
 }
 
+double structure_integrator_acceleration(const structure_integrator *integrator, const structure_motion *motion,
+                                         size_t mode) {
+    const structure_modes *modes = &integrator->modes;
+    const size_t loads = integrator->model->loads;
+    const double omega = modes->angular_frequency[mode];
+    const double force = structure_dot(modes->participation + mode * loads, motion->load, loads);
+    return force - 2.0 * integrator->damping_ratio[mode] * omega * motion->velocity[mode] -
+           omega * omega * motion->displacement[mode];
+}
+
+/* Add the accelerations that a second derivative of one modal coordinate makes. */
+static void add_acceleration(const structure_integrator *integrator, size_t mode, double acceleration, double *output) {
+    const size_t outputs = integrator->model->output_count, all = integrator->model->modal_outputs;
+    structure_add(output + outputs, all - outputs, acceleration, integrator->modes.output + mode * all + outputs);
+}
+
 void structure_integrator_output(const structure_integrator *integrator, const structure_motion *motion, double *output) {
     const structure_model *model = integrator->model;
     const structure_modes *modes = &integrator->modes;
@@ -160,11 +176,8 @@ void structure_integrator_output(const structure_integrator *integrator, const s
         return;
     }
     for (size_t i = 0; i < count; ++i) {
-        const double omega = modes->angular_frequency[i];
-        const double force = structure_dot(modes->participation + i * model->loads, motion->load, model->loads);
-        const double acceleration = force - 2.0 * integrator->damping_ratio[i] * omega * motion->velocity[i] -
-                                    omega * omega * motion->displacement[i];
-        structure_add(output + outputs, all - outputs, acceleration, modes->output + i * all + outputs);
+        const double acceleration = structure_integrator_acceleration(integrator, motion, i);
+        add_acceleration(integrator, i, acceleration, output);
     }
 }
 
@@ -180,11 +193,11 @@ static double point_correction(structure_integrator *integrator, size_t point, s
 }
 
 void structure_integrator_derivative(structure_integrator *integrator, const double *chosen, size_t which, size_t point,
-                                     double *output, double *load_point) {
+                                     double *output, double *load_point, double *rates) {
     const structure_model *model = integrator->model;
-    const structure_modes *modes = &integrator->modes;
-    const size_t outputs = model->output_count, all = model->modal_outputs, count = model->mode_count;
-    memset(output, 0, all * sizeof *output);
+    const size_t outputs = model->output_count, count = model->mode_count;
+    memset(output, 0, model->modal_outputs * sizeof *output);
+    memset(rates, 0, 2 * count * sizeof *rates);
     *load_point = 0.0;
     for (size_t k = 0; k < model->loads; ++k) {
         const double factor = structure_load_derivative(model, k, chosen, which);
@@ -193,11 +206,32 @@ void structure_integrator_derivative(structure_integrator *integrator, const dou
         }
         structure_add(output, outputs, factor, integrator->correction + k * outputs);
         *load_point += factor * point_correction(integrator, point, k);
-        for (size_t i = 0; i < count; ++i) { /* accelerations */
-            structure_add(output + outputs, all - outputs, factor * modes->participation[i * model->loads + k],
-                          modes->output + i * all + outputs);
+        for (size_t i = 0; i < count; ++i) {
+            const double acceleration = factor * integrator->modes.participation[i * model->loads + k];
+            rates[count + i] += acceleration;
+            add_acceleration(integrator, i, acceleration, output);
         }
     }
+}
+
+void structure_integrator_state_derivative(const structure_integrator *integrator, size_t state, size_t point,
+                                           double *output, double *load_point, double *rates) {
+    const structure_model *model = integrator->model;
+    const structure_modes *modes = &integrator->modes;
+    const size_t count = model->mode_count, mode = state % count;
+    const double omega = modes->angular_frequency[mode];
+    const bool velocity = state >= count;
+    memset(output, 0, model->modal_outputs * sizeof *output);
+    memset(rates, 0, 2 * count * sizeof *rates);
+    *load_point = 0.0;
+    if (velocity) {
+        rates[mode] = 1.0;
+    } else {
+        structure_add(output, model->output_count, 1.0, modes->output + mode * model->modal_outputs);
+        *load_point = modes->participation[mode * model->loads + point];
+    }
+    rates[count + mode] = velocity ? -2.0 * integrator->damping_ratio[mode] * omega : -omega * omega;
+    add_acceleration(integrator, mode, rates[count + mode], output);
 }
 
 double structure_integrator_load_point(structure_integrator *integrator, size_t point,

@@ -54,13 +54,21 @@ void structure_integrator_advance(structure_integrator *integrator, const struct
 void structure_integrator_take_over(structure_integrator *integrator, structure_integrator *former, const structure_motion *before,
                                structure_motion *after);
 
+/* Second derivative of one modal coordinate. */
+double structure_integrator_acceleration(const structure_integrator *integrator, const structure_motion *motion,
+                                         size_t mode);
+
 /* Write strains and displacements (O), then the accelerations of the kept modes. */
 void structure_integrator_output(const structure_integrator *integrator, const structure_motion *motion, double *output);
 
 /* Write the derivatives of the outputs with respect to one control of the loads, the motion of the modes being given,
-   and of the displacement along the load of index `point`. */
+   of the displacement along the load of index `point`, and of the rates (2 M) of modal coordinates and velocities. */
 void structure_integrator_derivative(structure_integrator *integrator, const double *chosen, size_t which, size_t point,
-                                     double *output, double *load_point);
+                                     double *output, double *load_point, double *rates);
+
+/* The same with respect to one modal coordinate, or from M on one of their rates. */
+void structure_integrator_state_derivative(const structure_integrator *integrator, size_t state, size_t point,
+                                           double *output, double *load_point, double *rates);
 
 /* Displacement along the load of index `point` at its point [m]. */
 double structure_integrator_load_point(structure_integrator *integrator, size_t point,

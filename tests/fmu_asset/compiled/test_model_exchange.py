@@ -1,0 +1,179 @@
+"""The compiled wing for model exchange: its states under CVODE are the motion of the co-simulation one."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fmpy import simulate_fmu
+from fmpy.fmi1 import FMICallException
+from fmpy.fmi2 import FMU2Model
+from fmpy.validation import validate_fmu
+
+from fe.runtime.reduced import ReducedModel
+from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
+from fmu_asset.check import check_fmu
+from fmu_asset.door.binding import Binding
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.errors import FmuBuildError
+from fmu_asset.packing.wing_fmu import build_fmu
+
+STATES = 16
+DISCARD, ERROR = 2, 3
+
+
+@pytest.fixture(scope="module")
+def exchange(compiler: list[str], model: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("exchange") / "wing.fmu"
+    return build_fmu(model, path, kind="compiled", interface="model-exchange").path
+
+
+@pytest.fixture
+def wing(exchange: Path) -> Iterator[tuple[FMU2Model, dict[str, int]]]:
+    """An instance in continuous time, damped and released, and its value references."""
+    described = read_fmu(exchange)
+    folder = extract_fmu(described)
+    made = FMU2Model(
+        guid=described.guid, modelIdentifier=described.model_identifier, unzipDirectory=str(folder)
+    )
+    reference = {variable.name: variable.reference for variable in described.variables}
+    made.instantiate()
+    made.setupExperiment(startTime=0.0)
+    made.enterInitializationMode()
+    names = ("damping.alpha", "damping.beta", "initial_tip_displacement", "health.z1")
+    made.setReal([reference[name] for name in names], [1.5, 3e-4, 0.05, 0.3])
+    made.exitInitializationMode()
+    made.newDiscreteStates()
+    made.enterContinuousTimeMode()
+    yield made, reference
+    made.freeInstance()
+    shutil.rmtree(folder)
+
+
+def test_nothing_is_found_to_complain_of(exchange: Path) -> None:
+    assert validate_fmu(str(exchange)) == []
+    assert read_fmu(exchange).states == STATES
+    assert check_fmu(exchange, cycles=20).problems == ()
+
+
+def test_cvode_moves_it_as_the_co_simulation_moves(exchange: Path, compiled_fmu: Path) -> None:
+    """Loads jump and health grows on the way; compared where nothing jumps."""
+    start = {"load_factor": 1.0, "initial_tip_displacement": 0.05, "damping.alpha": 1.0, "damping.beta": 1e-4}
+    rows = [
+        (0.0, 0.0, 1.0),
+        (0.1, 0.0, 1.0),
+        (0.1, 0.0, 2.0),
+        (0.2, 0.0, 2.0),
+        (0.2, 0.4, 2.0),
+        (1.0, 0.4, 2.0),
+    ]
+    course = np.array(rows, dtype=[(name, float) for name in ("time", "health.z1", "load_factor")])
+    names = ["strain[1]", "strain[20]", "tip_displacement", "load_point_displacement"]
+    flown = {
+        path: simulate_fmu(path, stop_time=0.4, output_interval=0.005, output=names, input=course, **options)
+        for path, options in (
+            (exchange, {"start_values": start, "relative_tolerance": 1e-10}),
+            (compiled_fmu, {"start_values": start | {"response": 2}, "step_size": 0.005}),
+        )
+    }
+    theirs = flown[compiled_fmu]
+    smooth = ~np.isin(np.round(theirs["time"], 6), [0.1, 0.2])
+    for name in names:
+        ours = np.interp(theirs["time"], flown[exchange]["time"], flown[exchange][name])
+        np.testing.assert_allclose(
+            ours[smooth], theirs[name][smooth], rtol=0, atol=1e-6 * np.abs(theirs[name]).max()
+        )
+
+
+def test_our_door_flies_both_alike(exchange: Path, compiled_fmu: Path, binding: Binding) -> None:
+    rng = np.random.default_rng(2)
+    settings = binding.binding.model_copy(update={"step_size": 0.01, "tolerance": 1e-9})
+    slow = binding.model_copy(update={"binding": settings})
+    parameters = {
+        "damping_alpha": 2.0,
+        "damping_beta": 2e-4,
+        "initial_tip_displacement": 0.05,
+        "response": 2.0,
+    }
+    with (
+        FmiAsset(exchange, slow, parameters=parameters, isolated=False) as one,
+        FmiAsset(compiled_fmu, slow, parameters=parameters, isolated=False) as two,
+    ):
+        for index in range(20):
+            control = {"load_factor": float(rng.uniform(-1, 4))}
+            health = {"z1": 0.04 * (index // 5), "z2": 0.02 * (index // 3)}
+            seen = [asset.step(control, health).values for asset in (one, two)]
+            np.testing.assert_allclose(seen[0], seen[1], rtol=0, atol=1e-6 * np.abs(seen[1]).max())
+
+
+def test_rates_and_outputs_are_linear_with_the_derivatives_that_it_gives(
+    wing: tuple[FMU2Model, dict[str, int]],
+) -> None:
+    fmu, reference = wing
+    modes = range(1, STATES // 2 + 1)
+    states = [reference[f"modal_{what}[{i}]"] for what in ("displacement", "velocity") for i in modes]
+    rates = [reference[f"der(modal_{what}[{i}])"] for what in ("displacement", "velocity") for i in modes]
+    outputs = [
+        reference[name] for name in ("strain[1]", "strain[13]", "tip_displacement", "load_point_displacement")
+    ]
+    inputs = [reference["load_factor"], reference["tip_force"]]
+    unknowns, knowns = [*rates, *outputs], [*states, *inputs]
+    columns = [fmu.getDirectionalDerivative(unknowns, [known], [1.0]) for known in knowns]
+    jacobian = np.array(columns).T
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        x, u = rng.normal(size=STATES), rng.uniform(0.5, 3.0, 2)
+        fmu.setReal(inputs, u.tolist())
+        fmu.setContinuousStates((np.ctypeslib.ctypes.c_double * STATES)(*x), STATES)
+        expected = jacobian @ [*x, *u]
+        seen = np.array(fmu.getReal(unknowns))
+        scale = np.abs(jacobian) @ np.abs([*x, *u])
+        np.testing.assert_array_less(np.abs(seen - expected), 1e-13 * scale)
+        assert fmu.getReal(states) == x.tolist()
+    with pytest.raises(FMICallException):  # health changes the modes
+        fmu.getDirectionalDerivative(unknowns, [reference["health.z1"]], [1.0])
+    frequencies = [reference[f"frequency[{i}]"] for i in range(1, 7)]
+    poles = np.linalg.eigvals(jacobian[:STATES, :STATES])
+    circular = np.sort(np.abs(poles[poles.imag > 0]))[:6] / (2 * np.pi)
+    np.testing.assert_allclose(circular, fmu.getReal(frequencies), rtol=1e-10)
+
+
+def test_health_is_discrete_and_wrong_calls_are_refused(wing: tuple[FMU2Model, dict[str, int]]) -> None:
+    fmu, reference = wing
+
+    def status_of(*call: object) -> int:
+        try:
+            getattr(fmu, str(call[0]))(*call[1:])
+        except FMICallException as error:
+            return int(error.status)
+        return 0
+
+    z1, strains = [reference["health.z1"]], [reference[f"strain[{i}]"] for i in range(1, 25)]
+    before = fmu.getReal(strains)
+    assert status_of("setReal", z1, [0.5]) == DISCARD
+    assert status_of("setReal", [reference["load_factor"]], [99.0]) == 0
+    assert status_of("getReal", strains) == DISCARD  # out of range
+    fmu.setReal([reference["load_factor"]], [1.0])
+    assert fmu.getReal(strains) == before
+    fmu.enterEventMode()
+    fmu.setReal(z1, [0.5])
+    *_, states_changed, _, _ = fmu.newDiscreteStates()
+    assert states_changed
+    fmu.enterContinuousTimeMode()
+    after = fmu.getReal(strains)
+    assert after != before
+    # The structure stays where it is, as far as the modes that are kept can say.
+    assert fmu.getReal([reference["tip_displacement"]])[0] != 0.0
+    assert not fmu.newDiscreteStates()[3]
+
+
+def test_what_it_cannot_be_is_refused(model: ReducedModel, tmp_path: Path, compiled_fmu: Path) -> None:
+    for options, sentence in (
+        ({"kind": "python"}, "build the kind 'compiled'"),
+        ({"kind": "compiled", "fmi": 3}, r"FMI 2\.0 only"),
+    ):
+        with pytest.raises(FmuBuildError, match=sentence):
+            build_fmu(model, tmp_path / "wing.fmu", interface="model-exchange", **options)
