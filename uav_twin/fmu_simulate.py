@@ -2,20 +2,12 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from reporting import terminal
-
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from fmu_asset.door.session import FmiAsset
-    from fmu_asset.door.simulation import ObservationHistory
-
-_MOST_PANELS, _MOST_LINES = 8, 10
+from uav_twin.simulated import draw, refuse_files, say, values_of
 
 
 def simulate(
@@ -58,14 +50,14 @@ def simulate(
     from fmu_asset.door.history_file import read_histories, write_history
     from fmu_asset.door.session import FmiAsset
 
-    _refuse_files(out, plot, replace=replace)
+    refuse_files(out, plot, replace=replace)
     _refuse_mixture(binding, inputs, others=stop_time is not None or step_size is not None or bool(values))
     if binding is not None and inputs is not None:
         asset = FmiAsset(file, binding, isolated=not in_process, step_timeout=step_timeout)
         given = read_histories(inputs, asset.binding)
     else:
         planned = default_experiment(
-            read_fmu(file), stop_time=stop_time, step_size=step_size, values=_values(values or [])
+            read_fmu(file), stop_time=stop_time, step_size=step_size, values=values_of(values or [])
         )
         asset = FmiAsset(file, planned.binding, isolated=not in_process, step_timeout=step_timeout)
     with closing(asset):
@@ -74,21 +66,10 @@ def simulate(
         else:
             history = fly(asset, planned, terminal.progress())
         if out is not None:
-            write_history(out, asset, history)
+            write_history(out, asset, (file.name, asset.description.sha256), history)
         if plot is not None:
-            _plot(plot, asset, history)
-    _say(asset, history, [str(path) for path in (out, plot) if path is not None], from_start=inputs is None)
-
-
-def _refuse_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
-    """Refuse files that cannot be written, before anything is simulated."""
-    from fmu_asset.errors import FmuInputError
-
-    for path, suffixes, option in ((out, (".csv", ".nc"), "--out"), (plot, (".png", ".svg"), "--plot")):
-        if path is not None and path.suffix not in suffixes:
-            raise FmuInputError(f"{path} must end in {' or '.join(suffixes)}: choose another {option}.")
-        if path is not None and path.exists() and not replace:
-            raise FmuInputError(f"{path} exists: choose another {option} or give --replace.")
+            draw(plot, asset, history)
+    say(asset, history, file, [out, plot], from_start=inputs is None)
 
 
 def _refuse_mixture(binding: Path | None, inputs: Path | None, *, others: bool) -> None:
@@ -102,79 +83,3 @@ def _refuse_mixture(binding: Path | None, inputs: Path | None, *, others: bool) 
             "--stop-time, --step-size and --set are for a simulation without --binding, which says these "
             "itself."
         )
-
-
-def _values(texts: list[str]) -> dict[str, float | list[float]]:
-    """Return values by name: numbers, true and false, or for an array several with commas between."""
-    from fmu_asset.errors import FmuInputError
-
-    found: dict[str, float | list[float]] = {}
-    for text in texts:
-        name, sign, value = text.rpartition("=")
-        words = [{"true": "1", "false": "0"}.get(word.strip(), word) for word in value.split(",")]
-        try:
-            numbers = [float(word) for word in words]
-        except ValueError:
-            numbers = []
-        if not (name and sign and numbers):
-            raise FmuInputError(
-                f"--set {text} is not understood; write NAME=NUMBER, such as --set mass=2.5, and for an "
-                "array NAME=1,2,3."
-            )
-        found[name] = numbers[0] if len(numbers) == 1 else numbers
-    return found
-
-
-def _say(asset: "FmiAsset", history: "ObservationHistory", written: list[str], *, from_start: bool) -> None:
-    """Say what was simulated; where nothing was written, what stands at the end."""
-    end = history.time[-1] if len(history.time) else asset.time
-    where = ", ".join(written) or str(asset.description.path)
-    # Without histories the start is a row of its own.
-    steps = len(history.time) - from_start
-    terminal.say(f"{where}: {steps} steps to t = {end:g} s, every {asset.binding.interval:g} s.")
-    if history.ended:
-        terminal.say(history.ended)
-    if not written:
-        from uav_twin.console_table import console_table
-
-        rows = [
-            (name, *(f"{value:.6g}" for value in (v[0], v.min(), v.max(), v[-1])), unit)
-            for name, unit, v in _columns(asset, history)
-        ]
-        headings = ("output", "first", "least", "largest", "last", "unit")
-        console = terminal.console()
-        console.print(console_table(headings, rows, console.width))
-
-
-def _columns(
-    asset: "FmiAsset", history: "ObservationHistory"
-) -> "list[tuple[str, str, npt.NDArray[np.float64]]]":
-    """Return name, unit and values of every output."""
-    binding, units = asset.binding, asset.recorded_units
-    observed = [unit for vector in binding.observation.values() for unit in vector.units]
-    names = zip(binding.observation_variables, observed, history.values.T, strict=True)
-    return [*names, *((name, units[name], values) for name, values in history.extra.items())]
-
-
-def _plot(path: Path, asset: "FmiAsset", history: "ObservationHistory") -> None:
-    """Draw the outputs over time, those of one unit in one panel, and write the picture."""
-    from reporting.figures import FULL_WIDTH, new_figure, publication_style, to_png, to_svg
-    from reporting.files import atomic_write_bytes
-
-    panels: dict[str, list[tuple[str, npt.NDArray[np.float64]]]] = {}
-    for name, unit, values in _columns(asset, history):
-        panels.setdefault(unit, []).append((name, values))
-    shown = dict(list(panels.items())[:_MOST_PANELS])
-    with publication_style():
-        figure = new_figure(0.5 + 1.5 * len(shown), FULL_WIDTH)
-        axes = figure.subplots(len(shown), squeeze=False, sharex=True)[:, 0]
-        for panel, (unit, lines) in zip(axes, shown.items(), strict=True):
-            for name, values in lines[:_MOST_LINES]:
-                panel.plot(history.time, values, label=name)
-            more = f" and {len(lines) - _MOST_LINES} more" if len(lines) > _MOST_LINES else ""
-            panel.set_ylabel(lines[0][0] + f" [{unit}]" if len(lines) == 1 else f"[{unit}]")
-            if len(lines) > 1:
-                panel.legend(title=more or None, loc="center left", bbox_to_anchor=(1.0, 0.5))
-        axes[-1].set_xlabel("time [s]")
-        figure.tight_layout()
-        atomic_write_bytes(path, to_svg(figure) if path.suffix == ".svg" else to_png(figure))

@@ -6,8 +6,9 @@ from typing import Annotated
 import typer
 
 from reporting import terminal
+from uav_twin.simulated import draw, refuse_files, say, values_of
 
-ssp_app = typer.Typer(no_args_is_help=True, help="Write and check systems of FMUs as SSP files.")
+ssp_app = typer.Typer(no_args_is_help=True, help="Write, check and simulate systems of FMUs as SSP files.")
 
 
 @ssp_app.command("export")
@@ -55,6 +56,81 @@ def _is_design(what: str) -> bool:
         return "planform" in read_toml(what, ReportingError)
     except ReportingError:
         return False
+
+
+@ssp_app.command("simulate")
+def simulate(
+    file: Annotated[Path, typer.Argument(help="An SSP file.", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option(help="The file to write: CSV, or NetCDF (.nc) with units.")
+    ] = None,
+    stop_time: Annotated[
+        float | None,
+        typer.Option(help="End in seconds; by default that of the file, or 1 s."),
+    ] = None,
+    step_size: Annotated[
+        float | None, typer.Option(help="Communication step size in seconds.", min=0.0)
+    ] = None,
+    values: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A connector of the system, or component.variable."),
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="A picture of the outputs to write: .png or .svg.")
+    ] = None,
+    algorithm: Annotated[
+        str, typer.Option(help="How values are passed on within a step: gauss_seidel or jacobi.")
+    ] = "gauss_seidel",
+    iterations: Annotated[
+        int, typer.Option(help="How often a step of a circle of components is made at most.", min=1)
+    ] = 1,
+    in_process: Annotated[
+        bool, typer.Option("--in-process", help="Faster, without protection from crashes and endless steps.")
+    ] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the files if they exist.")] = False,
+) -> None:
+    """Simulate the system of an SSP file from its start; all outputs of the system and its components."""
+    import tempfile
+
+    from fmu_asset.coupling.asset import CoupledAsset
+    from fmu_asset.coupling.experiment import fly_system, system_experiment
+    from fmu_asset.door.history_file import write_history
+    from fmu_asset.ssp.check import join_ssp
+    from fmu_asset.ssp.reader import read_ssp
+    from reporting.provenance import hash_file
+
+    refuse_files(out, plot, replace=replace)
+    given = _single_numbers(values or [])
+    with tempfile.TemporaryDirectory() as folder:
+        system = read_ssp(file, folder)
+        wiring = join_ssp(system)
+        span = (system.span[0], system.span[1] if stop_time is None else stop_time)
+        planned = system_experiment(wiring, span=span, step_size=step_size, values=given)
+        with CoupledAsset(
+            wiring,
+            planned.binding,
+            algorithm=algorithm,  # type: ignore[arg-type]  # said by itself
+            iterations=iterations,
+            isolated=not in_process,
+            parameters=planned.parameters,
+        ) as asset:
+            history = fly_system(asset, planned, terminal.progress())
+            if out is not None:
+                write_history(out, asset, (file.name, hash_file(file)), history)
+            if plot is not None:
+                draw(plot, asset, history)
+    say(asset, history, file, [out, plot], from_start=True)
+
+
+def _single_numbers(texts: list[str]) -> dict[str, float]:
+    from fmu_asset.errors import FmuInputError
+
+    found: dict[str, float] = {}
+    for name, value in values_of(texts).items():
+        if isinstance(value, list):
+            raise FmuInputError(f"--set {name} has {len(value)} values; ends of a system take one number.")
+        found[name] = value
+    return found
 
 
 @ssp_app.command("check")

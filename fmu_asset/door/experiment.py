@@ -69,19 +69,9 @@ def default_experiment(
     FmuInputError
         If the end does not come after the start, or the steps are too many.
     """
-    start = description.start_time or 0.0
-    end = next((time for time in (stop_time, description.stop_time) if time is not None), start + 1.0)
-    if not (math.isfinite(end) and end > start):
-        raise FmuInputError(
-            f"The simulation starts at {start:g} s and cannot end at {end:g} s; give a later end."
-        )
-    size = step_size or description.fixed_step or description.step_size or (end - start) / _STEPS
-    steps = max(1, round((end - start) / size))
-    if steps > _MOST_STEPS:
-        raise FmuInputError(
-            f"From {start:g} to {end:g} s there are {steps} steps of {size:g} s, more than {_MOST_STEPS}; "
-            "give another step size or end."
-        )
+    end = description.stop_time if stop_time is None else stop_time
+    size = step_size or description.fixed_step or description.step_size
+    _, steps, size = steps_to(description.start_time or 0.0, end, size)
     binding = trial_binding(description, step_size=size)
     places = {item.variable: ("parameter", name) for name, item in binding.parameter.items()}
     for role in INPUT_ROLES:
@@ -99,6 +89,29 @@ def default_experiment(
         role, name = places[variable]
         given.setdefault(role, {})[name] = value
     return Experiment(binding, steps, given.pop("parameter", {}), given)
+
+
+def steps_to(start: float, end: float | None, size: float | None) -> tuple[float, int, float]:
+    """Return start, number and size of the steps to an end: a second, and 500 steps, where nothing says more.
+
+    Raises
+    ------
+    FmuInputError
+        If the end does not come after the start, or the steps are too many.
+    """
+    end = start + 1.0 if end is None else end
+    if not (math.isfinite(end) and end > start):
+        raise FmuInputError(
+            f"The simulation starts at {start:g} s and cannot end at {end:g} s; give a later end."
+        )
+    size = size or (end - start) / _STEPS
+    steps = max(1, round((end - start) / size))
+    if steps > _MOST_STEPS:
+        raise FmuInputError(
+            f"From {start:g} to {end:g} s there are {steps} steps of {size:g} s, more than {_MOST_STEPS}; "
+            "give another step size or end."
+        )
+    return start, steps, size
 
 
 def fly(asset: FmiAsset, experiment: Experiment, progress: Progress) -> ObservationHistory:

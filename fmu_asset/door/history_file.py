@@ -14,8 +14,8 @@ from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.table_file import TableErrors, read_table
 
 from .binding import INPUT_ROLES, Binding
-from .session import FmiAsset
 from .simulation import ObservationHistory
+from .stepped import SteppedAsset
 
 Roles = dict[str, dict[str, npt.NDArray[np.float64]]]
 
@@ -95,15 +95,19 @@ def read_histories(path: Path, binding: Binding) -> InputHistories:
     return InputHistories(len(time), roles)
 
 
-def write_history(path: Path, asset: FmiAsset, history: ObservationHistory) -> None:
+def write_history(
+    path: Path, asset: SteppedAsset, source: tuple[str, str], history: ObservationHistory
+) -> None:
     """Write what came out of a simulation, whole or not at all: NetCDF if the name ends with .nc, else CSV.
 
     Parameters
     ----------
     path : Path
         The file.
-    asset : FmiAsset
+    asset : SteppedAsset
         The asset that was simulated.
+    source : (str, str)
+        Name and SHA-256 of its file.
     history : ObservationHistory
         What came out: time at the end of each step, observations and extras.
 
@@ -113,7 +117,7 @@ def write_history(path: Path, asset: FmiAsset, history: ObservationHistory) -> N
         If the file cannot be written.
     """
     if path.suffix == ".nc":
-        atomic_write_bytes(path, _netcdf(asset, history))
+        atomic_write_bytes(path, _netcdf(asset, source, history))
         return
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -146,7 +150,7 @@ def _input_names(binding: Binding) -> dict[str, tuple[str, str]]:
     }
 
 
-def _netcdf(asset: FmiAsset, history: ObservationHistory) -> bytes:
+def _netcdf(asset: SteppedAsset, source: tuple[str, str], history: ObservationHistory) -> bytes:
     import xarray as xr
 
     binding, units = asset.binding, asset.recorded_units
@@ -167,8 +171,8 @@ def _netcdf(asset: FmiAsset, history: ObservationHistory) -> bytes:
             "extra_name": ("extra_name", np.array([*history.extra], dtype=str)),
         },
         attrs={
-            "fmu": asset.description.path.name,
-            "fmu_sha256": asset.description.sha256,
+            "fmu": source[0],
+            "fmu_sha256": source[1],
             "binding": binding.name,
         },
     )

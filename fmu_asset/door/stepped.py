@@ -31,6 +31,11 @@ class SteppedAsset(ABC):
         """Number of steps since the last reset."""
         return self._index
 
+    @property
+    @abstractmethod
+    def recorded_units(self) -> dict[str, str]:
+        """Units of `Observation.extra` by name."""
+
     @abstractmethod
     def reset(self) -> None:
         """Go back to the start."""

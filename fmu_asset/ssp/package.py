@@ -24,6 +24,13 @@ OWN_NAMESPACE = "urn:uav-twin:coupling"
 """Of the annotations that say what SSP 1.0 has no word for: delayed connections, several steps in one."""
 OWN_ANNOTATION = "org.uav-twin.coupling"
 
+_NUMBERS_OF_2 = {
+    "Float32": "Real",
+    "Float64": "Real",
+    **{f"{sign}Int{bits}": "Integer" for sign in ("", "U") for bits in (8, 16, 32, 64)},
+}
+_LEFT_OUT_OF_2 = ("MetaData", "Signature")
+
 _SCHEMAS = {
     "ssd": "SystemStructureDescription.xsd",
     "ssv": "SystemStructureParameterValues.xsd",
@@ -92,6 +99,8 @@ class SspPackage:
             What it must be.
         """
         root = parse_xml(self.read(name), f"{name} in {self.path}")
+        if str(root.get("version", "")).startswith("2."):
+            in_words_of_1(root, f"{name} in {self.path}")
         validate(root, kind, f"{name} in {self.path}")
         return root
 
@@ -114,6 +123,41 @@ def parse_xml(content: bytes, where: str) -> Any:
             f"{where} has a document type declaration, which SSP files have no need of; it was refused."
         )
     return root
+
+
+def in_words_of_1(root: Any, where: str) -> None:
+    """Put a document of SSP 2.0 into the words of SSP 1.0, which has the same namespaces and fewer of them.
+
+    The numbers of FMI 3 become the two that 1.0 knows; what FMU they come from decides their size. Metadata
+    and signatures are left out.
+
+    Raises
+    ------
+    SspError
+        If it has what 1.0 has no word for: clocks, arrays, structural parameters, a component without a
+        source.
+    """
+    own = tuple(f"{{{uri}}}" for uri in NAMESPACES.values())
+    for element in list(root.iter(etree.Element)):
+        if not element.tag.startswith(own):
+            continue
+        namespace, _, name = element.tag.rpartition("}")
+        if str(element.get("version", "")).startswith("2."):
+            element.set("version", "1.0")
+        if name in _LEFT_OUT_OF_2:
+            element.getparent().remove(element)
+        elif name in _NUMBERS_OF_2:
+            element.tag = f"{namespace}}}{_NUMBERS_OF_2[name]}"
+        missing = {"Clock": "a clock", "Dimension": "an array"}.get(name)
+        if element.get("kind") in ("clock", "structuralParameter"):
+            missing = f"a connector of the kind {element.get('kind')}"
+        if name == "Component" and element.get("source") is None:
+            missing = f"the component {element.get('name')!r} without a source"
+        if missing:
+            raise SspError(
+                f"{where} is of SSP 2.0 and has {missing} (line {element.sourceline}), which is not "
+                "supported; leave it out, or use what SSP 1.0 has."
+            )
 
 
 def validate(root: Any, kind: str, where: str) -> None:

@@ -2,6 +2,7 @@
 
 What SSP 1.0 allows and is not read is refused in a sentence: signal dictionaries, components that are systems
 of their own files, model exchange, mappings of Booleans, integers and enumerations, texts and binary values.
+Of SSP 2.0 the same is read; see `package.in_words_of_1`.
 """
 
 import os
@@ -38,10 +39,13 @@ class SspSystem:
         The system, flat; a component of a nested system is named `system.component`.
     declared : dict of Endpoint to DeclaredConnector
         The connectors of the components, as the file declares them.
+    span : (float or None, float or None)
+        Start and end of the default experiment [s], where the file says them.
     """
 
     structure: SystemStructure
     declared: dict[Endpoint, DeclaredConnector]
+    span: tuple[float | None, float | None] = (None, None)
 
 
 def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> SspSystem:
@@ -98,7 +102,15 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Ss
         for node, declared in tree.connectors.items()
         if node.path in names
     }
-    return SspSystem(structure, inner)
+    return SspSystem(structure, inner, _span(root))
+
+
+def _span(root: Any) -> tuple[float | None, float | None]:
+    found = root.find(tag("ssd", "DefaultExperiment"))
+    if found is None:
+        return None, None
+    start, stop = (found.get(name) for name in ("startTime", "stopTime"))
+    return None if start is None else float(start), None if stop is None else float(stop)
 
 
 def _kind(tree: Tree, node: Node, declared: DeclaredConnector) -> ConnectorKind:

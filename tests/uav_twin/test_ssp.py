@@ -5,9 +5,12 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
+import xarray as xr
 
 from uav_twin import cli
 
@@ -67,6 +70,9 @@ def test_bad_calls_are_one_sentence(
         (("ssp", "export", "no_scenario", "--out", out), 1, "There is no scenario `no_scenario`"),
         (("ssp", "export", scenario, "--out", str(tmp_path / "x.zip")), 1, "must have the suffix .ssp"),
         (("run", str(bad), "--scenario", scenario, "--out", out + "d"), 1, "not a sound SSP archive"),
+        (("ssp", "simulate", str(tmp_path / "none.ssp")), 1, "There is no SSP file"),
+        (("ssp", "simulate", str(bad), "--out", "x.txt"), 1, "x.txt must end in .csv or .nc"),
+        (("ssp", "simulate", str(bad), "--set", "a"), 1, "--set a is not understood"),
         (("run", str(bad)), 2, "name a scenario as well"),
         (("run", scenario, "--scenario", scenario), 2, "belongs to an SSP file"),
     ):
@@ -76,6 +82,83 @@ def test_bad_calls_are_one_sentence(
         if code == 1:
             assert len(error.strip().splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["bad.ssp"]
+
+
+@pytest.fixture(scope="module")
+def system(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The heat exchanger as an SSP file."""
+    place = tmp_path_factory.mktemp("system") / "x.ssp"
+    with pytest.MonkeyPatch.context() as patch:
+        assert call(patch, "ssp", "export", str(folder / "fouling.toml"), "--out", str(place)) == 0
+    return place
+
+
+def changed(system: Path, target: Path, **pairs: str) -> Path:
+    """Write a system with texts of its XML files replaced."""
+    with zipfile.ZipFile(system) as old, zipfile.ZipFile(target, "w") as new:
+        for name in old.namelist():
+            content = old.read(name)
+            if not name.endswith(".fmu"):
+                for before, after in pairs.items():
+                    content = content.replace(before.encode(), after.encode())
+            new.writestr(name, content)
+    return target
+
+
+def test_a_system_is_simulated_as_it_lies_there(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], system: Path, tmp_path: Path
+) -> None:
+    """Against the closed form of the heat exchanger: what the file says, and what is set instead."""
+    table, picture = tmp_path / "x.csv", tmp_path / "x.svg"
+    simulate = ["ssp", "simulate", str(system), "--stop-time", "3", "--step-size", "1", "--in-process"]
+    assert call(monkeypatch, *simulate, "--out", str(table), "--plot", str(picture)) == 0
+    assert "3 steps to t = 3 s, every 1 s." in capsys.readouterr().out
+    assert picture.read_text(encoding="utf-8").startswith("<?xml")
+    rows = np.genfromtxt(table, delimiter=",", names=True)
+    np.testing.assert_allclose(rows["time"], [0.0, 1.0, 2.0, 3.0])
+    assert rows["outlet"][-1] == pytest.approx(20.0 + 60.0 * -np.expm1(-6100.0 / 4186.0), rel=1e-14)
+    for number, name in enumerate(("conductance", "heat_exchanger.conductance")):
+        again = tmp_path / f"{number}.nc"
+        values = ["--set", "mass_flow=0.5", "--set", f"{name}=5000"]
+        assert call(monkeypatch, *simulate, *values, "--out", str(again)) == 0
+        with xr.open_dataset(again, engine="h5netcdf") as data:
+            outlet = float(data["observation"].sel(observation_name="outlet")[-1])
+            assert data.attrs["fmu"] == "x.ssp"
+        assert outlet == pytest.approx(20.0 + 60.0 * -np.expm1(-5000.0 / (4186.0 * 0.5)), rel=1e-14)
+    assert call(monkeypatch, *simulate, "--set", "heat_exchanger.outlet=1") == 1
+    assert "declared as output" in capsys.readouterr().err
+
+
+def test_the_words_of_ssp_2_are_read(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], system: Path, tmp_path: Path
+) -> None:
+    """The numbers of FMI 3, metadata and the version; what 1.0 has no word for is refused."""
+    meta = '<ssc:MetaData kind="general" type="text/plain" source="note.txt" />'
+    words = {
+        'version="1.0" name=': 'version="2.0" name=',
+        "ssc:Real": "ssc:Float64",
+        "ssv:Real": "ssv:Float64",
+        "</ssd:SystemStructureDescription>": f"{meta}</ssd:SystemStructureDescription>",
+    }
+    newer = changed(system, tmp_path / "newer.ssp", **words)
+    tables = []
+    for number, file in enumerate((system, newer)):
+        tables.append(tmp_path / f"{number}.csv")
+        arguments = ["--out", str(tables[-1]), "--step-size", "0.25", "--in-process"]
+        assert call(monkeypatch, "ssp", "simulate", str(file), *arguments) == 0
+    assert tables[0].read_bytes() == tables[1].read_bytes()
+    capsys.readouterr()
+    for what, by, sentence in (
+        ("<ssc:Float64 />", '<ssc:Float64 /><ssd:Dimension size="2" />', "has an array"),
+        ("<ssc:Float64 />", "<ssc:Clock />", "has a clock"),
+        ('kind="parameter"', 'kind="structuralParameter"', "a connector of the kind structuralParameter"),
+        (' source="resources/heat_exchanger.fmu"', "", "'heat_exchanger' without a source"),
+    ):
+        bad = changed(newer, tmp_path / "bad.ssp", **{what: by})
+        assert call(monkeypatch, "ssp", "simulate", str(bad)) == 1
+        error = capsys.readouterr().err
+        assert sentence in error
+        assert len(error.strip().splitlines()) == 1
 
 
 def test_a_strain_library_cannot_be_exported(

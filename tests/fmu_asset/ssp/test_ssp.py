@@ -461,7 +461,7 @@ def test_nested_systems_parameters_and_mappings(theirs: Pack, tmp_path: Path) ->
         (('name="z1" kind="output"', 'name="z1" kind="output" colour="red"'),
          r"not valid by the schema of SSP 1\.0 \(line \d+\).*colour"),
         (("</ssd:Units>", "</ssd:Unit>"), "not well-formed XML"),
-        (('version="1.0" name="theirs"', 'version="2.0" name="theirs"'), "not valid by the schema"),
+        (('version="1.0" name="theirs"', 'version="3.0" name="theirs"'), "not valid by the schema"),
         (('<ssd:Connector name="health.z1" kind="input"><ssc:Real/>',
           '<ssd:Connector name="health.z1" kind="input"><ssc:Integer/>'),
          r"structure\.wing\.health\.z1 is declared of the type Integer, but its FMU has it as Real"),
