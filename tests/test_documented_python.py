@@ -59,6 +59,12 @@ def wing_fmu(folder: Path) -> None:
     build_fmu(reduced_model(), folder / "wing.fmu")
 
 
+def wing_of_fmi_3(folder: Path) -> None:
+    from fe.reduction.model_cache import reduced_model
+
+    build_fmu(reduced_model(), folder / "wing3.fmu", kind="compiled", fmi=3)
+
+
 def checkout(folder: Path) -> None:
     """The folder of the project, where the shipped bindings are."""
     (folder / "scenarios").symlink_to(ROOT / "scenarios")
@@ -195,7 +201,7 @@ READER_HAS: dict[str, tuple[Prepare, ...]] = {
     "docs/real_wing.md": (converted_wing,),
     "docs/rig_in_ten_minutes.md": (empty_rig,),
     "docs/structures.md": (bracket,),
-    "docs/use_the_wing_in.md": (wing_fmu,),
+    "docs/use_the_wing_in.md": (wing_fmu, wing_of_fmi_3),
     "docs/verdict.md": (verdict_folder,),
 }
 """What is in the reader's folder before the first block."""

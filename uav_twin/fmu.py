@@ -17,9 +17,12 @@ _SWITCH = re.compile(r"effect\.[A-Za-z0-9_]+\.active")
 """The switch of a missing effect among the variables of an FMU."""
 
 _Form = tuple[
-    Literal["python", "compiled", "source"], Literal[2, 3], Literal["co-simulation", "model-exchange"]
+    Literal["python", "compiled", "source"],
+    Literal[2, 3],
+    Literal["co-simulation", "model-exchange"],
+    bool,
 ]
-"""Kind, version of FMI and interface."""
+"""Kind, version of FMI, interface, and whether it is for Windows too."""
 
 fmu_app = typer.Typer(no_args_is_help=True, help="Build, describe, bind, check and simulate FMUs.")
 
@@ -43,6 +46,9 @@ def build(
         Literal["co-simulation", "model-exchange"],
         typer.Option(help="How it is run; in model exchange a compiled wing has its modes as states."),
     ] = "co-simulation",
+    windows: Annotated[
+        bool, typer.Option("--windows", help="Add a binary for 64-bit Windows to a compiled wing.")
+    ] = False,
     calibration: Annotated[
         Path | None,
         typer.Option(help="Tailor it to a wing: the calibration.nc of `uav-twin calibrate`."),
@@ -62,20 +68,20 @@ def build(
 ) -> None:
     """Pack a wing, a structure or a model script as an FMU; equal input gives equal bytes."""
     if script is None and calibration is None and design is not None and is_structure(design):
-        if patch is not None or activate or interface != "co-simulation":
+        if patch is not None or activate or interface != "co-simulation" or windows:
             raise typer.BadParameter(
-                "--patch, --activate and --interface are for wings, and the design is a structure."
+                "--patch, --activate, --interface and --windows are for wings; the design is a structure."
             )
         build_structure(design, out, kind, fmi, None, None, replace, None)
         return
     out = out or Path("uav_wing.fmu")
     _refuse_contradictions(out, design, calibration, patch, activate=activate, replace=replace)
     if script is not None:
-        plain = (kind, fmi, interface) == ("python", 2, "co-simulation")
+        plain = (kind, fmi, interface, windows) == ("python", 2, "co-simulation", False)
         for_the_wing = design is not None or calibration is not None or patch is not None or not plain
         _build_script(script, out, replace=replace, other=for_the_wing)
         return
-    form: _Form = (kind, 3 if fmi == 3 else 2, interface)
+    form: _Form = (kind, 3 if fmi == 3 else 2, interface, windows)
     _build_wing(out, design, form, calibration, patch, activate=activate, replace=replace)
 
 
@@ -91,18 +97,22 @@ def _build_wing(
 ) -> None:
     """Pack a wing, tailored where it was calibrated."""
     from fe.wing.design import load_design
-    from fmu_asset.compiled.compiler import find_compiler
+    from fmu_asset.compiled.compiler import find_compiler, find_cross_compiler
     from fmu_asset.packing.patch_file import load_patch
     from fmu_asset.packing.wing_fmu import check_kind, check_version
     from fmu_asset.packing.wing_packing import pack_wing
 
-    kind, fmi, interface = form
+    kind, fmi, interface, windows = form
     check_version(kind, fmi, interface)
     effects = None if patch is None else load_patch(patch)
     if effects is not None:
         check_kind(kind)
-    if kind == "compiled":
-        find_compiler()  # before the wing is modelled, which can take a minute
+    if windows and kind != "compiled":
+        raise typer.BadParameter("--windows is for --kind compiled.")
+    if kind == "compiled":  # before the wing is modelled, which can take a minute
+        find_compiler()
+    if windows:
+        find_cross_compiler()
     tailored = None
     if calibration is None:
         shape = load_design(design)
@@ -121,6 +131,7 @@ def _build_wing(
         activate=activate,
         fmi=fmi,
         interface=interface,
+        platforms=("linux64", "win64") if windows else ("linux64",),
         replace=replace,
         progress=terminal.progress(),
     )
@@ -156,7 +167,7 @@ def _build_script(script: str, out: Path, *, replace: bool, other: bool) -> None
 
     if other:
         raise typer.BadParameter(
-            "--design, --calibration, --patch, --kind, --fmi and --interface are for the wing.",
+            "--design, --calibration, --patch, --kind, --fmi, --interface and --windows are for the wing.",
             param_hint="--script",
         )
     built = build_script_fmu(asset_scripts().get(script, Path(script)), out, replace=replace)

@@ -7,6 +7,7 @@ import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 from fmpy import platform as fmi_platform
 
@@ -15,22 +16,31 @@ from fmu_asset.errors import FmuBuildError
 COMPILERS = ("cc", "gcc", "clang")
 """Tried in this order where the environment variable CC names none."""
 
-PLATFORM = "linux64"
-"""The only platform that is compiled for here; other platforms compile the sources inside the FMU."""
+Platform = Literal["linux64", "win64"]
+"""What is compiled for here; other platforms compile the sources inside the FMU."""
 
-FLAGS = (
+PLATFORM: Platform = "linux64"
+"""The platform that is compiled for by default, and on which every binary is made."""
+
+CROSS_COMPILER = "x86_64-w64-mingw32-gcc"
+"""Makes binaries for 64-bit Windows on Linux."""
+
+_COMMON_FLAGS = (
     "-std=c11",
     "-O3",
-    "-fPIC",
     "-shared",
     "-fvisibility=hidden",
     # Fused multiplications would make the last bit depend on the processor that is compiled for.
     "-ffp-contract=off",
     "-fno-math-errno",
-    # Nothing that depends on the place or the time of the build.
-    "-Wl,--build-id=none",
     "-Wl,-s",
 )
+
+# Nothing that depends on the place or the time of the build, or that is not there where the FMU runs.
+FLAGS: Mapping[Platform, tuple[str, ...]] = {
+    "linux64": (*_COMMON_FLAGS, "-fPIC", "-Wl,--build-id=none"),
+    "win64": (*_COMMON_FLAGS, "-static-libgcc", "-Wl,--no-insert-timestamp"),
+}
 
 LIBRARIES = ("-lm",)
 
@@ -63,7 +73,26 @@ def find_compiler() -> list[str]:
     )
 
 
-def compile_library(sources: Mapping[str, bytes], *, extra_flags: Sequence[str] = ()) -> bytes:
+def find_cross_compiler() -> list[str]:
+    """Return the command of the compiler for 64-bit Windows.
+
+    Raises
+    ------
+    FmuBuildError
+        If there is none.
+    """
+    program = shutil.which(CROSS_COMPILER)
+    if program is None:
+        raise FmuBuildError(
+            f"A binary for 64-bit Windows needs {CROSS_COMPILER}, which was not found; install it (such as "
+            "the package gcc-mingw-w64-x86-64), or build without --windows."
+        )
+    return [program]
+
+
+def compile_library(
+    sources: Mapping[str, bytes], *, extra_flags: Sequence[str] = (), platform: Platform = PLATFORM
+) -> bytes:
     """Return the shared library of C sources; the same sources and compiler give the same bytes.
 
     Parameters
@@ -72,6 +101,8 @@ def compile_library(sources: Mapping[str, bytes], *, extra_flags: Sequence[str] 
         Content of the sources and headers by file name, all in one folder.
     extra_flags : sequence of str
         Flags after the usual ones.
+    platform : {"linux64", "win64"}
+        What it is to run on.
 
     Returns
     -------
@@ -88,13 +119,13 @@ def compile_library(sources: Mapping[str, bytes], *, extra_flags: Sequence[str] 
             f"Compiled FMUs are built on {PLATFORM} only, but this is {fmi_platform}; build with --kind "
             "source and compile the FMU with `fmpy compile`."
         )
-    compiler = find_compiler()
+    compiler = find_compiler() if platform == "linux64" else find_cross_compiler()
     with tempfile.TemporaryDirectory(prefix="uav-twin-cc-") as folder:
         for name, content in sources.items():
             (Path(folder) / name).write_bytes(content)
         units = sorted(name for name in sources if name.endswith(".c"))
         # Names relative to the working folder, so that no path gets into the library.
-        command = [*compiler, *FLAGS, *extra_flags, "-o", "library.so", *units, *LIBRARIES]
+        command = [*compiler, *FLAGS[platform], *extra_flags, "-o", "library.so", *units, *LIBRARIES]
         try:
             done = subprocess.run(
                 command, cwd=folder, capture_output=True, text=True, timeout=_LONGEST_BUILD, check=False

@@ -16,7 +16,7 @@ from fmu_asset.instances.plan import Interface
 from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
 from .arrays import arrays_of
-from .compiler import PLATFORM, compile_library
+from .compiler import PLATFORM, Platform, compile_library
 from .data_file import data_file_bytes
 from .description3 import build_description, model_description3
 from .exchange import exchange_table
@@ -33,7 +33,12 @@ FMI_HEADERS: Mapping[FmiVersion, tuple[str, ...]] = {
 }
 """The headers of FMI as fmpy ships them, with their licence (2-clause BSD) in them."""
 
-_PLATFORM_FOLDERS: Mapping[FmiVersion, str] = {2: PLATFORM, 3: "x86_64-linux"}
+_BINARIES: Mapping[tuple[FmiVersion, Platform], str] = {
+    (2, "linux64"): "binaries/linux64/{}.so",
+    (2, "win64"): "binaries/win64/{}.dll",
+    (3, "linux64"): "binaries/x86_64-linux/{}.so",
+    (3, "win64"): "binaries/x86_64-windows/{}.dll",
+}
 
 _TIME = FmuVariable(
     name="time",
@@ -110,6 +115,7 @@ def compiled_members(
     made = variable_sources(table, roles, guid=guid, content_tag=content_tag, arrays=arrays)
     sources |= {name: text.encode() for name, text in made.items()}
     listed = sorted(name for name in sources if name.endswith(".c"))
+    sources["CMakeLists.txt"] = _cmake_lists(identifier, listed, fmi)
     if fmi == 3:
         sources["buildDescription.xml"] = build_description(identifier, listed)
         model_description_text = model_description3(
@@ -146,6 +152,45 @@ def compiled_members(
     }
 
 
+def _cmake_lists(identifier: str, names: Sequence[str], fmi: FmiVersion) -> bytes:
+    """Return the CMake project that makes the binary of any platform, in its place beside the sources."""
+    folder = (
+        "${machine}-${system}" if fmi == 3 else "${system}64"  # FMI 2 has names for x86-64 alone
+    )
+    systems = {"Windows": "windows" if fmi == 3 else "win", "Darwin": "darwin"}
+    named = "".join(
+        f'elseif(CMAKE_SYSTEM_NAME STREQUAL "{k}")\n  set(system {v})\n' for k, v in systems.items()
+    )
+    text = f"""# cmake -S sources -B build && cmake --build build --config Release
+cmake_minimum_required(VERSION 3.16)
+project({identifier} C)
+if(NOT CMAKE_BUILD_TYPE)
+  set(CMAKE_BUILD_TYPE Release)
+endif()
+set(system linux)
+if(CMAKE_SYSTEM_NAME STREQUAL "Linux")
+{named}endif()
+set(machine x86_64)
+if(CMAKE_SYSTEM_PROCESSOR MATCHES "arm64|aarch64")
+  set(machine aarch64)
+endif()
+add_library({identifier} SHARED {" ".join(names)})
+set_target_properties({identifier} PROPERTIES
+  PREFIX "" C_STANDARD 11 C_VISIBILITY_PRESET hidden
+  LIBRARY_OUTPUT_DIRECTORY "$<1:${{CMAKE_CURRENT_SOURCE_DIR}}/../binaries/{folder}>"
+  RUNTIME_OUTPUT_DIRECTORY "$<1:${{CMAKE_CURRENT_SOURCE_DIR}}/../binaries/{folder}>")
+if(APPLE)
+  set_target_properties({identifier} PROPERTIES SUFFIX ".dylib")
+endif()
+if(NOT MSVC)
+  # Fused multiplications would make the last bit depend on the processor that is compiled for.
+  target_compile_options({identifier} PRIVATE -ffp-contract=off -fno-math-errno)
+  target_link_libraries({identifier} PRIVATE m)
+endif()
+"""
+    return text.encode()
+
+
 def _sources(fmi: FmiVersion) -> dict[str, bytes]:
     """Return the C files that every compiled FMU of a version of FMI has, by name."""
     return {
@@ -172,8 +217,13 @@ def fmi_headers(fmi: FmiVersion = 2) -> dict[str, bytes]:
         ) from error
 
 
-def binary_of(members: Mapping[str, bytes], identifier: str, fmi: FmiVersion = 2) -> dict[str, bytes]:
-    """Return the binary of a compiled FMU, made of the sources among its files.
+def binaries_of(
+    members: Mapping[str, bytes],
+    identifier: str,
+    fmi: FmiVersion = 2,
+    platforms: Sequence[Platform] = (PLATFORM,),
+) -> dict[str, bytes]:
+    """Return the binaries of a compiled FMU, made of the sources among its files.
 
     Parameters
     ----------
@@ -183,20 +233,25 @@ def binary_of(members: Mapping[str, bytes], identifier: str, fmi: FmiVersion = 2
         Model identifier.
     fmi : {2, 3}
         Version of FMI.
+    platforms : sequence of {"linux64", "win64"}
+        What it is to run on.
 
     Returns
     -------
     dict of str to bytes
-        The binary under its name in the archive.
+        Each binary under its name in the archive.
 
     Raises
     ------
     FmuBuildError
-        If it cannot be compiled.
+        If one cannot be compiled.
     """
     sources = {
         name.removeprefix("sources/"): content
         for name, content in members.items()
         if name.startswith("sources/")
     }
-    return {f"binaries/{_PLATFORM_FOLDERS[fmi]}/{identifier}.so": compile_library(sources)}
+    return {
+        _BINARIES[fmi, platform].format(identifier): compile_library(sources, platform=platform)
+        for platform in platforms
+    }

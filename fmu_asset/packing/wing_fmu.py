@@ -9,13 +9,14 @@ import json
 import os
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
-from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binary_of, compiled_members
+from fmu_asset.compiled.compiler import PLATFORM, Platform
+from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binaries_of, compiled_members
 from fmu_asset.compiled.variable_header import Roles
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.instances.plan import Interface
@@ -66,6 +67,7 @@ def build_fmu(
     arrays: PatchArrays | None = None,
     fmi: FmiVersion = 2,
     interface: Interface = "co-simulation",
+    platforms: Sequence[Platform] = (PLATFORM,),
     replace: bool = False,
 ) -> FmuInfo:
     """Pack a reduced model as an FMU; equal input gives equal bytes.
@@ -96,6 +98,8 @@ def build_fmu(
         Version of FMI; 3 for the kinds in C.
     interface : {"co-simulation", "model-exchange"}
         How it is run; model exchange (the modes as states) for the kinds in C, in FMI 2.
+    platforms : sequence of {"linux64", "win64"}
+        What the binaries of a compiled one are for; the latter needs a cross compiler.
     replace : bool
         Whether an existing file may be replaced.
 
@@ -120,6 +124,7 @@ def build_fmu(
         arrays=arrays,
         fmi=fmi,
         interface=interface,
+        platforms=platforms,
     )
     return write_fmu(target, content, content_hash, "uav_wing", model.design_hash)
 
@@ -136,6 +141,7 @@ def fmu_bytes(
     arrays: PatchArrays | None = None,
     fmi: FmiVersion = 2,
     interface: Interface = "co-simulation",
+    platforms: Sequence[Platform] = (PLATFORM,),
 ) -> tuple[bytes, str]:
     """Return the archive and its content hash; see `build_fmu`."""
     check_version(kind, fmi, interface)
@@ -183,15 +189,21 @@ def fmu_bytes(
         if f"resources/{name}" in template or "/" in name or not name:
             raise FmuBuildError(f"A resource of an FMU cannot have the name {name!r}; choose another one.")
         template[f"resources/{name}"] = content
-    return packed(template, "uav_wing", kind, fmi)
+    return packed(template, "uav_wing", kind, fmi, platforms)
 
 
-def packed(template: Mapping[str, bytes], stem: str, kind: FmuKind, fmi: FmiVersion) -> tuple[bytes, str]:
+def packed(
+    template: Mapping[str, bytes],
+    stem: str,
+    kind: FmuKind,
+    fmi: FmiVersion,
+    platforms: Sequence[Platform] = (PLATFORM,),
+) -> tuple[bytes, str]:
     """Return the archive of the files with their placeholders, compiled where the kind is, and their hash."""
     content_hash = content_hash_of(template)
     members = filled(template, content_hash)
     if kind == "compiled":
-        members |= binary_of(members, f"{stem}_{tag_of(content_hash)}", fmi)
+        members |= binaries_of(members, f"{stem}_{tag_of(content_hash)}", fmi, platforms)
     return archive_bytes(members), content_hash
 
 

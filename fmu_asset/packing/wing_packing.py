@@ -1,7 +1,7 @@
 """The one way from a wing design to its FMU: reduced, tailored to a calibration, with missing effects."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from fe.reduction.model_cache import reduced_model
@@ -9,6 +9,7 @@ from fe.reduction.patch_cache import patch_arrays
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
+from fmu_asset.compiled.compiler import PLATFORM, Platform
 from fmu_asset.compiled.package import FmiVersion
 from fmu_asset.instances.plan import Interface
 from reporting.progress import Progress, SilentProgress
@@ -44,6 +45,7 @@ def pack_wing(
     activate: bool = False,
     fmi: FmiVersion = 2,
     interface: Interface = "co-simulation",
+    platforms: Sequence[Platform] = (PLATFORM,),
     replace: bool = False,
     progress: Progress | None = None,
 ) -> FmuInfo:
@@ -57,7 +59,7 @@ def pack_wing(
         Where to write, with the suffix .fmu.
     tailoring : Tailoring, optional
         The calibration: the FMU starts at its means and carries its record.
-    kind, patch, activate, fmi, interface, replace
+    kind, patch, activate, fmi, interface, platforms, replace
         See `fmu_asset.packing.wing_fmu.build_fmu`.
     progress : Progress, optional
         Shows what takes long.
@@ -82,6 +84,7 @@ def pack_wing(
         arrays=arrays_for(design, patch, progress),
         fmi=fmi,
         interface=interface,
+        platforms=platforms,
         replace=replace,
     )
 

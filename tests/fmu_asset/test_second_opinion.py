@@ -35,20 +35,26 @@ def opinion(fmutool: str, fmu: Path) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("name", ["python", "source", *sorted(COMPANION_NAMES), *sorted(asset_scripts())])
+@pytest.mark.parametrize(
+    "name", ["python", "source", "fmi3", "exchange", *sorted(COMPANION_NAMES), *sorted(asset_scripts())]
+)
 def test_it_has_no_complaint(fmutool: str, name: str, model: ReducedModel, tmp_path: Path) -> None:
     target = tmp_path / f"{name}.fmu"
     if name == "python":
         build_fmu(model, target)
     elif name == "source":  # the compiled one without its binary: the description is the same
         build_fmu(model, target, kind="source")
+    elif name == "fmi3":
+        build_fmu(model, target, kind="source", fmi=3)
+    elif name == "exchange":
+        build_fmu(model, target, kind="source", interface="model-exchange")
     elif name in COMPANION_NAMES:
         build_companion(name, target)
     else:
         build_script_fmu(asset_scripts()[name], target)
     code, said = opinion(fmutool, target)
     assert code == 0, said
-    assert "seems to be compliant with FMI-2.0" in said
+    assert f"seems to be compliant with FMI-{3 if name == 'fmi3' else 2}.0" in said
     assert "No semantic error" in said
     assert "ERROR" not in said
     assert "WARNING" not in said

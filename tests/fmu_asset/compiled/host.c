@@ -3,7 +3,15 @@
    host BINARY GUID RESOURCES STEPS REFERENCE ... */
 #include "fmi2FunctionTypes.h"
 
+#ifdef _WIN32
+#include <windows.h>
+#define dlopen(path, flags) ((void *)LoadLibraryA(path))
+#define dlsym(library, name) ((void *)(size_t)GetProcAddress((HMODULE)library, name))
+#define dlclose(library) (!FreeLibrary((HMODULE)library))
+#define dlerror() "no such library or function"
+#else
 #include <dlfcn.h>
+#endif
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib.util
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -16,6 +17,8 @@ import pytest
 
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.compiled.compiler import CROSS_COMPILER
+from fmu_asset.packing.wing_fmu import build_fmu
 
 COURSE = [(1.0 + 0.25 * k, 0.1 * (k // 3), 0.2, -5.0 if k % 2 else 0.0) for k in range(9)]
 
@@ -67,6 +70,47 @@ def test_a_host_without_python_needs_nothing_else(
     assert done.returncode == 0, done.stdout
     expected = model.static_response(1.0, (0.0, 0.0), 1.0).strain
     np.testing.assert_allclose([float(line) for line in done.stdout.split()], expected, rtol=1e-12)
+
+
+def test_the_windows_binary_gives_the_same_under_wine(
+    compiled_fmu: Path, compiler: list[str], model: ReducedModel, tmp_path: Path
+) -> None:
+    """To the last bit: statics, bound and modes."""
+    if shutil.which(CROSS_COMPILER) is None:
+        pytest.skip(f"{CROSS_COMPILER} is not installed")
+    path = build_fmu(model, tmp_path / "wing.fmu", kind="compiled", platforms=("linux64", "win64")).path
+    with zipfile.ZipFile(path) as archive, zipfile.ZipFile(compiled_fmu) as linux:
+        assert archive.read("modelDescription.xml") == linux.read("modelDescription.xml")
+        archive.extractall(tmp_path)
+    binary = next((tmp_path / "binaries" / "win64").glob("*.dll"))
+    libraries = [
+        line.split()[-1].lower()
+        for line in subprocess.run(
+            [CROSS_COMPILER.replace("gcc", "objdump"), "-p", binary],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.splitlines()
+        if "DLL Name" in line
+    ]
+    assert sorted(libraries) == ["kernel32.dll", "msvcrt.dll"]  # of every Windows
+    if shutil.which("wine") is None:
+        pytest.skip("wine is not installed")
+    source, host = Path(__file__).with_name("host.c"), tmp_path / "host"
+    for program, target, flags in ((compiler, host, ["-ldl"]), ([CROSS_COMPILER], f"{host}.exe", [])):
+        subprocess.run([*program, f"-I{tmp_path / 'sources'}", source, "-o", target, *flags], check=True)
+    shared = next((tmp_path / "binaries" / "linux64").glob("*.so"))
+    places = [str(place) for place in (*range(11, 37), *range(38, 51))]
+    given = [read_fmu(path).guid, (tmp_path / "resources").as_uri(), "3", *places]
+    environment = {**os.environ, "WINEPREFIX": str(tmp_path / "wine"), "WINEDEBUG": "-all"}
+    shown = [
+        subprocess.run(
+            command, capture_output=True, text=True, check=True, timeout=120, env=environment
+        ).stdout.split()
+        for command in ([host, shared, *given], ["wine", f"{host}.exe", f"Z:{binary}", *given])
+    ]
+    assert len(shown[0]) == len(places)
+    assert shown[0] == shown[1]
 
 
 def test_both_fmus_fly_in_libcosim(compiled_fmu: Path, fmu: Path, model: ReducedModel) -> None:

@@ -166,6 +166,23 @@ def test_fmpy_compiles_the_sources(
             np.testing.assert_allclose(seen[0].values, seen[1].values, rtol=1e-12)
 
 
+@pytest.mark.parametrize(("fmi", "binary"), [(2, "linux64"), (3, "x86_64-linux")])
+def test_cmake_builds_the_sources(
+    model: ReducedModel, compiler: list[str], tmp_path: Path, fmi: Any, binary: str
+) -> None:
+    """As a user without fmpy does: the project among the sources puts the binary in its place."""
+    cmake = shutil.which("cmake") or shutil.which("cmake", path=str(BIN))
+    if cmake is None:
+        pytest.skip("cmake is not installed")
+    with zipfile.ZipFile(build_fmu(model, tmp_path / "wing.fmu", kind="source", fmi=fmi).path) as archive:
+        archive.extractall(tmp_path / "wing")
+    place = ["-S", tmp_path / "wing" / "sources", "-B", tmp_path / "build", "-DCMAKE_C_FLAGS=-O0 -Werror"]
+    subprocess.run([cmake, *place, "-DCMAKE_BUILD_TYPE=Debug"], check=True, capture_output=True)
+    subprocess.run([cmake, "--build", tmp_path / "build"], check=True, capture_output=True)
+    identifier = read_model_description(str(tmp_path / "wing")).coSimulation.modelIdentifier
+    assert [path.name for path in (tmp_path / "wing" / "binaries" / binary).iterdir()] == [f"{identifier}.so"]
+
+
 def test_without_a_compiler_there_is_a_sentence(
     model: ReducedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
