@@ -9,7 +9,7 @@ from reporting import terminal
 from twin_master.command import guarded
 from twin_master.command import run as run_command
 from twin_master.fleet.command import compare, fleet_app
-from twin_master.viewer.command import view as view_command
+from twin_master.view_command import view as view_command
 from twin_master.watch_command import watch as watch_command
 from uav_twin.calibrate_commands import calibrate_app
 from uav_twin.discrepancy import discrepancy_app

@@ -81,11 +81,11 @@ def write_fleet_report(folder: Path | str) -> Path:
     page.add_section("The fleet")
     _figures(page, groups)
     if failures:
-        _failures(page, failures, twins)
+        add_failures(page, failures, twins, f"All of them stand in {RESULT_NAME}.")
     lessons = folder / LESSONS_NAME
     if lessons.is_file():
         page.add_section("Learnt across the fleet")
-        _lessons(page, json.loads(lessons.read_text()))
+        add_lessons(page, json.loads(lessons.read_text()))
     for record in fleet["groups"]:
         page.add_section(f"Group {record['name']}")
         _group(page, folder, record, groups[record["name"]])
@@ -102,7 +102,8 @@ def _figures(page: Page, groups: "dict[str, xr.Dataset]") -> None:
     page.add_table(Table(columns, rows), caption, title="How the twins fared")
 
 
-def _failures(page: Page, failures: dict[str, str], twins: int) -> None:
+def add_failures(page: Page, failures: dict[str, str], twins: int, caption: str) -> None:
+    """Add what ended flights, by cause."""
     page.add_notice(f"{len(failures)} of {twins} assets failed in flight; their twins end there.")
     kinds = Counter(failures.values()).most_common(FAILURES)
     rows = []
@@ -110,10 +111,11 @@ def _failures(page: Page, failures: dict[str, str], twins: int) -> None:
         names = [name for name, text in failures.items() if text == sentence]
         rows.append([sentence, str(count), ", ".join(names[:3]) + (", ..." if count > 3 else "")])
     columns = [Column("what ended the flight"), Column("assets", numeric=True), Column("such as")]
-    page.add_table(Table(columns, rows), f"All of them stand in {RESULT_NAME}.", title="Failures")
+    page.add_table(Table(columns, rows), caption, title="Failures")
 
 
-def _lessons(page: Page, record: dict[str, Any]) -> None:
+def add_lessons(page: Page, record: dict[str, Any]) -> None:
+    """Add what was learnt beside what was assumed."""
     rows = []
     for name, group in record["groups"].items():
         for control, rate in group["probability"].items():
@@ -145,19 +147,19 @@ def _group(page: Page, folder: Path, record: dict[str, Any], group: "xr.Dataset"
     if not len(flown):
         page.add_paragraph("No twin of this group has flown to its end yet.")
         return
-    scale, unit = _scale(scenario)
+    scale, unit = scale_of(scenario)
     mean = scale * group["mean"].values[flown]  # (B, T, F)
     failed = int(np.sum(group["status"].values == FAILED))
     last = mean[np.arange(len(flown)), last_turns(group)[flown]]
     with style.publication_style():
         page.add_figure(
-            style.to_svg(_map_figure(scenario, last, failed, unit)),
+            style.to_svg(map_figure(scenario, last, failed, unit)),
             f"Filtered mean after the last {scenario.mission.step_name}, one cell for each asset, "
             f"the worst first by the sum of its states. Grey: {failed} that failed in flight.",
             title="The assets by health",
         )
         page.add_figure(
-            style.to_svg(_course_figure(scenario, mean, scale * group["state"].values[flown], unit)),
+            style.to_svg(course_figure(scenario, mean, scale * group["state"].values[flown], unit)),
             "Bands hold 90 and 50 % of the assets; the line is the median of the filtered means, "
             "the dash-dotted one that of the true states, where they are known.",
             title="Health over time",
@@ -165,14 +167,15 @@ def _group(page: Page, folder: Path, record: dict[str, Any], group: "xr.Dataset"
     _attention(page, folder, record, group, flown)
 
 
-def _scale(scenario: Scenario) -> tuple[float, str]:
+def scale_of(scenario: Scenario) -> tuple[float, str]:
+    """Return what states are multiplied by for people, and their unit then."""
     units = {factor.unit for factor in scenario.state}
     if units == {"1"}:
         return 100.0, "%"
     return 1.0, units.pop() if len(units) == 1 else "SI"
 
 
-def _map_figure(scenario: Scenario, last: Float, failed: int, unit: str) -> Figure:
+def map_figure(scenario: Scenario, last: Float, failed: int, unit: str) -> Figure:
     """Return a map of the assets: (B, F), a panel for each factor."""
     count = len(last) + failed
     wide = max(1, int(np.ceil(np.sqrt(2.0 * count))))
@@ -181,7 +184,7 @@ def _map_figure(scenario: Scenario, last: Float, failed: int, unit: str) -> Figu
     cells = np.full((last.shape[1], high * wide), np.nan)
     cells[:, : len(last)] = last[order].T
     figure = style.new_figure(0.4 + 1.9 * last.shape[1])
-    norm = Normalize(0.0, float(max(factor.levels[-1] for factor in scenario.state)) * _scale(scenario)[0])
+    norm = Normalize(0.0, float(max(factor.levels[-1] for factor in scenario.state)) * scale_of(scenario)[0])
     for number, factor in enumerate(scenario.state):
         axes = figure.add_subplot(last.shape[1], 1, number + 1)
         image = axes.imshow(
@@ -203,7 +206,8 @@ def _map_figure(scenario: Scenario, last: Float, failed: int, unit: str) -> Figu
     return figure
 
 
-def _course_figure(scenario: Scenario, mean: Float, state: Float, unit: str) -> Figure:
+def course_figure(scenario: Scenario, mean: Float, state: Float, unit: str) -> Figure:
+    """Return bands of the states of B assets over the turns: (B, T, F), true ones NaN where not known."""
     figure = style.new_figure(2.4)
     seen = ~np.isnan(mean).all(axis=(0, 2))
     mean, state, steps = mean[:, seen], state[:, seen], np.flatnonzero(seen)
@@ -242,7 +246,7 @@ def _attention(
     for index in np.unique(control[flown]):
         mine = flown[control[flown] == index]
         chance[mine] = attention(knowledge, belief[mine], int(index))
-    scale, unit = _scale(scenario)
+    scale, unit = scale_of(scenario)
     rows = []
     for row in flown[np.argsort(-chance[flown], kind="stable")][:NEXT].tolist():
         moments = (group[name].values[row, last[row]] for name in ("mean", "standard_deviation"))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
+from twin_master.viewer.command import View, shown
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -37,6 +38,7 @@ def watch(
     ca_file: Annotated[
         Path | None, typer.Option(help="Certificate of the authority of an mqtts:// broker.")
     ] = None,
+    view: View = False,
 ) -> None:
     """Watch many real assets: observations in, a decision for each turn of each asset out, as a line of JSON.
 
@@ -44,6 +46,7 @@ def watch(
     worst assets in the place of decisions. Ctrl-C ends it in order; the command repeated goes on.
     """
     from twin_master.fleet.plan import load_fleet
+    from twin_master.fleet.view import is_fleet, serve_fleet
     from twin_master.fleet.watching import FleetWatch
 
     fleet = load_fleet(file, seed)
@@ -58,7 +61,9 @@ def watch(
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        with console.showing(watched):
+        with shown(view, (is_fleet, serve_fleet)) as begun, console.showing(watched):
+            if begun is not None:
+                begun(folder)
             watched.run(console.refresh)
     except Exception as error:
         error.add_note("What was observed is kept: repeat the command to go on.")

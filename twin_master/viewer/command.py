@@ -1,10 +1,9 @@
-"""`uav-twin view`, and the process behind `--view`."""
+"""The process behind `--view`."""
 
 import multiprocessing
 import os
 import signal
 import time
-import webbrowser
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,39 +20,24 @@ _LOOK_AGAIN = 0.05
 _COURTESY = 5
 """Niceness of a view beside a mission: the mission comes first."""
 
+Server = tuple[Callable[[Path], bool], Callable[[Path, int, Callable[[str], None], Callable[[], bool]], None]]
+"""Whether a folder can be shown, and what shows it, as `viewer.server.serve`."""
+
 View = Annotated[
     bool, typer.Option("--view", help="Show the flight in a browser of this machine while it goes on.")
 ]
 
 
-def view(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="A run folder, finished or in flight.", show_default=False)
-    ],
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Port on the loopback.", show_default="any that is free")
-    ] = 0,
-    browser: Annotated[bool, typer.Option("--browser", help="Open the page in the default browser.")] = False,
-) -> None:
-    """Show a flight in the browser: replay it turn by turn, or follow it while it goes on."""
-    from twin_master.viewer.server import serve
-
-    def ready(address: str) -> None:
-        typer.echo(f"{folder}: {address} (Ctrl-C ends it)")
-        if browser:
-            webbrowser.open(address)
-
-    serve(folder, port, ready)
-
-
 @contextmanager
-def shown(wanted: bool) -> Iterator[Callable[[Path], None] | None]:
+def shown(wanted: bool, server: Server | None = None) -> Iterator[Callable[[Path], None] | None]:
     """Give what shows a mission from its beginning in a process beside it; at the end wait for Ctrl-C.
 
     Parameters
     ----------
     wanted
         Whether to show it at all; if not, None is given.
+    server
+        Says whether a folder can be shown yet, and shows it; that of one flight if left out.
     """
     if not wanted:
         yield None
@@ -63,7 +47,7 @@ def shown(wanted: bool) -> Iterator[Callable[[Path], None] | None]:
     def begin(folder: Path) -> None:
         nonlocal process
         context = multiprocessing.get_context("spawn")
-        process = context.Process(target=_beside, args=(folder, os.getpid()), daemon=True)
+        process = context.Process(target=_beside, args=(folder, os.getpid(), server), daemon=True)
         process.start()
 
     try:
@@ -78,21 +62,22 @@ def shown(wanted: bool) -> Iterator[Callable[[Path], None] | None]:
             process.join()
 
 
-def _beside(folder: Path, mission: int) -> None:
+def _beside(folder: Path, mission: int, server: "Server | None") -> None:
     """Show a mission as soon as it is prepared; end with the process that flies it."""
     from twin_master.viewer.flight import is_prepared
     from twin_master.viewer.server import serve
 
+    prepared, serving = server or (is_prepared, serve)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the mission ends it
     os.nice(_COURTESY)
 
     def wanted() -> bool:
         return os.getppid() == mission
 
-    while wanted() and not is_prepared(folder):
+    while wanted() and not prepared(folder):
         time.sleep(_LOOK_AGAIN)
     try:
-        serve(folder, 0, lambda address: _say(f"View: {address}"), wanted)
+        serving(folder, 0, lambda address: _say(f"View: {address}"), wanted)
     except (TwinMasterError, ReportingError) as error:
         typer.secho(f"The view ended: {error}", fg="red", err=True)
 

@@ -28,7 +28,9 @@ _SECONDS_BETWEEN = 0.5
 LONGEST_REQUEST = 4096
 """Bytes."""
 
-_HEADERS = {
+OWN_NAMES = r"(localhost|127\.0\.0\.1)(:\d+)?"
+"""A page of another site that lets its name point here would come with that name, and is not answered."""
+HEADERS = {
     "Content-Security-Policy": "default-src 'self'; connect-src 'self' ws:; img-src 'self' data: blob:; "
     "style-src 'self' 'unsafe-inline'; script-src 'self'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -105,7 +107,7 @@ class _Text(RequestHandler):
         self._text, self._kind = text, kind
 
     def set_default_headers(self) -> None:
-        for name, value in _HEADERS.items():
+        for name, value in HEADERS.items():
             self.set_header(name, value)
 
     def get(self) -> None:
@@ -125,9 +127,8 @@ def _application(flight: Flight, viewers: _Viewers) -> Application:
         ),
     ]
     application = Application(websocket_max_message_size=LONGEST_REQUEST, websocket_ping_interval=20)
-    # A page of another site that lets its name point here would come with that name.
     application.add_handlers(
-        r"(localhost|127\.0\.0\.1)(:\d+)?",
+        OWN_NAMES,
         [
             *((path, _Text, {"text": text, "kind": kind}) for path, text, kind in texts),
             ("/turns", _Turns, {"viewers": viewers}),
@@ -140,7 +141,19 @@ def _application(flight: Flight, viewers: _Viewers) -> Application:
 async def _serve(flight: Flight, port: int, ready: Callable[[str], None], wanted: Callable[[], bool]) -> None:
     teller = Teller(flight, scene_of(flight.folder, flight.knowledge))
     viewers = _Viewers(flight, teller)
-    server = HTTPServer(_application(flight, viewers), max_body_size=LONGEST_REQUEST)
+    looking = PeriodicCallback(viewers.look, POLL_MILLISECONDS)
+    looking.start()
+    try:
+        await serve_application(_application(flight, viewers), port, ready, wanted)
+    finally:
+        looking.stop()
+
+
+async def serve_application(
+    application: Application, port: int, ready: Callable[[str], None], wanted: Callable[[], bool]
+) -> None:
+    """Serve an application on the loopback as long as it is wanted, see `serve`."""
+    server = HTTPServer(application, max_body_size=LONGEST_REQUEST)
     try:
         sockets = bind_sockets(port, ADDRESS)
     except OSError as error:
@@ -149,14 +162,11 @@ async def _serve(flight: Flight, port: int, ready: Callable[[str], None], wanted
             "choose another --port."
         ) from error
     server.add_sockets(sockets)
-    looking = PeriodicCallback(viewers.look, POLL_MILLISECONDS)
-    looking.start()
     ready(f"http://{ADDRESS}:{sockets[0].getsockname()[1]}/")
     try:
         while wanted():
             await asyncio.sleep(_SECONDS_BETWEEN)
     finally:
-        looking.stop()
         server.stop()
 
 

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import tomllib
 from collections.abc import Mapping
+from contextlib import closing
+from http.client import HTTPConnection
 from pathlib import Path
+from queue import Queue
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -26,6 +31,7 @@ from twin_master.fleet.lessons import lessons_record, write_learnt
 from twin_master.fleet.plan import ensemble, load_fleet
 from twin_master.fleet.reading import fleet_groups, group_figures
 from twin_master.fleet.report import write_fleet_report
+from twin_master.fleet.view import fleet_view, serve_fleet
 from twin_master.fleet.watching import FleetWatch, WatchedAsset
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import load_scenario
@@ -253,3 +259,45 @@ def test_recordings_teach_what_the_flights_taught(fleet_file: Path, tmp_path: Pa
     np.testing.assert_allclose(again["mean"].values, group["mean"].values, atol=1e-4)
     first, second = (learn_fleet(tmp_path / name).groups[0].grid.marginals for name in ("flown", "recorded"))
     assert [m.mean for m in first] == [m.mean for m in second]
+
+
+def test_the_page_of_a_fleet(fleet_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "logs" / "wing-0.csv").write_text("turn,colour\n0,red\n")
+    out = tmp_path / "out"
+    watched(fleet_file, out)
+    fly_fleet(ensemble(str(tmp_path / "wing.toml"), range(60)), tmp_path / "flown", Engine(0))
+    flown = fleet_view(tmp_path / "flown")
+    group = fleet_groups(tmp_path / "flown")["growing_damage"]
+    worst = np.argsort(-group["mean"].values[:, -1].sum(axis=1), kind="stable")
+    assert re.findall(r"seed-\d+", flown) == [f"seed-{row}" for row in worst[:50]]
+    with pytest.raises(FleetError, match="holds no fleet"):
+        fleet_view(tmp_path)
+    address, ended = Queue[str](), Event()
+    serving = Thread(target=serve_fleet, args=(out, 0, address.put, lambda: not ended.is_set()))
+    serving.start()
+    try:
+        port = int(address.get(timeout=20).rstrip("/").rpartition(":")[2])
+
+        def asked(path: str, host: str = "localhost") -> tuple[int, str]:
+            connection = HTTPConnection("127.0.0.1", port, timeout=20)
+            connection.request("GET", path, headers={"Host": host})
+            with closing(connection), connection.getresponse() as answer:
+                return answer.status, answer.read().decode()
+
+        status, page = asked("/")
+        assert status == 200
+        assert "wing-1" in page
+        assert "colour" in page  # why the other one is not watched
+        assert asked("/version") == (200, "0")
+        assert asked("/", "evil.example")[0] == 404
+        state = json.loads((out / "watched.json").read_text())
+        state["assets"]["north/wing-1"]["alarms"] = 1234
+        (out / "watched.json").write_text(json.dumps(state))
+        for _ in range(100):
+            if asked("/version") == (200, "1"):
+                break
+            ended.wait(0.05)
+        assert "1234" in asked("/")[1]
+    finally:
+        ended.set()
+        serving.join()

@@ -1,0 +1,266 @@
+"""The page of a fleet that follows it in the browser: while it flies, while it is watched, or afterwards.
+
+It is made of what the fleet writes anyway, and reads the same with ten assets and with ten thousand: maps and
+bands of all, and the fifty that are worst.
+"""
+
+import asyncio
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tornado.web import Application, RequestHandler
+
+from reporting import figures as style
+from reporting.errors import ReportingError
+from reporting.json_file import read_json
+from reporting.page import Column, Page, Table
+from reporting.words import counted
+from twin_master.errors import FleetError, TwinMasterError
+from twin_master.fleet.flight import KIND as FLOWN_KIND
+from twin_master.fleet.lessons import LESSONS_NAME
+from twin_master.fleet.outcome import FAILED, FLOWN
+from twin_master.fleet.reading import last_turns
+from twin_master.fleet.report import add_failures, add_lessons, course_figure, map_figure, scale_of
+from twin_master.fleet.store import DONE_NAME, open_group
+from twin_master.fleet.watching import KIND as WATCHED_KIND
+from twin_master.fleet.watching import STATE_NAME
+from twin_master.run_folder import CONFIG_NAME
+from twin_master.scenario.schema import Scenario
+from twin_master.viewer.server import HEADERS, OWN_NAMES, serve_application
+
+__all__ = ["fleet_view", "is_fleet", "serve_fleet"]
+
+Float = NDArray[np.float64]
+
+WORST = 50
+"""Assets in the table."""
+LOOK_SECONDS = 1.0
+"""Between two looks at the fleet."""
+
+
+def _config(folder: Path) -> dict[str, Any]:
+    path = folder / CONFIG_NAME
+    found = read_json(path, FleetError) if path.is_file() else None
+    return found if isinstance(found, dict) else {}
+
+
+def is_fleet(folder: Path) -> bool:
+    """Return whether a folder is that of a fleet, flown or watched."""
+    return _config(folder).get("kind") in (FLOWN_KIND, WATCHED_KIND)
+
+
+@dataclass(frozen=True)
+class _Standing:
+    """How B assets of a group stand: turns and alarms (B,), moments of the state (B, F), SI, controls."""
+
+    scenario: Scenario
+    names: list[str]
+    turn: NDArray[np.int64]
+    mean: Float
+    deviation: Float
+    control: list[str]
+    alarms: NDArray[np.int64]
+
+
+def fleet_view(folder: Path) -> str:
+    """Return the page of a fleet as it stands.
+
+    Raises
+    ------
+    FleetError
+        The folder holds none, or nothing was begun there.
+    """
+    config = _config(folder)
+    if config.get("kind") not in (FLOWN_KIND, WATCHED_KIND):
+        raise FleetError(f"{folder} holds no fleet.")
+    watched, fleet = config["kind"] == WATCHED_KIND, config["fleet"]
+    page = Page(fleet["title"] or fleet["name"], f"seed {fleet['seed']}, {'watched' if watched else 'flown'}")
+    if watched:
+        _add_watched(page, folder, fleet)
+    else:
+        _add_flown(page, folder, fleet)
+    lessons = folder / LESSONS_NAME
+    if lessons.is_file():
+        page.add_section("Learnt across the fleet")
+        add_lessons(page, json.loads(lessons.read_text()))
+    return page.render()
+
+
+def _add_watched(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
+    path = folder / STATE_NAME
+    state = read_json(path, FleetError) if path.is_file() else {"assets": {}, "failures": {}}
+    assets = {name: told for name, told in state["assets"].items() if told["turn"] is not None}
+    turns = sum(told["turn"] + 1 for told in assets.values())
+    alarms = sum(told["alarms"] for told in assets.values())
+    told = [(str(len(assets)), "assets"), (str(turns), "turns"), (str(alarms), "alarms")]
+    page.add_highlights([*told, (str(len(state["failures"])), "not watched")])
+    if state["failures"]:
+        add_failures(
+            page, state["failures"], len(assets) + len(state["failures"]), f"They stand in {STATE_NAME}."
+        )
+    for record in fleet["groups"]:
+        scenario = Scenario.model_validate(record["scenarios"][0])
+        own = {name: told for name, told in assets.items() if name.startswith(f"{record['name']}/")}
+        mean, deviation = (
+            np.array([[told["health"][n][m] for n in scenario.state_names] for told in own.values()])
+            for m in ("mean", "standard_deviation")
+        )
+        standing = _Standing(
+            scenario, [name.partition("/")[2] for name in own],
+            np.array([told["turn"] for told in own.values()], dtype=np.int64), mean, deviation,
+            [told["next_control"] for told in own.values()],
+            np.array([told["alarms"] for told in own.values()], dtype=np.int64),
+        )  # fmt: skip
+        _add_group(page, record["name"], standing, 0)
+
+
+def _add_flown(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
+    groups = {record["name"]: open_group(folder, record["name"]) for record in fleet["groups"]}
+    status = np.concatenate([group["status"].values for group in groups.values()])
+    flown, failed = int(np.sum(status == FLOWN)), int(np.sum(status == FAILED))
+    page.add_highlights(
+        [(str(len(status)), "assets"), (str(flown), "flown"), (str(failed), "failed in flight")]
+    )
+    failures = _failures(folder)
+    if failures:
+        add_failures(page, failures, len(status), "They stand in fleet.json once the fleet has flown.")
+    for record in fleet["groups"]:
+        group, scenario = groups[record["name"]], Scenario.model_validate(record["scenarios"][0])
+        known = group["status"].values
+        rows, last = np.flatnonzero(known == FLOWN), last_turns(group)
+        mean = group["mean"].values[rows]
+        at = np.arange(len(rows)), last[rows]
+        control = group["control_index"].values[rows][at]
+        standing = _Standing(
+            scenario, [record["members"][row][0] for row in rows], last[rows], mean[at],
+            group["standard_deviation"].values[rows][at], [scenario.control_names[u] for u in control],
+            np.zeros(len(rows), dtype=np.int64),
+        )  # fmt: skip
+        _add_group(
+            page, record["name"], standing, int(np.sum(known == FAILED)), group["state"].values[rows], mean
+        )
+
+
+def _add_group(
+    page: Page, name: str, standing: _Standing, failed: int, state: Float | None = None,
+    mean: Float | None = None,
+) -> None:  # fmt: skip
+    """Add a map of a group, bands where all turns are at hand, and its worst assets."""
+    page.add_section(f"Group {name}")
+    count, scenario = len(standing.names), standing.scenario
+    if not count:
+        page.add_paragraph("Nothing is known of its assets yet.")
+        return
+    scale, unit = scale_of(scenario)
+    with style.publication_style():
+        drawn = map_figure(scenario, scale * standing.mean, failed, unit)
+    caption = (
+        f"Filtered means, one cell for each asset, the worst first. Grey: {failed} that failed in flight."
+    )
+    page.add_figure(style.to_svg(drawn), caption, title="The assets by health")
+    if state is not None and mean is not None:
+        with style.publication_style():
+            drawn = course_figure(scenario, scale * mean, scale * state, unit)
+        page.add_figure(style.to_svg(drawn), "Bands hold 90 and 50 % of the assets.", title="Over time")
+    order = np.lexsort((-standing.mean.sum(axis=1), -standing.alarms))[:WORST]
+    rows, told = [], bool(standing.alarms.any())
+    for row in order.tolist():
+        pairs = zip(scale * standing.mean[row], scale * standing.deviation[row], strict=True)
+        states = [
+            f"{mean:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{deviation:.1f}" for mean, deviation in pairs
+        ]
+        alarms = [str(standing.alarms[row] or "")] * told
+        rows.append([standing.names[row], str(standing.turn[row]), *states, standing.control[row], *alarms])
+    columns = [Column("asset"), Column(scenario.mission.step_name, numeric=True)]
+    columns += [Column(factor.name, unit, numeric=True) for factor in scenario.state]
+    columns += [Column("control"), *[Column("alarms", numeric=True)] * told]
+    by = "by alarms, then by the sum of their states" if told else "by the sum of their states"
+    caption = f"{len(rows)} of {counted(count, 'asset')}, {by}."
+    page.add_table(Table(columns, rows), caption, title="The worst")
+
+
+def _failures(folder: Path) -> dict[str, str]:
+    """Return the failures of the shards that are done; the last line may still be written."""
+    found: dict[str, str] = {}
+    path = folder / DONE_NAME
+    for line in path.read_bytes().splitlines(keepends=True) if path.is_file() else []:
+        if line.endswith(b"\n"):
+            found |= json.loads(line)["failures"]
+    return found
+
+
+class _Fleet:
+    """The page, made again when the fleet has changed."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._seen = folder, ""
+        self.version, self.html = 0, fleet_view(folder)
+        self._seen = self._stamp()
+
+    def _stamp(self) -> str:
+        names = (DONE_NAME, STATE_NAME, LESSONS_NAME)
+        paths = [self._folder / name for name in names if (self._folder / name).is_file()]
+        return str([(path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in paths])
+
+    async def follow(self) -> None:
+        """Look now and then, without end; what cannot be read is looked at again."""
+        while True:
+            await asyncio.sleep(LOOK_SECONDS)
+            try:
+                stamp = self._stamp()
+                if stamp != self._seen:
+                    self.html = await asyncio.to_thread(fleet_view, self._folder)
+                    self.version, self._seen = self.version + 1, stamp
+            except (TwinMasterError, ReportingError, OSError, ValueError):
+                continue  # it was just being written, or another fleet takes its place
+
+
+class _Answer(RequestHandler):
+    """What the page asks for."""
+
+    def initialize(self, answer: Callable[[], str], kind: str) -> None:
+        self._answer, self._kind = answer, kind
+
+    def set_default_headers(self) -> None:
+        for name, value in HEADERS.items():
+            self.set_header(name, value)
+
+    def get(self) -> None:
+        self.set_header("Content-Type", f"{self._kind}; charset=utf-8")
+        self.write(self._answer())
+
+
+def serve_fleet(
+    folder: Path, port: int, ready: Callable[[str], None], wanted: Callable[[], bool] = lambda: True
+) -> None:
+    """Show a fleet to browsers of this machine, as `viewer.server.serve` shows a flight."""
+    fleet = _Fleet(folder)
+    script = resources.files(__package__).joinpath("view.js").read_text(encoding="utf-8")
+
+    def page() -> str:
+        tag = f'<script src="/view.js" data-version="{fleet.version}"></script></body>'
+        return fleet.html.replace("</body>", tag)
+
+    handlers = [
+        (path, _Answer, {"answer": answer, "kind": kind})
+        for path, answer, kind in (
+            ("/", page, "text/html"),
+            ("/version", lambda: str(fleet.version), "text/plain"),
+            ("/view.js", lambda: script, "text/javascript"),
+        )
+    ]
+    application = Application()
+    application.add_handlers(OWN_NAMES, handlers)
+
+    async def follow_and_serve() -> None:
+        following = asyncio.create_task(fleet.follow())
+        await serve_application(application, port, ready, wanted)
+        following.cancel()
+
+    asyncio.run(follow_and_serve())
