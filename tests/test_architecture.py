@@ -44,7 +44,7 @@ ROOMS = {
     "twin_master": (
         "errors", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library", "mission",
         "store", "report", "viewer", "workflow", "watch", "scenario_check", "study", "fleet", "environment",
-        "command", "watch_command", "__main__",
+        "command", "watch_command", "view_command", "__main__",
     ),
     "discrepancy": (
         "errors", "campaign", "models", "lumped_models", "location", "catalogue", "document_types", "verdict",
