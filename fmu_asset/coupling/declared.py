@@ -10,6 +10,7 @@ from fmpy import read_model_description
 
 from fmu_asset.archive.fmu_file import FmuDescription, VariableInfo, read_fmu
 from fmu_asset.errors import FmuFileError
+from fmu_asset.instances.plan import Interface
 from reporting.words import one_line
 
 READABLE = ("output", "local", "calculatedParameter")
@@ -39,7 +40,7 @@ class DeclaredFmu:
     items: Mapping[str, Mapping[str, int]]
 
 
-def read_declared(path: Path) -> DeclaredFmu:
+def read_declared(path: Path, interface: Interface | None = None) -> DeclaredFmu:
     """Check an FMU and return what it declares.
 
     Raises
@@ -47,7 +48,7 @@ def read_declared(path: Path) -> DeclaredFmu:
     FmuFileError, FmuUnsupportedError
         If the file is missing, damaged, unsafe or of a kind that cannot be flown.
     """
-    description = read_fmu(path)
+    description = read_fmu(path, interface)
     variables = {variable.name: variable for variable in description.variables}
     inputs = frozenset(v.name for v in description.variables if v.causality == "input")
     feedthrough = {v.name: inputs for v in description.variables if v.causality in READABLE}

@@ -187,6 +187,8 @@ class Layout:
             name=name,
             step_size=self._binding.step_size / self.substeps[index],
             start_time=self._binding.binding.start_time,
+            interface=wiring.structure.component(name).interface,
+            tolerance=self._binding.binding.tolerance,
         )
         return Binding(
             binding=header,

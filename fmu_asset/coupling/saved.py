@@ -96,6 +96,7 @@ def wiring_hash(wiring: Wiring, binding: Binding, algorithm: str, iterations: in
     record = {
         "components": [
             [c.name, wiring.declared[c.name].description.sha256, wiring.settings[c.name], c.substeps]
+            + ([] if c.interface is None else [c.interface])
             for c in wiring.structure.components
         ],
         "feeds": [

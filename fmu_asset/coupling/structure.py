@@ -8,6 +8,7 @@ from typing import Literal
 from fmu_asset.archive.fmu_file import UnitInfo
 from fmu_asset.door.binding import expand
 from fmu_asset.errors import CouplingError
+from fmu_asset.instances.plan import Interface
 
 ConnectorKind = Literal["input", "output", "parameter"]
 SettingValue = float | bool | str
@@ -54,12 +55,15 @@ class Component:
         Parameters and start values by variable name.
     substeps : int
         Number of steps that the FMU makes in one step of the system, its inputs held.
+    interface : {"co-simulation", "model-exchange"}, optional
+        How it is run; co-simulation where it offers that.
     """
 
     name: str
     fmu: Path
     settings: Mapping[str, Setting] = field(default_factory=dict)
     substeps: int = 1
+    interface: Interface | None = None
 
 
 @dataclass(frozen=True)

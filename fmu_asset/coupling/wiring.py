@@ -83,7 +83,9 @@ class Wiring:
                     f"The system {structure.name} has two components named {name!r}; each needs a name of "
                     "its own."
                 )
-        self.declared: dict[str, DeclaredFmu] = {c.name: read_declared(c.fmu) for c in structure.components}
+        self.declared: dict[str, DeclaredFmu] = {
+            c.name: read_declared(c.fmu, c.interface) for c in structure.components
+        }
         self.settings = {c.name: self._settings(c) for c in structure.components}
         self._connectors = {connector.name: connector for connector in structure.connectors}
         self.units: dict[str, str | None] = {c.name: c.unit for c in structure.connectors}

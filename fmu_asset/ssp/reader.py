@@ -1,7 +1,7 @@
 """Reading an SSP file: nested systems flattened, parameters and mappings applied, FMUs taken out.
 
 What SSP 1.0 allows and is not read is refused in a sentence: signal dictionaries, components that are systems
-of their own files, model exchange, mappings of Booleans, integers and enumerations, texts and binary values.
+of their own files, mappings of Booleans, integers and enumerations, texts and binary values.
 Of SSP 2.0 the same is read; see `package.in_words_of_1`.
 """
 
@@ -19,6 +19,7 @@ from fmu_asset.coupling.structure import (
     Setting,
     SystemStructure,
 )
+from fmu_asset.instances.plan import Interface
 from reporting.files import atomic_write_bytes
 
 from .flatten import flat_connections, flat_settings
@@ -26,6 +27,11 @@ from .package import NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage, tag
 from .parameters import flag, read_bindings, read_transformation, read_units
 from .tree import INWARD, DeclaredConnector, Edge, ElementPath, Node, Tree
 
+_INTERFACES: dict[str, Interface | None] = {
+    "any": None,
+    "CoSimulation": "co-simulation",
+    "ModelExchange": "model-exchange",
+}
 _FMU_TYPE = "application/x-fmu-sharedlibrary"
 
 
@@ -86,8 +92,9 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Ss
             fmus[source],
             {node.connector: value for node, value in settings.items() if node.path == place},
             substeps,
+            interface,
         )
-        for place, (source, substeps) in tree.components.items()
+        for place, (source, substeps, interface) in tree.components.items()
     )
     connectors = tuple(
         Connector(node.connector, _kind(tree, node, declared), declared.unit)
@@ -164,15 +171,16 @@ def _component(tree: Tree, element: Any, path: ElementPath) -> None:
     where = f"the component {'.'.join(path)!r}"
     if element.get("type", _FMU_TYPE) != _FMU_TYPE:
         raise tree.error(f"{where} is of the type {element.get('type')!r}; only FMUs are supported.")
-    if element.get("implementation", "any") == "ModelExchange":
-        raise tree.error(f"{where} asks for model exchange; only co-simulation is supported.")
+    implementation = element.get("implementation", "any")
+    if implementation not in _INTERFACES:
+        raise tree.error(f"{where} asks for {implementation!r}, which is not supported.")
     source = tree.package.resolve(str(element.get("source")), where)
     substeps = _annotation(element).get("substeps", "1")
     if not (substeps.isascii() and substeps.isdigit() and int(substeps) > 0):
         raise tree.error(
             f"{where} has the number of steps {substeps!r}, which must be a positive whole number."
         )
-    tree.components[path] = (source, int(substeps))
+    tree.components[path] = (source, int(substeps), _INTERFACES[implementation])
     _connectors(tree, element, path)
     _bind(tree, element, path)
 
@@ -280,7 +288,7 @@ def _names(tree: Tree) -> dict[ElementPath, str]:
 def _extract(tree: Tree, folder: Path) -> dict[str, Path]:
     """Write each FMU once, under a plain name; return the files by their names in the archive."""
     files: dict[str, Path] = {}
-    for source, _ in tree.components.values():
+    for source, *_ in tree.components.values():
         if source not in files:
             stem = re.sub(r"[^A-Za-z0-9_\-]", "_", Path(source).stem)
             target = folder / f"{len(files) + 1}-{stem}.fmu"

@@ -6,6 +6,7 @@ from typing import NamedTuple
 from fmu_asset.archive.fmu_file import UnitInfo
 from fmu_asset.coupling.structure import Setting
 from fmu_asset.errors import SspError
+from fmu_asset.instances.plan import Interface
 
 from .package import SSD_NAME, SspPackage
 
@@ -52,8 +53,8 @@ class Tree:
     ----------
     package : SspPackage
         The file.
-    components : dict of ElementPath to (str, int)
-        FMU in the archive and number of steps in a step, by component.
+    components : dict of ElementPath to (str, int, str or None)
+        FMU in the archive, number of steps in a step, and interface, by component.
     connectors : dict of Node to DeclaredConnector
         All connectors, those of systems too.
     edges : dict of Node to Edge
@@ -65,7 +66,7 @@ class Tree:
     """
 
     package: SspPackage
-    components: dict[ElementPath, tuple[str, int]] = field(default_factory=dict)
+    components: dict[ElementPath, tuple[str, int, Interface | None]] = field(default_factory=dict)
     connectors: dict[Node, DeclaredConnector] = field(default_factory=dict)
     edges: dict[Node, Edge] = field(default_factory=dict)
     settings: dict[Node, Setting] = field(default_factory=dict)

@@ -21,6 +21,9 @@ SSM_NAME = "resources/parameters.ssm"
 _SYMBOLS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 
+_IMPLEMENTATIONS = {"co-simulation": "CoSimulation", "model-exchange": "ModelExchange"}
+
+
 def write_ssp(
     wiring: Wiring,
     path: str | os.PathLike[str],
@@ -203,7 +206,7 @@ def _component(
         name=component.name,
         type="application/x-fmu-sharedlibrary",
         source=_resource(component),
-        implementation="CoSimulation",
+        implementation=_IMPLEMENTATIONS[wiring.declared[component.name].description.interface],
     )
     used = dict.fromkeys(
         end.variable

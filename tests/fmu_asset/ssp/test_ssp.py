@@ -444,7 +444,7 @@ def test_nested_systems_parameters_and_mappings(theirs: Pack, tmp_path: Path) ->
         (("resources/wing.fmu", "%2e%2e/wing.fmu"), "lies outside the archive"),
         (("resources/wing.fmu", "/etc/wing.fmu"), "lies outside the archive"),
         (("resources/wing.fmu", "https://example.org/wing.fmu"), "lies outside the archive"),
-        (('implementation="CoSimulation"', 'implementation="ModelExchange"'), "asks for model exchange"),
+        (('implementation="CoSimulation"', 'implementation="ModelExchange"'), "asks for model-exchange"),
         (('type="application/x-fmu-sharedlibrary"', 'type="application/x-ssp-package"'),
          "only FMUs are supported"),
         (('<ssd:ParameterBinding source="resources/top.ssv">',
