@@ -51,6 +51,7 @@ from twin_master.assets.resolution import (
     portable_scenario,
     resolve_scenario,
 )
+from twin_master.fleet.outcome import in_credible_set
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.run_folder import create_run_folder
@@ -58,7 +59,6 @@ from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.writing import store_mission
-from twin_master.study import in_credible_set
 
 TURNS = 50
 

@@ -25,11 +25,12 @@ from fe.runtime.reduced import ReducedModel
 from fe.wing.design import load_design
 from twin_master.assets.interface import Asset, AssetReading, StatelessAsset
 from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.fleet.reading import Estimated, Outcomes
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.side_by_side import Flights
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.study import Estimated, Study, mission_outcome
 
 SCENARIO = "level_turns_learning"
 REACH = (0.9, 1.1)
@@ -47,7 +48,7 @@ TARGETS = {"early": 0.08, "within": 0.98, "z1": 0.045, "z2": 0.13, "coverage": (
 class Result:
     """Missions of one kind of twin; `covered` says whether the 90 % interval of e held its true value."""
 
-    study: Study
+    study: Outcomes
     covered: Estimated
     error_of_e: float
     seconds_per_turn: float
@@ -70,7 +71,7 @@ def with_factor(scenario: Scenario, wing: ReducedModel, e: float) -> ReducedMode
 
 def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> Result:
     """Fly one mission with each wing."""
-    scenario, outcomes, covered, errors, seconds = knowledge.scenario, [], [], [], 0.0
+    scenario, flights, covered, errors, seconds = knowledge.scenario, [], [], [], 0.0
     for seed in seeds:
         e = factor_of(scenario, seed)
         asset = with_factor(scenario, wing, e).open()
@@ -79,7 +80,7 @@ def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> Result:
         begin = time.process_time()
         flight = fly(scenario, twin, plant)
         seconds += time.process_time() - begin
-        outcomes.append(mission_outcome(knowledge, flight))
+        flights.append(Flights.of(flight))
         # What was learnt at the end: the belief is pure, so the last turn can be asked again.
         learnt = twin.revise(twin.turns - 1, twin.observed(twin.turns - 1)).learnt
         if scenario.calibration.parameter in learnt:
@@ -90,7 +91,9 @@ def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> Result:
     spread = float(np.sqrt(share * (1.0 - share) / max(len(covered), 1)))
     root = float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan")
     per_turn = seconds / (len(seeds) * scenario.mission.steps)
-    return Result(Study.of(tuple(seeds), outcomes), Estimated(share, spread), root, per_turn)
+    return Result(
+        Outcomes.flown(knowledge, Flights.joined(flights)), Estimated(share, spread), root, per_turn
+    )
 
 
 @dataclass(frozen=True)
@@ -231,8 +234,8 @@ def reached(result: Result) -> bool:
     """Return whether every target is reached."""
     study, covered = result.study, result.covered.value
     return (
-        study.early_share <= TARGETS["early"]
-        and study.share_within(2) >= TARGETS["within"]
+        study.early_fallback.value <= TARGETS["early"]
+        and study.within(2).value >= TARGETS["within"]
         and study.rms(0).value <= TARGETS["z1"]
         and study.rms(1).value <= TARGETS["z2"]
         and TARGETS["coverage"][0] <= covered <= TARGETS["coverage"][1]

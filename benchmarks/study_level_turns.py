@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -34,12 +34,12 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.fleet.reading import Estimated, Outcomes, fly_seeds
 from twin_master.mission.preparation import prepare_knowledge
+from twin_master.mission.side_by_side import fly_side_by_side
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.study import Estimated, Study, fly_many
 
 Float = NDArray[np.float64]
 
@@ -66,22 +66,6 @@ class ScaledSource(PairedSource):
         return np.asarray(table * (shown / table[:, 0, -1].mean(axis=0)))
 
 
-class KnownSource(PairedSource):
-    """A wing of many; what the twin knows of them is given, so that it is not made for each anew."""
-
-    def __init__(self, asset: AssetSource, model: AssetSource, draws: ParameterDraws, table: Float) -> None:
-        super().__init__(asset, model)
-        self._draws, self._table = draws, table
-
-    def draws(self, seed: int) -> ParameterDraws:
-        """Return the draws that are known."""
-        return self._draws
-
-    def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the predictions (E, S, U, G) that are known."""
-        return self._table
-
-
 @dataclass(frozen=True)
 class Row:
     """One study with what was flown in it."""
@@ -90,7 +74,7 @@ class Row:
     twin: str
     model_error: str
     first_seed: int
-    study: Study
+    study: Outcomes
 
     def cells(self) -> list[tuple[str, bool]]:
         """Return the figures as printed, each with whether it reaches its target."""
@@ -214,7 +198,7 @@ def combinations(given: argparse.Namespace, scenario: Scenario, seeds: Sequence[
                     continue
                 kind = ScaledSource if name == SCALED else PairedSource
                 source = known[asset] if asset == twin else kind(known[asset], known[twin])
-                study = fly_many(chosen, source, flown, calibration_seed=first)
+                study = fly_seeds(chosen, source, flown, calibration_seed=first)
                 rows.append(Row(asset, twin, LABELS.get(name) or f"{float(name):g} %", first, study))
     return rows
 
@@ -228,22 +212,13 @@ def model_error(name: str, misfit: Misfit) -> float | tuple[float, ...]:
 
 def fly_own_wings(
     scenario: Scenario, source: AssetSource, wing: Callable[[ParameterDraws, int], AssetSource], seeds: range
-) -> Study:
+) -> Outcomes:
     """Fly every mission with a wing of its own: its factor is one of the twin's draws, as likely as any."""
-    model = build_graphical_model(scenario)
-    draws = source.draws(seeds[0])
-    table = source.observation_table(draws, model)
-    chosen = np.random.default_rng(seeds[0]).integers(len(draws.values), size=len(seeds))
-    flown = [
-        fly_many(scenario, KnownSource(wing(draws, index), source, draws, table), [seed])
-        for seed, index in zip(seeds, chosen.tolist(), strict=True)
-    ]
-    parts = {
-        item.name: np.concatenate([getattr(study, item.name) for study in flown])
-        for item in fields(Study)
-        if item.name != "seeds"
-    }
-    return Study(tuple(seeds), **parts)
+    knowledge = prepare_knowledge(scenario, source, seeds[0])
+    chosen = np.random.default_rng(seeds[0]).integers(len(knowledge.draws.values), size=len(seeds))
+    assets = [wing(knowledge.draws, index).open() for index in chosen.tolist()]
+    truths = [knowledge.truth(seed) for seed in seeds]
+    return Outcomes.flown(knowledge, fly_side_by_side(knowledge, truths, assets))
 
 
 def library_wings(scenario: Scenario, folder: Path) -> Callable[[ParameterDraws, int], AssetSource]:
@@ -293,7 +268,7 @@ def single(given: argparse.Namespace, scenario: Scenario, seeds: Sequence[int]) 
         for first in seeds:
             missions = range(first, first + given.missions)
             study = (
-                fly_many(scenario, source, missions, calibration_seed=first)
+                fly_seeds(scenario, source, missions, calibration_seed=first)
                 if wings is None
                 else fly_own_wings(scenario, source, wings, missions)
             )

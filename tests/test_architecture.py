@@ -43,7 +43,7 @@ ROOMS = {
     ),
     "twin_master": (
         "errors", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library", "mission",
-        "store", "report", "viewer", "workflow", "watch", "scenario_check", "study", "fleet", "environment",
+        "store", "report", "viewer", "workflow", "watch", "scenario_check", "fleet", "environment",
         "command", "watch_command", "view_command", "__main__",
     ),
     "discrepancy": (

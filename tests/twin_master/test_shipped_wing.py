@@ -18,9 +18,9 @@ from fmu_asset.packing.wing_fmu import build_fmu
 from twin_master import workflow
 from twin_master.assets.resolution import Overrides
 from twin_master.assets.wing_model import ReducedModelSource
+from twin_master.fleet.reading import fly_seeds
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.scenario.reading import load_scenario
-from twin_master.study import fly_many
 from twin_master.workflow import new_run, resume_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
@@ -44,10 +44,10 @@ def test_the_papers_policy(wing: ReducedModel) -> None:
 def test_reliability(wing: ReducedModel) -> None:
     """Bars of 300 missions, widened for 80; `benchmarks/study_level_turns.py` flies as many as wanted."""
     scenario = load_scenario("level_turns").scenario
-    study = fly_many(scenario, ReducedModelSource(scenario, wing), range(80))
-    assert study.share_within(2) >= 0.95
-    assert study.early_share <= 0.2
-    assert np.all(study.rms_error <= [0.045, 0.13])
+    study = fly_seeds(scenario, ReducedModelSource(scenario, wing), range(80))
+    assert study.within(2).value >= 0.95
+    assert study.early_fallback.value <= 0.2
+    assert np.all([study.rms(0).value <= 0.045, study.rms(1).value <= 0.13])
 
 
 def test_the_whole_chain_and_its_resumption(

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from twin_master.fleet.engine import Engine
     from twin_master.fleet.flight import FleetOutcome
     from twin_master.fleet.plan import Fleet
-    from twin_master.study import Estimated
+    from twin_master.fleet.reading import Estimated
 
 fleet_app = typer.Typer(no_args_is_help=True, help="Fly fleets of assets, and learn across them.")
 fleet_app.command("watch")(watch)

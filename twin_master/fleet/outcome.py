@@ -10,11 +10,17 @@ from numpy.typing import NDArray
 from twin_master.fleet.plan import Member
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights
+from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.schema import Scenario
 from twin_master.store.summary import find_fallback
-from twin_master.study import in_credible_set
 
-__all__ = ["FAILED", "FLOWN", "VARIABLES", "Variable", "outcomes_of", "sizes_of"]
+__all__ = ["FAILED", "FLOWN", "VARIABLES", "Variable", "in_credible_set", "outcomes_of", "sizes_of"]
+
+Float = NDArray[np.float64]
+
+CREDIBILITY = 0.9
+"""Probability of the set of states in which the true one is looked for."""
+_TOLERANCE = 1e-9
 
 FLOWN, FAILED = 1, 2
 """Values of `status`; 0 has not flown yet."""
@@ -109,3 +115,33 @@ def _fallbacks(knowledge: Knowledge, flights: Flights) -> tuple[NDArray[np.float
         if fallback.called_for_step is not None:
             delay[twin] = np.inf if fallback.delay is None else fallback.delay
     return delay, early
+
+
+def in_credible_set(
+    model: GraphicalModel, probability: Float, true_state: Float, credibility: float = CREDIBILITY
+) -> NDArray[np.bool_]:
+    """Return whether the smallest set of states with a probability holds the true state: (T,).
+
+    Between the levels the true state counts as the nearest level of each factor, half-way between two as
+    either. Of equally probable states all are in the set, or none.
+
+    Parameters
+    ----------
+    model : GraphicalModel
+        S states of F factors.
+    probability : (T, S)
+        Beliefs.
+    true_state : (T, F)
+        True state, SI.
+    credibility : float
+        Probability of the set.
+    """
+    nearest = np.ones((len(true_state), model.states.size), dtype=bool)
+    for axis, factor in enumerate(model.states.factors):
+        distance = np.abs(np.asarray(factor.levels) - true_state[:, axis, None])  # (T, levels)
+        level_distance = np.abs(model.states.coordinates[:, axis] - true_state[:, axis, None])
+        nearest &= level_distance <= distance.min(axis=1, keepdims=True) + _TOLERANCE
+    descending = -np.sort(-probability, axis=1)
+    reached = np.cumsum(descending, axis=1) >= credibility - _TOLERANCE
+    least = descending[np.arange(len(descending)), np.argmax(reached, axis=1)]
+    return np.asarray(np.any(nearest & (probability >= least[:, None] * (1.0 - _TOLERANCE)), axis=1))

@@ -1,23 +1,145 @@
 """What stands in the store of a fleet, as figures with their errors."""
 
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.interface import Asset, StatelessAsset
+from twin_master.errors import FleetError
 from twin_master.fleet.flight import fleet_config
-from twin_master.fleet.outcome import FAILED, FLOWN
+from twin_master.fleet.outcome import FAILED, FLOWN, outcomes_of
+from twin_master.fleet.plan import Member
 from twin_master.fleet.store import open_group
-from twin_master.study import Estimated, Study
+from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
+from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["fleet_groups", "fleet_study", "group_figures"]
+__all__ = ["Estimated", "Outcomes", "fleet_groups", "fly_seeds", "group_figures"]
+
+Float = NDArray[np.float64]
 
 WITHIN = 2
 """Turns within which the fallback is to come."""
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """A figure with its standard error."""
+
+    value: float
+    error: float
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """What became of N missions, of F factors of the state.
+
+    Attributes
+    ----------
+    delay : (N,)
+        Steps from the damage that calls for it to the fallback; infinite where there was none, NaN where
+        no damage called for it.
+    early : (N,)
+        Whether another control than the first was flown before the damage could be seen.
+    error, squared_error : (N, F)
+        Mean error of the filtered mean of each factor over the steps, and mean squared error, SI.
+    log_evidence : (N,)
+        Mean log evidence of a step.
+    credible : (N,)
+        Share of the turns in which the true state lies in the smallest set of states that the filtered
+        belief holds for `CREDIBILITY` probable.
+    """
+
+    delay: Float
+    early: NDArray[np.bool_]
+    error: Float
+    squared_error: Float
+    log_evidence: Float
+    credible: Float
+
+    @classmethod
+    def of(cls, stored: Mapping[Any, Any]) -> "Outcomes":
+        """Return those of the twins that flew to their end, from the variables of the store."""
+        flown = np.flatnonzero(np.asarray(stored["status"]) == FLOWN)
+        kept = {
+            name: np.asarray(stored[name])[flown].astype(np.float64)
+            for name in ("delay", "credible", "mean", "state", "log_evidence")
+        }
+        error = kept["mean"] - kept["state"]
+        return cls(
+            delay=kept["delay"],
+            early=np.asarray(stored["early"])[flown].astype(bool),
+            error=error.mean(axis=1),
+            squared_error=(error**2).mean(axis=1),
+            log_evidence=np.nanmean(kept["log_evidence"], axis=1),
+            credible=kept["credible"],
+        )
+
+    @classmethod
+    def flown(cls, knowledge: Knowledge, flights: Flights) -> "Outcomes":
+        """Return those of missions that are not stored.
+
+        Raises
+        ------
+        FleetError
+            One of them failed.
+        """
+        for sentence in filter(None, flights.failure):
+            raise FleetError(sentence)
+        members = [Member(row, str(row), row, {}) for row in range(len(flights.failure))]
+        return cls.of(outcomes_of(knowledge, flights, members))
+
+    def within(self, steps: int) -> Estimated:
+        """Return the share of the called-for fallbacks that came within some steps; NaN without any."""
+        called = self.delay[~np.isnan(self.delay)]
+        return _share(called <= steps)
+
+    @property
+    def early_fallback(self) -> Estimated:
+        """Share of missions with a fallback before the damage."""
+        return _share(self.early)
+
+    def rms(self, factor: int) -> Estimated:
+        """Return the root of the mean squared error of one factor over all steps of all missions, SI."""
+        mean = _mean(self.squared_error[:, factor])
+        root = float(np.sqrt(mean.value))
+        return Estimated(root, mean.error / (2.0 * root) if root > 0.0 else 0.0)
+
+    def bias(self, factor: int) -> Estimated:
+        """Return the mean error of the filtered mean of one factor, SI."""
+        return _mean(self.error[:, factor])
+
+    @property
+    def evidence(self) -> Estimated:
+        """Mean log evidence of a step."""
+        return _mean(self.log_evidence)
+
+    @property
+    def credible_share(self) -> Estimated:
+        """Share of the turns in which the true state lies in its credible set."""
+        return _mean(self.credible)
+
+
+def _share(hits: NDArray[np.bool_]) -> Estimated:
+    if not len(hits):
+        return Estimated(float("nan"), float("nan"))
+    share = float(np.mean(hits))
+    return Estimated(share, float(np.sqrt(share * (1.0 - share) / len(hits))))
+
+
+def _mean(values: Float) -> Estimated:
+    """Return the mean over missions; the turns of a mission are not independent, the missions are."""
+    count = len(values)
+    error = float(np.std(values, ddof=1) / np.sqrt(count)) if count > 1 else float("nan")
+    return Estimated(float(np.mean(values)), error)
 
 
 def fleet_groups(folder: Path) -> "dict[str, xr.Dataset]":
@@ -30,22 +152,6 @@ def fleet_groups(folder: Path) -> "dict[str, xr.Dataset]":
     """
     names = [group["name"] for group in fleet_config(folder)["fleet"]["groups"]]
     return {name: open_group(folder, name) for name in names}
-
-
-def fleet_study(group: "xr.Dataset") -> Study:
-    """Return the outcomes of the twins of a group that flew to their end."""
-    flown = np.flatnonzero(group["status"].values == FLOWN)
-    kept = {name: group[name].values[flown].astype(np.float64) for name in ("delay", "credible")}
-    error = (group["mean"].values[flown] - group["state"].values[flown]).astype(np.float64)
-    return Study(
-        seeds=tuple(group["seed"].values[flown].tolist()),
-        delay=kept["delay"],
-        early=group["early"].values[flown].astype(bool),
-        error=error.mean(axis=1),
-        squared_error=(error**2).mean(axis=1),
-        log_evidence=np.nanmean(group["log_evidence"].values[flown], axis=1, dtype=np.float64),
-        credible=kept["credible"],
-    )
 
 
 def last_turns(group: "xr.Dataset") -> NDArray[np.int64]:
@@ -64,7 +170,7 @@ def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
     }
     if not found["flown"]:
         return found
-    study = fleet_study(group)
+    study = Outcomes.of(group)
     if not len(study.error) or np.isnan(study.error).all():  # real assets: nobody knows the truth
         return found | {"log evidence of a step": study.evidence}
     called = bool(np.any(~np.isnan(study.delay)))
@@ -88,3 +194,36 @@ def shown(figure: Estimated | int | None) -> str:
         return str(figure)
     error = f" ± {figure.error:.2g}" if np.isfinite(figure.error) else ""  # one twin has none
     return f"{figure.value:.4g}{error}"
+
+
+def fly_seeds(
+    scenario: Scenario, source: AssetSource, seeds: Sequence[int], *, calibration_seed: int | None = None
+) -> Outcomes:
+    """Fly a mission under many seeds in this process, without a store, whatever its source is.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    source : AssetSource
+        Already prepared; its asset is opened once, and brought back to its start for each mission.
+    seeds : sequence of int
+    calibration_seed : int, optional
+        Of the calibration, which all missions share; the first of the seeds by default.
+    """
+    seed = seeds[0] if calibration_seed is None else calibration_seed
+    knowledge = prepare_knowledge(scenario, source, seed)
+    truths, asset = [knowledge.truth(seed) for seed in seeds], source.open()
+    try:
+        if isinstance(asset, StatelessAsset) and scenario.learning is None and scenario.notice is None:
+            return Outcomes.flown(knowledge, fly_side_by_side(knowledge, truths, [asset] * len(truths)))
+        return Outcomes.flown(knowledge, fly_one_by_one(knowledge, truths, _again(asset, len(truths))))
+    finally:
+        asset.close()
+
+
+def _again(asset: Asset, count: int) -> Iterator[Asset]:
+    """Yield an asset at its start, again and again."""
+    start = asset.save_state()
+    for _ in range(count):
+        asset.restore_state(start)
+        yield asset

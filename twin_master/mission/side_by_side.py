@@ -16,7 +16,7 @@ from fe.runtime.errors import FiniteElementError
 from fmu_asset.errors import FmuError
 from twin_master.assets.interface import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
-from twin_master.mission.loop import fly
+from twin_master.mission.loop import Flight, fly
 from twin_master.mission.plant import Plant, checked_values
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import DamageGrowth, SensorStatus, Truth
@@ -71,6 +71,13 @@ class Flights:
             log_evidence=np.full((count, steps), np.nan),
             failure=("",) * count,
         )
+
+    @classmethod
+    def of(cls, flight: Flight) -> "Flights":
+        """Return one mission that `fly` has flown."""
+        names = ("observed", "control_index", "filtered", "log_evidence")
+        arrays = {name: getattr(flight, name)[None] for name in names}
+        return cls(**arrays, state=flight.happened.state[None], failure=("",))
 
     @classmethod
     def joined(cls, parts: "Sequence[Flights]") -> "Flights":
@@ -221,14 +228,11 @@ def fly_one_by_one(knowledge: Knowledge, truths: Sequence[Truth], assets: Iterab
     knowledge, truths, assets
         As of `fly_side_by_side`; an asset is asked for when its twin begins.
     """
-    flights, failure = Flights.empty(knowledge, len(truths)), [""] * len(truths)
-    for twin, (truth, asset) in enumerate(zip(truths, assets, strict=True)):
+    flown = []
+    for truth, asset in zip(truths, assets, strict=True):
         try:
             flight = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(truth, asset))
+            flown.append(Flights.of(flight))
         except IN_FLIGHT as error:
-            failure[twin] = str(error)
-            continue
-        flights.observed[twin], flights.control_index[twin] = flight.observed, flight.control_index
-        flights.state[twin], flights.filtered[twin] = flight.happened.state, flight.filtered
-        flights.log_evidence[twin] = flight.log_evidence
-    return replace(flights, failure=tuple(failure))
+            flown.append(replace(Flights.empty(knowledge, 1), failure=(str(error),)))
+    return Flights.joined(flown)

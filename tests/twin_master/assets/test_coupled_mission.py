@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +20,13 @@ from scenarios import binding_files, scenario_files
 from twin_master import workflow
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
-from twin_master.errors import MissionInputError, ScenarioError
+from twin_master.errors import FleetError, MissionInputError, ScenarioError
+from twin_master.fleet.flight import fly_fleet
+from twin_master.fleet.plan import ensemble
 from twin_master.mission.plant import Plant
 from twin_master.mission.truth import Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
-from twin_master.study import fly_many
 from twin_master.workflow import new_run, resume_run
 
 HERE = Path(__file__).with_name("heat_exchanger")
@@ -329,10 +331,13 @@ def test_the_shipped_scenario_in_process_in_workers_and_resumed(
     assert rows(new_run(loaded, tmp_path / "ssp", Overrides(ssp=ssp)).folder) == rows(whole)
 
 
-def test_many_lives_of_an_asset_with_its_own_damage_are_refused() -> None:
-    scenario = load_scenario("three_fmus").scenario
-    with pytest.raises(MissionInputError, match="every seed would fly the same life"):
-        fly_many(scenario, asset_source(resolve_scenario(load_scenario("three_fmus"), Overrides())), range(3))
+def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path: Path) -> None:
+    fleet = ensemble("three_fmus", range(3))
+    (group,) = fleet.groups
+    (scenario,) = group.scenarios
+    seedless = scenario.model_copy(update={"asset": scenario.asset.model_copy(update={"seeds": ()})})
+    with pytest.raises(FleetError, match="every seed would fly the same life"):
+        fly_fleet(replace(fleet, groups=(replace(group, scenarios=(seedless,)),)), tmp_path / "fleet")
 
 
 def test_the_law_of_the_shipped_damage_is_what_the_twin_believes() -> None:

