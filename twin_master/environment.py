@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmu_asset.errors import FmuEndedError
 from reporting.progress import Progress, SilentProgress
 from twin_master.assets.interface import Asset
 from twin_master.assets.resolution import Overrides, given_overrides, resolve_scenario
@@ -98,6 +99,8 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         self._start = self._asset.save_state()
         self._plant: Plant | None = None
         self._step, self._seed, self._control = 0, 0, 0
+        self._seen: Float = np.empty(0)
+        self._info: dict[str, Any] = {}
         sensors = self.scenario.observation.count
         self.action_space = gymnasium.spaces.Discrete(len(self.scenario.control))
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (sensors,), np.float64)
@@ -125,7 +128,10 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         return observation, info
 
     def step(self, action: np.int64 | int) -> tuple[Float, float, bool, bool, dict[str, Any]]:
-        """Fly one step under a control: observation, reward, False, whether it was the last one, info.
+        """Fly one step under a control: observation, reward, terminated, truncated, info.
+
+        An asset that ends its simulation by itself terminates the episode, with the last observation, no
+        reward and the sentence in `info["ended"]`; the last step of the mission truncates it.
 
         Raises
         ------
@@ -141,7 +147,11 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
                 f"expected the index of one of the controls {', '.join(self.scenario.control_names)}, "
                 f"got {action!r}"
             )
-        observation, reward, info = self._fly(int(action), self._control)
+        try:
+            observation, reward, info = self._fly(int(action), self._control)
+        except FmuEndedError as error:
+            self._step = self.scenario.mission.steps
+            return self._seen, 0.0, True, False, self._info | {"ended": error.sentence}
         return observation, reward, False, self._step >= self.scenario.mission.steps, info
 
     def close(self) -> None:
@@ -170,4 +180,5 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
             "reward_control": worth,
         }
         self._control, self._step = control, self._step + 1
-        return np.nan_to_num(sensed, nan=0.0), reward, info
+        self._seen, self._info = np.nan_to_num(sensed, nan=0.0), info
+        return self._seen.copy(), reward, info

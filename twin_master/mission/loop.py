@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from fmu_asset.errors import FmuEndedError
 from reporting.progress import Progress, SilentProgress
 from twin_master.errors import ImpossibleObservation, MissionError, NotResumableError
 from twin_master.mission.checkpoint import Checkpoint, FlownTurn
@@ -189,7 +190,7 @@ def fly(
     keep: Callable[[FlownTurn], None] | None = None,
     progress: Progress | None = None,
 ) -> Flight:
-    """Fly a mission, or the rest of one.
+    """Fly a mission, or the rest of one; an asset that ends its simulation ends the mission, and is a notice.
 
     Parameters
     ----------
@@ -240,15 +241,27 @@ def fly(
     unit = f"{scenario.mission.step_name}s"
     with (progress or SilentProgress()).stage("Flying", total=steps, unit=unit) as stage:
         stage.advance(resumed_at)
-        for reading, turn, seconds in operate(twin, _Flown(plant, steps), kept):
+        source = _Flown(plant, steps)
+        for reading, turn, seconds in operate(twin, source, kept):
             beliefs.add(reading.observed, turn)
             timing.append(seconds)
             stage.advance(detail=scenario.control_names[turn.control_index])
+    if source.ended is not None:
+        sentence = f"The asset ended the mission after {twin.turns} of {steps} {unit}: {source.ended}"
+        beliefs.notices.append((twin.turns - 1, Notice("ended", sentence)))
     return beliefs.flight(twin, plant.record(), tuple(timing), resumed_at=resumed_at)
 
 
 class _Flown:
-    """A simulated asset as a source: it is flown under the control that the twin proposed."""
+    """A simulated asset as a source: it is flown under the control that the twin proposed.
+
+    Attributes
+    ----------
+    ended : str or None
+        How the asset has ended its simulation before the mission was over, in a sentence.
+    """
+
+    ended: str | None = None
 
     def __init__(self, plant: Plant, steps: int) -> None:
         self._plant = plant
@@ -259,7 +272,13 @@ class _Flown:
             return None
         control = twin.proposed_control
         before = twin.control_of(twin.turns - 1) if twin.turns else None
-        return Reading(self._plant.turn(control, before), control)
+        try:
+            return Reading(self._plant.turn(control, before), control)
+        except FmuEndedError as error:
+            if not twin.turns:
+                raise
+            self.ended = error.sentence
+            return None
 
     def impossible(self, reading: Reading, error: ImpossibleObservation) -> Reading:
         raise error

@@ -340,7 +340,7 @@ def _notice(result: MissionResult, labels: _Labels) -> xr.Dataset:
 
 def _truth(result: MissionResult, labels: _Labels, truth: Truth) -> xr.Dataset:
     record, role = result.flight.happened, result.scenario.observation.role
-    status = truth.status
+    status = truth.status[: len(record.state)]  # the asset may have ended the mission
     if truth.in_asset:
         status = np.where(np.isnan(result.flight.observed), SensorStatus.LOST, status).astype(status.dtype)
     variables: dict[str, Variable] = {

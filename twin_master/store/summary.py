@@ -243,7 +243,7 @@ def _learnt_figures(result: MissionResult) -> list[Figure]:
 
 def noticed(result: MissionResult) -> dict[str, Any]:
     """Return what the operator was told, `notices`, for the summary; nothing where nothing is watched."""
-    if result.scenario.notice is None:
+    if result.scenario.notice is None and not result.flight.notices:
         return {}
     return {"notices": [{"turn": turn} | vars(notice) for turn, notice in result.flight.notices]}
 

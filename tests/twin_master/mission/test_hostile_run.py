@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import gymnasium
+import numpy as np
 import pytest
 import xarray as xr
 
 from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
 from twin_master import workflow
+from twin_master.environment import ScenarioEnvironment
 from twin_master.scenario.reading import load_scenario
 from twin_master.workflow import new_run, resume_run
 
@@ -147,6 +150,34 @@ def test_a_run_is_resumed_once_the_cause_is_gone(
     resume_run(tmp_path / "part")
     for name in ("run.nc", "config.json", "summary.json", "csv/observed.csv"):
         assert (tmp_path / "part" / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
+    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fmu, flag = foreign_fmu("hostile2", "ENDS", "STATELESS", "AFTER=20"), tmp_path / "flag"
+    monkeypatch.setenv("HOSTILE_FLAG", str(flag))
+    loaded = scenario(tmp_path, fmu)
+    whole = new_run(loaded, tmp_path / "whole")
+    assert whole.notices == ()
+    flag.touch()
+    part = new_run(loaded, tmp_path / "part")
+    (said,) = part.notices
+    assert said.startswith("The asset ended the mission after 20 of 30 turns: ")
+    assert "The FMU asked to end the simulation in the step from t = 20 s" in said
+    with xr.open_datatree(whole.folder / "run.nc") as long, xr.open_datatree(part.folder / "run.nc") as short:
+        for name in ("observed/y", "truth/y", "truth/state", "truth/sensor_status", "filtered/belief"):
+            if name in long:
+                np.testing.assert_array_equal(short[name].values, long[name].values[:20])
+        assert short["truth/sensor_status"].shape == (20, 1)
+    assert resume_run(part.folder).notices == part.notices
+    with ScenarioEnvironment(loaded) as environment:
+        environment.reset(seed=4)
+        seen = [environment.step(0) for _ in range(20)]
+        assert [terminated for _, _, terminated, _, _ in seen] == [False] * 19 + [True]
+        assert "asked to end" in seen[-1][4]["ended"]
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            environment.step(0)
 
 
 ARRAY_BINDING = """
