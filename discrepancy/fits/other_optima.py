@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from discrepancy.catalogue.entry import EffectParameter
 from discrepancy.search_settings import SEARCH
 
 from .candidate import Candidate, Term
@@ -49,6 +50,30 @@ def around(problem: Problem, found: CandidateFit) -> CandidateFit:
         if better is found:
             break
         found = better
+    return found
+
+
+def elsewhere(problem: Problem, found: CandidateFit) -> CandidateFit:
+    """Return the best fit of the same candidate begun at other places of the structure, or the fit itself.
+
+    A mass on either side of an antinode changes a frequency alike, and a fit that began on one side may stay
+    there though the other explains the data far better.
+    """
+    parameters = [item for term in found.candidate.terms for item in term.parameters]
+    for number, item in enumerate(parameters):
+        if not isinstance(item, EffectParameter) or item.magnitude or not item.levels:
+            continue
+        for value in SEARCH.places:
+            effect = found.point.effect.copy()
+            effect[number] = value
+            again = attempt(
+                problem,
+                found.candidate,
+                Point(found.point.shared, found.point.local, effect),
+                give_up=found.objective,
+            )
+            if again is not None and again.log_evidence > found.log_evidence + SEARCH.neighbour_gain:
+                found = again
     return found
 
 

@@ -12,7 +12,7 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, attempt, fit
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate
 from discrepancy.fits.linearisation import Point
-from discrepancy.fits.other_optima import around, free_shape, is_box
+from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
 from discrepancy.search_settings import SEARCH
@@ -243,6 +243,13 @@ class Search(Hypotheses):
         for family in kept.values():
             self.keep(family, exact=True)
 
+    def other_places(self) -> None:
+        """Fit the best candidate from other places of the structure."""
+        best = self.best()
+        found = elsewhere(self.problem, best)
+        if found is not best:
+            self.keep(found, exact=True)
+
     def _settle_steps(self) -> None:
         """Halve the time steps while they cost the best candidate too much, and fit the best ones again."""
         while (
@@ -363,6 +370,7 @@ STRATEGY = (
     Move(Search.fit_pairs, lambda found: _open(found) and len(found.effects) > 1 and found.unexplained()),
     Move(Search.shorter, _open),
     Move(Search.longer_again, lambda found: _open(found) and found.shortened(), settled=True),
+    Move(Search.other_places, settled=True),
 )
 """Simple causes before others: one effect, one law of free shape, more effects, any two; then fewer again."""
 
