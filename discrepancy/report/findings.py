@@ -26,7 +26,7 @@ from discrepancy.report.text import (
     shares_sentence,
     unit_text,
 )
-from discrepancy.verdict import NamedEffect, VerdictKind
+from discrepancy.verdict import NamedEffect, Proof, Scores, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Column, Page, Table
 from reporting.words import counted
@@ -41,10 +41,8 @@ def add_verdict(page: Page, content: ReportInput) -> None:
     investigation = content.investigation
     verdict = investigation.verdict
     page.add_notice(headline(verdict))
-    if content.intervals and investigation.problem is not None and investigation.fit is not None:
-        effects = named_effects(investigation.problem, investigation.fit)
-        if sentence := size_sentence(investigation, effects, content.intervals):
-            page.add_paragraph(sentence)
+    if opening := " ".join(filter(None, (_sizes(content), closing_sentence(investigation)))):
+        page.add_paragraph(opening)
     page.add_paragraph(meaning(verdict))
     if shares := shares_sentence(verdict):
         page.add_paragraph(f"{shares} {remainders_sentence(verdict)}".strip())
@@ -91,6 +89,51 @@ def add_verdict(page: Page, content: ReportInput) -> None:
         title="What is added" if verdict.kind in NAMING else "What could be added",
     )  # fmt: skip
     _add_primitives(page, content)
+
+
+def _sizes(content: ReportInput) -> str:
+    """Return how large what is missing is, in SI units, or by its parameters where none has a unit."""
+    found = content.investigation
+    if content.intervals and found.problem is not None and found.fit is not None:
+        effects = named_effects(found.problem, found.fit)
+        if sentence := size_sentence(found, effects, content.intervals):
+            return sentence
+    if found.verdict.kind not in NAMING:
+        return ""
+    parts = []
+    for effect in found.verdict.effects:
+        for item in effect.parameters:
+            value, interval = estimate_text(item)
+            what = formula(item.description or item.name.replace("_", " "))
+            parts.append(f"{what} {value} {unit_text(item.unit)}".rstrip() + f" ({interval})")
+    return f"Its size: {'; '.join(parts)}; 90 % intervals in brackets." if parts else ""
+
+
+def closing_sentence(investigation: Investigation) -> str:
+    """Return how much of the gap is closed and what is left; empty where nothing was added or scored."""
+    verdict, proof = investigation.verdict, investigation.proof
+    added = "It" if verdict.kind in NAMING else "The best hypothesis, which is no name,"
+    if (share := verdict.explained) is not None:
+        interval = f"{100.0 * share.low:.0f} to {100.0 * share.high:.0f} %"
+        closed = f"{100.0 * share.value:.0f} % of the gap on {share.trials} trials ({interval})"
+        return f"{added} closes {closed} and leaves {number(share.left, 2)} noises."
+    if proof is None or not added_label(investigation):
+        return ""
+    before, after, where = _scored(proof)
+    if not (isfinite(before.chi_square_per_dof) and isfinite(after.chi_square_per_dof)):
+        return ""
+    course = f"{number(before.chi_square_per_dof)} before and {number(after.chi_square_per_dof)} after it"
+    if proof.gap_closed > 0.0:
+        closed = f"{percent(proof.gap_closed)} % of the gap on {where} trials"
+        return f"{added} closes {closed}: χ²/dof is {course}, 1 for noise alone."
+    return f"On {where} trials χ²/dof is {course}, 1 for noise alone."
+
+
+def _scored(proof: Proof) -> tuple[Scores, Scores, str]:
+    """Return the scores before and after, and on which trials: those held out, where there are any."""
+    if proof.held_out_before is not None and proof.held_out_after is not None:
+        return proof.held_out_before, proof.held_out_after, "held-out"
+    return proof.fitted_before, proof.fitted_after, "fitted"
 
 
 def _sentence(text: str) -> str:
@@ -142,39 +185,28 @@ def _add_primitives(page: Page, content: ReportInput) -> None:
 
 
 def _add_highlights(page: Page, investigation: Investigation) -> None:
+    """Add what the sentences above do not say."""
     verdict, proof = investigation.verdict, investigation.proof
     items: list[tuple[str, str]] = []
-    if (share := verdict.explained) is not None:
-        items.append(
-            (
-                f"{100.0 * share.value:.0f} %",
-                f"of the gap explained on {share.trials} trials, "
-                f"{100.0 * share.low:.0f} to {100.0 * share.high:.0f} %",
-            )
-        )
-        items.append((number(share.left, 2), "noises are left"))
-    if not isnan(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
+    said = "probability" in headline(verdict) or verdict.kind is VerdictKind.UNEXPLAINED
+    if not isnan(verdict.probability) and not said:
         items.append((probability_text(verdict.probability), "probability of the verdict"))
     if isfinite(verdict.log_bayes_factor) and verdict.hypotheses and verdict.hypotheses[0].effects:
         items.append((f"{verdict.log_bayes_factor:,.1f} nat", "ln Bayes factor against nothing missing"))
     if proof is not None:
-        first, second, where = proof.fitted_before, proof.fitted_after, "fitted"
-        if proof.held_out_before is not None and proof.held_out_after is not None:
-            first, second, where = proof.held_out_before, proof.held_out_after, "held-out"
+        first, second, where = _scored(proof)
         if verdict.explained is not None:  # at the scale of its share: χ²/dof counts uncertainty as expected
             before, after = residual_sizes(verdict.explained)
             items.append(
                 (f"{before} → {after}", f"noise deviations, rms on {where} trials, before and after")
             )
-        else:
+        elif not closing_sentence(investigation):
             items.append(
                 (
                     f"{number(first.chi_square_per_dof)} → {number(second.chi_square_per_dof)}",
                     f"χ²/dof on {where} trials, before and after",
                 )
             )
-        if isfinite(proof.gap_closed) and verdict.explained is None:  # whose share says nearly the same
-            items.append((f"{percent(proof.gap_closed)} %", "of the gap closed on held-out trials"))
     elif judged := [
         gate
         for gate in verdict.gates

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 import tomllib
@@ -40,7 +41,7 @@ from discrepancy.report.check_tables import (
 )
 from discrepancy.report.content import ReportInput
 from discrepancy.report.figures import draw, report_figures
-from discrepancy.report.findings import add_verdict
+from discrepancy.report.findings import add_verdict, closing_sentence
 from discrepancy.report.grounds import add_gates
 from discrepancy.report.page import render_report
 from discrepancy.report.parameter_table import parameter_rows
@@ -57,6 +58,7 @@ from discrepancy.report.text import (
     headline,
     listing,
     number,
+    percent,
     probability_text,
     remainders_sentence,
     residual_sizes,
@@ -385,6 +387,29 @@ def test_the_headline_size_is_that_of_the_patch(drag: Investigation) -> None:
     assert "m/s; 90 % intervals" in sentence
 
 
+def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag: Investigation) -> None:
+    assert drag.proof is not None
+    closed, held = drag.proof.gap_closed, drag.proof.held_out_after
+    assert held is not None
+    said = closing_sentence(drag)
+    assert said.startswith(f"It closes {percent(closed)} % of the gap on held-out trials: χ²/dof is ")
+    assert f"and {number(held.chi_square_per_dof)} after it" in said
+    page = Page("a", "b")
+    page.add_section("c")
+    add_verdict(page, ReportInput(drag, ORIGIN))  # without intervals of the patch, by its parameters
+    text = html.unescape(page.render()).replace("\N{NO-BREAK SPACE}", " ")
+    assert text.index(headline(drag.verdict)) < text.index("Its size: ") < text.index(said)
+    assert text.count(f"{percent(closed)} %") == 1
+    # no name, no gap to close, no proof
+    group = replace(drag, verdict=replace(drag.verdict, kind=VerdictKind.GROUP))
+    assert closing_sentence(group).startswith("The best hypothesis, which is no name, closes")
+    none = replace(drag, proof=replace(drag.proof, gap_closed=float("nan")))
+    assert closing_sentence(none).startswith("On held-out trials χ²/dof is ")
+    worse = replace(drag, proof=replace(drag.proof, gap_closed=-0.2, held_out_after=None))
+    assert closing_sentence(worse).startswith("On fitted trials χ²/dof is ")
+    assert closing_sentence(replace(drag, proof=None)) == ""
+
+
 def test_parameters_are_shown_before_and_after(drag: Investigation) -> None:
     rows = parameter_rows(drag)
     assert [row[0] for row in rows] == ["stiffness factor", "damping factor"]
@@ -621,7 +646,7 @@ def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(dr
     for words in (
         "90.0 % of the mean square on held-out trials",
         "displacement 3.1 noises over 0.25 s, swinging at 2 Hz",
-        "of the gap explained on held-out trials, 92 to 95 %",
+        "It closes 94 % of the gap on held-out trials (92 to 95 %) and leaves 3.1 noises.",
         "No flight trial.",
         "closes most of the gap on trials that it did not see",
     ):

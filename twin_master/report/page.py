@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from reporting.figures import to_png, to_svg
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.page import Column, Page, Table
-from reporting.words import parameter_title
 from twin_master.assets.asset_source import calibrated_with
 from twin_master.errors import RunFolderError
 from twin_master.report.belief import belief_figure, policy_figure
@@ -27,6 +26,7 @@ from twin_master.report.data import RunRecord
 from twin_master.report.learnt import learnt_caption, learnt_figure, learnt_tables
 from twin_master.report.mission import mission_figure
 from twin_master.report.network import network_figure
+from twin_master.report.opening import opening_sentences
 from twin_master.report.reading import read_run
 from twin_master.report.structure import structure_figure
 from twin_master.report.text import (
@@ -41,7 +41,7 @@ from twin_master.report.text import (
 )
 from twin_master.report.view import choose_sensors, default_now, sensor_title, sensor_word, state_scale
 from twin_master.store.outcome import REPORT_NAME
-from twin_master.store.summary import another_truth, control_changes
+from twin_master.store.summary import another_truth
 
 FIGURE_FOLDER = "figures"
 MAIN_FIGURE = "mission_now"
@@ -228,9 +228,7 @@ def _summary_figures(record: RunRecord) -> list[Mapping[str, Any]]:
 
 
 def _add_outcome(page: Page, record: RunRecord) -> None:
-    said = control_changes(record.controls, record.control_index, record.step_word)
-    page.add_paragraph(f"The twin {said}.")
-    page.add_highlights(_highlights(record))
+    page.add_paragraph(" ".join(opening_sentences(record)))
     for text in _notices(record):
         page.add_notice(text)
     figures = _summary_figures(record)
@@ -257,40 +255,6 @@ def _add_outcome(page: Page, record: RunRecord) -> None:
 def _points(record: RunRecord) -> str:
     titles = [title for k, title in enumerate(record.state_titles) if state_scale(record, k)[1] == "%"]
     return f"Points are percentage points of {' and '.join(titles)}. " if titles else ""
-
-
-def _highlights(record: RunRecord) -> list[tuple[str, str]]:
-    items = []
-    final = record.filtered
-    for factor, title in enumerate(record.state_titles):
-        scale, unit = state_scale(record, factor)
-        mean, deviation = scale * final.mean[-1, factor], scale * final.standard_deviation[-1, factor]
-        (estimate, width), true = ((".1f", ".1f"), ".0f") if unit == "%" else ((".3g", ".2g"), ".3g")
-        truth = ""
-        if record.truth_state is not None:
-            truth = f" (truth {scale * record.truth_state[-1, factor]:{true}} {unit})"
-        items.append(
-            (f"{mean:{estimate}}\u00a0±\u00a0{deviation:{width}} {unit}", f"{title} at the end{truth}")
-        )
-    changes = np.flatnonzero(np.diff(record.control_index)) + 1
-    if len(changes):
-        first = int(changes[0])
-        before, after = (record.controls[record.control_index[turn]] for turn in (first - 1, first))
-        items.append((f"{record.step_word} {first}", f"left {before} for {after}"))
-    else:
-        items.append((record.controls[record.control_index[0]], f"control of every {record.step_word}"))
-    for learnt in record.learnt:
-        if learnt.name == record.parameter_name:
-            mean, deviation = learnt.course[-1, :2]
-            truth = "" if learnt.truth is None else f" (truth {float(learnt.truth):.4g})"
-            label = parameter_title(learnt.name)
-            items.append((f"{mean:.3f}\u00a0±\u00a0{deviation:.3f}", f"{label} learnt{truth}"))
-    check = predictive_check(record)
-    if check is not None and np.isfinite(check.overall_coverage):
-        items.append(
-            (f"{100.0 * check.overall_coverage:.0f} %", "of the observations within their 95 % intervals")
-        )
-    return items
 
 
 def _add_calibrated_wing(page: Page, view: CalibrationView | None) -> None:

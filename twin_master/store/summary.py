@@ -12,7 +12,7 @@ from twin_master.assets.mismatch import Misfit
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.mission.loop import Flight
 from twin_master.mission.plant import PlantRecord
-from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.graphical_model import GraphicalModel, StateSpace
 from twin_master.network.rewards import REWARD_NAMES
 from twin_master.scenario.schema import FALLBACK_FIGURES, MISFIT_FIGURES, NOTICE_FIGURES, Reference
 from twin_master.store.learnt import printed_learnt
@@ -89,14 +89,14 @@ class Fallback:
 
 
 def find_fallback(
-    model: GraphicalModel, policy_index: Index, first_control: int, control_index: Index, true_state: Float
+    states: StateSpace, policy_index: Index, first_control: int, control_index: Index, true_state: Float
 ) -> Fallback:
     """Return how the control fell back.
 
     Parameters
     ----------
-    model : GraphicalModel
-        S states with F factors.
+    states : StateSpace
+        S states of F factors.
     policy_index : (S,)
         Control of the policy in each state.
     first_control : int
@@ -106,8 +106,8 @@ def find_fallback(
     true_state : (T, F)
         True state, SI.
     """
-    table = (policy_index != first_control).reshape(model.states.shape)
-    for axis, factor in enumerate(model.states.factors):
+    table = (policy_index != first_control).reshape(states.shape)
+    for axis, factor in enumerate(states.factors):
         others = tuple(index for index in range(table.ndim) if index != axis)
         any_of, all_of = table.any(axis=others), table.all(axis=others)
         switched = np.flatnonzero(all_of)
@@ -264,7 +264,8 @@ def _scored(result: MissionResult, truth: PlantRecord) -> list[Figure]:
     """Return the figures that need the truth: how the control fell back, and errors of the estimate."""
     scenario, flight, model = result.scenario, result.flight, result.model
     first = scenario.control_names.index(scenario.mission.first_control)
-    fallback = find_fallback(model, result.plan.control_index, first, flight.control_index, truth.state)
+    policy = result.plan.control_index
+    fallback = find_fallback(model.states, policy, first, flight.control_index, truth.state)
     units = {factor.name: factor.unit for factor in scenario.state}
     figures = _fallback_figures(fallback, units, scenario.mission.step_name)
     errors = filtered_rms_error(model, flight.filtered, truth.state)
@@ -302,7 +303,9 @@ def _watched(result: MissionResult) -> list[Figure]:
     return figures
 
 
-def control_changes(controls: Sequence[str], control_index: Index, step_name: str) -> str:
+def control_changes(
+    controls: Sequence[str], control_index: Index, step_name: str, first_step: int = 0
+) -> str:
     """Return in words when which control was left for which: ``left 3g for 2g at turn 31``.
 
     Parameters
@@ -313,13 +316,15 @@ def control_changes(controls: Sequence[str], control_index: Index, step_name: st
         Controls flown.
     step_name : str
         What a step is called.
+    first_step : int
+        Number of the first one.
     """
     steps = (np.flatnonzero(np.diff(control_index)) + 1).tolist()
     if not steps:
         return f"flew {controls[int(control_index[0])]} at every {step_name}"
     changes = [
         f"left {controls[int(control_index[step - 1])]} for {controls[int(control_index[step])]} "
-        f"at {step_name} {step}"
+        f"at {step_name} {first_step + step}"
         for step in steps[:_CHANGES_SAID]
     ]
     more = len(steps) - len(changes)

@@ -43,7 +43,7 @@ def controls(*gentle: int) -> np.ndarray:
     ],
 )
 def test_fallback(gentle: range | list[int], delay: int | None, early: int | None) -> None:
-    found = find_fallback(MODEL, POLICY, 1, controls(*gentle), TRUTH)
+    found = find_fallback(MODEL.states, POLICY, 1, controls(*gentle), TRUTH)
     assert (found.switch_state, found.switch_level) == ("z1", 0.6)
     assert found.called_for_step == 30
     assert found.delay == delay
@@ -53,13 +53,13 @@ def test_fallback(gentle: range | list[int], delay: int | None, early: int | Non
 def test_a_policy_of_several_states_or_none_has_no_switch() -> None:
     both = np.where(MODEL.states.coordinates.sum(axis=1) > 0.59, 0, 1)
     for policy in (both, np.ones(25, dtype=np.int64)):
-        found = find_fallback(MODEL, policy, 1, controls(31), TRUTH)
+        found = find_fallback(MODEL.states, policy, 1, controls(31), TRUTH)
         assert found.switch_state is None
         assert found.delay is None
 
 
 def test_no_damage_calls_for_no_fallback() -> None:
-    found = find_fallback(MODEL, POLICY, 1, controls(12), np.zeros((50, 2)))
+    found = find_fallback(MODEL.states, POLICY, 1, controls(12), np.zeros((50, 2)))
     assert found.called_for_step is None
     assert found.early_step == 12
     assert found.delay is None
