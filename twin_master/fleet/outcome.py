@@ -110,7 +110,7 @@ def _fallbacks(knowledge: Knowledge, flights: Flights) -> tuple[NDArray[np.float
     for twin, (control, state) in enumerate(zip(flights.control_index, flights.state, strict=True)):
         if np.isnan(state[0]).any():
             continue
-        fallback = find_fallback(knowledge.model, plan.control_index, first, control, state)
+        fallback = find_fallback(knowledge.model.states, plan.control_index, first, control, state)
         early[twin] = fallback.early_step is not None
         if fallback.called_for_step is not None:
             delay[twin] = np.inf if fallback.delay is None else fallback.delay

@@ -71,7 +71,7 @@ def _fallback(record: RunRecord) -> Fallback | None:
         record.policy.control_index,
         int(record.control_index[0]),
         record.control_index,
-        record.truth_state,
+        np.asarray(record.truth_state, dtype=np.float64),
     )
 
 
