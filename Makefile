@@ -3,6 +3,7 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
+DOCS_VENV := .venv-docs
 OUT ?= runs/demo
 
 .PHONY: help
@@ -43,14 +44,20 @@ fmu: $(VENV)/.runtime ## Build the wing as an FMU into runs/wing.fmu
 	@mkdir -p runs
 	$(BIN)/uav-twin fmu build --out runs/wing.fmu --replace
 
+.PHONY: docs
+docs: $(DOCS_VENV)/.docs ## Build the site of the documentation into build/docs; a warning is an error
+	$(DOCS_VENV)/bin/python -m sphinx -q -W --keep-going -c docs/site -d build/doctrees docs build/docs
+	@echo "The site is build/docs/index.html."
+
 .PHONY: lock
-lock: $(VENV)/.dev ## Renew both lock files from pyproject.toml
+lock: $(VENV)/.dev ## Renew the lock files from pyproject.toml and docs/site/requirements.in
 	$(BIN)/pip-compile -q --upgrade --extra build -o requirements.lock pyproject.toml
 	$(BIN)/pip-compile -q --extra build --extra dev -c requirements.lock -o requirements-dev.lock pyproject.toml
+	$(BIN)/pip-compile -q -c requirements.lock -o requirements-docs.lock docs/site/requirements.in
 
 .PHONY: clean
-clean: ## Remove .venv, runs and caches of this folder
-	rm -rf $(VENV) runs build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+clean: ## Remove .venv, .venv-docs, build, runs and caches of this folder
+	rm -rf $(VENV) $(DOCS_VENV) runs build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/bin/python:
@@ -65,4 +72,12 @@ $(VENV)/.runtime: requirements.lock pyproject.toml | $(VENV)/bin/python
 
 $(VENV)/.dev: requirements-dev.lock $(VENV)/.runtime
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-dev.lock
+	@touch $@
+
+# The site reads docstrings, so its packages see those of the runtime behind their own.
+$(DOCS_VENV)/.docs: requirements-docs.lock $(VENV)/.runtime
+	$(BIN)/python -m venv $(DOCS_VENV)
+	$(DOCS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-docs.lock
+	@$(BIN)/python -c 'import sysconfig; print("import site; site.addsitedir(%r)" % sysconfig.get_path("purelib"))' \
+	  > "$$($(DOCS_VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/runtime.pth"
 	@touch $@

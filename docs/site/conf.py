@@ -1,0 +1,74 @@
+"""The site of the documentation: the Markdown of the folder above, ordered by `index.md` beside this file."""
+
+import inspect
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+import uav_twin
+
+DOCS = Path(__file__).resolve().parent.parent
+
+project = "uav-twin"
+author = "The uav-twin authors"
+root_doc = "index"
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["site/index.md"]
+default_role = "code"
+highlight_language = "none"
+
+myst_heading_anchors = 5
+myst_enable_extensions = ["colon_fence"]
+
+napoleon_google_docstring = False
+napoleon_use_ivar = True
+autodoc_typehints = "none"
+maximum_signature_line_length = 100
+
+html_theme = "pydata_sphinx_theme"
+html_title = "uav-twin"
+html_static_path = ["site.css"]
+html_css_files = ["site.css"]
+html_show_sourcelink = False
+html_theme_options = {"show_prev_next": True, "navbar_align": "left", "secondary_sidebar_items": ["page-toc"]}
+
+
+def _front(_: str) -> str:
+    return (DOCS / "site" / "index.md").read_text(encoding="utf-8")
+
+
+def _interface(text: str) -> str:
+    """Return the page of the interface: every name of `uav_twin.__all__` from its docstring."""
+    entries = []
+    for name in uav_twin.__all__:
+        found = getattr(uav_twin, name)
+        if inspect.isclass(found):
+            entries.append(f".. autoclass:: uav_twin.{name}\n   :members:")
+        elif callable(found):
+            entries.append(f".. autofunction:: uav_twin.{name}")
+    body = "\n\n".join(entries)
+    return f"{text}\n```{{eval-rst}}\n{body}\n```\n"
+
+
+def _gallery(text: str) -> str:
+    """Return the page of pictures: one for each effect, leading to its page."""
+    pictures = []
+    for page in sorted((DOCS / "effects").glob("[!R]*.md")):
+        title = page.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
+        picture = f"![{title}](../effects/images/{page.stem}.png)"
+        pictures.append(f"- [{picture}](../effects/{page.name})\n  [{title}](../effects/{page.name})")
+    return f"{text}\n:::{{container}} gallery\n" + "\n".join(pictures) + "\n:::\n"
+
+
+MADE = {"index": _front, "site/api": _interface, "site/gallery": _gallery}
+"""Pages that are made, or stand in the place of what is read on a code host."""
+
+
+def _make(app: Sphinx, name: str, source: list[str]) -> None:
+    if name in MADE:
+        source[0] = MADE[name](source[0])
+
+
+def setup(app: Sphinx) -> None:
+    """Make the pages of `MADE` where Sphinx reads them."""
+    app.connect("source-read", _make)
