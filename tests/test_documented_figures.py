@@ -21,6 +21,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 pytestmark = pytest.mark.xdist_group("wing")
 
 
+@pytest.mark.long
 def test_the_error_reward_with_and_without_the_load_factor() -> None:
     scenario = load_scenario("level_turns").scenario
     source = ReducedModelSource(scenario, reduced_model())

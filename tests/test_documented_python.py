@@ -215,8 +215,8 @@ MADE_ONCE = {
 }
 """Folders that fixtures make, and where the page has them."""
 
-MINUTES = {"docs/real_wing.md"}
-"""Pages whose search takes minutes of processor time."""
+MINUTES = {"docs/real_wing.md", "docs/python.md", "docs/discrepancy_missions.md", "docs/verdict.md"}
+"""Pages whose blocks take a quarter of a minute or more of processor time, and show what others show."""
 
 MODULES = {"docs/use_the_wing_in.md": "libcosimpy"}
 """What the page tells the reader to install; without it the blocks before are run."""

@@ -24,6 +24,8 @@ from benchmarks.blind.structure import Release, Structure
 from benchmarks.blind.traps import TRAPS
 from benchmarks.blind.writing import write_case
 
+pytestmark = pytest.mark.long  # the loops of the generators are compiled in half a minute
+
 RATE = 250.0
 STIFFNESS, W = 1000.0, 10.0 * np.pi  # N/m, rad/s: 5 Hz
 
@@ -65,7 +67,6 @@ def motion(
 # ---------------------------------------------------------------- laws
 
 
-@pytest.mark.long
 def test_dry_friction_takes_two_widths_from_every_half_swing_and_stops_within_one() -> None:
     friction = 0.4
     width = friction / STIFFNESS
@@ -79,7 +80,6 @@ def test_dry_friction_takes_two_widths_from_every_half_swing_and_stops_within_on
     assert abs(values[-1]) <= width
 
 
-@pytest.mark.long
 def test_structural_damping_has_the_same_decrement_at_every_amplitude() -> None:
     loss = 0.05
     tops = peaks(motion(Law("x", FRICTION, (loss * STIFFNESS, 1.0))))
@@ -88,7 +88,6 @@ def test_structural_damping_has_the_same_decrement_at_every_amplitude() -> None:
     np.testing.assert_allclose(tops[1:] / tops[:-1], wanted, rtol=2e-3)
 
 
-@pytest.mark.long
 def test_drag_follows_the_energy_balance_of_a_half_swing() -> None:
     drag = 3.0
     mass = STIFFNESS / W**2
@@ -126,7 +125,6 @@ def _period(values: np.ndarray) -> float:
     return float((crossing[-1] - crossing[0]) / (len(crossing) - 1))
 
 
-@pytest.mark.long
 def test_breathing_crack_has_half_a_period_of_each_spring() -> None:
     values = motion(Law("x", POWER, (-0.4 * STIFFNESS, 1.0, -1.0)), seconds=4.0)
     period = np.pi / W * (1.0 + 1.0 / np.sqrt(0.6))

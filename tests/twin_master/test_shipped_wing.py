@@ -74,6 +74,7 @@ def test_the_whole_chain_and_its_resumption(
         assert (tmp_path / "part" / name).read_bytes() == (outcome.folder / name).read_bytes(), name
 
 
+@pytest.mark.long
 def test_the_mission_is_the_same_with_the_compiled_wing_and_without_a_worker(
     wing: ReducedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -348,6 +348,7 @@ def test_overrides(tmp_path: Path, library_file: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_kill_at_random_moments(library_file: Path) -> None:
     """A few trials; `python -m benchmarks.kill_and_resume --trials 20` makes more."""
     result = subprocess.run(

@@ -99,6 +99,7 @@ def test_refusals(
     assert [path.name for path in out.iterdir()] == ["mine.txt"]
 
 
+@pytest.mark.long
 def test_another_wing_is_measured_as_it_was_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     text = SHIPPED_DESIGN.read_text(encoding="utf-8")
     for old, new in (("semi_span = 1.828", "semi_span = 1.9"), ("refinement = 1.0", "refinement = 0.25")):

@@ -351,6 +351,7 @@ def test_missing_steps_are_told_and_a_full_disk_leaves_nothing(
     assert [path.name for path in tmp_path.iterdir()] == ["lab"]
 
 
+@pytest.mark.long
 def test_records_may_be_left_aside(
     wings: dict[str, Tailored], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -373,6 +374,7 @@ def measured_planform(folder: Path, semi_span: float) -> Path:
     return folder / "lab"
 
 
+@pytest.mark.long
 def test_the_model_follows_the_measured_planform(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

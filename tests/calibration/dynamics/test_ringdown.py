@@ -94,6 +94,7 @@ def test_a_time_printed_to_few_digits_is_even_enough() -> None:
     assert fit.modes[1].frequency == pytest.approx(29.97, rel=1e-3)
 
 
+@pytest.mark.long
 def test_standard_errors_are_those_of_repetitions_and_scale_with_the_noise() -> None:
     time = np.arange(0.0, 4.0, 1.0 / 250.0)
     clean = ring_down(time)

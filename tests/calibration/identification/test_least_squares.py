@@ -14,7 +14,8 @@ from calibration.identification.parameters import FreeParameter, scaled, values_
 from calibration.identification.targets import Targets, Weights
 from fe.wing.design import WingDesign
 
-pytestmark = pytest.mark.xdist_group("least_squares")  # the fit that most need takes a minute
+# the fit that most need takes a minute
+pytestmark = [pytest.mark.long, pytest.mark.xdist_group("least_squares")]
 
 FREE = ("skin modulus at 0", "flap root spring", "net lift at 3g", "skin density", "cluster 1 chord")
 

@@ -30,6 +30,7 @@ def test_the_pieces_are_those_of_the_operators(virtual_design: WingDesign, relie
     assert found.gauges == pytest.approx(operators.gauge_output @ static, rel=1e-9)
 
 
+@pytest.mark.long
 def test_values_are_those_of_the_full_model(virtual_model: LocalModel, virtual_design: WingDesign) -> None:
     operators = assemble(virtual_design)
     wing = virtual_model.wing

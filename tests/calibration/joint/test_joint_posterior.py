@@ -128,6 +128,7 @@ def stretch_sampler(prior: JointPrior, modal: ModalMeasurement, steps: int) -> F
     return np.concatenate(kept)
 
 
+@pytest.mark.long
 def test_an_independent_sampler_finds_the_same(tables: WingTables) -> None:
     # Ratios that leave little for alpha: the cut at zero matters.
     modal = replace(MODAL, damping_ratio=(0.02, 0.08), damping_ratio_standard_deviation=(0.004, 0.008))

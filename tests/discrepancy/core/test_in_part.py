@@ -69,6 +69,7 @@ def test_friction_beside_a_remainder_is_named_in_part(rig, effects, seed: int) -
 
 
 @pytest.mark.parametrize("seed", [3])
+@pytest.mark.long
 def test_a_remainder_alone_gets_no_name(rig, effects, seed: int) -> None:  # type: ignore[no-untyped-def]
     verdict, _, _ = name(rig.problem(rig.measured(seed, noise=remainder(5.0, 0.95))), effects)
     assert verdict.kind is VerdictKind.UNEXPLAINED, verdict.sentence

@@ -301,6 +301,7 @@ def test_what_all_probable_sets_hold_is_named_where_it_fits_alone(searched, few)
 # ---------------------------------------------------------------- families
 
 
+@pytest.mark.long
 def test_a_law_between_two_named_ones_is_their_family_once(small, few) -> None:  # type: ignore[no-untyped-def]
     """|v|^0.5 lies between dry friction and viscous damping: one family, beside those of other laws."""
     law = PowerDamping("end", 1.0, 0.5, 0.0, 1.0, 1.0)
@@ -319,6 +320,7 @@ def test_a_law_between_two_named_ones_is_their_family_once(small, few) -> None: 
     assert fit.candidate.is_family
 
 
+@pytest.mark.long
 def test_a_law_of_free_shape_beside_two_effects_is_no_verdict(small, few) -> None:  # type: ignore[no-untyped-def]
     """With three effects and a shape to choose nearly anything fits."""
     law = ModelPatch((PowerDamping("end", 0.15, 1.0, 0.0, 1.0, 1.0),))

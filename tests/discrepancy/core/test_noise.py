@@ -125,6 +125,7 @@ def test_records_that_say_little() -> None:
 
 
 @pytest.mark.parametrize("coefficient", [pytest.param(0.9, marks=pytest.mark.long), 0.99])
+@pytest.mark.long
 def test_the_first_whitened_samples_weigh_what_they_are_worth(kit, coefficient: float) -> None:  # type: ignore[no-untyped-def]
     """Without a history the first sample has the process's variance, 1 / (1 - a^2) of the innovation's: 50 at
     0.99. Counted as one innovation it would be an outlier in every record."""

@@ -344,6 +344,7 @@ def some_effects() -> list[Effect]:
     return [effect for effect in load_catalogue() if effect.identifier in FEW]
 
 
+@pytest.mark.long
 def test_hidden_friction_is_named(rig: FmuModel, lumped: LumpedModel) -> None:
     assert len(some_effects()) == len(FEW)
     friction = PowerDamping("slide", 0.008 * STIFFNESS * 0.008, 0.0, 0.0, 1.0, 1.0)

@@ -172,6 +172,7 @@ def test_effects_that_the_fmu_carries_are_used(pair: tuple[FmuModel, WingModel])
     assert wing.supports(PointMass)
 
 
+@pytest.mark.long
 def test_scales_and_a_law_at_the_tip(pair: tuple[FmuModel, WingModel]) -> None:
     fmu, wing = pair
     campaign = Campaign("", {}, (RINGDOWN,), None, {}, "")

@@ -176,6 +176,7 @@ def test_derivatives_by_uncertain_health_are_in_the_order_of_the_unknowns(
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
+@pytest.mark.long
 def test_a_drifting_gauge_is_found_in_the_run(campaign: Campaign, model: Model) -> None:
     found = investigate(campaign, model, RIVALS, thorough=False)
     assert found.verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP)

@@ -207,6 +207,7 @@ def test_every_file_that_shapes_the_model_counts_for_the_key() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_real_build_is_reproducible_in_any_number_of_threads(
     coarse_design: WingDesign, coarse_wing: WingFields, own_cache: Path
 ) -> None:

@@ -201,6 +201,7 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@pytest.mark.long
 def test_both_models_of_the_wing_agree(agreement):
     # Nothing is fitted to either; docs/verification.md says what is left and why.
     assert abs(agreement.relative("tip_stiffness")) < 0.003

@@ -65,6 +65,7 @@ def convergence(shipped_design: WingDesign):
     return mesh_convergence(shipped_design, (0.25, 0.5, 1.0))
 
 
+@pytest.mark.long
 def test_the_mesh_converges(convergence):
     coarse, half, one = convergence
     assert coarse.unknowns < half.unknowns < one.unknowns

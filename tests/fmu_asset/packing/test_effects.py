@@ -120,6 +120,7 @@ ROW = st.fixed_dictionaries(
 
 @settings(max_examples=12, deadline=None)
 @given(inputs=st.lists(ROW, min_size=1, max_size=6), response=st.sampled_from([1.0, 2.0]))
+@pytest.mark.long
 def test_off_is_the_plain_wing_to_the_bit(
     fmu: Path, patched: Path, everything: Binding, inputs: list[dict[str, float]], response: float
 ) -> None:

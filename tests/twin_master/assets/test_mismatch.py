@@ -107,6 +107,7 @@ def resolved(library: Path, path: Path | str = "model_mismatch") -> Scenario:
     return resolve_scenario(load_scenario(path), Overrides(strain_library=library))
 
 
+@pytest.mark.long
 def test_the_twin_may_believe_a_calibrated_wing(
     library_file: Path, tmp_path: Path, make_calibration: Callable[..., CalibrationResult]
 ) -> None:
