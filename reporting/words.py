@@ -1,6 +1,7 @@
 """Numbers beside their nouns, names of parameters, and reasons, for sentences."""
 
 import re
+from collections.abc import Iterable
 
 
 def counted(count: int, noun: str, plural: str | None = None) -> str:
@@ -21,6 +22,14 @@ def counted(count: int, noun: str, plural: str | None = None) -> str:
 def be(count: int) -> str:
     """Return "is" for one and "are" for any other count."""
     return "is" if count == 1 else "are"
+
+
+def listing(words: Iterable[str]) -> str:
+    """Return words as "a, b and c"."""
+    found = list(words)
+    if len(found) < 2:
+        return "".join(found)
+    return f"{', '.join(found[:-1])} and {found[-1]}"
 
 
 def one_line(reason: object) -> str:

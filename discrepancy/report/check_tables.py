@@ -8,8 +8,9 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.catalogue.entry import Effect
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
-from discrepancy.report.text import listing, number, unit_text
+from discrepancy.report.text import number, unit_text
 from reporting.page import Column, Table
+from reporting.words import listing
 
 HEADINGS = (
     "effect",

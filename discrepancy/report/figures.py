@@ -21,10 +21,10 @@ from discrepancy.report.motion_figures import (
     worst_record,
 )
 from discrepancy.report.residual_figures import heat_figure, load_figure, planform_figure
-from discrepancy.report.text import listing
 from discrepancy.report.time_line import time_line_figure
 from discrepancy.workflow import Investigation
 from reporting.figures import to_svg
+from reporting.words import listing
 
 
 def report_figures(content: ReportInput) -> dict[str, ReportFigure]:

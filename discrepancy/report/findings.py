@@ -14,7 +14,6 @@ from discrepancy.report.text import (
     estimate_text,
     formula,
     headline,
-    listing,
     meaning,
     number,
     p_value_text,
@@ -29,7 +28,7 @@ from discrepancy.report.text import (
 from discrepancy.verdict import NamedEffect, Proof, Scores, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Column, Page, Table
-from reporting.words import counted
+from reporting.words import counted, listing
 
 LEAST_SHARE = 0.05
 """Findings in words that explain less of the excess variance are left to the file."""

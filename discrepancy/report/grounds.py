@@ -7,19 +7,12 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.files.document import Origin
 from discrepancy.report.check_tables import can_decide_table, group_lines
 from discrepancy.report.content import ReportInput
-from discrepancy.report.text import (
-    NAMING,
-    added_label,
-    listing,
-    number,
-    p_value_text,
-    percent,
-    probability_text,
-)
+from discrepancy.report.text import NAMING, added_label, number, p_value_text, percent, probability_text
 from discrepancy.self_calibration import Share, outcomes
 from discrepancy.verdict import Gate, Proof, Scores, Verdict
 from discrepancy.workflow import Investigation
 from reporting.page import Column, Page, Table
+from reporting.words import listing
 
 
 def add_gates(page: Page, investigation: Investigation) -> None:

@@ -1,7 +1,6 @@
 """Numbers and sentences of the report and of the summary on the terminal."""
 
 import re
-from collections.abc import Iterable, Sequence
 from math import floor, isfinite, isnan, log10
 
 from discrepancy.catalogue.entry import Effect
@@ -194,14 +193,6 @@ def catalogue_of(investigation: Investigation) -> dict[str, Effect]:
         if investigation.search is None
         else {item.identifier: item for item in investigation.search.effects}
     )
-
-
-def listing(words: Iterable[str]) -> str:
-    """Return words as "a, b and c"."""
-    found: Sequence[str] = list(words)
-    if len(found) < 2:
-        return "".join(found)
-    return f"{', '.join(found[:-1])} and {found[-1]}"
 
 
 _GREEK = {

@@ -146,9 +146,7 @@ class FleetWatch:
                 self._sources.append(_Files(self, group, follow))
         self.closing.callback(os.close, _held(fleet, folder))
         known = folder / STATE_NAME
-        self._told_before: dict[str, Any] = (
-            read_json(known, RunFolderExistsError)["assets"] if known.is_file() else {}
-        )
+        self._told_before = _assets_of(read_json(known, RunFolderExistsError)) if known.is_file() else {}
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (limits[1], limits[1]))  # three files for each asset
 
@@ -260,6 +258,13 @@ class FleetWatch:
         atomic_write_text(self.folder / STATE_NAME, json.dumps(record, allow_nan=False) + "\n")
 
 
+def _assets_of(state: object) -> dict[str, dict[str, Any]]:
+    """Return what a state file holds of its assets; of one that was changed by hand only what is sound."""
+    assets = state.get("assets") if isinstance(state, dict) else None
+    found = assets if isinstance(assets, dict) else {}
+    return {name: record for name, record in found.items() if isinstance(record, dict)}
+
+
 def _held(fleet: Fleet, folder: Path) -> int:
     """Make the folder of a fleet, or see that it holds the same; return what holds it for this process."""
     groups = [
@@ -366,16 +371,19 @@ class _Topics:
         fleet.closing.callback(self._session.close)
         self._messages = self._session.messages(0.0)
         self._assets: dict[str, WatchedAsset] = {}
-        self._inboxes: dict[str, _Inbox] = {}
+        self._inboxes: dict[str, _Inbox | None] = {}
 
     def look(self) -> int:
         """Take in what the broker has sent; return the number of turns."""
         turns = 0
         while not self._fleet.asked and (message := next(self._messages)) is not None:
-            inbox = self._inboxes.get(message.topic) or self._begun(message.topic)
-            if inbox is not None:
+            topic = message.topic
+            if topic not in self._inboxes and len(self._inboxes) < LARGEST_FLEET:
+                self._inboxes[topic] = self._begun(topic)  # one that is refused is refused once
+            inbox = self._inboxes.get(topic)
+            if inbox is not None and not self._fleet.done(self._assets[topic]):
                 inbox.came.append(message.payload)
-                turns += self._fleet.advance(self._assets[message.topic])
+                turns += self._fleet.advance(self._assets[topic])
         return turns
 
     def _begun(self, topic: str) -> _Inbox | None:
@@ -387,5 +395,5 @@ class _Topics:
         asset = self._fleet.take_up(self._group, name, lambda _scenario: inbox, publish)
         if asset is None:
             return None
-        self._assets[topic], self._inboxes[topic] = asset, inbox
+        self._assets[topic] = asset
         return inbox

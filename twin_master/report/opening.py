@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.stats import binom
 
-from reporting.words import parameter_title
+from reporting.words import listing, parameter_title
 from twin_master.network.graphical_model import Factor, StateSpace
 from twin_master.report.check import PredictiveCheck, predictive_check
 from twin_master.report.data import RunRecord
@@ -81,7 +81,7 @@ def _belief(record: RunRecord) -> str:
     rest = len(record.state_names) - len(parts)
     if rest:
         parts.append(f"{_count(rest, 'other state')} as the figures below show")
-    said = f"At the end the twin puts {_listing(parts)}; in brackets two standard deviations either side"
+    said = f"At the end the twin puts {listing(parts)}; in brackets two standard deviations either side"
     for learnt in record.learnt:
         if learnt.name == record.parameter_name:
             mean, deviation = learnt.course[-1, :2]
@@ -144,7 +144,3 @@ def _named(title: str) -> str:
 
 def _count(count: int, word: str) -> str:
     return f"one {word}" if count == 1 else f"{count} {word}s"
-
-
-def _listing(parts: list[str]) -> str:
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
