@@ -56,7 +56,6 @@ from discrepancy.report.sizes import si_sizes, size_sentence
 from discrepancy.report.text import (
     formula,
     headline,
-    listing,
     number,
     percent,
     probability_text,
@@ -91,6 +90,7 @@ from fe.wing.design import load_design
 from reporting.errors import FileNotWrittenError
 from reporting.page import Page
 from reporting.provenance import collect_provenance
+from reporting.words import listing
 
 MODEL = "single_mass_rig"
 ORIGIN = Origin("Rig", MODEL, "ab" * 32, "cd" * 32, "uav-twin discrepancy run rig", collect_provenance(0))
