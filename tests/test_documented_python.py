@@ -215,8 +215,16 @@ MADE_ONCE = {
 }
 """Folders that fixtures make, and where the page has them."""
 
-MINUTES = {"docs/real_wing.md", "docs/python.md", "docs/discrepancy_missions.md", "docs/verdict.md"}
-"""Pages whose blocks take a quarter of a minute or more of processor time, and show what others show."""
+MINUTES = {
+    "docs/calibration.md",
+    "docs/campaign.md",
+    "docs/discrepancy_missions.md",
+    "docs/notices.md",
+    "docs/python.md",
+    "docs/real_wing.md",
+    "docs/verdict.md",
+}
+"""Pages whose blocks take ten seconds of processor time or more, and show what others show."""
 
 MODULES = {"docs/use_the_wing_in.md": "libcosimpy"}
 """What the page tells the reader to install; without it the blocks before are run."""

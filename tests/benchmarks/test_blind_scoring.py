@@ -90,7 +90,7 @@ def test_interval_of_a_share(hits: int, count: int) -> None:
 
 def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = ["--out", str(tmp_path)]
-    sizes = ["--count-per-effect", "0", "--nulls", "3", "--pairs", "2", "--outside", "0", "--traps", "0"]
+    sizes = ["--count-per-effect", "0", "--nulls", "4", "--pairs", "0", "--outside", "0", "--traps", "0"]
     assert main(["generate", *out, *sizes, "--seed", "7", "--rigs", "lumped", "--jobs", "1"]) == 0
     sealed = sorted((tmp_path / "sealed").glob("*.json"))
     assert len(sealed) == len(list((tmp_path / "campaigns").iterdir())) >= 2

@@ -114,7 +114,8 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_mission(
 
 
 @pytest.mark.parametrize(
-    ("scenario", "turns"), [("level_turns", 1), ("growing_damage", 30), ("failing_gauges", 50)]
+    ("scenario", "turns"),
+    [("level_turns", 1), ("failing_gauges", 50), pytest.param("growing_damage", 30, marks=pytest.mark.long)],
 )
 def test_a_resumed_run_is_bit_identical(
     tmp_path: Path,

@@ -147,6 +147,7 @@ def test_what_a_calibration_leaves_and_says(wings: dict[str, Tailored]) -> None:
     assert paper.reward.information_gain is None
 
 
+@pytest.mark.long
 def test_a_calibration_repeats_to_the_byte_and_another_wing_is_not_overwritten(
     wings: dict[str, Tailored],
     tmp_path: Path,

@@ -16,7 +16,12 @@ from discrepancy.search.starting_points import are_related
     ("hidden", "values", "taken"),
     [
         ("joint_micro_slip", {"stiffness_share": 0.3, "slip_ratio": 0.2}, "bouc_wen_hysteresis"),
-        ("bouc_wen_hysteresis", {"stiffness_share": 0.3, "yield_ratio": 0.3}, "joint_micro_slip"),
+        pytest.param(
+            "bouc_wen_hysteresis",
+            {"stiffness_share": 0.3, "yield_ratio": 0.3},
+            "joint_micro_slip",
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_a_relative_is_reached_from_what_is_taken_for_it(bench, catalogue, hidden, values, taken) -> None:  # type: ignore[no-untyped-def]

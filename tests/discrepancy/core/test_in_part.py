@@ -45,6 +45,7 @@ def remainder(size: float, share: float):  # type: ignore[no-untyped-def]
     return draw
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1])
 def test_friction_beside_a_remainder_is_named_in_part(rig, effects, seed: int) -> None:  # type: ignore[no-untyped-def]
     truth = {"friction_ratio": 0.02}

@@ -66,7 +66,17 @@ TRUTHS = {
 }
 
 
-@pytest.mark.parametrize("identifier", TRUTHS)
+@pytest.mark.parametrize(
+    "identifier",
+    [
+        *("gauge_gain", "coulomb_friction"),
+        *(
+            pytest.param(name, marks=pytest.mark.long)
+            for name in TRUTHS
+            if name not in ("gauge_gain", "coulomb_friction")
+        ),
+    ],
+)
 def test_an_effect_is_named_with_intervals_that_hold_it(small, effects, catalogue, identifier: str) -> None:  # type: ignore[no-untyped-def]
     values, place = TRUTHS[identifier]
     if place is None:
@@ -89,7 +99,7 @@ def test_an_effect_is_named_with_intervals_that_hold_it(small, effects, catalogu
     assert sum(found.set_probabilities().values()) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("slip_ratio", [0.3, 1.5])
+@pytest.mark.parametrize("slip_ratio", [pytest.param(0.3, marks=pytest.mark.long), 1.5])
 def test_a_joint_that_slips_is_named_with_many_elements(small, catalogue, slip_ratio: float) -> None:  # type: ignore[no-untyped-def]
     """A joint of 400 elements; with few of its own the model would take their dents for knowledge."""
     values = {"stiffness_share": 0.3, "slip_ratio": slip_ratio}
@@ -107,6 +117,7 @@ def test_a_joint_that_slips_is_named_with_many_elements(small, catalogue, slip_r
         assert abs(values[estimate.name] - middle) <= 2.0 * half, estimate
 
 
+@pytest.mark.long
 def test_a_law_that_has_become_another_one_is_not_named(small, catalogue) -> None:  # type: ignore[no-untyped-def]
     """A joint that slips at a ten-thousandth of its motion is a soft one; micro-slip alone fits it."""
     soft = small.patch("joint_micro_slip", {"stiffness_share": 0.2, "slip_ratio": 1e-4}, "joint")
@@ -261,6 +272,7 @@ def searched(small, few):  # type: ignore[no-untyped-def]
     return problem, name(problem, few)[1]
 
 
+@pytest.mark.long
 def test_members_that_do_not_fit_are_no_part_of_a_group(searched, few) -> None:  # type: ignore[no-untyped-def]
     """Patch and proof are those of a member; the probability is that of the members together."""
     problem, found = searched

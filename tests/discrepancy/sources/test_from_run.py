@@ -121,6 +121,7 @@ def test_the_model_of_the_run_gives_the_strains_that_the_fmu_had(
     np.testing.assert_allclose(response, truth, atol=2e-4 * np.abs(truth).max())
 
 
+@pytest.mark.long
 @pytest.mark.xdist_group("wing")
 def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path: Path) -> None:
     known = (

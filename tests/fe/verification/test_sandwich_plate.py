@@ -259,6 +259,7 @@ def test_a_straight_section_lies_on_both_sides_of_the_true_one(coarse_design):
         assert np.trapezoid(ours**2, x) == pytest.approx(np.trapezoid(exact**2, x), rel=2e-3)
 
 
+@pytest.mark.long
 def test_gauges_at_the_edges_of_the_shipped_design(agreement, shipped_design):
     assert np.flatnonzero(agreement.at_edges).tolist() == [16, 17, 22, 23]
     finer = shipped_design.changed(mesh={"refinement": 2.0})

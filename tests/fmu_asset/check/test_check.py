@@ -57,6 +57,7 @@ def test_one_fault_is_one_problem(foreign_fmu: Any, what: str, check: str, sente
         assert verdicts(result)["state"] == "skipped"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_eighty_instances_in_one_process(foreign_fmu: Any) -> None:
     """Create, run and free: the process does not grow, and one that leaks 256 KiB each is found out."""

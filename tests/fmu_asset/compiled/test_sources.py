@@ -154,6 +154,7 @@ def test_driven_in_c_under_sanitizers(
     assert run.returncode == 0, run.stdout + run.stderr
 
 
+@pytest.mark.long
 def test_driven_in_c_without_a_lost_byte(compiler: list[str], extracted: Path, tmp_path: Path) -> None:
     """The same, optimised and warned of as much as the compiler can, under valgrind."""
     driver = tmp_path / "driver"

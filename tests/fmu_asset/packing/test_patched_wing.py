@@ -369,6 +369,7 @@ def test_what_has_no_bounds_is_refused(patched: Path, door: Binding) -> None:
         asset.simulate({"load_factor": 0.0}, steps=2000)
 
 
+@pytest.mark.long
 def test_it_is_sound(patched: Path, model: ReducedModel, arrays: PatchArrays, tmp_path: Path) -> None:
     again = build_fmu(model, tmp_path / "again.fmu", patch=patch_of(*EFFECTS), arrays=arrays).path
     assert again.read_bytes() == patched.read_bytes()

@@ -269,6 +269,7 @@ def test_sessions_leak_nothing(fmu: Path, binding: Binding) -> None:
     assert len(list(Path("/proc/self/fd").iterdir())) == before
 
 
+@pytest.mark.long
 def test_a_thousand_instances_in_one_process(fmu: Path) -> None:
     """In a process of its own, since the failure that this guards against is a crash."""
     program = (

@@ -175,6 +175,7 @@ def test_what_is_refused_before_a_folder_is_made(file: Path, tmp_path: Path, lib
             asset_source(resolve_scenario(loaded, Overrides(calibration=path))).check()
 
 
+@pytest.mark.long
 def test_the_wing_among_several_fmus_is_tailored_too(file: Path, tmp_path: Path) -> None:
     scenario = resolve_scenario(load_scenario("three_fmus"), Overrides(calibration=file))
     assert [component.design for component in scenario.asset.component] == [None, "calibration", None]

@@ -86,6 +86,7 @@ def test_the_twin_finds_the_loss_from_records_of_accelerations(flown: Path) -> N
     np.testing.assert_allclose(tree["filtered"]["mean"].values, tree["truth"]["state"].values, atol=0.02)
 
 
+@pytest.mark.long
 def test_an_ambient_record_tells_the_same_mode(file: Path, tmp_path: Path) -> None:
     """White noise on the push: its three features within four standard errors of the record."""
     modes = MODES | {"bands": MODES["bands"][:1], "numbers": [1]}

@@ -104,7 +104,9 @@ def heard_interruptions() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("heard_interruptions")
-@pytest.mark.parametrize("signals", [[signal.SIGKILL], [signal.SIGINT, signal.SIGKILL]])
+@pytest.mark.parametrize(
+    "signals", [pytest.param([signal.SIGKILL], marks=pytest.mark.long), [signal.SIGINT, signal.SIGKILL]]
+)
 def test_what_an_interrupted_sampling_finished_is_kept(
     files: tuple[Path, Path], tmp_path: Path, signals: list[signal.Signals]
 ) -> None:

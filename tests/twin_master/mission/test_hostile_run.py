@@ -125,7 +125,9 @@ def scenario(folder: Path, fmu: Path) -> Any:
     [
         ("SEGFAULT", FmuWorkerError, r"step 20 from t = 20 s: .*SIGSEGV"),
         ("HANG", FmuTimeoutError, r"step 20 from t = 20 s: .*longer than 3 s for the step"),
-        ("LEAK_IN_STEP", FmuMemoryError, r"more than the limit of 400 MiB"),
+        pytest.param(
+            "LEAK_IN_STEP", FmuMemoryError, r"more than the limit of 400 MiB", marks=pytest.mark.long
+        ),
     ],
 )
 def test_a_run_is_resumed_once_the_cause_is_gone(
