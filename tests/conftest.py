@@ -37,11 +37,11 @@ settings.load_profile("ci" if os.environ.get("CI") else "developer")
 SHARED = ("coarse_reduction", "coarse_patch_arrays", "virtual_model", "beam_reduction")
 """Fixtures of several files that take three to ten seconds each."""
 
-LARGEST, COMPILED = "wing", "discrepancy"
-"""The group of tests that takes longest, and the folder of those that need loops which a minute compiles."""
+LARGEST, COMPILING = "wing", "compiling"
+"""The group of tests that takes longest, and the one that compiles loops, which takes more than a minute."""
 
-COMPILING = "tests/discrepancy/catalogue/test_lumped.py"
-"""The group that compiles these loops while the other workers do what does not need them."""
+COMPILED = ("discrepancy", "benchmarks", "test_documented_python.py")
+"""Folders and a file whose tests need these loops: they come once one worker has compiled all of them."""
 
 LONG = "takes minutes of processor time; set UAV_TWIN_LONG_TESTS to run it"
 
@@ -70,13 +70,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if named:
             group[item.path] = named.args[0]
     slow = {group[item.path] for item in items if item.get_closest_marker("slow")}
-    # The largest group ends with tests of `discrepancy`: by then the other worker has compiled the loops.
+    waiting = {item.path for item in items if set(COMPILED) & set(item.path.parts)}
     items.sort(
         key=lambda item: (
             group[item.path] != LARGEST,
             group[item.path] != COMPILING,
             group[item.path] not in slow,
-            group[item.path] == LARGEST and COMPILED in item.path.parts,
+            item.path in waiting,
         )
     )
     for item in items:

@@ -217,9 +217,7 @@ MADE_ONCE = {
 
 MINUTES = {
     "docs/calibration.md",
-    "docs/campaign.md",
     "docs/discrepancy_missions.md",
-    "docs/notices.md",
     "docs/python.md",
     "docs/real_wing.md",
     "docs/verdict.md",

@@ -17,6 +17,8 @@ from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
+pytestmark = pytest.mark.xdist_group("compiling")
+
 OUTPUTS = {"tip": ("x3", Quantity.DISPLACEMENT), "g0": ("base_strain", Quantity.STRAIN)}
 
 

@@ -18,6 +18,8 @@ from fe.runtime.motion import NO_LAWS, laws_of, simulate
 from fe.runtime.patch import HighPass, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.runtime.sensors import SensorRecord, apply_sensors
 
+pytestmark = pytest.mark.xdist_group("compiling")
+
 FloatArray = NDArray[np.float64]
 
 OUTPUTS = (("x1", Quantity.DISPLACEMENT), ("x3", Quantity.VELOCITY), ("x3", Quantity.ACCELERATION))
