@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from reporting import terminal
-from uav_twin.simulated import draw, refuse_files, say, values_of
+from uav_twin.simulated import draw, interpolation_of, refuse_files, say, values_of
 
 
 def simulate(
@@ -36,6 +36,12 @@ def simulate(
     plot: Annotated[
         Path | None, typer.Option(help="A picture of the outputs to write: .png or .svg.")
     ] = None,
+    interpolation: Annotated[
+        str | None,
+        typer.Option(
+            help="How inputs go on between rows: zero-order or linear; by default as the binding says."
+        ),
+    ] = None,
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Faster, without protection from crashes and endless steps.")
     ] = False,
@@ -46,14 +52,21 @@ def simulate(
 ) -> None:
     """Simulate an FMU: its default experiment, or with --binding and --inputs under histories."""
     from fmu_asset.archive.fmu_file import read_fmu
-    from fmu_asset.door.experiment import default_experiment, fly
+    from fmu_asset.door.binding import load_binding
+    from fmu_asset.door.experiment import default_experiment, fly, fly_histories
     from fmu_asset.door.history_file import read_histories, write_history
     from fmu_asset.door.session import FmiAsset
+    from fmu_asset.errors import FmuInputError
 
     refuse_files(out, plot, replace=replace)
     _refuse_mixture(binding, inputs, others=stop_time is not None or step_size is not None or bool(values))
+    if interpolation is not None and inputs is None:
+        raise FmuInputError("--interpolation says how inputs go on between the rows of --inputs: give these.")
     if binding is not None and inputs is not None:
-        asset = FmiAsset(file, binding, isolated=not in_process, step_timeout=step_timeout)
+        bound = load_binding(binding)
+        if interpolation is not None:
+            bound = bound.with_interpolation(interpolation_of(interpolation))
+        asset = FmiAsset(file, bound, isolated=not in_process, step_timeout=step_timeout)
         given = read_histories(inputs, asset.binding)
     else:
         planned = default_experiment(
@@ -62,7 +75,7 @@ def simulate(
         asset = FmiAsset(file, planned.binding, isolated=not in_process, step_timeout=step_timeout)
     with closing(asset):
         if inputs is not None:
-            history = asset.simulate(**given.roles, steps=given.steps, progress=terminal.progress())
+            history = fly_histories(asset, given, terminal.progress())
         else:
             history = fly(asset, planned, terminal.progress())
         if out is not None:

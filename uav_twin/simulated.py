@@ -1,7 +1,7 @@
 """What a simulation of an FMU or of a system takes from the command line, says, draws and leaves."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from reporting import terminal
 
@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from fmu_asset.door.binding import Interpolation
     from fmu_asset.door.simulation import ObservationHistory
     from fmu_asset.door.stepped import SteppedAsset
 
@@ -45,6 +46,15 @@ def values_of(texts: list[str]) -> dict[str, float | list[float]]:
             )
         found[name] = numbers[0] if len(numbers) == 1 else numbers
     return found
+
+
+def interpolation_of(text: str) -> "Interpolation":
+    """Return a kind of interpolation that is given as a text."""
+    from fmu_asset.errors import FmuInputError
+
+    if text not in ("zero-order", "linear"):
+        raise FmuInputError(f"--interpolation must be zero-order or linear, and {text!r} came.")
+    return cast("Interpolation", text)
 
 
 def say(

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from reporting import terminal
-from uav_twin.simulated import draw, refuse_files, say, values_of
+from uav_twin.simulated import draw, interpolation_of, refuse_files, say, values_of
 
 ssp_app = typer.Typer(no_args_is_help=True, help="Write, check and simulate systems of FMUs as SSP files.")
 
@@ -84,6 +84,10 @@ def simulate(
     iterations: Annotated[
         int, typer.Option(help="How often a step of a circle of components is made at most.", min=1)
     ] = 1,
+    interpolation: Annotated[
+        str,
+        typer.Option(help="How inputs of components go on between two exchanges: zero-order or linear."),
+    ] = "zero-order",
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Faster, without protection from crashes and endless steps.")
     ] = False,
@@ -108,7 +112,7 @@ def simulate(
         planned = system_experiment(wiring, span=span, step_size=step_size, values=given)
         with CoupledAsset(
             wiring,
-            planned.binding,
+            planned.binding.with_interpolation(interpolation_of(interpolation)),
             algorithm=algorithm,  # type: ignore[arg-type]  # said by itself
             iterations=iterations,
             isolated=not in_process,

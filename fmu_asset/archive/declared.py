@@ -69,6 +69,11 @@ class VariableInfo:
         """Whether its values are numbers."""
         return self.kind in NUMERIC_KINDS
 
+    @property
+    def continuous(self) -> bool:
+        """Whether it is a real number that changes at any time."""
+        return self.kind in FLOAT_KINDS and self.variability == "continuous"
+
 
 @dataclass(frozen=True)
 class UnitInfo:
@@ -99,6 +104,9 @@ class FmuDescription:
         Folders of binaries, such as linux64.
     can_get_and_set_state, can_serialise_state, can_vary_step : bool
         Declared capabilities of `interface`.
+    takes_lines : bool
+        Whether inputs can move in straight lines between communication points: in model exchange, and where
+        co-simulation declares `canInterpolateInputs` (FMI 1 and 2).
     variables : tuple of VariableInfo
         In the order of the model description.
     units : tuple of UnitInfo
@@ -134,6 +142,7 @@ class FmuDescription:
     can_get_and_set_state: bool
     can_serialise_state: bool
     can_vary_step: bool
+    takes_lines: bool
     variables: tuple[VariableInfo, ...]
     units: tuple[UnitInfo, ...]
     interface: Interface = "co-simulation"
@@ -193,8 +202,10 @@ def read_declared(
     # fmpy does not read the capabilities of FMI 1.
     capabilities = root.find("Implementation//Capabilities")
     vary = getattr(chosen, "canHandleVariableCommunicationStepSize", True)
+    lines = interface == "model-exchange" or getattr(chosen, "canInterpolateInputs", False)
     if capabilities is not None:
         vary = capabilities.get("canHandleVariableCommunicationStepSize") in ("true", "1")
+        lines = lines or capabilities.get("canInterpolateInputs") in ("true", "1")
     # FMI 1 always wants it.
     completed = bool(getattr(chosen, "needsCompletedIntegratorStep", False)) or declared.fmiVersion == "1.0"
 
@@ -217,6 +228,7 @@ def read_declared(
         can_get_and_set_state=bool(chosen.canGetAndSetFMUstate),
         can_serialise_state=bool(chosen.canSerializeFMUstate),
         can_vary_step=bool(vary),
+        takes_lines=bool(lines),
         variables=tuple(_variable(variable) for variable in declared.modelVariables),
         units=tuple(_unit(unit) for unit in declared.unitDefinitions),
         interface=interface,

@@ -111,7 +111,8 @@ class CoupledAsset(SteppedAsset):
         self._parameter_values = self._layout.parameters(self._parameters)
         self._held: list[dict[str, float]] = [dict(constants) for constants in self._layout.constants]
         self._now = [0.0] * self._layout.output_count
-        self._before = list(self._now)
+        self._before = self._earlier = list(self._now)
+        self._stepped: set[int] = set()
         self._assets = self._open(isolated, step_timeout)
         if iterations > 1:
             self._check_restorable()
@@ -208,7 +209,8 @@ class CoupledAsset(SteppedAsset):
         """
         self._opened()
         self._place(control, health, load)
-        self._before = list(self._now)
+        self._earlier, self._before = self._before, list(self._now)
+        self._stepped.clear()
         self._phase = "broken"
         for group, circular in self._layout.groups:
             if circular and self._iterations > 1:
@@ -278,15 +280,37 @@ class CoupledAsset(SteppedAsset):
         for index in group:
             held = self._held[index]
             names, pick = self._layout.fed[index]
-            held.update(zip(names, pick.of(source, self._before), strict=True))
+            values = pick.of(source, self._before)
             asset = self._assets[index]
             try:
+                if self._layout.linear[index]:
+                    asset.hold(load=dict(zip(names, self._draw(index, values, source), strict=True)))
+                held.update(zip(names, values, strict=True))
                 seen = asset.step(load=held)
                 for _ in range(self._layout.substeps[index] - 1):
                     seen = asset.step()
             except FmuError as error:
                 raise self._named(error, index) from error
             self._now[self._layout.spans[index]] = seen.values.tolist()
+            if source is self._now:
+                self._stepped.add(index)
+        self._stepped.update(group)
+
+    def _draw(self, index: int, values: list[float], source: list[float]) -> list[float]:
+        """Return where the lines of the inputs that others feed begin; `values` becomes where they end.
+
+        Where the source is not there yet, its last line goes on, within the range of the input.
+        """
+        names, pick = self._layout.fed[index]
+        begins = pick.of(self._before, self._before)
+        earlier = pick.of(self._earlier, self._earlier)
+        for position, tap in enumerate(pick.taps):
+            if not self._layout.moving[index][position]:
+                begins[position] = values[position]
+            elif tap.delayed or source is self._before or self._layout.owner[tap.place] not in self._stepped:
+                low, high = self._assets[index].input_range("load", names[position])
+                values[position] = min(max(2.0 * begins[position] - earlier[position], low), high)
+        return begins
 
     def _iterate(self, group: Sequence[int]) -> None:
         """Repeat the step of a circle of components until what they exchange has settled."""
@@ -402,6 +426,7 @@ class CoupledAsset(SteppedAsset):
                 for name, asset in zip(self._layout.names, self._assets, strict=True)
             },
             "order": list(plan.order),
+            "linear": [name for name, on in zip(self._layout.names, self._layout.linear, strict=True) if on],
             "held": [f"{link.source} -> {link.target}" for link in plan.held],
             "loops": [" -> ".join(str(end) for end in loop) for loop in plan.loops],
             "binding": self._binding.name,

@@ -41,11 +41,14 @@ class Pick:
 
     Attributes
     ----------
+    taps : tuple of Tap
+        As given.
     places : tuple of int
         Where they stand.
     """
 
     def __init__(self, taps: Sequence[Tap]) -> None:
+        self.taps = tuple(taps)
         self.places = tuple(tap.place for tap in taps)
         # With two places or more an item getter gives a tuple, at a fraction of the cost of a loop.
         self._get = itemgetter(*self.places, 0, 0)
@@ -77,14 +80,21 @@ class Layout:
     ----------
     names : list of str
         The components; a component's number is its place here.
+    linear : list of bool
+        For each component, whether its inputs move in straight lines over a step.
+    moving : list of tuple of bool
+        For each component, which of the inputs that others feed do: those with a continuous real number at
+        both ends.
     substeps : list of int
-        Steps of each component in a step of the system.
+        Steps of each component in a step of the system, as calls of its asset.
     order : list of int
         The components in the order of evaluation.
     groups : list of (tuple of int, bool)
         The same, cut into groups; whether a group is connected in a circle.
     spans : list of slice
         For each component, where its outputs stand among all that are read.
+    owner : list of int
+        For each output that is read, the component.
     fed : list of (tuple of str, Pick)
         For each component, the inputs that others feed, and their values.
     observed : Pick
@@ -102,7 +112,6 @@ class Layout:
         components = wiring.structure.components
         self.names = [component.name for component in components]
         self._number = {name: index for index, name in enumerate(self.names)}
-        self.substeps = [component.substeps for component in components]
         self.order = [self._number[name] for name in wiring.schedule.order]
         self.groups = [
             (tuple(self._number[name] for name in group), circular)
@@ -124,7 +133,21 @@ class Layout:
                 if f.target.component == name
             ]
             self.fed.append((tuple(variable for variable, _ in own), self._pick(p for _, p in own)))
+        self.owner = [self._number[end.component] for end in self._place]
+        self.moving = [
+            tuple(
+                wiring.variable(f.source).continuous and wiring.variable(f.target).continuous
+                for f in wiring.feeds
+                if f.target.component == name
+            )
+            for name in self.names
+        ]
         self.observed = self._pick(roles.observations)
+        self.linear = self._linear()
+        # Where inputs move over several steps, the door makes these.
+        self.substeps = [
+            1 if linear else c.substeps for linear, c in zip(self.linear, components, strict=True)
+        ]
         self.monitored = (tuple(roles.monitors), self._pick(roles.monitors.values()))
         self.entries = {
             role: {
@@ -140,6 +163,31 @@ class Layout:
             inputs = {key for key in given if wiring.variable(Endpoint(name, key)).causality == "input"}
             self.settings.append({key: value for key, value in given.items() if key not in inputs})
             self.constants.append({key: value for key, value in given.items() if key in inputs})
+
+    def _linear(self) -> list[bool]:
+        """Return which components have inputs that move in straight lines.
+
+        Raises
+        ------
+        BindingError
+            If the binding asks for them, and there are none.
+        """
+        if self._binding.binding.interpolation == "zero-order":
+            return [False] * len(self.names)
+        wiring, linear = self._wiring, []
+        given = {
+            port.end for table in self._roles.inputs.values() for ports in table.values() for port in ports
+        }
+        for name, moving in zip(self.names, self.moving, strict=True):
+            own = any(wiring.variable(end).continuous for end in given if end.component == name)
+            linear.append(wiring.declared[name].description.takes_lines and (own or any(moving)))
+        if not any(linear):
+            raise BindingError(
+                f"The binding {self._binding.name} asks for linear interpolation of inputs, but no component "
+                f"of the system {wiring.structure.name} has a continuous input and takes its derivatives "
+                "(`canInterpolateInputs`, or model exchange); leave it out."
+            )
+        return linear
 
     def _read(self, ports: Iterable[ConnectedVariable]) -> list[list[str]]:
         """Return the outputs that are read of each component; at least one, to see that it is alive."""
@@ -183,9 +231,12 @@ class Layout:
         ]
         ports = [port for ports in self._roles.parameters.values() for port in ports]
         parameters = [*self.settings[index], *(p.end.variable for p in ports if p.end.component == name)]
+        linear = self.linear[index]
         header = Header(
             name=name,
-            step_size=self._binding.step_size / self.substeps[index],
+            step_size=self._binding.step_size / wiring.structure.components[index].substeps,
+            decimation=wiring.structure.components[index].substeps if linear else 1,
+            interpolation="linear" if linear else "zero-order",
             start_time=self._binding.binding.start_time,
             interface=wiring.structure.component(name).interface,
             tolerance=self._binding.binding.tolerance,

@@ -42,6 +42,9 @@ INPUT_ROLES = ("control", "health", "load")
 PORT_QUANTITIES = {"force": ("N", "N.m"), "displacement": ("m", "rad"), "velocity": ("m/s", "rad/s")}
 """What a mechanical port consists of, with its units where it is one of translation or of rotation."""
 
+Interpolation = Literal["zero-order", "linear"]
+"""How inputs go on between communication points."""
+
 _RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
 _LARGEST_PATTERN = 100_000
 
@@ -201,6 +204,9 @@ class Header(Section):
     tolerance : float, optional
         Relative tolerance of the FMU's solver, and of ours in model exchange; if absent, what the FMU
         declares for its default experiment (ours is never looser than 1e-6 then).
+    interpolation : {"zero-order", "linear"}
+        How inputs go on between communication points: held, or, where the FMU can follow and both ends are
+        continuous, in a straight line to the value given for a step, which they reach at its end.
     state : {"auto", "serialised", "replay"}
         How `save_state` keeps the state; auto trusts what the FMU declares.
     description : str
@@ -214,6 +220,7 @@ class Header(Section):
     fmi_version: Literal["1.0", "2.0", "3.0"] | None = None
     interface: Interface | None = None
     tolerance: _Positive | None = None
+    interpolation: Interpolation = "zero-order"
     state: Literal["auto", "serialised", "replay"] = "auto"
     description: str = ""
 
@@ -293,6 +300,11 @@ class Binding(Section):
         raise BindingError(
             f"The binding {self.name} has no observation {name!r}; it has {_listed(self.observation)}."
         )
+
+    def with_interpolation(self, interpolation: Interpolation) -> "Binding":
+        """Return the binding with inputs that go on so between communication points."""
+        header = self.binding.model_copy(update={"interpolation": interpolation})
+        return self.model_copy(update={"binding": header})
 
     def with_regions(self, regions: Sequence[str]) -> "Binding":
         """Return the binding for a wing with these damage regions: their health inputs, and no others.

@@ -139,8 +139,12 @@ class Exchange:
         for name, variables, _ in ports:
             places["port", name] = [self._find(item, f"port.{name}", "input") for item in variables]
         self._inputs = BlockLayout(
-            self._description, [place.variable for found in places.values() for place in found], begin=2
+            self._description,
+            [place.variable for found in places.values() for place in found],
+            begin=2,
+            linear=self._binding.binding.interpolation == "linear",
         )
+        self._check_lines()
         self._slots: dict[str, dict[str, Slot]] = {role: {} for role in (*INPUT_ROLES, "port")}
         taken: dict[int, str] = {}
         items: dict[tuple[str, str], Input] = {
@@ -181,6 +185,25 @@ class Exchange:
             self._parameter_slots[name] = self._slot(
                 f"parameter.{name}", parameter, place.variable, positions
             )
+
+    def _check_lines(self) -> None:
+        """Refuse straight lines of inputs where the FMU or none of its inputs can follow them."""
+        if self._binding.binding.interpolation == "zero-order":
+            return
+        asked = f"The binding {self._binding.name} asks for linear interpolation of inputs, but"
+        path = self._description.path
+        if not self._description.takes_lines:
+            why = (
+                "FMI 3.0 has no derivatives of inputs in co-simulation"
+                if self._description.major_version == 3
+                else "it does not declare `canInterpolateInputs`"
+            )
+            raise BindingError(
+                f"{asked} {path} takes no derivatives of inputs: {why}. Leave `interpolation` out and take "
+                "smaller steps, or run it by model exchange if it has that."
+            )
+        if not any(group.linear for group in self._inputs.groups):
+            raise BindingError(f"{asked} none of them is a continuous real number in {path}; leave it out.")
 
     def _own_slot(self, name: str) -> Slot:
         """Return the slot of a parameter by its name in the FMU, which the binding does not name."""
@@ -284,7 +307,7 @@ class Exchange:
         values = [0.0, 0.0]
         for variable in self._inputs.variables:
             values += start_values(self._description, variable)
-        return values
+        return values + values[2 : 2 + self.plan.linear_count]
 
     def settings(self, parameters: Values) -> Settings:
         """Return what is set before initialisation: the values of the binding, then the caller's.

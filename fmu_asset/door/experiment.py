@@ -12,6 +12,7 @@ from reporting.progress import Progress
 
 from .binding import INPUT_ROLES, Binding
 from .draft import trial_binding
+from .history_file import InputHistories
 from .session import FmiAsset
 from .simulation import ObservationHistory
 
@@ -112,6 +113,31 @@ def steps_to(start: float, end: float | None, size: float | None) -> tuple[float
             "give another step size or end."
         )
     return start, steps, size
+
+
+def fly_histories(asset: FmiAsset, given: InputHistories, progress: Progress) -> ObservationHistory:
+    """Simulate an asset under the histories of a file.
+
+    Each row holds over the step that begins at its time. Under linear interpolation the first is where the
+    asset starts and the lines lead from row to row, so that there is a step less.
+
+    Raises
+    ------
+    FmuInputError
+        If there is nothing to lead a line to.
+    FmuError
+        As `FmiAsset.simulate`.
+    """
+    if asset.binding.binding.interpolation == "zero-order":
+        return asset.simulate(**given.roles, steps=given.steps, progress=progress)
+    if given.steps < 2:
+        raise FmuInputError(
+            "Linear interpolation leads from one row of the inputs to the next: give two or more."
+        )
+    first = {role: {name: v[0] for name, v in table.items()} for role, table in given.roles.items()}
+    rest = {role: {name: v[1:] for name, v in table.items()} for role, table in given.roles.items()}
+    asset.reset(**first)
+    return asset.simulate(**rest, steps=given.steps - 1, progress=progress)
 
 
 def fly(asset: FmiAsset, experiment: Experiment, progress: Progress) -> ObservationHistory:

@@ -119,6 +119,8 @@ class BlockLayout:
         What is exchanged; one that is named twice stands there once.
     begin : int
         Position of the first value.
+    linear : bool
+        Whether continuous ones, which then come first, move in straight lines.
 
     Attributes
     ----------
@@ -128,10 +130,23 @@ class BlockLayout:
         The same by base type.
     """
 
-    def __init__(self, description: FmuDescription, variables: Sequence[VariableInfo], begin: int) -> None:
+    def __init__(
+        self,
+        description: FmuDescription,
+        variables: Sequence[VariableInfo],
+        begin: int,
+        *,
+        linear: bool = False,
+    ) -> None:
         unique = list({variable.name: variable for variable in variables}.values())
-        kinds = [description.exchange_kind(variable) for variable in unique]
-        present = sorted({*kinds}, key=lambda kind: (*_KIND_ORDER, kind).index(kind))
+        kinds = [
+            (
+                linear and variable.continuous and variable.causality == "input",
+                description.exchange_kind(variable),
+            )
+            for variable in unique
+        ]
+        present = sorted({*kinds}, key=lambda kind: (not kind[0], (*_KIND_ORDER, kind[1]).index(kind[1])))
         self._begin = begin
         self._positions: dict[str, int] = {}
         groups, ordered, position = [], [], begin
@@ -144,7 +159,8 @@ class BlockLayout:
                 self._positions[variable.name] = position
                 position += variable.size
             ordered += members
-            groups.append(Group(kind, tuple(member.reference for member in members), position - first))
+            moves, name = kind
+            groups.append(Group(name, tuple(m.reference for m in members), position - first, moves))
         self.variables, self.groups = tuple(ordered), tuple(groups)
 
     def positions(self, place: Place) -> range:

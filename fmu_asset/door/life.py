@@ -57,6 +57,7 @@ class OpenedFmu(SteppedAsset):
         self._settings = self._exchange.settings(parameters or {})
         self._parameters = plain_values(parameters or {})
         self._step_size = self._binding.step_size
+        self._lines = self._exchange.plan.linear_count
         self._recording = self.state_method == "replay"
         self._record: list[bytes] = []
         self._start_inputs = b""
@@ -239,6 +240,8 @@ class OpenedFmu(SteppedAsset):
     # ------------------------------------------------------------------ inside
 
     def _begin(self, request: list[float], *, with_inputs: bool, renewed: bool = False) -> None:
+        if self._lines:
+            request[-self._lines :] = request[2 : 2 + self._lines]
         start = Start(self._start_time, self._step_size, self._settings, request, with_inputs)
         try:
             instance = self._housing.instance

@@ -84,6 +84,8 @@ class FmiAsset(OpenedFmu):
         request = self._request
         before = request.tobytes()
         begin = self._start_time + self._index * self._interval
+        if self._lines:
+            request[-self._lines :] = request[2 : 2 + self._lines]
         try:
             self._exchange.place(request, control, health, load, port)
             request[0] = begin
@@ -96,6 +98,31 @@ class FmiAsset(OpenedFmu):
         if self._recording:
             self._record.append(request.tobytes()[16:])
         return self._observation()
+
+    def hold(
+        self,
+        control: Values | None = None,
+        health: Values | None = None,
+        load: Values | None = None,
+        port: Values | None = None,
+    ) -> None:
+        """Let inputs stand at values from this moment on, without a step.
+
+        A step that does not name them keeps them; under linear interpolation the next step's lines begin
+        there, so that an input can jump.
+
+        Raises
+        ------
+        FmuInputError, BindingError
+            As `step`.
+        """
+        self._opened()
+        before = self._request.tobytes()
+        try:
+            self._exchange.place(self._request, control, health, load, port)
+        except FmuError:
+            self._request.cast("B")[:] = before
+            raise
 
     def simulate(
         self,
@@ -137,6 +164,10 @@ class FmiAsset(OpenedFmu):
         index = np.arange(self._index, self._index + len(rows) + 1)
         moments = np.asarray(self._start_time + index * self._interval, dtype=np.float64)
         rows[:, 0], rows[:, 1] = moments[:-1], self._step_size
+        if self._lines:
+            moving = slice(2, 2 + self._lines)
+            rows[0, -self._lines :] = np.array(self._request[moving])
+            rows[1:, -self._lines :] = rows[:-1, moving]
         replies = np.full((len(rows), len(self._reply)), np.nan)
         with (progress or SilentProgress()).stage("Simulating", total=len(rows), unit="steps") as stage:
             begin = self._index
@@ -280,7 +311,7 @@ class FmiAsset(OpenedFmu):
             else:
                 instance.restore(saved.body)
                 self._index = saved.index
-                memoryview(instance.request).cast("B")[16:] = saved.inputs
+            memoryview(instance.request).cast("B")[16:] = saved.inputs
             saved.refuse_other_outputs(self._outputs_now(), self._exchange.output_name)
         except FmuError as error:
             self._phase = "broken"

@@ -19,6 +19,7 @@ from fmpy.fmi1 import FMICallException
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError, FmuWorkerError
 
 from .block import Block
+from .lines import Lines
 from .messages import Mailbox, callbacks
 from .plan import Group, Plan, Settings
 from .prepared import prepared
@@ -29,7 +30,7 @@ OK, WARNING, DISCARD, ERROR, FATAL, PENDING = range(6)
 ACCEPTED = frozenset({OK, WARNING})
 _MESSAGES_IN_ERROR = 10
 
-_Calls = list[tuple[str, Callable[[], int], Callable[[], None] | None]]
+Calls = list[tuple[str, Callable[[], int], Callable[[], None] | None]]
 """Name of the function, the prepared call, and what converts the values before or after it, if needed."""
 
 
@@ -60,6 +61,7 @@ class FmuInstance(ABC):
         self._size = ctypes.c_double.from_buffer(self.request, 8)
         self._plan = plan
         self._substeps = plan.substeps
+        self._lines = Lines(self.request, plan) if plan.linear_count else None
         self._mailbox = Mailbox(plan.instance_name)
         self._lost = False
         self._ended: float | None = None
@@ -76,8 +78,10 @@ class FmuInstance(ABC):
             if getattr(function, "restype", None) is ctypes.c_int:
                 function.errcheck = _refuse_negative
         self._component = self._fmu.component
-        self._set = self._blocks("Set", plan.inputs, self.request, 2)
+        self._values = self.request if self._lines is None else self._lines.values
+        self._set = self._blocks("Set", plan.inputs, self._values, 2)
         self._get = self._blocks("Get", plan.outputs, self.reply, 0)
+        self._moving = [] if self._lines is None else self._calls_of(self._lines)
 
     _fmpy_class: ClassVar[type[Any]]
     """fmpy's class for the FMI version and interface."""
@@ -126,16 +130,29 @@ class FmuInstance(ABC):
         self._apply(parameters)
         fmu.enterInitializationMode(**(experiment if self._plan.fmi_version == 3 else {}))
         if with_inputs:
-            FmuInstance._send(self)
+            self._set_values(self._set)
         fmu.exitInitializationMode()
 
     @abstractmethod
     def _advance(self) -> None:
         """Make one communication step from `_begin` over `_size`; the inputs are set."""
 
+    @abstractmethod
+    def _calls_of(self, lines: Lines) -> Calls:
+        """Return what makes inputs move: calls that tell how fast, or that set them again."""
+
     def _send(self) -> None:
         """Set the inputs of the request block."""
-        self._set_values(self._set)
+        if self._lines is None:
+            self._set_values(self._set)
+        else:
+            self._lines.aim()
+            self._set_values(self._set + self._moving)
+
+    def _follow(self, lines: Lines) -> None:
+        """Set the inputs where their lines are at a later communication point of the step."""
+        lines.move(self._begin.value)
+        self._set_values(self._set + self._moving)
 
     def _receive(self) -> None:
         """Read the outputs into the reply block."""
@@ -176,6 +193,8 @@ class FmuInstance(ABC):
             If a call fails, or the FMU logs an error on the way.
         """
         errors = self._mailbox.errors
+        if self._lines is not None:
+            self._lines.stand()
         with self._calls("initialisation"):
             self._initialise(start_time, parameters, with_inputs=with_inputs)
             self._phase = "stepping"
@@ -213,6 +232,8 @@ class FmuInstance(ABC):
         for number in range(self._substeps):
             self._begin.value = first + number * size
             try:
+                if number and self._lines is not None:
+                    self._follow(self._lines)
                 self._advance()
             except FmuEndedError:
                 raise
@@ -300,8 +321,8 @@ class FmuInstance(ABC):
 
     # ------------------------------------------------------------------ inside
 
-    def _blocks(self, verb: str, groups: tuple[Group, ...], doubles: Any, begin: int) -> _Calls:
-        calls: _Calls = []
+    def _blocks(self, verb: str, groups: tuple[Group, ...], doubles: Any, begin: int) -> Calls:
+        calls: Calls = []
         for group in groups:
             name = f"{verb}{group.kind}"
             block = Block(self._plan.fmi_version, self._component, group, doubles, begin)
@@ -317,7 +338,7 @@ class FmuInstance(ABC):
             group = Group(kind, (reference,), len(values))
             self._set_values(self._blocks("Set", (group,), doubles, 0))
 
-    def _set_values(self, calls: _Calls) -> None:
+    def _set_values(self, calls: Calls) -> None:
         for name, call, convert in calls:
             if convert is not None:
                 convert()

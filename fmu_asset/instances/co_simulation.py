@@ -10,7 +10,8 @@ from fmpy.fmi3 import FMU3Slave
 
 from fmu_asset.errors import FmuCallError
 
-from .base import ACCEPTED, DISCARD, OK, FmuInstance
+from .base import ACCEPTED, DISCARD, OK, Calls, FmuInstance
+from .lines import Lines
 from .messages import Mailbox
 from .plan import Plan, Settings
 from .prepared import prepared
@@ -49,6 +50,20 @@ class CoSimulation(FmuInstance):
         )
         return fmu
 
+    def _calls_of(self, lines: Lines) -> Calls:
+        name = "SetRealInputDerivatives"
+        references = [number for group in self._plan.inputs if group.linear for number in group.references]
+        count = len(references)
+        call = prepared(
+            self._function(name),
+            ctypes.c_void_p.from_param(self._component),
+            ctypes.byref((ctypes.c_uint * count)(*references)),
+            ctypes.c_size_t.from_param(count),
+            ctypes.byref((ctypes.c_int * count)(*[1] * count)),
+            ctypes.byref(lines.slopes),
+        )
+        return [(name, call, None)]
+
     def _advance(self) -> None:
         status = self._do_step()
         if status not in ACCEPTED:
@@ -75,7 +90,7 @@ class CoSimulation1(CoSimulation):
     def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
         self._apply(parameters)
         if with_inputs:
-            self._send()
+            self._set_values(self._set)
         self._fmu.initialize(tStart=start_time)
 
 

@@ -11,7 +11,8 @@ from fmpy.fmi3 import FMU3Model
 
 from fmu_asset.errors import FmuCallError
 
-from .base import FmuInstance
+from .base import Calls, FmuInstance
+from .lines import Lines
 from .plan import Settings
 from .solver import Solver
 
@@ -20,10 +21,11 @@ _MOST_EVENTS_IN_A_STEP = 10_000
 
 
 class ModelExchange(FmuInstance):
-    """A model-exchange instance with its solver; inputs are held over a communication step.
+    """A model-exchange instance with its solver.
 
-    Inputs that differ from the last ones are an event at the communication point, and the solver starts again
-    there; without a change it keeps its step size and order.
+    Inputs are held over a communication step, or move in straight lines. Where they differ from the last
+    ones there is an event at the communication point, and the solver starts again there, as it does where a
+    line bends; without a change it keeps its step size and order.
     """
 
     _solver: Solver | None = None
@@ -69,20 +71,38 @@ class ModelExchange(FmuInstance):
         self._close_solver()
         self._start(start_time, parameters, with_inputs=with_inputs)
         self._iterate_event(start_time)
-        self._sent = bytes(self.request)[16:] if with_inputs else None
+        self._sent = bytes(self._values)[16:] if with_inputs else None
 
     def _send(self) -> None:
         """Send inputs that have changed, as an event."""
-        now = bytes(self.request)[16:]
-        if now == self._sent:
+        bends = False
+        if self._lines is not None:
+            before = bytes(self._lines.slopes)
+            self._lines.aim()
+            bends = bytes(self._lines.slopes) != before
+        now = bytes(self._values)[16:]
+        if now == self._sent and not bends:
             return
         with self._calls("setting inputs"):
-            self._enter_event_mode()
-            super()._send()
-            self._sent = now
-            self._iterate_event(self.request[0])
+            if now != self._sent:
+                self._enter_event_mode()
+                self._set_values(self._set)
+                self._sent = now
+                self._iterate_event(self.request[0])
             if self._solver is not None:
                 self._solver.reset(self.request[0])
+
+    def _calls_of(self, lines: Lines) -> Calls:
+        return self._blocks("Set", tuple(g for g in self._plan.inputs if g.linear), self._values, 2)
+
+    def _follow(self, lines: Lines) -> None:
+        """Leave the inputs: they move with the solver's time."""
+
+    def apply(self, time: float) -> None:
+        """Set the inputs of a moment [s], where they move."""
+        if self._lines is not None:
+            self._lines.move(time)
+            self._set_values(self._moving)
 
     def _advance(self) -> None:
         begin, size = self._begin.value, self._size.value
@@ -96,11 +116,13 @@ class ModelExchange(FmuInstance):
                     states=self._plan.states,
                     event_indicators=self._plan.event_indicators,
                     functions=self._functions(),
+                    inputs=self,
                 )
             time = begin
             for _ in range(_MOST_EVENTS_IN_A_STEP):
                 time = self._advance_to_event(self._solver, time, end, 1e-12 * size)
                 if time >= end:
+                    self._sent = bytes(self._values)[16:]
                     return
         self._lost = True
         raise FmuCallError(
@@ -127,6 +149,7 @@ class ModelExchange(FmuInstance):
         if not event and abs(time - end) <= close:
             time = end
         self._fmu.setTime(time)
+        self.apply(time)
         if self._plan.completed_step:
             wanted, finished = self._completed_step()
             self._heed_end(finished, time)
@@ -183,7 +206,7 @@ class ModelExchange1(ModelExchange):
         self._fmu.setTime(start_time)
         self._apply(parameters)
         if with_inputs:
-            FmuInstance._send(self)
+            self._set_values(self._set)
         tolerance = self._plan.tolerance
         converged, _, _, finished, due, time = self._fmu.initialize(
             toleranceControlled=b"\x00" if tolerance is None else b"\x01", relativeTolerance=tolerance or 0.0

@@ -25,11 +25,14 @@ class Group:
         Value references, in the order of the block.
     count : int
         Number of values; more than references if there are arrays.
+    linear : bool
+        Whether the values move in straight lines over a step; such inputs come first.
     """
 
     kind: str
     references: tuple[int, ...]
     count: int
+    linear: bool = False
 
 
 @dataclass(frozen=True)
@@ -76,9 +79,14 @@ class Plan:
     completed_step: bool = False
 
     @property
+    def linear_count(self) -> int:
+        """Number of input values that move in straight lines."""
+        return sum(group.count for group in self.inputs if group.linear)
+
+    @property
     def input_count(self) -> int:
-        """Number of input values."""
-        return sum(group.count for group in self.inputs)
+        """Number of values behind time and step size in a request: all inputs, then where lines begin."""
+        return sum(group.count for group in self.inputs) + self.linear_count
 
     @property
     def output_count(self) -> int:
@@ -95,6 +103,6 @@ class Plan:
         record = json.loads(text)
         for side in ("inputs", "outputs"):
             record[side] = tuple(
-                Group(group["kind"], tuple(group["references"]), group["count"]) for group in record[side]
+                Group(**(group | {"references": tuple(group["references"])})) for group in record[side]
             )
         return cls(**record)

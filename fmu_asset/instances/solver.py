@@ -2,12 +2,14 @@
 
 import ctypes
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 from fmpy.fmi1 import FMICallException
 from fmpy.sundials import CVodeSolver
 from fmpy.sundials.libraries import sundials_core
 from fmpy.sundials.nvector_serial import N_VDestroy_Serial
+
+from fmu_asset.errors import FmuError
 
 from .base import DISCARD
 
@@ -17,11 +19,11 @@ for _name in ("SUNLinSolFree", "SUNMatDestroy", "SUNContext_Free"):
     getattr(sundials_core, _name).argtypes = [ctypes.c_void_p]
 
 
-class _HeldInputs:
-    """Inputs do not change between communication points."""
+class Inputs(Protocol):
+    """What sets inputs that change between communication points."""
 
     def apply(self, time: float) -> None:
-        """Leave them."""
+        """Set the inputs of a moment [s]."""
 
 
 class Solver(CVodeSolver):  # type: ignore[misc]
@@ -40,6 +42,8 @@ class Solver(CVodeSolver):  # type: ignore[misc]
         Numbers of continuous states and event indicators.
     functions : mapping of str to callable
         `get_x`, `set_x`, `get_dx`, `get_z`, `get_nominals`, `set_time` of fmpy's model.
+    inputs : Inputs
+        Asked before each evaluation.
     """
 
     def __init__(
@@ -51,8 +55,9 @@ class Solver(CVodeSolver):  # type: ignore[misc]
         states: int,
         event_indicators: int,
         functions: dict[str, Callable[..., Any]],
+        inputs: Inputs,
     ) -> None:
-        self._failure: FMICallException | None = None
+        self._failure: Exception | None = None
         self._open = True
         nominals = functions["get_nominals"]
 
@@ -65,7 +70,7 @@ class Solver(CVodeSolver):  # type: ignore[misc]
         super().__init__(
             nx=states,
             nz=event_indicators,
-            input=_HeldInputs(),
+            input=inputs,
             startTime=start_time,
             maxStep=largest_step,
             relativeTolerance=tolerance,
@@ -77,7 +82,11 @@ class Solver(CVodeSolver):  # type: ignore[misc]
 
     def f(self, t: float, y: Any, ydot: Any, user_data: Any) -> int:
         """Return the right-hand side; 1 asks CVODE for a smaller step, -1 ends the integration."""
-        return self._guarded(super().f, t, y, ydot, user_data)
+        return self._guarded(self._right_hand_side, t, y, ydot, user_data)
+
+    def _right_hand_side(self, t: float, *rest: Any) -> int:
+        self.input.apply(t)
+        return int(super().f(t, *rest))
 
     def g(self, t: float, y: Any, gout: Any, user_data: Any) -> int:
         """Return the event indicators."""
@@ -86,16 +95,16 @@ class Solver(CVodeSolver):  # type: ignore[misc]
     def _guarded(self, function: Callable[..., int], *arguments: Any) -> int:
         try:
             return function(*arguments)
-        except FMICallException as error:
+        except (FMICallException, FmuError) as error:
             self._failure = error
-            return 1 if error.status == DISCARD else -1
+            return 1 if getattr(error, "status", None) == DISCARD else -1
 
     def advance(self, begin: float, end: float) -> tuple[bool, float]:
         """Integrate until `end` or an event; return whether there was one, and the time reached.
 
         Raises
         ------
-        FMICallException
+        FMICallException, FmuCallError
             If the FMU failed.
         RuntimeError
             If CVODE failed.

@@ -197,3 +197,27 @@ def test_columns_of_arrays_in_any_order_and_time_alone(room: Path, tmp_path: Pat
     assert roles["control"]["power"].tolist() == [[2.0, 1.0], [4.0, 3.0]]
     given.write_text("time\n120\n180.00001\n240\n", encoding="utf-8")
     assert read_histories(given, load_binding(room)) == (3, {})
+
+
+def test_rows_that_are_joined_by_lines(
+    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """x' = u - x from rest under u = t: x = t - 1 + exp(-t); the first row is where the asset starts."""
+    given, bound, out = tmp_path / "u.csv", tmp_path / "follow.toml", tmp_path / "x.csv"
+    bound.write_text(
+        '[binding]\nname = "follow"\nstep_size = 0.5\n[load.u]\nvariable = "u"\nunit = "1"\n'
+        '[observation.x]\nvariables = "x"\nunit = "1"\n'
+    )
+    given.write_text("time,u\n0,0\n0.5,0.5\n1,1\n")
+    wanted = (foreign_fmu("follow2"), "--binding", bound, "--inputs", given, "--out", out, "--in-process")
+    assert flown(monkeypatch, *wanted, "--interpolation", "linear") == 0
+    assert "2 steps to t = 1 s" in capsys.readouterr().out
+    rows = np.genfromtxt(out, delimiter=",", names=True)
+    np.testing.assert_allclose(rows["x"], rows["time"] - 1.0 + np.exp(-rows["time"]), rtol=1e-13)
+    given.write_text("time,u\n0,0\n")
+    for more, sentence in (
+        (("--interpolation", "linear"), "leads from one row of the inputs to the next: give two or more"),
+        (("--interpolation", "cubic"), "--interpolation must be zero-order or linear, and 'cubic' came"),
+    ):
+        assert flown(monkeypatch, *wanted, *more, "--replace") != 0
+        assert sentence in " ".join(capsys.readouterr().err.split())

@@ -9,6 +9,7 @@
 
 HOOK void model_start(Model *m) {}
 HOOK int model_initialise(Model *m) { return OK; }
+HOOK int model_input_slope(Model *m, unsigned int reference, double slope) { return ERROR; }
 HOOK int model_step(Model *m, double time, double size) { return OK; }
 HOOK void model_outputs(Model *m) {}
 HOOK void model_derivatives(Model *m, double *dx) {}
@@ -62,7 +63,11 @@ fmi1Status F(ResetSlave)(fmi1Component c) {
     return fmi1OK;
 }
 void F(FreeSlaveInstance)(fmi1Component c) { free(c); }
-fmi1Status F(SetRealInputDerivatives)(fmi1Component c, const fmi1ValueReference vr[], size_t n, const fmi1Integer order[], const fmi1Real value[]) { return fmi1Error; }
+fmi1Status F(SetRealInputDerivatives)(fmi1Component c, const fmi1ValueReference vr[], size_t n, const fmi1Integer order[], const fmi1Real value[]) {
+    for (size_t k = 0; k < n; k++)
+        if (order[k] != 1 || model_input_slope(M, vr[k], value[k]) != OK) return fmi1Error;
+    return fmi1OK;
+}
 fmi1Status F(GetRealOutputDerivatives)(fmi1Component c, const fmi1ValueReference vr[], size_t n, const fmi1Integer order[], fmi1Real value[]) { return fmi1Error; }
 fmi1Status F(CancelStep)(fmi1Component c) { return fmi1Error; }
 fmi1Status F(DoStep)(fmi1Component c, fmi1Real time, fmi1Real size, fmi1Boolean new_step) {

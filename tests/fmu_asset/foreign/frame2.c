@@ -4,6 +4,7 @@
 
 HOOK void model_start(Model *m) {}
 HOOK int model_initialise(Model *m) { return OK; }
+HOOK int model_input_slope(Model *m, unsigned int reference, double slope) { return ERROR; }
 HOOK int model_step(Model *m, double time, double size) { return OK; }
 HOOK void model_outputs(Model *m) {}
 HOOK void model_derivatives(Model *m, double *dx) {}
@@ -100,7 +101,11 @@ fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size
     return fmi2OK;
 }
 fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference u[], size_t nu, const fmi2ValueReference k[], size_t nk, const fmi2Real dk[], fmi2Real du[]) { return fmi2Error; }
-fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], const fmi2Real value[]) { return fmi2Error; }
+fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], const fmi2Real value[]) {
+    for (size_t k = 0; k < n; k++)
+        if (order[k] != 1 || model_input_slope(M, vr[k], value[k]) != OK) return fmi2Error;
+    return fmi2OK;
+}
 fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Integer order[], fmi2Real value[]) { return fmi2Error; }
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real size, fmi2Boolean no_return) {
 #ifdef STANDS_STILL_ONCE_TERMINATED

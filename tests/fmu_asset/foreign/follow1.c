@@ -1,0 +1,1 @@
+#include "follow2.c"
