@@ -7,7 +7,18 @@ from typing import Annotated
 import typer
 
 from reporting import terminal
-from uav_twin.simulated import draw, interpolation_of, refuse_files, say, values_of
+from uav_twin.simulated import (
+    InProcess,
+    InterpolationName,
+    OutFile,
+    PlotFile,
+    Replace,
+    draw,
+    interpolated,
+    refuse_files,
+    say,
+    values_of,
+)
 
 
 def simulate(
@@ -19,9 +30,7 @@ def simulate(
         Path | None,
         typer.Option(help="CSV: `time` (s, where each step begins) and the inputs by the binding's names."),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="The file to write: CSV, or NetCDF (.nc) with units.")
-    ] = None,
+    out: OutFile = None,
     stop_time: Annotated[
         float | None, typer.Option(help="End in seconds; the FMU's own by default, or 1 s after the start.")
     ] = None,
@@ -33,22 +42,13 @@ def simulate(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="A parameter or input by its name in the FMU."),
     ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="A picture of the outputs to write: .png or .svg.")
-    ] = None,
-    interpolation: Annotated[
-        str | None,
-        typer.Option(
-            help="How inputs go on between rows: zero-order or linear; by default as the binding says."
-        ),
-    ] = None,
-    in_process: Annotated[
-        bool, typer.Option("--in-process", help="Faster, without protection from crashes and endless steps.")
-    ] = False,
+    plot: PlotFile = None,
+    interpolation: InterpolationName = None,
+    in_process: InProcess = False,
     step_timeout: Annotated[
         float | None, typer.Option(help="Wall-clock limit of a step in seconds.", min=0.0)
     ] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace the files if they exist.")] = False,
+    replace: Replace = False,
 ) -> None:
     """Simulate an FMU: its default experiment, or with --binding and --inputs under histories."""
     from fmu_asset.archive.fmu_file import read_fmu
@@ -56,16 +56,13 @@ def simulate(
     from fmu_asset.door.experiment import default_experiment, fly, fly_histories
     from fmu_asset.door.history_file import read_histories, write_history
     from fmu_asset.door.session import FmiAsset
-    from fmu_asset.errors import FmuInputError
 
     refuse_files(out, plot, replace=replace)
-    _refuse_mixture(binding, inputs, others=stop_time is not None or step_size is not None or bool(values))
-    if interpolation is not None and inputs is None:
-        raise FmuInputError("--interpolation says how inputs go on between the rows of --inputs: give these.")
+    _refuse_mixture(
+        binding, inputs, interpolation, others=stop_time is not None or step_size is not None or bool(values)
+    )
     if binding is not None and inputs is not None:
-        bound = load_binding(binding)
-        if interpolation is not None:
-            bound = bound.with_interpolation(interpolation_of(interpolation))
+        bound = interpolated(load_binding(binding), interpolation)
         asset = FmiAsset(file, bound, isolated=not in_process, step_timeout=step_timeout)
         given = read_histories(inputs, asset.binding)
     else:
@@ -85,7 +82,9 @@ def simulate(
     say(asset, history, file, [out, plot], from_start=inputs is None)
 
 
-def _refuse_mixture(binding: Path | None, inputs: Path | None, *, others: bool) -> None:
+def _refuse_mixture(
+    binding: Path | None, inputs: Path | None, interpolation: str | None, *, others: bool
+) -> None:
     """Refuse half of a simulation under histories, and one that is half without."""
     from fmu_asset.errors import FmuInputError
 
@@ -96,3 +95,5 @@ def _refuse_mixture(binding: Path | None, inputs: Path | None, *, others: bool) 
             "--stop-time, --step-size and --set are for a simulation without --binding, which says these "
             "itself."
         )
+    if interpolation is not None and inputs is None:
+        raise FmuInputError("--interpolation says how inputs go on between the rows of --inputs: give these.")

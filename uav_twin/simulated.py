@@ -1,7 +1,9 @@
 """What a simulation of an FMU or of a system takes from the command line, says, draws and leaves."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
 
 from reporting import terminal
 
@@ -9,9 +11,24 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from fmu_asset.door.binding import Interpolation
+    from fmu_asset.door.binding import Binding, Interpolation
     from fmu_asset.door.simulation import ObservationHistory
     from fmu_asset.door.stepped import SteppedAsset
+
+OutFile = Annotated[Path | None, typer.Option(help="The file to write: CSV, or NetCDF (.nc) with units.")]
+PlotFile = Annotated[Path | None, typer.Option(help="A picture of the outputs to write: .png or .svg.")]
+InterpolationName = Annotated[
+    str | None,
+    typer.Option(
+        "--interpolation",
+        help="How inputs go on between communication points: zero-order or linear; by default as the binding "
+        "says, and zero-order in a system.",
+    ),
+]
+InProcess = Annotated[
+    bool, typer.Option("--in-process", help="Faster, without protection from crashes and endless steps.")
+]
+Replace = Annotated[bool, typer.Option("--replace", help="Replace the files if they exist.")]
 
 _MOST_PANELS, _MOST_LINES = 8, 10
 
@@ -48,13 +65,15 @@ def values_of(texts: list[str]) -> dict[str, float | list[float]]:
     return found
 
 
-def interpolation_of(text: str) -> "Interpolation":
-    """Return a kind of interpolation that is given as a text."""
+def interpolated(binding: "Binding", kind: str | None) -> "Binding":
+    """Return a binding with inputs that go on between communication points as `--interpolation` says."""
     from fmu_asset.errors import FmuInputError
 
-    if text not in ("zero-order", "linear"):
-        raise FmuInputError(f"--interpolation must be zero-order or linear, and {text!r} came.")
-    return cast("Interpolation", text)
+    if kind is None:
+        return binding
+    if kind not in ("zero-order", "linear"):
+        raise FmuInputError(f"--interpolation must be zero-order or linear, and {kind!r} came.")
+    return binding.with_interpolation(cast("Interpolation", kind))
 
 
 def say(

@@ -6,7 +6,18 @@ from typing import Annotated
 import typer
 
 from reporting import terminal
-from uav_twin.simulated import draw, interpolation_of, refuse_files, say, values_of
+from uav_twin.simulated import (
+    InProcess,
+    InterpolationName,
+    OutFile,
+    PlotFile,
+    Replace,
+    draw,
+    interpolated,
+    refuse_files,
+    say,
+    values_of,
+)
 
 ssp_app = typer.Typer(no_args_is_help=True, help="Write, check and simulate systems of FMUs as SSP files.")
 
@@ -61,9 +72,7 @@ def _is_design(what: str) -> bool:
 @ssp_app.command("simulate")
 def simulate(
     file: Annotated[Path, typer.Argument(help="An SSP file.", show_default=False)],
-    out: Annotated[
-        Path | None, typer.Option(help="The file to write: CSV, or NetCDF (.nc) with units.")
-    ] = None,
+    out: OutFile = None,
     stop_time: Annotated[
         float | None,
         typer.Option(help="End in seconds; by default that of the file, or 1 s."),
@@ -75,23 +84,16 @@ def simulate(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="A connector of the system, or component.variable."),
     ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="A picture of the outputs to write: .png or .svg.")
-    ] = None,
+    plot: PlotFile = None,
     algorithm: Annotated[
         str, typer.Option(help="How values are passed on within a step: gauss_seidel or jacobi.")
     ] = "gauss_seidel",
     iterations: Annotated[
         int, typer.Option(help="How often a step of a circle of components is made at most.", min=1)
     ] = 1,
-    interpolation: Annotated[
-        str,
-        typer.Option(help="How inputs of components go on between two exchanges: zero-order or linear."),
-    ] = "zero-order",
-    in_process: Annotated[
-        bool, typer.Option("--in-process", help="Faster, without protection from crashes and endless steps.")
-    ] = False,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace the files if they exist.")] = False,
+    interpolation: InterpolationName = None,
+    in_process: InProcess = False,
+    replace: Replace = False,
 ) -> None:
     """Simulate the system of an SSP file from its start; all outputs of the system and its components."""
     import tempfile
@@ -112,7 +114,7 @@ def simulate(
         planned = system_experiment(wiring, span=span, step_size=step_size, values=given)
         with CoupledAsset(
             wiring,
-            planned.binding.with_interpolation(interpolation_of(interpolation)),
+            interpolated(planned.binding, interpolation),
             algorithm=algorithm,  # type: ignore[arg-type]  # said by itself
             iterations=iterations,
             isolated=not in_process,
