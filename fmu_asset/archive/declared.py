@@ -104,9 +104,6 @@ class FmuDescription:
         Folders of binaries, such as linux64.
     can_get_and_set_state, can_serialise_state, can_vary_step : bool
         Declared capabilities of `interface`.
-    takes_lines : bool
-        Whether inputs can move in straight lines between communication points: in model exchange, and where
-        co-simulation declares `canInterpolateInputs` (FMI 1 and 2).
     variables : tuple of VariableInfo
         In the order of the model description.
     units : tuple of UnitInfo
@@ -127,6 +124,9 @@ class FmuDescription:
         Numbers of continuous states and event indicators.
     completed_step : bool
         Whether model exchange wants to hear of completed integrator steps.
+    takes_lines : bool
+        Whether inputs can move in straight lines between communication points: in model exchange, and where
+        co-simulation declares `canInterpolateInputs` (FMI 1 and 2).
     """
 
     path: Path
@@ -142,7 +142,6 @@ class FmuDescription:
     can_get_and_set_state: bool
     can_serialise_state: bool
     can_vary_step: bool
-    takes_lines: bool
     variables: tuple[VariableInfo, ...]
     units: tuple[UnitInfo, ...]
     interface: Interface = "co-simulation"
@@ -157,6 +156,7 @@ class FmuDescription:
     states: int = 0
     event_indicators: int = 0
     completed_step: bool = False
+    takes_lines: bool = False
 
     @property
     def major_version(self) -> int:
