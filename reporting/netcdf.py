@@ -14,11 +14,12 @@ import resource
 import signal
 import warnings
 from pathlib import Path
-from typing import NoReturn
-
-import xarray as xr
+from typing import TYPE_CHECKING, NoReturn
 
 from reporting.errors import DamagedFileError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 SECONDS, BYTES_IN_A_SECOND = 10, 5_000_000
 """Processor time for a file: so much for any, and a second more for so many bytes (1e8 are read in truth)."""
@@ -38,7 +39,9 @@ def read_groups(path: Path) -> xr.DataTree:
     """
     if not path.is_file():
         raise DamagedFileError(f"there is no file {path}")
-    import h5netcdf  # noqa: F401 - here, and not again in each fork
+    # Here, and not again in each fork.
+    import h5netcdf  # noqa: F401
+    import xarray as xr
 
     reading, writing = os.pipe()
     with warnings.catch_warnings():
@@ -79,6 +82,8 @@ def _answer(path: Path, writing: int) -> NoReturn:
 
 
 def _groups(path: Path) -> dict[str, xr.Dataset] | str:
+    import xarray as xr
+
     try:
         with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as tree:
             return {node.path: node.to_dataset(inherit=False).load() for node in tree.subtree}

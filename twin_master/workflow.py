@@ -50,12 +50,7 @@ from twin_master.store.learnt import learnt_record
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.outcome import RunOutcome, finished_run, read_outcome
 from twin_master.store.summary import another_truth, control_changes, noticed, summarise
-from twin_master.store.writing import (
-    store_mission,
-    values_of,
-    write_summary,
-    write_timing,
-)
+from twin_master.store.writing import store_mission, write_summary, write_timing
 
 POLICY_NAME = "policy.npy"
 """In the run folder: the policy (S, U) that was given in the place of a plan."""
@@ -371,9 +366,9 @@ def _store(
         "asset": source.origin.asset,
         "twin_model": source.origin.model,
     }
-    tree = store_mission(folder, result, attributes, _field_writer(knowledge, source, result))
+    groups = store_mission(folder, result, attributes, _field_writer(knowledge, source, result))
     figures = summarise(
-        result, knowledge.draws, values_of(tree, "filtered", "reward_mean"), _misfit(knowledge, source)
+        result, knowledge.draws, groups["filtered"]["reward_mean"].values, _misfit(knowledge, source)
     )
     heading = {"scenario": mission.name, "title": mission.title, "seed": mission.seed, "steps": mission.steps}
     controls = knowledge.scenario.control_names

@@ -1,10 +1,9 @@
 """What is built once and kept between runs in files: of several processes one builds, the others wait."""
 
-import fcntl
 import logging
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -28,7 +27,7 @@ def kept(load: Callable[[], _Kept]) -> _Kept | None:
     except OSError:  # not there, or not readable
         return None
     except ReducedModelFileError as error:
-        _logger.warning("A kept model is not usable and is built anew: %s", error)
+        _logger.warning("What is kept is not usable and is built anew: %s", error)
         return None
 
 
@@ -58,7 +57,7 @@ def built_once(
             keep(built)
         except OSError as error:
             _logger.warning(
-                "The model could not be kept in %s and will be built again: %s", path.parent, error
+                "What was built could not be kept in %s and will be built again: %s", path.parent, error
             )
     return built
 
@@ -73,7 +72,10 @@ def _locked(path: Path) -> Iterator[None]:
         yield
         return
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+        with suppress(ImportError):  # Windows: several builders then build the same
+            import fcntl
+
+            fcntl.flock(handle, fcntl.LOCK_EX)
         yield
     finally:
         os.close(handle)

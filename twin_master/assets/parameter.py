@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -16,8 +15,7 @@ from twin_master.seeds import generator, seed_sequence
 
 if TYPE_CHECKING:
     from calibration.parameters.result import ParameterCalibration
-    from calibration.static.record import StaticCalibration
-    from calibration.static.stiffness_curve import TipStiffnessModel
+    from fe.runtime.reduced import ReducedModel
 
 Float = NDArray[np.float64]
 
@@ -56,7 +54,7 @@ class ParameterDraws:
 
 
 def draw_parameter(
-    calibration: Calibration, seed: int, model: "TipStiffnessModel | None" = None
+    calibration: Calibration, seed: int, model: "ReducedModel | None" = None
 ) -> ParameterDraws:
     """Return draws of the calibrated parameter: Kapteyn et al. 2021, calibration step 2.
 
@@ -68,7 +66,7 @@ def draw_parameter(
         Section of the scenario.
     seed : int
         Seed of the run.
-    model : TipStiffnessModel, optional
+    model : ReducedModel, optional
         The structural model, where its own stiffness curve is to be used.
 
     Raises
@@ -104,46 +102,32 @@ def draw_parameter(
             calibration.standard_deviation,
             "normal distribution of the scenario",
         )
-    table: tuple[str, bytes, bytes, float] | None = None
-    if calibration.curve == "design":
-        if model is None:
-            raise MissingObservationModelError(
-                "`calibration.curve` asks for the stiffness curve of a design, and the asset has none: "
-                "let the twin believe a `design`, or set `calibration.curve` to `published`."
-            )
-        from calibration.static.stiffness_curve import stiffness_curve_of
+    if calibration.curve == "design" and model is None:
+        raise MissingObservationModelError(
+            "`calibration.curve` asks for the stiffness curve of a design, and the asset has none: "
+            "let the twin believe a `design`, or set `calibration.curve` to `published`."
+        )
+    # A scenario can be read without any of this, and it takes a while to load.
+    from calibration.static.kept import static_record
+    from calibration.static.posterior import ScalarPosterior
+    from reporting.record_json import record_of
 
-        curve = stiffness_curve_of(model)
-        table = (curve.name, curve.factors.tobytes(), curve.stiffnesses.tobytes(), curve.table_error)
     sequence = seed_sequence(seed, "calibration")
-    found = _static_test(table, int(sequence.generate_state(1)[0]))
-    posterior = found.exact if calibration.method == "exact" else found.particle.posterior
+    own = model if calibration.curve == "design" else None
+    record = static_record(own, int(sequence.generate_state(1)[0]))
+    found = record["exact"] if calibration.method == "exact" else record["particle"]["posterior"]
+    posterior = record_of(ScalarPosterior, found)
     return ParameterDraws(
         name=calibration.parameter,
         values=posterior.samples(sequence, calibration.draws, stratified=True),
         mean=posterior.mean,
         standard_deviation=posterior.standard_deviation,
-        source=f"static test of the wing, {calibration.method.replace('_', ' ')}, {found.curve.name}",
-        record=found.to_dict(),
+        source=(
+            f"static test of the wing, {calibration.method.replace('_', ' ')}, "
+            f"{record['stiffness_curve']['name']}"
+        ),
+        record=record,
     )
-
-
-@lru_cache(maxsize=2)
-def _static_test(table: tuple[str, bytes, bytes, float] | None, seed: int) -> "StaticCalibration":
-    """Return the calibration by the published static test, once for a curve and a seed.
-
-    `table` is a curve's name, its nodes and its error; None for the published line. A million particles take
-    seconds, and missions of one seed that follow each other in a process share them.
-    """
-    # A scenario can be read without any of this, and it takes seconds to load.
-    from calibration.static.stiffness import calibrate_static
-    from calibration.static.stiffness_curve import PUBLISHED_LINE, TabulatedStiffnessCurve
-
-    if table is None:
-        return calibrate_static(PUBLISHED_LINE, seed=seed)
-    name, factors, stiffnesses, error = table
-    nodes = (np.frombuffer(factors), np.frombuffer(stiffnesses))
-    return calibrate_static(TabulatedStiffnessCurve(*nodes, name=name, table_error=error), seed=seed)
 
 
 def _draws_of_file(calibration: Calibration, seed: int) -> ParameterDraws:

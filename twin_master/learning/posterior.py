@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
 
 from twin_master.network.estimator import Learnt
 
@@ -121,6 +120,8 @@ class DrawsPosterior:
 
 def _spline(x: Float, at: Float) -> Callable[[Float], Float]:
     """Return what interpolates values at `x` (n,); with fewer than four of them it is one polynomial."""
+    from scipy.interpolate import CubicSpline  # takes a while to load, and only a twin that learns needs it
+
     if len(x) > _DRAWS_PREPARED:
         return lambda values: np.asarray(CubicSpline(x, values)(at))
     matrix: Float = np.ascontiguousarray(CubicSpline(x, np.eye(len(x)))(at))  # it is linear in the values

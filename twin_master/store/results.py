@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
+from reporting.groups import Group, Variable
 from twin_master.learning.expectation import Expected
 from twin_master.mission.truth import SensorStatus, Truth
 from twin_master.network.inference import known_control
@@ -17,16 +17,8 @@ from twin_master.store.mission_result import SEVERAL_UNITS, MissionResult
 Float = NDArray[np.float64]
 
 
-def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.DataTree:
-    """Return the groups of `run.nc`; every variable carries its unit and a description.
-
-    Parameters
-    ----------
-    result
-        The mission.
-    attributes
-        Attributes of the root: seed, versions, hashes.
-    """
+def groups_of(result: MissionResult) -> dict[str, Group]:
+    """Return the groups of `run.nc` for a mission; every variable carries its unit and a description."""
     labels = _Labels(result)
     groups = {
         "observed": _observed(result, labels),
@@ -34,7 +26,7 @@ def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.Data
         "smoothed": _smoothed(result, labels),
         "predicted": _predicted(result, labels),
         "policy": _policy(result, labels),
-        "calibration": labels.dataset(
+        "calibration": labels.group(
             {
                 "draw_value": (
                     ("draw",),
@@ -42,8 +34,9 @@ def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.Data
                     result.parameter_unit,
                     "draws of the uncertain parameter, equally weighted",
                 )
-            }
-        ).assign_attrs(parameter=result.scenario.calibration.parameter),
+            },
+            {"parameter": result.scenario.calibration.parameter},
+        ),
     }
     if result.learnt:
         groups["learnt"] = _learnt(result, labels)
@@ -51,83 +44,89 @@ def to_datatree(result: MissionResult, attributes: Mapping[str, Any]) -> xr.Data
         groups["notice"] = _notice(result, labels)
     if result.truth is not None:
         groups["truth"] = _truth(result, labels, result.truth)
-    return xr.DataTree.from_dict({"/": xr.Dataset(attrs=dict(attributes)), **groups})
+    return groups
 
 
-Variable = tuple[tuple[str, ...], NDArray[Any], str, str]
+Described = tuple[tuple[str, ...], NDArray[Any], str, str]
+"""Axes, values, unit and description."""
 
 
 class _Labels:
-    """Coordinates of every dimension, and datasets that carry those which they use."""
+    """Coordinates of every dimension, and groups that carry those which they use."""
 
     def __init__(self, result: MissionResult) -> None:
         scenario, model = result.scenario, result.model
         names = scenario.state_names
-        self.coordinates: dict[str, xr.Variable] = {
-            "step": xr.Variable(
-                "step",
+        self.coordinates: dict[str, Variable] = {
+            "step": Variable(
+                ("step",),
                 result.flight.first_turn + np.arange(len(result.flight.observed)),
                 {"long_name": "step", "units": "1"},
             ),
-            "sensor": xr.Variable(
-                "sensor", np.arange(1, scenario.observation.count + 1), {"long_name": "sensor", "units": "1"}
+            "sensor": Variable(
+                ("sensor",),
+                np.arange(1, scenario.observation.count + 1),
+                {"long_name": "sensor", "units": "1"},
             ),
-            "region": xr.Variable("region", np.array(names), {"long_name": "factor of the state"}),
-            "control": xr.Variable("control", np.array(scenario.control_names), {"long_name": "control"}),
-            "horizon": xr.Variable(
-                "horizon",
+            "region": Variable(("region",), np.array(names), {"long_name": "factor of the state"}),
+            "control": Variable(("control",), np.array(scenario.control_names), {"long_name": "control"}),
+            "horizon": Variable(
+                ("horizon",),
                 np.arange(1, scenario.mission.prediction_steps + 1),
                 {"long_name": "steps ahead", "units": "1"},
             ),
-            "reward": xr.Variable("reward", np.array(REWARD_NAMES), {"long_name": "reward"}),
-            "draw": xr.Variable(
-                "draw", np.arange(len(result.draws)), {"long_name": "draw of the parameter", "units": "1"}
+            "reward": Variable(("reward",), np.array(REWARD_NAMES), {"long_name": "reward"}),
+            "draw": Variable(
+                ("draw",), np.arange(len(result.draws)), {"long_name": "draw of the parameter", "units": "1"}
             ),
         }
         observation = scenario.observation
-        self.sensors: dict[str, xr.Variable] = {}
+        self.sensors: dict[str, Variable] = {}
         if result.observation_unit == SEVERAL_UNITS:
             unit = np.array(observation.sensor_units)
-            self.sensors["sensor_unit"] = xr.Variable("sensor", unit, {"long_name": "unit of each sensor"})
+            self.sensors["sensor_unit"] = Variable(("sensor",), unit, {"long_name": "unit of each sensor"})
         if observation.titles:
             title = np.array(observation.titles)
-            self.sensors["sensor_title"] = xr.Variable("sensor", title, {"long_name": "name of each sensor"})
+            self.sensors["sensor_title"] = Variable(("sensor",), title, {"long_name": "name of each sensor"})
         self.states = {
-            factor.name: xr.Variable(
-                "state", model.states.coordinates[:, index], {"long_name": factor.name, "units": factor.unit}
+            factor.name: Variable(
+                ("state",),
+                model.states.coordinates[:, index],
+                {"long_name": factor.name, "units": factor.unit},
             )
             for index, factor in enumerate(scenario.state)
         }
 
-    def dataset(self, variables: Mapping[str, Variable]) -> xr.Dataset:
+    def group(self, variables: Mapping[str, Described], attrs: Mapping[str, str] | None = None) -> Group:
         dimensions = {name for variable in variables.values() for name in variable[0]}
-        coordinates: dict[str, xr.Variable] = {
+        coordinates: dict[str, Variable] = {
             name: variable for name, variable in self.coordinates.items() if name in dimensions
         }
         if "state" in dimensions:
             coordinates |= self.states
         if "sensor" in dimensions:
             coordinates |= self.sensors
-        return xr.Dataset(
+        return Group(
             {
-                name: (dims, values, {"units": unit, "long_name": text})
+                name: Variable(dims, np.asarray(values), {"units": unit, "long_name": text})
                 for name, (dims, values, unit, text) in variables.items()
             },
-            coords=coordinates,
+            coordinates,
+            attrs or {},
         )
 
 
-def _observed(result: MissionResult, labels: _Labels) -> xr.Dataset:
+def _observed(result: MissionResult, labels: _Labels) -> Group:
     flight, scenario = result.flight, result.scenario
     role, unit = scenario.observation.role, result.observation_unit
-    variables: dict[str, Variable] = {
+    variables: dict[str, Described] = {
         role: (("step", "sensor"), flight.observed, unit, f"{role} as received; NaN where a sensor is lost"),
         "control_index": (("step",), flight.control_index, "1", "control in force"),
     }
     for name in sorted(scenario.control[0].values):  # config.json does not keep their order
         values = np.array([control.values[name] for control in scenario.control])[flight.control_index]
         variables[name] = (("step",), values, result.units.get(name, "1"), f"{name} in force")
-    return labels.dataset(variables)
+    return labels.group(variables)
 
 
 def _expected(result: MissionResult, joint: Float, observed: Float | None) -> Expected:
@@ -143,7 +142,7 @@ def _expected(result: MissionResult, joint: Float, observed: Float | None) -> Ex
 
 def _belief(
     result: MissionResult, lead: tuple[str, ...], probability: Float, expected: Expected, given: str
-) -> dict[str, Variable]:
+) -> dict[str, Described]:
     """Return belief, moments, quantities of interest and rewards; `given` says what the belief is given."""
     states = result.model.states
     role, unit = result.scenario.observation.role, result.observation_unit
@@ -187,7 +186,7 @@ _DECIDED_ON = {
 }
 
 
-def _filtered(result: MissionResult, labels: _Labels) -> xr.Dataset:
+def _filtered(result: MissionResult, labels: _Labels) -> Group:
     flight = result.flight
     if result.expectation is None:
         joint = known_control(flight.filtered, flight.control_index, len(result.model.controls))
@@ -225,20 +224,20 @@ def _filtered(result: MissionResult, labels: _Labels) -> xr.Dataset:
             "sensors received; with none the belief follows the dynamics",
         ),
     }
-    return labels.dataset(variables)
+    return labels.group(variables)
 
 
-def _smoothed(result: MissionResult, labels: _Labels) -> xr.Dataset:
+def _smoothed(result: MissionResult, labels: _Labels) -> Group:
     flight = result.flight
     if result.expectation is None:
         joint = known_control(flight.smoothed, flight.control_index, len(result.model.controls))
         expected = _expected(result, joint, flight.observed)
     else:
         expected = result.expectation.smoothed(flight.carried, flight.observed)
-    return labels.dataset(_belief(result, ("step",), flight.smoothed, expected, "all observations"))
+    return labels.group(_belief(result, ("step",), flight.smoothed, expected, "all observations"))
 
 
-def _predicted(result: MissionResult, labels: _Labels) -> xr.Dataset:
+def _predicted(result: MissionResult, labels: _Labels) -> Group:
     flight = result.flight
     lead = ("step", "horizon")
     joint = flight.predicted[..., :, None] * result.plan.policy  # (T, H, S, U), eqs. (37)-(39)
@@ -254,12 +253,12 @@ def _predicted(result: MissionResult, labels: _Labels) -> xr.Dataset:
         "1",
         "p(control | observations up to the step): what the policy asks for in the state predicted",
     )
-    return labels.dataset(variables)
+    return labels.group(variables)
 
 
-def _policy(result: MissionResult, labels: _Labels) -> xr.Dataset:
+def _policy(result: MissionResult, labels: _Labels) -> Group:
     plan = result.plan
-    return labels.dataset(
+    return labels.group(
         {
             "control_index": (("state",), plan.control_index, "1", "control of the policy in each state"),
             "action_value": (("state", "control"), plan.action_value, "1", "Q of value iteration, eq. (36)"),
@@ -273,8 +272,8 @@ _MOMENT_TITLES = dict(
 )
 
 
-def _learnt(result: MissionResult, labels: _Labels) -> xr.Dataset:
-    variables: dict[str, Variable] = {}
+def _learnt(result: MissionResult, labels: _Labels) -> Group:
+    variables: dict[str, Described] = {}
     for quantity in result.learnt:
         sensor = ("sensor",) if quantity.of_sensors else ()
         for index, (moment, text) in enumerate(_MOMENT_TITLES.items()):
@@ -290,13 +289,13 @@ def _learnt(result: MissionResult, labels: _Labels) -> xr.Dataset:
                 quantity.unit,
                 f"{quantity.title}: {text} before the first step",
             )
-    return labels.dataset(variables)
+    return labels.group(variables)
 
 
-def _notice(result: MissionResult, labels: _Labels) -> xr.Dataset:
+def _notice(result: MissionResult, labels: _Labels) -> Group:
     turns = result.flight.suspicion
     sensor = ("step", "sensor")
-    return labels.dataset(
+    return labels.group(
         {
             "none_of_these": (
                 ("step",),
@@ -338,12 +337,12 @@ def _notice(result: MissionResult, labels: _Labels) -> xr.Dataset:
     )
 
 
-def _truth(result: MissionResult, labels: _Labels, truth: Truth) -> xr.Dataset:
+def _truth(result: MissionResult, labels: _Labels, truth: Truth) -> Group:
     record, role = result.flight.happened, result.scenario.observation.role
     status = truth.status[: len(record.state)]  # the asset may have ended the mission
     if truth.in_asset:
         status = np.where(np.isnan(result.flight.observed), SensorStatus.LOST, status).astype(status.dtype)
-    variables: dict[str, Variable] = {
+    variables: dict[str, Described] = {
         "state": (
             ("step", "region"),
             record.state,
@@ -373,4 +372,4 @@ def _truth(result: MissionResult, labels: _Labels, truth: Truth) -> xr.Dataset:
             )
     for name, values in sorted(record.monitors.items()):  # a checkpoint does not keep their order
         variables[name] = (("step",), values, result.units.get(name, "1"), f"{name}, as the asset reports it")
-    return labels.dataset(variables)
+    return labels.group(variables)

@@ -10,8 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
+
+from reporting.groups import Group
 
 Float = NDArray[np.float64]
 
@@ -21,7 +22,7 @@ PERCENT = 100.0
 Table = tuple[list[str], list[list[str]]]
 
 
-def tables_of(groups: Mapping[str, xr.Dataset], role: str) -> dict[str, str]:
+def tables_of(groups: Mapping[str, Group], role: str) -> dict[str, str]:
     """Return the text of each CSV file by its name.
 
     Parameters
@@ -43,7 +44,7 @@ def tables_of(groups: Mapping[str, xr.Dataset], role: str) -> dict[str, str]:
     return {name: _csv(*table) for name, table in tables.items()}
 
 
-def _observations(steps: list[str], group: xr.Dataset, variable: str, role: str) -> Table:
+def _observations(steps: list[str], group: Group, variable: str, role: str) -> Table:
     sensors = group["sensor"].values
     units = [group[variable].attrs["units"]] * len(sensors)
     if "sensor_unit" in group.coords:
@@ -58,7 +59,7 @@ def _observations(steps: list[str], group: xr.Dataset, variable: str, role: str)
     return header, [[step, *_numbers(row)] for step, row in rows]
 
 
-def _health(steps: list[str], groups: Mapping[str, xr.Dataset]) -> Table:
+def _health(steps: list[str], groups: Mapping[str, Group]) -> Table:
     kinds = [(kind, name) for kind in ("filtered", "smoothed") for name in ("mean", "standard_deviation")]
     known = [groups["truth"]["state"].values] if "truth" in groups else []
     columns = [*known, *(groups[kind][name].values for kind, name in kinds)]
@@ -73,7 +74,7 @@ def _health(steps: list[str], groups: Mapping[str, xr.Dataset]) -> Table:
     return header, [[step, *_numbers(row)] for step, row in zip(steps, stacked, strict=True)]
 
 
-def _decisions(steps: list[str], groups: Mapping[str, xr.Dataset]) -> Table:
+def _decisions(steps: list[str], groups: Mapping[str, Group]) -> Table:
     names = _names(groups["policy"]["control"].values)
     flown = groups["observed"]["control_index"].values
     rewards = groups["filtered"]
@@ -85,7 +86,7 @@ def _decisions(steps: list[str], groups: Mapping[str, xr.Dataset]) -> Table:
     return header, [[step, names[now], *_numbers(row), names[coming]] for step, now, row, coming in rows]
 
 
-def _policy(groups: Mapping[str, xr.Dataset]) -> Table:
+def _policy(groups: Mapping[str, Group]) -> Table:
     policy = groups["policy"]
     names = _names(policy["control"].values)
     regions = _names(groups["filtered"]["region"].values)

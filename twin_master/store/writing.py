@@ -2,20 +2,20 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-import xarray as xr
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_file, atomic_write_text
+from reporting.groups import Group, write_groups
 from reporting.netcdf import read_groups
 from twin_master.run_folder import FIELD_NAME, to_json
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.results import to_datatree
+from twin_master.store.results import groups_of
 from twin_master.store.summary import Figure, to_record
 from twin_master.store.tables import tables_of
+
+if TYPE_CHECKING:
+    from xarray import DataTree
 
 RUN_NAME = "run.nc"
 SUMMARY_NAME = "summary.json"
@@ -23,25 +23,29 @@ TIMING_NAME = "timing.json"
 CSV_FOLDER = "csv"
 
 
-def values_of(tree: xr.DataTree, group: str, name: str) -> NDArray[Any]:
-    """Return the values of a variable or coordinate of a group."""
-    return np.asarray(tree[group].to_dataset()[name].values)
+def write_run(folder: Path, groups: Mapping[str, Group], attributes: Mapping[str, Any]) -> Path:
+    """Write `run.nc`; the bytes depend on nothing but what is given.
 
-
-def write_run(folder: Path, tree: xr.DataTree) -> Path:
-    """Write `run.nc`; the bytes depend on nothing but the tree.
+    Parameters
+    ----------
+    folder
+        The run folder.
+    groups
+        By name.
+    attributes
+        Of the root: seed, versions, hashes.
 
     Raises
     ------
     FileNotWrittenError
         The disk is full or the folder cannot be written.
     """
-    with atomic_file(folder / RUN_NAME) as temporary:  # in memory it would be there twice more
-        tree.to_netcdf(temporary, engine="h5netcdf")
+    with atomic_file(folder / RUN_NAME) as temporary:
+        write_groups(temporary, groups, attributes)
     return folder / RUN_NAME
 
 
-def read_run(folder: Path) -> xr.DataTree:
+def read_run(folder: Path) -> "DataTree":
     """Return the groups of a run, loaded into memory.
 
     Raises
@@ -70,8 +74,8 @@ def store_mission(
     result: MissionResult,
     attributes: Mapping[str, Any],
     write_field: Callable[[Path], object] | None = None,
-) -> xr.DataTree:
-    """Write `run.nc`, the CSV files and, where the asset has a mesh, `wing.vtu`.
+) -> dict[str, Group]:
+    """Write `run.nc`, the CSV files and, where the asset has a mesh, `wing.vtu`; return the groups.
 
     Parameters
     ----------
@@ -84,11 +88,10 @@ def store_mission(
     write_field
         Writes the VTU file to the path that it is given.
     """
-    tree = to_datatree(result, attributes)
-    write_run(folder, tree)
-    groups = {name: tree[name].to_dataset() for name in tree.children}
+    groups = groups_of(result)
+    write_run(folder, groups, attributes)
     for name, text in tables_of(groups, result.scenario.observation.role).items():
         atomic_write_text(folder / CSV_FOLDER / f"{name}.csv", text)
     if write_field is not None:
         write_field(folder / FIELD_NAME)
-    return tree
+    return groups

@@ -36,7 +36,7 @@ from twin_master.scenario.schema import Scenario
 from twin_master.store.learnt import learnt_record
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure, control_changes, noticed, summarise
-from twin_master.store.writing import store_mission, values_of, write_summary
+from twin_master.store.writing import store_mission, write_summary
 from twin_master.watch.decision import decision_of
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile
 from twin_master.watch.keeping import Keeper
@@ -302,9 +302,9 @@ class Watch:
             text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
             atomic_write_text(self.folder / "calibration.json", text + "\n")
         with self._progress.stage("Storing"):
-            tree = store_mission(self.folder, result, attributes)
+            groups = store_mission(self.folder, result, attributes)
             figures = self._figures(counts, turns)
-            figures += summarise(result, knowledge.draws, values_of(tree, "filtered", "reward_mean"))
+            figures += summarise(result, knowledge.draws, groups["filtered"]["reward_mean"].values)
             heading = {
                 "scenario": mission.name, "title": mission.title, "seed": mission.seed, "steps": turns,
                 "control": control_changes(

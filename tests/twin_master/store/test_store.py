@@ -17,7 +17,7 @@ from twin_master.mission.loop import fly
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.results import to_datatree
+from twin_master.store.results import groups_of
 from twin_master.store.summary import Figure
 from twin_master.store.tables import tables_of
 from twin_master.store.writing import read_run, store_mission, write_run, write_summary
