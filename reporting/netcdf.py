@@ -10,7 +10,6 @@ import faulthandler
 import gc
 import os
 import pickle
-import resource
 import signal
 import warnings
 from pathlib import Path
@@ -94,6 +93,8 @@ def _groups(path: Path) -> dict[str, xr.Dataset] | str:
 
 def _limit(size: int) -> None:
     """Let the kernel end this process when it takes more time or memory than a file of `size` bytes may."""
+    import resource
+
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
         signal.signal(number, signal.SIG_DFL)
     seconds = SECONDS + size // BYTES_IN_A_SECOND

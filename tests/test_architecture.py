@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import ast
 import io
+import subprocess
+import sys
 import tokenize
 import tomllib
 from bisect import bisect
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -72,6 +75,7 @@ LONGER: dict[str, str] = {
 """What may be longer, each with its reason."""
 
 
+@cache
 def modules() -> dict[str, Path]:
     """Return every module of the project by its dotted name."""
     found = {}
@@ -82,11 +86,24 @@ def modules() -> dict[str, Path]:
     return found
 
 
-def imported(name: str, path: Path, known: dict[str, Path]) -> Iterator[str]:
-    """Yield the project modules that `name` imports, in functions and for type checking too."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+@cache
+def nodes(path: Path) -> tuple[ast.Import | ast.ImportFrom | ast.FunctionDef | ast.AsyncFunctionDef, ...]:
+    """Return imports and functions of a module, wherever they stand."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    wanted = (ast.Import, ast.ImportFrom, ast.FunctionDef, ast.AsyncFunctionDef)
+    return tuple(node for node in ast.walk(tree) if isinstance(node, wanted))
+
+
+@cache
+def imported(name: str, path: Path) -> frozenset[str]:
+    """Return the project modules that `name` imports, in functions and for type checking too."""
+    return frozenset(other for other in _candidates(name, path) if other in modules() and other != name)
+
+
+def _candidates(name: str, path: Path) -> Iterator[str]:
+    for node in nodes(path):
         if isinstance(node, ast.Import):
-            candidates = [alias.name for alias in node.names]
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
@@ -94,12 +111,8 @@ def imported(name: str, path: Path, known: dict[str, Path]) -> Iterator[str]:
                 for _ in range(node.level - 1):
                     package = package.rpartition(".")[0]
                 base = f"{package}.{base}".rstrip(".")
-            candidates = [f"{base}.{alias.name}" for alias in node.names] + [base]
-        else:
-            continue
-        for candidate in candidates:
-            if candidate in known and candidate != name:
-                yield candidate
+            yield from (f"{base}.{alias.name}" for alias in node.names)
+            yield base
 
 
 @pytest.mark.parametrize("package", sorted(MAY_IMPORT))
@@ -109,7 +122,7 @@ def test_imports_run_downwards_only(package: str) -> None:
         f"{name} imports {other}"
         for name, path in known.items()
         if name.split(".")[0] == package
-        for other in imported(name, path, known)
+        for other in imported(name, path)
         if other.split(".")[0] not in MAY_IMPORT[package] | {package}
     ]
     assert not wrong
@@ -125,7 +138,7 @@ def test_rooms_import_rooms_below_them_only(package: str) -> None:
     wrong = [
         f"{name} imports {other}"
         for name, room in own.items()
-        for other in imported(name, known[name], known)
+        for other in imported(name, known[name])
         if other in own and order[own[other]] > order[room]
     ]
     assert not wrong
@@ -135,7 +148,7 @@ def test_no_two_files_import_each_other_in_a_circle() -> None:
     known = modules()
     # A package's __init__ re-exports its files, and its files never need it: leave it out of the graph.
     graph = {
-        name: {o for o in imported(name, path, known) if known[o].name != "__init__.py"}
+        name: {o for o in imported(name, path) if known[o].name != "__init__.py"}
         for name, path in known.items()
         if path.name != "__init__.py"
     }
@@ -160,28 +173,53 @@ def test_modules_and_functions_are_short_or_say_why_not() -> None:
         place = path.relative_to(ROOT).as_posix()
         if text.count("\n") > LONGEST_MODULE:
             long[place] = text.count("\n")
-        nodes = list(ast.walk(ast.parse(text)))
-        lines = sorted(code_lines(text, nodes))
-        for node in nodes:
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                length = bisect(lines, node.end_lineno or 0) - bisect(lines, node.lineno - 1)
-                if length > LONGEST_FUNCTION:
-                    long[f"{place}:{node.name}"] = length
+        functions = [node for node in nodes(path) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+        # Most are short with their comments, too.
+        functions = [node for node in functions if (node.end_lineno or 0) - node.lineno >= LONGEST_FUNCTION]
+        lines = sorted(code_lines(text)) if functions else []
+        for node in functions:
+            length = bisect(lines, node.end_lineno or 0) - bisect(lines, node.lineno - 1)
+            if length > LONGEST_FUNCTION:
+                long[f"{place}:{node.name}"] = length
     assert {place: length for place, length in long.items() if place not in LONGER} == {}
     assert not set(LONGER) - set(long), "no longer long"
 
 
-def code_lines(text: str, nodes: list[ast.AST]) -> set[int]:
+def code_lines(text: str) -> set[int]:
     """Return the rows of a module that hold code: no comment, no docstring, not blank."""
     ignored = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
     rows: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type not in ignored:
             rows.update(range(token.start[0], token.end[0] + 1))
-    for node in nodes:
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):  # a docstring
             rows.difference_update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
     return rows
+
+
+def test_modules_of_posix_alone_are_imported_where_they_are_used() -> None:
+    posix = {"fcntl", "grp", "pwd", "resource", "termios"}
+    wrong = [
+        name
+        for name, path in modules().items()
+        for node in nodes(path)
+        if not node.col_offset  # neither in a function nor after a question
+        and isinstance(node, ast.Import)
+        and posix & {item.name for item in node.names}
+    ]
+    assert not wrong
+
+
+@pytest.mark.long
+def test_every_module_is_imported_where_there_is_no_posix() -> None:
+    code = (
+        "import importlib, sys\n"
+        "sys.modules.update(dict.fromkeys(['fcntl', 'grp', 'pwd', 'resource', 'termios']))\n"
+        "for name in sys.argv[1:]: importlib.import_module(name)"
+    )
+    names = [name for name in modules() if not name.endswith("__main__")]
+    subprocess.run([sys.executable, "-c", code, *names], check=True)
 
 
 def test_every_package_has_its_own_room_in_the_tests() -> None:

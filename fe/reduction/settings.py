@@ -10,10 +10,33 @@ import numpy.typing as npt
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced_arrays import MOST_ANCHORS
 
-from .modal_basis import MOST_GRID_REGIONS, ModalSettings
-
 FloatArray = npt.NDArray[np.float64]
 Range = tuple[float, float]
+
+MOST_GRID_REGIONS = 3
+"""Regions up to which the states that are looked at form a full grid; with more, they are chosen."""
+
+
+@dataclass(frozen=True)
+class ModalSettings:
+    """How many modes are kept and how well.
+
+    Attributes
+    ----------
+    mode_count : int
+        Modes that the reduced model returns.
+    residual_tolerance : float
+        Relative residual of the sampled modes in the working basis; frequencies err by about its square.
+    frequency_tolerance : float
+        Relative error of any frequency that compression may add.
+    most_corrections : int
+        Limit of Davidson corrections for one state.
+    """
+
+    mode_count: int = 6
+    residual_tolerance: float = 3e-3
+    frequency_tolerance: float = 1e-5
+    most_corrections: int = 12
 
 
 @dataclass(frozen=True)

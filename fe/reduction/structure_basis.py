@@ -20,8 +20,8 @@ from fe.structure.affine import AffineStructure
 
 from .certified_basis import AffineProblem, Judgement, State, StaticReduction, greedy
 from .compression import compressed, fewest_directions
-from .modal_basis import ModalSettings, ModalState, loss_corners, modal_basis
-from .settings import TOGETHER, default_anchors, loss_splits, remaining_levels
+from .modal_basis import ModalState, loss_corners, modal_basis
+from .settings import TOGETHER, ModalSettings, default_anchors, loss_splits, remaining_levels
 from .stages import Progress, stage_of
 
 FloatArray = npt.NDArray[np.float64]

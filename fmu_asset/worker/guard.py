@@ -6,7 +6,7 @@ never use it (Java, .NET, CUDA, the stacks of threads); under either resource li
 the FMU, which then crashes somewhere, and nobody could say why.
 """
 
-import resource
+import os
 import signal
 
 LARGEST_FILE = 2 * 1024**3
@@ -15,6 +15,8 @@ LARGEST_FILE = 2 * 1024**3
 
 def restrict() -> None:
     """End an FMU that fills the disk."""
+    import resource
+
     _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     limit = LARGEST_FILE if hard == resource.RLIM_INFINITY else min(LARGEST_FILE, hard)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
@@ -26,6 +28,6 @@ def resident_memory(process: int) -> int | None:
     """Return the resident memory of a process [bytes], or None if it is gone or the system does not say."""
     try:
         with open(f"/proc/{process}/statm", "rb") as file:  # noqa: PTH123 - half the time of Path.open
-            return int(file.read().split()[1]) * resource.getpagesize()
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, IndexError, ValueError):
         return None

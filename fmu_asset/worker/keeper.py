@@ -9,7 +9,6 @@ and from the twin it goes off when the thread that started the worker ends, not 
 
 import ctypes
 import os
-import resource
 import select
 import signal
 import time
@@ -35,6 +34,8 @@ def keep(incoming: int, outgoing: int, scratch: str, shared: str) -> NoReturn:
     scratch, shared : str
         Folder of the worker, and of the extracted FMU; the twin removes them unless it is dead.
     """
+    import resource
+
     twin, keeper = os.getppid(), os.getpid()
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     prctl = ctypes.CDLL(None).prctl

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def frequencies_observed(scenario: Scenario) -> int:
     """Return how many natural frequencies a scenario observes; raises `MissionInputError` for too many."""
-    from fe.reduction.modal_basis import ModalSettings
+    from fe.reduction.settings import ModalSettings
 
     if scenario.observation.role != "frequency":
         return 0
@@ -29,7 +29,7 @@ def frequencies_observed(scenario: Scenario) -> int:
 
 def check_observed(scenario: Scenario, design: "StructureDesign") -> None:
     """Refuse observations that a structure does not have; raises `MissingObservationModelError`."""
-    from fe.reduction.modal_basis import ModalSettings
+    from fe.reduction.settings import ModalSettings
 
     known = {
         "strain": len(design.gauge),

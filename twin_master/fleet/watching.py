@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import resource
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -147,6 +146,8 @@ class FleetWatch:
         self.closing.callback(os.close, _held(fleet, folder))
         known = folder / STATE_NAME
         self._told_before = _assets_of(read_json(known, RunFolderExistsError)) if known.is_file() else {}
+        import resource
+
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (limits[1], limits[1]))  # three files for each asset
 

@@ -20,9 +20,14 @@ from fe.full.affine import affine_sum
 from fe.full.operators import AffineOperators
 from fe.full.subspace import Norm, OrthonormalBasis, conjugate_gradients, triangular_factors
 from fe.reduction.compression import compressed, relative_bound
-from fe.reduction.modal_basis import ModalSettings
 from fe.reduction.reduced_basis import Reduction, reduce_model
-from fe.reduction.settings import ReductionSettings, loss_splits, remaining_levels, training_set
+from fe.reduction.settings import (
+    ModalSettings,
+    ReductionSettings,
+    loss_splits,
+    remaining_levels,
+    training_set,
+)
 from fe.runtime.errors import ReductionError, SolutionError
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import region_names

@@ -1,0 +1,82 @@
+"""Files of groups are those that xarray writes, and are written without it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from reporting.groups import Group, Variable, write_groups
+
+SIZES = {"step": 4, "sensor": 3, "state": 2}
+_TYPES = ("f8", "f4", "i8", "i1", "U5")
+_NAMES = st.text("abcxyz", min_size=1, max_size=6).map("v_{}".format)
+
+
+@st.composite
+def variables(draw: st.DrawFn, axes: tuple[str, ...]) -> Variable:
+    """Draw a variable of some axes."""
+    values = np.arange(np.prod([SIZES[axis] for axis in axes], dtype=int)) * draw(st.integers(1, 5))
+    shaped = values.reshape([SIZES[axis] for axis in axes]).astype(draw(st.sampled_from(_TYPES)))
+    attrs = {"units": "1", "long_name": draw(st.text("abc äµ", max_size=9))}
+    return Variable(axes, shaped, attrs)
+
+
+@st.composite
+def group(draw: st.DrawFn) -> Group:
+    """Draw a group: some axes have labels, others have coordinates beside them."""
+    axes = st.lists(st.sampled_from(list(SIZES)), unique=True, max_size=3).map(tuple)
+    told = draw(st.dictionaries(_NAMES, axes.flatmap(variables), min_size=1, max_size=4))
+    used = {axis for variable in told.values() for axis in variable.dims}
+    coords = {axis: draw(variables((axis,))) for axis in sorted(used) if draw(st.booleans())}
+    beside = {f"w_{axis}": draw(variables((axis,))) for axis in sorted(used) if draw(st.booleans())}
+    return Group(told, {**coords, **beside}, {"parameter": "e"} if draw(st.booleans()) else {})
+
+
+def as_xarray(groups: dict[str, Group], attrs: dict[str, object]) -> xr.DataTree:
+    """Return the same for xarray."""
+
+    def taken(content: object) -> dict[str, xr.Variable]:
+        assert isinstance(content, dict)
+        return {name: xr.Variable(item.dims, item.values, item.attrs) for name, item in content.items()}
+
+    datasets = {
+        name: xr.Dataset(taken(item.variables), taken(item.coords), item.attrs)
+        for name, item in groups.items()
+    }
+    return xr.DataTree.from_dict({"/": xr.Dataset(attrs=attrs), **datasets})
+
+
+@settings(max_examples=25)
+@given(groups=st.dictionaries(st.sampled_from(["one", "two", "three"]), group(), min_size=1))
+def test_the_bytes_are_those_of_xarray(
+    groups: dict[str, Group], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("groups")
+    attrs: dict[str, object] = {"title": "a tree", "seed": 7}
+    write_groups(folder / "ours.nc", groups, attrs)
+    as_xarray(groups, attrs).to_netcdf(folder / "theirs.nc", engine="h5netcdf")
+    assert (folder / "ours.nc").read_bytes() == (folder / "theirs.nc").read_bytes()
+
+
+def test_an_empty_axis_reads_back(tmp_path: Path) -> None:
+    empty = Variable(("step",), np.zeros(0), {"units": "1"})
+    write_groups(tmp_path / "a.nc", {"one": Group({"v": empty}, {"step": empty})}, {})
+    with xr.open_datatree(tmp_path / "a.nc", engine="h5netcdf") as tree:
+        assert tree["one"]["v"].shape == (0,)
+
+
+def test_a_run_is_flown_and_stored_without_heavy_libraries() -> None:
+    """`uav-twin run --no-report` reads the program's modules and none of these."""
+    code = (
+        "import sys, twin_master.workflow, twin_master.assets.design_source, calibration.static.kept\n"
+        "heavy = {'xarray', 'pandas', 'dask', 'distributed', 'zarr', 'matplotlib', 'bokeh', 'skfem', 'pymor',"
+        " 'meshio', 'scipy.interpolate', 'scipy.optimize', 'scipy.sparse'}\n"
+        "print(*sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
