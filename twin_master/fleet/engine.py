@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -81,6 +81,10 @@ def flown(engine: Engine, pieces: Iterable[Piece], progress: Progress) -> Iterat
         The scheduler does not answer, or workers run another version of the program.
     """
     pieces = iter(pieces)
+    first = next(pieces, None)
+    if first is None:
+        return  # all is done: nobody need be called
+    pieces = chain([first], pieces)
     if engine.cluster is None and not engine.workers:
         for piece in pieces:
             yield piece, fly_shard(piece.kit(), piece.members)

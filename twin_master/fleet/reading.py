@@ -129,10 +129,12 @@ class Outcomes:
 
 
 def _share(hits: NDArray[np.bool_]) -> Estimated:
+    """Return a share; its error is that of its posterior under a uniform prior: 0 of 20 is not 0 ± 0."""
     if not len(hits):
         return Estimated(float("nan"), float("nan"))
-    share = float(np.mean(hits))
-    return Estimated(share, float(np.sqrt(share * (1.0 - share) / len(hits))))
+    yes, no = np.sum(hits) + 1.0, np.sum(~hits) + 1.0  # of the Beta distribution
+    error = np.sqrt(yes * no / (yes + no + 1.0)) / (yes + no)
+    return Estimated(float(np.mean(hits)), float(error))
 
 
 def _mean(values: Float) -> Estimated:

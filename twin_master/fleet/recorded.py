@@ -57,7 +57,11 @@ def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Fl
         turns = len(beliefs.observed)
         most = scenario.mission.steps
         if not 0 < turns <= most:
-            failure[number] = f"it has {turns} turns, not 1 to {most}: set `steps` of the group."
+            failure[number] = (
+                f"it has {turns} turns, and {most} at most are flown: set `steps` of the group."
+                if turns
+                else "its recording has no turn yet."
+            )
             continue
         flights.observed[number, :turns] = beliefs.observed
         flights.control_index[number, :turns] = beliefs.control_index

@@ -38,6 +38,11 @@ Float = NDArray[np.float64]
 REPORT_NAME = "report.html"
 NEXT, FAILURES = 15, 10
 """Rows of the tables of who needs attention next, and of failures."""
+LOST = "{} of {} assets failed in flight; their twins end there."
+BANDS = (
+    "Bands hold 90 and 50 % of the assets; the line is the median of the filtered means, "
+    "the dash-dotted one that of the true states, where they are known."
+)
 
 
 def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
@@ -81,7 +86,9 @@ def write_fleet_report(folder: Path | str) -> Path:
     page.add_section("The fleet")
     _figures(page, groups)
     if failures:
-        add_failures(page, failures, twins, f"All of them stand in {RESULT_NAME}.")
+        add_failures(
+            page, failures, LOST.format(len(failures), twins), f"All of them stand in {RESULT_NAME}."
+        )
     lessons = folder / LESSONS_NAME
     if lessons.is_file():
         page.add_section("Learnt across the fleet")
@@ -102,15 +109,15 @@ def _figures(page: Page, groups: "dict[str, xr.Dataset]") -> None:
     page.add_table(Table(columns, rows), caption, title="How the twins fared")
 
 
-def add_failures(page: Page, failures: dict[str, str], twins: int, caption: str) -> None:
-    """Add what ended flights, by cause."""
-    page.add_notice(f"{len(failures)} of {twins} assets failed in flight; their twins end there.")
+def add_failures(page: Page, failures: dict[str, str], notice: str, caption: str) -> None:
+    """Add what ended flights or watches, by cause."""
+    page.add_notice(notice)
     kinds = Counter(failures.values()).most_common(FAILURES)
     rows = []
     for sentence, count in kinds:
         names = [name for name, text in failures.items() if text == sentence]
         rows.append([sentence, str(count), ", ".join(names[:3]) + (", ..." if count > 3 else "")])
-    columns = [Column("what ended the flight"), Column("assets", numeric=True), Column("such as")]
+    columns = [Column("cause"), Column("assets", numeric=True), Column("such as")]
     page.add_table(Table(columns, rows), caption, title="Failures")
 
 
@@ -155,13 +162,12 @@ def _group(page: Page, folder: Path, record: dict[str, Any], group: "xr.Dataset"
         page.add_figure(
             style.to_svg(map_figure(scenario, last, failed, unit)),
             f"Filtered mean after the last {scenario.mission.step_name}, one cell for each asset, "
-            f"the worst first by the sum of its states. Grey: {failed} that failed in flight.",
+            f"the worst first by the sum of its states.{grey(failed)}",
             title="The assets by health",
         )
         page.add_figure(
             style.to_svg(course_figure(scenario, mean, scale * group["state"].values[flown], unit)),
-            "Bands hold 90 and 50 % of the assets; the line is the median of the filtered means, "
-            "the dash-dotted one that of the true states, where they are known.",
+            BANDS,
             title="Health over time",
         )
     _attention(page, folder, record, group, flown)
@@ -173,6 +179,11 @@ def scale_of(scenario: Scenario) -> tuple[float, str]:
     if units == {"1"}:
         return 100.0, "%"
     return 1.0, units.pop() if len(units) == 1 else "SI"
+
+
+def grey(failed: int) -> str:
+    """Return what the grey cells of a map are, where it has some."""
+    return f" Grey: {failed} that failed in flight." if failed else ""
 
 
 def map_figure(scenario: Scenario, last: Float, failed: int, unit: str) -> Figure:

@@ -26,7 +26,16 @@ from twin_master.fleet.flight import KIND as FLOWN_KIND
 from twin_master.fleet.lessons import LESSONS_NAME
 from twin_master.fleet.outcome import FAILED, FLOWN
 from twin_master.fleet.reading import last_turns
-from twin_master.fleet.report import add_failures, add_lessons, course_figure, map_figure, scale_of
+from twin_master.fleet.report import (
+    BANDS,
+    LOST,
+    add_failures,
+    add_lessons,
+    course_figure,
+    grey,
+    map_figure,
+    scale_of,
+)
 from twin_master.fleet.store import DONE_NAME, open_group
 from twin_master.fleet.watching import KIND as WATCHED_KIND
 from twin_master.fleet.watching import STATE_NAME
@@ -95,15 +104,20 @@ def fleet_view(folder: Path) -> str:
 def _add_watched(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
     path = folder / STATE_NAME
     state = read_json(path, FleetError) if path.is_file() else {"assets": {}, "failures": {}}
-    assets = {name: told for name, told in state["assets"].items() if told["turn"] is not None}
+    known, failures = state["assets"], state["failures"]
+    assets = {name: told for name, told in known.items() if told["turn"] is not None}
+    silent = sorted(known.keys() - assets.keys() - failures.keys())
     turns = sum(told["turn"] + 1 for told in assets.values())
-    alarms = sum(told["alarms"] for told in assets.values())
-    told = [(str(len(assets)), "assets"), (str(turns), "turns"), (str(alarms), "alarms")]
-    page.add_highlights([*told, (str(len(state["failures"])), "not watched")])
-    if state["failures"]:
-        add_failures(
-            page, state["failures"], len(assets) + len(state["failures"]), f"They stand in {STATE_NAME}."
-        )
+    totals = [sum(told.get(name, 0) for told in known.values()) for name in ("alarms", "refused")]
+    counts = [len(known), turns, *totals, len(failures)]
+    titles = ("assets", "turns", "alarms", "messages refused", "not watched")
+    page.add_highlights([(str(count), title) for count, title in zip(counts, titles, strict=True)])
+    if failures:
+        notice = f"{len(failures)} of {counted(len(known | failures), 'asset')} are not watched."
+        add_failures(page, failures, notice, f"They stand in {STATE_NAME}.")
+    if silent:
+        named = ", ".join(silent[:WORST]) + ", ..." * (len(silent) > WORST)
+        page.add_notice(f"Without a turn yet: {counted(len(silent), 'asset')} ({named}).")
     for record in fleet["groups"]:
         scenario = Scenario.model_validate(record["scenarios"][0])
         own = {name: told for name, told in assets.items() if name.startswith(f"{record['name']}/")}
@@ -129,7 +143,8 @@ def _add_flown(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
     )
     failures = _failures(folder)
     if failures:
-        add_failures(page, failures, len(status), "They stand in fleet.json once the fleet has flown.")
+        notice = LOST.format(len(failures), len(status))
+        add_failures(page, failures, notice, "They stand in fleet.json once the fleet has flown.")
     for record in fleet["groups"]:
         group, scenario = groups[record["name"]], Scenario.model_validate(record["scenarios"][0])
         known = group["status"].values
@@ -160,14 +175,12 @@ def _add_group(
     scale, unit = scale_of(scenario)
     with style.publication_style():
         drawn = map_figure(scenario, scale * standing.mean, failed, unit)
-    caption = (
-        f"Filtered means, one cell for each asset, the worst first. Grey: {failed} that failed in flight."
-    )
+    caption = f"Filtered means, one cell for each asset, the worst first.{grey(failed)}"
     page.add_figure(style.to_svg(drawn), caption, title="The assets by health")
     if state is not None and mean is not None:
         with style.publication_style():
             drawn = course_figure(scenario, scale * mean, scale * state, unit)
-        page.add_figure(style.to_svg(drawn), "Bands hold 90 and 50 % of the assets.", title="Over time")
+        page.add_figure(style.to_svg(drawn), BANDS, title="Over time")
     order = np.lexsort((-standing.mean.sum(axis=1), -standing.alarms))[:WORST]
     rows, told = [], bool(standing.alarms.any())
     for row in order.tolist():

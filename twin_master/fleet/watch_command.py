@@ -72,6 +72,8 @@ def watch(
         for number, handler in before.items():
             signal.signal(number, handler)
     console.say(_heading(watched) + f": {folder}.")
+    if watched.failures and not watched.assets:
+        raise typer.Exit(1)
 
 
 class _Console:
@@ -126,8 +128,11 @@ def _heading(watched: "FleetWatch") -> str:
     assets = watched.assets.values()
     turns = sum(asset.keep.twin.turns for asset in assets)
     alarms = sum(len(asset.alarms) for asset in assets)
-    lost = f", {len(watched.failures)} not watched" if watched.failures else ""
-    return f"{counted(len(assets), 'asset')}, {counted(turns, 'turn')}, {counted(alarms, 'alarm')}{lost}"
+    refused = sum(asset.keep.intake.counts.rejected for asset in assets)
+    told = [counted(len(assets), "asset"), counted(turns, "turn"), counted(alarms, "alarm")]
+    told += [f"{counted(refused, 'message')} refused"] * (refused > 0)
+    told += [f"{len(watched.failures)} not watched"] * bool(watched.failures)
+    return ", ".join(told)
 
 
 def worst_first(assets: "list[WatchedAsset]") -> "list[WatchedAsset]":

@@ -79,7 +79,7 @@ class WatchedAsset:
         """Return how it stands, for the view."""
         told = self.decision or {}
         known = {key: told.get(key) for key in ("turn", "control", "next_control", "probability", "health")}
-        return known | {"alarms": len(self.alarms)}
+        return known | {"alarms": len(self.alarms), "refused": self.keep.intake.counts.rejected}
 
 
 class FleetWatch:
@@ -105,7 +105,7 @@ class FleetWatch:
     Raises
     ------
     FleetError, MissionInputError
-        A group is flown and not watched; an address is wrong.
+        A group is flown and not watched, or has no recording; an address is wrong.
     RunFolderExistsError, NotResumableError
         The folder holds something else, or was begun with another version.
 
@@ -228,8 +228,8 @@ class FleetWatch:
         asset.tell(decision)
         asset.alarms |= {notice["sentence"] for notice in decision["notices"]}
 
-    def advance(self, asset: WatchedAsset) -> int:
-        """Take in what has come of an asset; return the number of turns."""
+    def advance(self, asset: WatchedAsset, most: int | None = None) -> int:
+        """Take in what has come of an asset, in so many turns at most; return the number of turns."""
         count = 0
         if self.done(asset):
             return count
@@ -237,7 +237,7 @@ class FleetWatch:
             for decision in asset.watch.decisions(asset.keep.intake, asset.keep):
                 self._decided(asset, decision)
                 count += 1
-                if count == TURNS_AT_ONCE or self.done(asset) or self.asked:
+                if count == most or self.done(asset) or self.asked:
                     break
         except IN_FLIGHT as error:
             self._lost(asset.name, error)
@@ -304,6 +304,10 @@ class _Files:
 
     def __init__(self, fleet: FleetWatch, group: Group, follow: bool) -> None:
         self._fleet, self._group, self._follow = fleet, group, follow
+        if not follow and not recordings(group.observations):
+            raise FleetError(
+                f"no recording fits {group.observations}; what is still to come is waited for with --follow."
+            )
         self._assets: dict[Path, WatchedAsset | None] = {}
         self._searched = -SEARCH_SECONDS
 
@@ -326,7 +330,7 @@ class _Files:
             if self._fleet.asked:
                 break
             if asset is not None:
-                turns += self._fleet.advance(asset)
+                turns += self._fleet.advance(asset, TURNS_AT_ONCE)
         return turns
 
     def _feed(self, path: Path, scenario: Scenario) -> Feed:

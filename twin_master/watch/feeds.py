@@ -57,6 +57,8 @@ class CsvFeed:
                 names = _cells(file.readline(LARGEST_MESSAGE))
         except (OSError, ValueError) as error:
             raise MissionInputError(f"{path} cannot be read as CSV: {error}.") from None
+        if not any(names):
+            raise MissionInputError(f"{path} is empty: a CSV file begins with a line of its columns.")
         self._names = ["turn" if name in _TURN_COLUMNS else name for name in names]
         sensors = [place for place, name in enumerate(self._names) if name not in _OTHERS and name[:1] != "_"]
         try:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.stats
 import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -243,8 +244,8 @@ def test_standard_errors_of_a_study() -> None:
         credible=np.r_[np.zeros(25), np.ones(25)],
     )
     assert study.within(2).value == pytest.approx(40 / 45)
-    assert study.within(2).error == pytest.approx(np.sqrt(40 / 45 * 5 / 45 / 45))
-    assert study.early_fallback.error == pytest.approx(np.sqrt(0.2 * 0.8 / 50))
+    assert study.within(2).error == pytest.approx(scipy.stats.beta(41, 6).std())
+    assert study.early_fallback.error == pytest.approx(scipy.stats.beta(11, 41).std())
     assert study.evidence.value == 3.0
     assert study.evidence.error == 0.0
     assert study.credible_share.error == pytest.approx(0.5 / 7.0)

@@ -32,7 +32,7 @@ from twin_master.fleet.plan import ensemble, load_fleet
 from twin_master.fleet.reading import fleet_groups, group_figures
 from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.view import fleet_view, serve_fleet
-from twin_master.fleet.watching import FleetWatch, WatchedAsset
+from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch, WatchedAsset
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import file_feed
@@ -143,10 +143,15 @@ def test_files_that_grow(
 def test_an_asset_is_lost_alone(fleet_file: Path, alone: list[bytes], tmp_path: Path) -> None:
     (tmp_path / "logs" / "wing-0.csv").write_text("turn,colour\n0,red\n")
     (tmp_path / "logs" / "not a name!.csv").write_text("turn\n")
+    (tmp_path / "logs" / "void.csv").write_text("")
     fleet = watched(fleet_file, tmp_path / "out")
-    assert set(fleet.failures) == {"north/wing-0", "north/not a name!"}
+    assert set(fleet.failures) == {"north/wing-0", "north/not a name!", "north/void"}
     assert "colour" in fleet.failures["north/wing-0"]
+    assert "void.csv is empty" in fleet.failures["north/void"]
     assert journals(tmp_path / "out") == alone[1:]
+    with pytest.raises(FleetError, match="no recording fits"):
+        FleetWatch(load_fleet(fleet_of(tmp_path, "none/*.csv")), tmp_path / "none", print, print)
+    fleet_of(tmp_path, "logs/*.csv")
     fleet_file.write_text(fleet_file.read_text().replace('observations = "logs/*.csv"', "count = 2"))
     with pytest.raises(FleetError, match="north has none"):
         FleetWatch(load_fleet(fleet_file), tmp_path / "flown", print, print)
@@ -198,6 +203,39 @@ def test_a_topic_for_each_asset(
                 del record["intake"]
         assert found == wanted
     assert {topic for topic, _ in heard} == {"wings/wing-0/decision", "wings/wing-2/decision"}
+
+
+@pytest.mark.skipif(shutil.which("mosquitto") is None, reason="no mosquitto")
+def test_a_topic_that_jumps_ahead_and_is_left_alone(
+    fleet_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("UAV_TWIN_MQTT_PASSWORD", PASSWORD)
+    broker = Mosquitto(tmp_path)
+    fleet_of(tmp_path, f"mqtt://wing@127.0.0.1:{broker.port}/wings/+")
+    publisher, notes, told = broker.client("publisher"), list[str](), list[tuple[str, int, int]]()
+    last = 2 * TURNS_AT_ONCE  # a single message that brings more turns than a file is read at once
+
+    def send() -> None:
+        if notes:
+            for turn in (0, *range(last, last + 20)):
+                record = {"turn": turn, "control": "2g", "strain": [1e-3] * 24}
+                publisher.publish("wings/wing-0", json.dumps(record), qos=1)
+            publisher.publish("wings/last", json.dumps({"turn": 0, "control": "2g"}), qos=1)
+            notes.clear()
+
+    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+        told.append((asset.name, decision["turn"], decision["lost_sensors"]))
+        fleet.asked = asset.name == "north/last"
+
+    fleet = FleetWatch(
+        load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append, turns=last + 1
+    )
+    fleet.run(send)
+    broker.stop()
+    lost = [0, *[24] * (last - 1), 0]
+    assert told == [*(("north/wing-0", turn, lost[turn]) for turn in range(last + 1)), ("north/last", 0, 24)]
+    inboxes = fleet._sources[0]._inboxes  # type: ignore[union-attr]
+    assert [len(inbox.came) for inbox in inboxes.values() if inbox] == [0, 0]  # nineteen came too late
 
 
 def test_the_command(fleet_file: Path, tmp_path: Path) -> None:
@@ -263,6 +301,7 @@ def test_recordings_teach_what_the_flights_taught(fleet_file: Path, tmp_path: Pa
 
 def test_the_page_of_a_fleet(fleet_file: Path, tmp_path: Path) -> None:
     (tmp_path / "logs" / "wing-0.csv").write_text("turn,colour\n0,red\n")
+    (tmp_path / "logs" / "wing-9.csv").write_text("turn,control\n")
     out = tmp_path / "out"
     watched(fleet_file, out)
     fly_fleet(ensemble(str(tmp_path / "wing.toml"), range(60)), tmp_path / "flown", Engine(0))
@@ -288,6 +327,9 @@ def test_the_page_of_a_fleet(fleet_file: Path, tmp_path: Path) -> None:
         assert status == 200
         assert "wing-1" in page
         assert "colour" in page  # why the other one is not watched
+        assert "1 of 4 assets are not watched" in page
+        assert "Without a turn yet: 1 asset (north/wing-9)" in page
+        assert "<strong>1</strong><span>messages refused" in page
         assert asked("/version") == (200, "0")
         assert asked("/", "evil.example")[0] == 404
         state = json.loads((out / "watched.json").read_text())
