@@ -20,7 +20,7 @@ def model_description3(
     model_name: str,
     units: Sequence[Unit],
 ) -> bytes:
-    """Return modelDescription.xml of an FMI 3.0 co-simulation FMU in C.
+    """Return modelDescription.xml of an FMI 3.0 FMU in C: for model exchange if local variables are in it.
 
     Parameters
     ----------
@@ -48,9 +48,14 @@ def model_description3(
         generationTool="uav-twin",
         variableNamingConvention="structured",
     )
-    SubElement(
+    heads = {array.rows[0].reference: array for array in arrays}
+    inner = {row.reference for array in arrays for row in array.rows[1:]}
+    rows = [row for row in table if row.reference not in inner]
+    local = [row for row in rows if row.causality == "local"]
+    states, rates = local[: len(local) // 2], local[len(local) // 2 :]
+    interface = SubElement(
         root,
-        "CoSimulation",
+        "ModelExchange" if states else "CoSimulation",
         modelIdentifier=identifier,
         needsExecutionTool="false",
         canBeInstantiatedOnlyOncePerProcess="false",
@@ -58,8 +63,9 @@ def model_description3(
         canSerializeFMUState="true",
         providesDirectionalDerivatives="true",
         providesAdjointDerivatives="true",
-        canHandleVariableCommunicationStepSize="true",
     )
+    if not states:
+        interface.set("canHandleVariableCommunicationStepSize", "true")
     add_units(root, units)
     types = SubElement(root, "TypeDefinitions")
     for enumeration in ENUMERATIONS:
@@ -72,17 +78,20 @@ def model_description3(
     SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="50.0", stepSize="1.0")
     variables = SubElement(root, "ModelVariables")
     structure = SubElement(root, "ModelStructure")
-    heads = {array.rows[0].reference: array for array in arrays}
-    inner = {row.reference for array in arrays for row in array.rows[1:]}
-    outputs = []
-    for row in table:
-        if row.reference not in inner:
-            variables.append(_variable(row, heads.get(row.reference)))
-            if row.causality == "output":
-                outputs.append(str(row.reference))
-    for kind in ("Output", "InitialUnknown"):
-        for reference in outputs:
-            SubElement(structure, kind, valueReference=reference)
+    derived = {rate.reference: state.reference for state, rate in zip(states, rates, strict=True)}
+    for row in rows:
+        element = _variable(row, heads.get(row.reference))
+        if row.reference in derived:
+            element.set("derivative", str(derived[row.reference]))
+        variables.append(element)
+    outputs = [row for row in rows if row.causality == "output"]
+    for kind, unknown in (
+        ("Output", outputs),
+        ("ContinuousStateDerivative", rates),
+        ("InitialUnknown", [*outputs, *local]),
+    ):
+        for row in unknown:
+            SubElement(structure, kind, valueReference=str(row.reference))
     return _text(root)
 
 
@@ -95,7 +104,7 @@ def _variable(row: FmuVariable, array: ArrayVariable | None) -> Element:
         "causality": row.causality,
         "variability": row.variability,
     }
-    if row.causality in ("parameter", "output"):
+    if row.causality in ("parameter", "output", "local"):
         attributes["initial"] = "exact" if row.causality == "parameter" else "calculated"
     if row.enumeration is not None:
         attributes["declaredType"] = row.enumeration

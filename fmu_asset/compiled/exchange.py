@@ -8,7 +8,9 @@ from fmu_asset.slaves.variables import TRANSIENT, FmuVariable
 STATES = ("modal_displacement", "modal_velocity")
 
 
-def exchange_table(table: Sequence[FmuVariable], mode_count: int) -> tuple[FmuVariable, ...]:
+def exchange_table(
+    table: Sequence[FmuVariable], mode_count: int, *, arrays: bool = False
+) -> tuple[FmuVariable, ...]:
     """Return the table for model exchange.
 
     Parameters
@@ -17,6 +19,8 @@ def exchange_table(table: Sequence[FmuVariable], mode_count: int) -> tuple[FmuVa
         That of co-simulation.
     mode_count : int
         Number M of modes.
+    arrays : bool
+        Whether the rows are to become arrays, whose derivative is an array too.
 
     Returns
     -------
@@ -32,7 +36,8 @@ def exchange_table(table: Sequence[FmuVariable], mode_count: int) -> tuple[FmuVa
             row = replace(row, start=float(TRANSIENT))
         rows.append(row)
     states = [f"{name}[{mode}]" for name in STATES for mode in range(1, mode_count + 1)]
-    for name in (*states, *(f"der({state})" for state in states)):
+    rates = [f"der({name})[{mode}]" for name in STATES for mode in range(1, mode_count + 1)]
+    for name in (*states, *(rates if arrays else (f"der({state})" for state in states))):
         what = "Coordinate" if "displacement" in name else "Rate of the coordinate"
         text = f"{what} of mode {name.partition('[')[2].partition(']')[0]}, mass-normalised"
         rows.append(

@@ -94,7 +94,7 @@ def compiled_members(
         Version of FMI: the same sources but for its functions. In 3 numbered variables, and inputs and
         outputs such as `health.z1`, pass as arrays.
     interface : {"co-simulation", "model-exchange"}
-        How it is run; model exchange in FMI 2.
+        How it is run; in model exchange the modes are states.
 
     Returns
     -------
@@ -108,7 +108,7 @@ def compiled_members(
     """
     sources = _sources(fmi)
     if interface == "model-exchange":
-        table = exchange_table(table, model.mode_count)
+        table = exchange_table(table, model.mode_count, arrays=fmi == 3)
     if fmi == 3:
         table = (*table, replace(_TIME, reference=len(table)))
     arrays = arrays_of(table) if fmi == 3 else ()

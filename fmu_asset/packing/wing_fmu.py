@@ -97,7 +97,7 @@ def build_fmu(
     fmi : {2, 3}
         Version of FMI; 3 for the kinds in C.
     interface : {"co-simulation", "model-exchange"}
-        How it is run; model exchange (the modes as states) for the kinds in C, in FMI 2.
+        How it is run; model exchange (the modes as states) for the kinds in C.
     platforms : sequence of {"linux64", "win64"}
         What the binaries of a compiled one are for; the latter needs a cross compiler.
     replace : bool
@@ -248,8 +248,6 @@ def check_version(kind: FmuKind, fmi: FmiVersion, interface: Interface = "co-sim
             f"The FMU of the kind 'python' is of FMI 2.0 for co-simulation, but FMI {fmi}.0 for {interface} "
             "was asked for: build the kind 'compiled' or 'source'."
         )
-    if fmi == 3 and interface == "model-exchange":
-        raise FmuBuildError("Model exchange is offered in FMI 2.0 only: build it with --fmi 2.")
 
 
 def start_values(model: ReducedModel, state: DigitalState) -> dict[str, float]:

@@ -13,6 +13,7 @@ import pytest
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.companions.build import build_companion
+from fmu_asset.compiled.package import FmiVersion
 from fmu_asset.packing.script import build_script_fmu
 from fmu_asset.packing.wing_fmu import build_fmu
 from scenarios import asset_scripts
@@ -36,7 +37,8 @@ def opinion(fmutool: str, fmu: Path) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize(
-    "name", ["python", "source", "fmi3", "exchange", *sorted(COMPANION_NAMES), *sorted(asset_scripts())]
+    "name",
+    ["python", "source", "fmi3", "exchange", "exchange3", *sorted(COMPANION_NAMES), *sorted(asset_scripts())],
 )
 def test_it_has_no_complaint(fmutool: str, name: str, model: ReducedModel, tmp_path: Path) -> None:
     target = tmp_path / f"{name}.fmu"
@@ -46,15 +48,16 @@ def test_it_has_no_complaint(fmutool: str, name: str, model: ReducedModel, tmp_p
         build_fmu(model, target, kind="source")
     elif name == "fmi3":
         build_fmu(model, target, kind="source", fmi=3)
-    elif name == "exchange":
-        build_fmu(model, target, kind="source", interface="model-exchange")
+    elif name in ("exchange", "exchange3"):
+        fmi: FmiVersion = 3 if name == "exchange3" else 2
+        build_fmu(model, target, kind="source", interface="model-exchange", fmi=fmi)
     elif name in COMPANION_NAMES:
         build_companion(name, target)
     else:
         build_script_fmu(asset_scripts()[name], target)
     code, said = opinion(fmutool, target)
     assert code == 0, said
-    assert f"seems to be compliant with FMI-{3 if name == 'fmi3' else 2}.0" in said
+    assert f"seems to be compliant with FMI-{3 if name in ('fmi3', 'exchange3') else 2}.0" in said
     assert "No semantic error" in said
     assert "ERROR" not in said
     assert "WARNING" not in said

@@ -1,4 +1,4 @@
-/* The functions of FMI 3.0 for co-simulation, on top of structure_instance. */
+/* The functions of FMI 3.0 for co-simulation or model exchange, on top of structure_instance. */
 #include "fmi3Functions.h"
 
 #include <stdlib.h>
@@ -35,22 +35,27 @@ fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean loggingOn, siz
     return fmi3OK;
 }
 
-static fmi3Instance refuse_interface(fmi3String name, fmi3InstanceEnvironment environment,
-                                     fmi3LogMessageCallback logMessage) {
+#define ONLY(INTERFACE) "this FMU is for " INTERFACE " only"
+#define OWN_INTERFACE (STRUCTURE_STATE_COUNT > 0 ? ONLY("model exchange") : ONLY("co-simulation"))
+
+static fmi3Instance open_instance(fmi3String name, fmi3String token, fmi3String folder, bool own,
+                                  fmi3InstanceEnvironment environment, fmi3LogMessageCallback logMessage) {
     const structure_host host = {log_message, (void (*)(void))logMessage, environment};
-    structure_log(&host, name == NULL ? "" : name, STRUCTURE_ERROR, "this FMU is for co-simulation only");
-    return NULL;
+    if (!own) {
+        structure_log(&host, name == NULL ? "" : name, STRUCTURE_ERROR, OWN_INTERFACE);
+        return NULL;
+    }
+    return structure_instance_open(&host, name, token, folder);
 }
 
 fmi3Instance fmi3InstantiateModelExchange(fmi3String instanceName, fmi3String instantiationToken,
                                           fmi3String resourcePath, fmi3Boolean visible, fmi3Boolean loggingOn,
                                           fmi3InstanceEnvironment instanceEnvironment,
                                           fmi3LogMessageCallback logMessage) {
-    (void)instantiationToken;
-    (void)resourcePath;
     (void)visible;
-    (void)loggingOn;
-    return refuse_interface(instanceName, instanceEnvironment, logMessage);
+    (void)loggingOn; /* refusals are always logged, and there is nothing else to log */
+    return open_instance(instanceName, instantiationToken, resourcePath, STRUCTURE_STATE_COUNT > 0,
+                         instanceEnvironment, logMessage);
 }
 
 fmi3Instance fmi3InstantiateScheduledExecution(fmi3String instanceName, fmi3String instantiationToken,
@@ -59,14 +64,12 @@ fmi3Instance fmi3InstantiateScheduledExecution(fmi3String instanceName, fmi3Stri
                                                fmi3LogMessageCallback logMessage, fmi3ClockUpdateCallback clockUpdate,
                                                fmi3LockPreemptionCallback lockPreemption,
                                                fmi3UnlockPreemptionCallback unlockPreemption) {
-    (void)instantiationToken;
-    (void)resourcePath;
     (void)visible;
     (void)loggingOn;
     (void)clockUpdate;
     (void)lockPreemption;
     (void)unlockPreemption;
-    return refuse_interface(instanceName, instanceEnvironment, logMessage);
+    return open_instance(instanceName, instantiationToken, resourcePath, false, instanceEnvironment, logMessage);
 }
 
 fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String instantiationToken,
@@ -78,17 +81,18 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String ins
                                          fmi3LogMessageCallback logMessage,
                                          fmi3IntermediateUpdateCallback intermediateUpdate) {
     (void)visible;
-    (void)loggingOn; /* refusals are always logged, and there is nothing else to log */
+    (void)loggingOn;
     (void)earlyReturnAllowed;
     (void)requiredIntermediateVariables;
     (void)intermediateUpdate;
-    const structure_host host = {log_message, (void (*)(void))logMessage, instanceEnvironment};
     if (eventModeUsed || nRequiredIntermediateVariables > 0) {
+        const structure_host host = {log_message, (void (*)(void))logMessage, instanceEnvironment};
         structure_log(&host, instanceName == NULL ? "" : instanceName, STRUCTURE_ERROR,
                       "this FMU has no event mode and no intermediate variables");
         return NULL;
     }
-    return structure_instance_open(&host, instanceName, instantiationToken, resourcePath);
+    return open_instance(instanceName, instantiationToken, resourcePath, STRUCTURE_STATE_COUNT == 0,
+                         instanceEnvironment, logMessage);
 }
 
 void fmi3FreeInstance(fmi3Instance instance) { structure_instance_free(instance_of(instance)); }
@@ -216,6 +220,81 @@ fmi3Status fmi3GetAdjointDerivative(fmi3Instance instance, const fmi3ValueRefere
         structure_adjoint_derivative(instance_of(instance), &pairs, seed, nSeed, sensitivity, nSensitivity));
 }
 
+/* ---------------------------------------------------------------- model exchange */
+
+fmi3Status fmi3EnterEventMode(fmi3Instance instance) {
+    if (STRUCTURE_STATE_COUNT == 0) {
+        return refuse(instance, "the FMU has no event mode");
+    }
+    instance_of(instance)->event_mode = true;
+    return fmi3OK;
+}
+
+fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *discreteStatesNeedUpdate,
+                                    fmi3Boolean *terminateSimulation, fmi3Boolean *nominalsOfContinuousStatesChanged,
+                                    fmi3Boolean *valuesOfContinuousStatesChanged, fmi3Boolean *nextEventTimeDefined,
+                                    fmi3Float64 *nextEventTime) {
+    *discreteStatesNeedUpdate = *terminateSimulation = *nominalsOfContinuousStatesChanged = fmi3False;
+    *valuesOfContinuousStatesChanged = *nextEventTimeDefined = fmi3False;
+    *nextEventTime = 0.0;
+    return status_of(structure_event(instance_of(instance), valuesOfContinuousStatesChanged));
+}
+
+fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance instance) {
+    instance_of(instance)->event_mode = false;
+    return fmi3OK;
+}
+
+fmi3Status fmi3CompletedIntegratorStep(fmi3Instance instance, fmi3Boolean noSetFMUStatePriorToCurrentPoint,
+                                       fmi3Boolean *enterEventMode, fmi3Boolean *terminateSimulation) {
+    (void)instance;
+    (void)noSetFMUStatePriorToCurrentPoint;
+    *enterEventMode = *terminateSimulation = fmi3False;
+    return fmi3OK;
+}
+
+fmi3Status fmi3SetTime(fmi3Instance instance, fmi3Float64 time) {
+    return status_of(structure_setup(instance_of(instance), time));
+}
+
+fmi3Status fmi3SetContinuousStates(fmi3Instance instance, const fmi3Float64 continuousStates[],
+                                   size_t nContinuousStates) {
+    return status_of(structure_set_states(instance_of(instance), continuousStates, nContinuousStates));
+}
+
+fmi3Status fmi3GetContinuousStates(fmi3Instance instance, fmi3Float64 continuousStates[], size_t nContinuousStates) {
+    return status_of(structure_get_states(instance_of(instance), continuousStates, nContinuousStates));
+}
+
+fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance instance, fmi3Float64 derivatives[],
+                                             size_t nContinuousStates) {
+    return status_of(structure_get_rates(instance_of(instance), derivatives, nContinuousStates));
+}
+
+fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, fmi3Float64 nominals[],
+                                             size_t nContinuousStates) {
+    (void)instance;
+    structure_nominals(nominals, nContinuousStates);
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *nContinuousStates) {
+    (void)instance;
+    *nContinuousStates = STRUCTURE_STATE_COUNT;
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *nEventIndicators) {
+    (void)instance;
+    *nEventIndicators = 0;
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 eventIndicators[], size_t nEventIndicators) {
+    (void)eventIndicators;
+    return nEventIndicators == 0 ? fmi3OK : refuse(instance, "the FMU has no event indicators");
+}
+
 /* ---------------------------------------------------------------- what this FMU does not offer */
 
 #define UNUSED_REFERENCES const fmi3ValueReference valueReferences[], size_t nValueReferences
@@ -255,8 +334,7 @@ NO_VARIABLES(String, "String")
 
 #define NO_BINARIES "the FMU has no binary variables"
 #define NO_CLOCKS "the FMU has no clocks"
-#define NO_EVENTS "the FMU has no event mode"
-#define NO_EXCHANGE "this FMU is for co-simulation only"
+#define NO_EVENTS "the FMU has no step mode and no discrete states"
 #define NO_DEPENDENCIES "the FMU does not tell dependencies of elements"
 
 REFUSED(GetBinary, NO_BINARIES, UNUSED_REFERENCES, size_t sizes[], fmi3Binary values[], size_t nValues)
@@ -279,19 +357,5 @@ REFUSED(GetOutputDerivatives, "the FMU does not offer derivatives of outputs", U
         const fmi3Int32 orders[], fmi3Float64 values[], size_t nValues)
 REFUSED_CALL(EnterConfigurationMode, "the FMU has no structural parameters")
 REFUSED_CALL(ExitConfigurationMode, "the FMU has no structural parameters")
-REFUSED_CALL(EnterEventMode, NO_EVENTS)
 REFUSED_CALL(EnterStepMode, NO_EVENTS)
 REFUSED_CALL(EvaluateDiscreteStates, NO_EVENTS)
-REFUSED(UpdateDiscreteStates, NO_EVENTS, fmi3Boolean *needUpdate, fmi3Boolean *terminate, fmi3Boolean *nominalsChanged,
-        fmi3Boolean *valuesChanged, fmi3Boolean *nextEventTimeDefined, fmi3Float64 *nextEventTime)
-REFUSED_CALL(EnterContinuousTimeMode, NO_EXCHANGE)
-REFUSED(CompletedIntegratorStep, NO_EXCHANGE, fmi3Boolean noSetFMUStatePriorToCurrentPoint, fmi3Boolean *enterEventMode,
-        fmi3Boolean *terminateSimulation)
-REFUSED(SetTime, NO_EXCHANGE, fmi3Float64 time)
-REFUSED(SetContinuousStates, NO_EXCHANGE, const fmi3Float64 states[], size_t count)
-REFUSED(GetContinuousStateDerivatives, NO_EXCHANGE, fmi3Float64 derivatives[], size_t count)
-REFUSED(GetEventIndicators, NO_EXCHANGE, fmi3Float64 indicators[], size_t count)
-REFUSED(GetContinuousStates, NO_EXCHANGE, fmi3Float64 states[], size_t count)
-REFUSED(GetNominalsOfContinuousStates, NO_EXCHANGE, fmi3Float64 nominals[], size_t count)
-REFUSED(GetNumberOfEventIndicators, NO_EXCHANGE, size_t *count)
-REFUSED(GetNumberOfContinuousStates, NO_EXCHANGE, size_t *count)

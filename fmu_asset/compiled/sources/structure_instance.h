@@ -98,6 +98,7 @@ structure_result structure_event(structure_instance *instance, bool *states_chan
 structure_result structure_set_states(structure_instance *instance, const double *states, size_t count);
 structure_result structure_get_states(structure_instance *instance, double *states, size_t count);
 structure_result structure_get_rates(structure_instance *instance, double *rates, size_t count);
+void structure_nominals(double *nominals, size_t count);
 
 /* The state as numbers, to be freed by the caller; false without memory. */
 bool structure_save(const structure_instance *instance, structure_saved_state *saved);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,17 +12,20 @@ import pytest
 from fmpy import simulate_fmu
 from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Model
+from fmpy.fmi3 import FMU3Model
 from fmpy.validation import validate_fmu
 
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
 from fmu_asset.check import check_fmu
+from fmu_asset.compiled.exchange import STATES as STATE_NAMES
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.wing_fmu import build_fmu
 
 STATES = 16
+HALF = STATES // 2
 DISCARD, ERROR = 2, 3
 
 
@@ -29,6 +33,12 @@ DISCARD, ERROR = 2, 3
 def exchange(compiler: list[str], model: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("exchange") / "wing.fmu"
     return build_fmu(model, path, kind="compiled", interface="model-exchange").path
+
+
+@pytest.fixture(scope="module")
+def exchange3(compiler: list[str], model: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("exchange3") / "wing.fmu"
+    return build_fmu(model, path, kind="compiled", fmi=3, interface="model-exchange").path
 
 
 @pytest.fixture
@@ -53,10 +63,67 @@ def wing(exchange: Path) -> Iterator[tuple[FMU2Model, dict[str, int]]]:
     shutil.rmtree(folder)
 
 
-def test_nothing_is_found_to_complain_of(exchange: Path) -> None:
-    assert validate_fmu(str(exchange)) == []
-    assert read_fmu(exchange).states == STATES
-    assert check_fmu(exchange, cycles=20).problems == ()
+def test_nothing_is_found_to_complain_of(exchange: Path, exchange3: Path) -> None:
+    for fmu in (exchange, exchange3):
+        assert validate_fmu(str(fmu)) == []
+        assert read_fmu(fmu).states == STATES
+    assert check_fmu(exchange3, cycles=20).problems == ()
+
+
+def test_fmi_3_gives_the_numbers_of_fmi_2(exchange3: Path, wing: tuple[FMU2Model, dict[str, int]]) -> None:
+    """To the last bit: states, rates, outputs and derivatives, before and after an event."""
+    two, reference = wing
+    described = read_fmu(exchange3)
+    folder = extract_fmu(described)
+    place = {variable.name: variable.reference for variable in described.variables}
+    three = FMU3Model(
+        guid=described.guid, modelIdentifier=described.model_identifier, unzipDirectory=str(folder)
+    )
+    three.instantiate()
+    three.enterInitializationMode(startTime=0.0)
+    names = ("damping.alpha", "damping.beta", "initial_tip_displacement", "health")
+    three.setFloat64([place[name] for name in names], [1.5, 3e-4, 0.05, 0.3, 0.0])
+    three.exitInitializationMode()
+    three.updateDiscreteStates()
+    three.enterContinuousTimeMode()
+    assert three.getNumberOfContinuousStates() == STATES
+    assert three.getNumberOfEventIndicators() == 0
+    rng = np.random.default_rng(3)
+    for loss in (0.3, 0.5, 0.5):
+        for fmu in (two, three):
+            fmu.enterEventMode()
+        two.setReal([reference["health.z1"]], [loss])
+        three.setFloat64([place["health"]], [loss, 0.0])
+        assert two.newDiscreteStates()[3] == three.updateDiscreteStates()[3]
+        x, load = rng.normal(size=STATES), float(rng.uniform(0.5, 3.0))
+        for fmu in (two, three):
+            fmu.enterContinuousTimeMode()
+            fmu.setTime(1.0)
+            fmu.setContinuousStates((ctypes.c_double * STATES)(*x), STATES)
+        two.setReal([reference["load_factor"]], [load])
+        three.setFloat64([place["load_factor"]], [load])
+        rates = (ctypes.c_double * STATES)(), (ctypes.c_double * STATES)()
+        two.getDerivatives(rates[0], STATES)
+        three.getContinuousStateDerivatives(rates[1], STATES)
+        assert list(rates[0]) == list(rates[1])
+        moving = [place["modal_displacement"], place["modal_velocity"]]
+        assert three.getFloat64(moving, STATES) == x.tolist()
+        assert three.getFloat64([place[f"der({name})"] for name in STATE_NAMES], STATES) == list(rates[1])
+        seen = two.getReal([reference[f"strain[{i}]"] for i in range(1, 25)])
+        assert three.getFloat64([place["strain"]], 24) == seen
+        assert three.getFloat64([place["time"]]) == [1.0]
+        column = two.getDirectionalDerivative(
+            [reference[f"der(modal_velocity[{i}])"] for i in range(1, HALF + 1)],
+            [reference["modal_displacement[2]"]],
+            [1.0],
+        )
+        direction = np.eye(HALF)[1].tolist()
+        knowns = [place["modal_displacement"]]
+        assert column == three.getDirectionalDerivative(
+            [place["der(modal_velocity)"]], knowns, direction, HALF
+        )
+    three.freeInstance()
+    shutil.rmtree(folder)
 
 
 def test_cvode_moves_it_as_the_co_simulation_moves(exchange: Path, compiled_fmu: Path) -> None:
@@ -88,7 +155,19 @@ def test_cvode_moves_it_as_the_co_simulation_moves(exchange: Path, compiled_fmu:
         )
 
 
-def test_our_door_flies_both_alike(exchange: Path, compiled_fmu: Path, binding: Binding) -> None:
+def elementwise(binding: Binding) -> Binding:
+    """Return the binding of FMI 2 with health as elements of the array that it is in FMI 3."""
+    health = {
+        name: item.model_copy(update={"variable": f"health[{number}]"})
+        for number, (name, item) in enumerate(binding.health.items(), 1)
+    }
+    header = binding.binding.model_copy(update={"fmi_version": "3.0"})
+    return binding.model_copy(update={"health": health, "binding": header})
+
+
+def test_our_door_flies_all_alike(
+    exchange: Path, exchange3: Path, compiled_fmu: Path, binding: Binding
+) -> None:
     rng = np.random.default_rng(2)
     settings = binding.binding.model_copy(update={"step_size": 0.01, "tolerance": 1e-9})
     slow = binding.model_copy(update={"binding": settings})
@@ -100,13 +179,15 @@ def test_our_door_flies_both_alike(exchange: Path, compiled_fmu: Path, binding: 
     }
     with (
         FmiAsset(exchange, slow, parameters=parameters, isolated=False) as one,
+        FmiAsset(exchange3, elementwise(slow), parameters=parameters, isolated=False) as three,
         FmiAsset(compiled_fmu, slow, parameters=parameters, isolated=False) as two,
     ):
         for index in range(20):
             control = {"load_factor": float(rng.uniform(-1, 4))}
             health = {"z1": 0.04 * (index // 5), "z2": 0.02 * (index // 3)}
-            seen = [asset.step(control, health).values for asset in (one, two)]
+            seen = [asset.step(control, health).values for asset in (one, two, three)]
             np.testing.assert_allclose(seen[0], seen[1], rtol=0, atol=1e-6 * np.abs(seen[1]).max())
+            assert seen[2].tobytes() == seen[0].tobytes()
 
 
 def test_rates_and_outputs_are_linear_with_the_derivatives_that_it_gives(
@@ -173,7 +254,7 @@ def test_health_is_discrete_and_wrong_calls_are_refused(wing: tuple[FMU2Model, d
 def test_what_it_cannot_be_is_refused(model: ReducedModel, tmp_path: Path, compiled_fmu: Path) -> None:
     for options, sentence in (
         ({"kind": "python"}, "build the kind 'compiled'"),
-        ({"kind": "compiled", "fmi": 3}, r"FMI 2\.0 only"),
+        ({"kind": "python", "fmi": 3}, "build the kind 'compiled'"),
     ):
         with pytest.raises(FmuBuildError, match=sentence):
             build_fmu(model, tmp_path / "wing.fmu", interface="model-exchange", **options)
