@@ -1,6 +1,6 @@
 """`modelDescription.xml` and `buildDescription.xml` of FMI 3.0, from the table of variables."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from fmu_asset.description import LOG_CATEGORIES, add_units, number
@@ -51,11 +51,10 @@ def model_description3(
     heads = {array.rows[0].reference: array for array in arrays}
     inner = {row.reference for array in arrays for row in array.rows[1:]}
     rows = [row for row in table if row.reference not in inner]
-    local = [row for row in rows if row.causality == "local"]
-    states, rates = local[: len(local) // 2], local[len(local) // 2 :]
+    exchange = any(row.causality == "local" for row in rows)
     interface = SubElement(
         root,
-        "ModelExchange" if states else "CoSimulation",
+        "ModelExchange" if exchange else "CoSimulation",
         modelIdentifier=identifier,
         needsExecutionTool="false",
         canBeInstantiatedOnlyOncePerProcess="false",
@@ -64,7 +63,7 @@ def model_description3(
         providesDirectionalDerivatives="true",
         providesAdjointDerivatives="true",
     )
-    if not states:
+    if not exchange:
         interface.set("canHandleVariableCommunicationStepSize", "true")
     add_units(root, units)
     types = SubElement(root, "TypeDefinitions")
@@ -76,14 +75,22 @@ def model_description3(
     for name, text in LOG_CATEGORIES.items():
         SubElement(categories, "Category", name=name, description=text.replace("fmi2", "fmi3"))
     SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="50.0", stepSize="1.0")
-    variables = SubElement(root, "ModelVariables")
-    structure = SubElement(root, "ModelStructure")
+    _add_variables(root, rows, heads)
+    return _text(root)
+
+
+def _add_variables(root: Element, rows: Sequence[FmuVariable], heads: Mapping[int, ArrayVariable]) -> None:
+    """Add the variables, of which the local ones are states and then their derivatives, and the structure."""
+    local = [row for row in rows if row.causality == "local"]
+    states, rates = local[: len(local) // 2], local[len(local) // 2 :]
     derived = {rate.reference: state.reference for state, rate in zip(states, rates, strict=True)}
+    variables = SubElement(root, "ModelVariables")
     for row in rows:
         element = _variable(row, heads.get(row.reference))
         if row.reference in derived:
             element.set("derivative", str(derived[row.reference]))
         variables.append(element)
+    structure = SubElement(root, "ModelStructure")
     outputs = [row for row in rows if row.causality == "output"]
     for kind, unknown in (
         ("Output", outputs),
@@ -92,7 +99,6 @@ def model_description3(
     ):
         for row in unknown:
             SubElement(structure, kind, valueReference=str(row.reference))
-    return _text(root)
 
 
 def _variable(row: FmuVariable, array: ArrayVariable | None) -> Element:
