@@ -45,8 +45,8 @@ fmu: $(VENV)/.runtime ## Build the wing as an FMU into runs/wing.fmu
 	$(BIN)/uav-twin fmu build --out runs/wing.fmu --replace
 
 .PHONY: docs
-docs: $(DOCS_VENV)/.docs ## Build the site of the documentation into build/docs; a warning is an error
-	$(DOCS_VENV)/bin/python -m sphinx -q -W --keep-going -c docs/site -d build/doctrees docs build/docs
+docs: $(DOCS_VENV)/.docs ## Run the notebooks and build the site of the documentation into build/docs; a warning is an error
+	$(DOCS_VENV)/bin/python -m sphinx -j 2 -q -W --keep-going -c docs/site -d build/doctrees docs build/docs
 	@echo "The site is build/docs/index.html."
 
 .PHONY: lock

@@ -1,6 +1,7 @@
 """The Python of README and docs runs as it is printed: the blocks of a page one after the other.
 
-Each page has a namespace and a folder of its own, which holds what the page says that the reader has by then.
+Notebooks are pages like others. Each page has a namespace and a folder of its own, which holds what the page
+says that the reader has by then.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from fmu_asset.packing.wing_fmu import build_fmu
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT.parent / "shared" / "reference"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
-BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```(?:\{code-cell\} )?(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -74,10 +75,6 @@ def patch_file(folder: Path) -> None:
     """The patch that the page shows."""
     (patch,) = (text for text in blocks(ROOT / "docs" / "fmu.md", "json") if "uav-twin patch" in text)
     (folder / "patch.json").write_text(patch, encoding="utf-8")
-
-
-def empty_rig(folder: Path) -> None:
-    (folder / "my_rig").mkdir()
 
 
 def empty_cart(folder: Path) -> None:
@@ -199,7 +196,6 @@ READER_HAS: dict[str, tuple[Prepare, ...]] = {
     "docs/inference.md": (strain_library,),
     "docs/python.md": (wing_fmu, drafted_binding, without_the_fmu, verdict_folder),
     "docs/real_wing.md": (converted_wing,),
-    "docs/rig_in_ten_minutes.md": (empty_rig,),
     "docs/structures.md": (bracket,),
     "docs/use_the_wing_in.md": (wing_fmu, wing_of_fmi_3),
     "docs/verdict.md": (verdict_folder,),
@@ -220,6 +216,10 @@ MINUTES = {
     "docs/discrepancy_missions.md",
     "docs/python.md",
     "docs/real_wing.md",
+    "docs/tutorials/a_fleet_that_learns.md",
+    "docs/tutorials/calibrate_a_wing.md",
+    "docs/tutorials/fly_the_mission.md",
+    "docs/tutorials/name_an_effect.md",
     "docs/verdict.md",
 }
 """Pages whose blocks take ten seconds of processor time or more, and show what others show."""
@@ -272,6 +272,10 @@ def test_the_blocks_of_a_page_run_as_printed(
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {"__name__": "__main__"}
     for number, block in enumerate(blocks(WITH_PYTHON[name], "python"), 1):
+        first, _, rest = block.partition("\n")
+        if first.startswith("%%writefile "):
+            Path(first.split()[1]).write_text(rest, encoding="utf-8")
+            continue
         if name in MODULES and MODULES[name] in block:
             pytest.importorskip(MODULES[name])
         exec(compile(block, f"{name}, block {number}", "exec"), names)

@@ -27,6 +27,9 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from fmu_asset.packing.wing_fmu import build_fmu
     from scenarios import structure_files
     from twin_master.environment import ScenarioEnvironment
+    from twin_master.fleet.flight import fly_fleet
+    from twin_master.fleet.lessons import learn_from_fleet
+    from twin_master.fleet.reading import fleet_groups as open_fleet
     from twin_master.learning.monitor import WatchfulEstimator
     from twin_master.mission.preparation import prepare_twin
     from twin_master.network.estimator import Carried, Estimate, ExactFilter
@@ -38,6 +41,7 @@ if TYPE_CHECKING:  # what type checkers and editors read; `_HOMES` says the same
     from twin_master.report.page import report_figures, write_report
     from twin_master.report.reading import open_run
     from twin_master.scenario.reading import load_scenario
+    from twin_master.watch.from_python import watch
     from twin_master.workflow import new_run as fly
     from twin_master.workflow import resume_run as resume
 
@@ -58,13 +62,16 @@ __all__ = [
     "eigenmodes",
     "filter_sequence",
     "fly",
+    "fly_fleet",
     "identify_modes",
     "investigate",
+    "learn_from_fleet",
     "load_calibration",
     "load_design",
     "load_model",
     "load_scenario",
     "natural_frequencies",
+    "open_fleet",
     "open_run",
     "prepare_twin",
     "read_campaign",
@@ -77,6 +84,7 @@ __all__ = [
     "static_responses",
     "structure_files",
     "value_iteration",
+    "watch",
     "write_report",
 ]
 
@@ -97,13 +105,16 @@ _HOMES = {
     "eigenmodes": "fe.full.modes",
     "filter_sequence": "twin_master.network.inference",
     "fly": "twin_master.workflow:new_run",
+    "fly_fleet": "twin_master.fleet.flight",
     "identify_modes": "calibration.dynamics.modal_identification",
     "investigate": "discrepancy.workflow",
+    "learn_from_fleet": "twin_master.fleet.lessons",
     "load_calibration": "calibration.reading",
     "load_design": "fe.wing.design",
     "load_model": "discrepancy.model_choice",
     "load_scenario": "twin_master.scenario.reading",
     "natural_frequencies": "fe.structure.solution",
+    "open_fleet": "twin_master.fleet.reading:fleet_groups",
     "open_run": "twin_master.report.reading",
     "prepare_twin": "twin_master.mission.preparation",
     "read_campaign": "discrepancy.campaign.reading",
@@ -116,6 +127,7 @@ _HOMES = {
     "static_responses": "fe.structure.solution",
     "structure_files": "scenarios",
     "value_iteration": "twin_master.network.planner",
+    "watch": "twin_master.watch.from_python",
     "write_report": "twin_master.report.page",
 }
 """Module of each name; behind a colon what it is called there, where that differs."""

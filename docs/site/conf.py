@@ -12,13 +12,20 @@ DOCS = Path(__file__).resolve().parent.parent
 project = "uav-twin"
 author = "The uav-twin authors"
 root_doc = "index"
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["site/index.md"]
 default_role = "code"
 highlight_language = "none"
 
 myst_heading_anchors = 5
 myst_enable_extensions = ["colon_fence"]
+
+# Each notebook runs in an empty folder; what it prints and draws is on its page, and an error ends the build.
+nb_execution_mode = "force"
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 600
+nb_merge_streams = True
 
 napoleon_google_docstring = False
 napoleon_use_ivar = True

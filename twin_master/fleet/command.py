@@ -66,15 +66,9 @@ def learn(
     json: terminal.Json = False,
 ) -> None:
     """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ."""
-    from reporting.files import atomic_write_text
-    from twin_master.fleet.learn import learn_fleet
-    from twin_master.fleet.lessons import LESSONS_NAME, lessons_record, write_learnt
-    from twin_master.run_folder import to_json
+    from twin_master.fleet.lessons import learn_from_fleet
 
-    lessons = learn_fleet(folder, progress=terminal.progress())
-    write_learnt(out, lessons)
-    record = lessons_record(lessons)
-    atomic_write_text(folder / LESSONS_NAME, to_json(record))
+    record = learn_from_fleet(folder, out, progress=terminal.progress())
     if not no_report:
         _report(folder)
     if json:

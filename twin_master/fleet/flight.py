@@ -22,7 +22,7 @@ from twin_master.assets.resolution import asset_source, believed_source, located
 from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine, Piece, flown
 from twin_master.fleet.outcome import FAILED, sizes_of
-from twin_master.fleet.plan import Fleet, Group
+from twin_master.fleet.plan import Fleet, Group, load_fleet
 from twin_master.fleet.recorded import read_recording
 from twin_master.fleet.shard import Kit, ShardResult, with_parameters
 from twin_master.fleet.store import FleetStore, written
@@ -71,7 +71,7 @@ class FleetOutcome:
 
 
 def fly_fleet(
-    fleet: Fleet,
+    fleet: Fleet | str | Path,
     folder: Path | str,
     engine: Engine | None = None,
     *,
@@ -82,7 +82,8 @@ def fly_fleet(
 
     Parameters
     ----------
-    fleet : Fleet
+    fleet : Fleet or path
+        The fleet, or its file.
     folder : Path
         Of the store; a fleet that was begun there with the same plan and program is gone on with.
     engine : Engine, optional
@@ -104,6 +105,7 @@ def fly_fleet(
         The disk is full or the folder cannot be written; what was flown is kept.
     """
     begin = time.perf_counter()
+    fleet = fleet if isinstance(fleet, Fleet) else load_fleet(fleet)
     folder, progress = Path(folder), progress or SilentProgress()
     config = {"kind": KIND, "format": 1, "fleet": fleet.record()}
     _look_at(folder, config, fleet.seed, replace_old=replace_old)

@@ -7,14 +7,47 @@ from typing import Any
 import numpy as np
 
 from reporting.files import atomic_write_text
-from twin_master.fleet.learn import FleetLessons
+from reporting.progress import Progress
+from twin_master.fleet.learn import FleetLessons, learn_fleet
 from twin_master.fleet.population import Line
 from twin_master.fleet.posterior import Marginal
+from twin_master.run_folder import to_json
 
-__all__ = ["LESSONS_NAME", "lessons_record", "write_learnt"]
+__all__ = ["LESSONS_NAME", "learn_from_fleet", "lessons_record", "write_learnt"]
 
 LESSONS_NAME = "learnt.json"
 """In the folder of a fleet: what was learnt from it, for its report."""
+
+
+def learn_from_fleet(
+    folder: Path | str, out: Path | str = "learnt.toml", *, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the fleet, which may still fly.
+    out : Path
+        The file to write, for the override ``learnt`` of a mission or the key of that name of a group.
+    progress : Progress, optional
+
+    Returns
+    -------
+    record : dict
+        What was learnt beside what was assumed: `groups`, by the name of each, with `probability` (by
+        control), `noise_factor` and `population`; `shared` over several groups; `source`.
+
+    Raises
+    ------
+    RunFolderExistsError, FleetError
+        There is no fleet, nothing has flown, or its transitions cannot be learnt.
+    """
+    lessons = learn_fleet(folder, progress=progress)
+    write_learnt(Path(out), lessons)
+    record = lessons_record(lessons)
+    atomic_write_text(Path(folder) / LESSONS_NAME, to_json(record))
+    return record
 
 
 def write_learnt(path: Path, lessons: FleetLessons) -> Path:

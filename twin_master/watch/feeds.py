@@ -1,10 +1,11 @@
-"""Messages from files, recorded or growing, and from standard input."""
+"""Messages from files, recorded or growing, from standard input, and from a program."""
 
 import csv
+import json
 import math
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from hashlib import sha256
 from itertools import islice
 from pathlib import Path
@@ -240,6 +241,30 @@ class JsonLinesFeed:
         for line in _lines(self._stream or sys.stdin.buffer):
             if line is not None:
                 yield parsed(self._reader, line), shown(line)
+
+
+class MappingFeed:
+    """Messages of a program, as mappings; arrays of numbers may stand where JSON has lists."""
+
+    replayable = False
+
+    def __init__(self, messages: Iterable[Mapping[str, Any]], scenario: Scenario) -> None:
+        self._reader = MessageReader(scenario)
+        self._messages = messages
+
+    def beginning(self, count: int) -> str:
+        """Return nothing: what comes goes on where it is."""
+        return ""
+
+    def messages(self, after: int) -> Iterator[Fed]:
+        """Return what comes."""
+        for message in self._messages:
+            line = json.dumps(message, default=_plain).encode()
+            yield parsed(self._reader, line), shown(line)
+
+
+def _plain(value: Any) -> Any:
+    return np.asarray(value).tolist()
 
 
 def parsed(reader: MessageReader, content: bytes | Refused) -> Message | Refused:

@@ -152,6 +152,26 @@ def test_a_run_file_is_watched_too(base: Watch, whole: Path, tmp_path: Path) -> 
         file_feed(tmp_path, base.scenario)
 
 
+def test_a_program_hands_over_messages_and_is_told_decisions(
+    scenario: LoadedScenario, mission: Flight, whole: Path, tmp_path: Path
+) -> None:
+    controls = [("2g", "3g")[index] for index in mission.control_index]
+    messages = (
+        {"turn": turn, "control": controls[turn], "strain": mission.observed[turn]} for turn in range(6)
+    )
+    decisions: list[dict[str, object]] = []
+    folder = uav_twin.watch(
+        scenario, messages, tmp_path / "watch", report=False, decide=lambda told: decisions.append(dict(told))
+    )
+    assert decisions == json.loads((whole / "decisions.json").read_text())[:6]
+    np.testing.assert_array_equal(uav_twin.open_run(folder)["filtered"]["probability"], mission.filtered[:6])
+    with pytest.raises(MissionInputError, match="names no recording: give the observations"):
+        uav_twin.watch(scenario, folder=tmp_path / "none")
+    with pytest.raises(MissionInputError, match="--teach begins with an alarm"):
+        uav_twin.watch(scenario, [], tmp_path / "none", teach=True)
+    assert not (tmp_path / "none").exists()
+
+
 def killed(watch: Watch, feed: CsvFeed, size: int) -> bool:
     """Watch in a process of its own, killed once the journal has a size; return whether it was killed."""
     child = os.fork()
