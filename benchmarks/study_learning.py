@@ -80,7 +80,7 @@ def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> Result:
         begin = time.process_time()
         flight = fly(scenario, twin, plant)
         seconds += time.process_time() - begin
-        flights.append(Flights.of(flight))
+        flights.append(Flights.of(knowledge, flight))
         # What was learnt at the end: the belief is pure, so the last turn can be asked again.
         learnt = twin.revise(twin.turns - 1, twin.observed(twin.turns - 1)).learnt
         if scenario.calibration.parameter in learnt:

@@ -154,7 +154,9 @@ def fly_and_show(
     figures = _figures([outcome.folder])
     if json:
         told = {"folder": str(outcome.folder), "twins": outcome.twins, "failed": outcome.failed}
-        terminal.print_json(told | {"failures": outcome.failures, "groups": _plain(figures)})
+        terminal.print_json(
+            told | {"failures": outcome.failures, "ended": outcome.ended, "groups": _plain(figures)}
+        )
     else:
         _show(outcome, figures)
     return outcome
@@ -220,10 +222,12 @@ def _show(outcome: "FleetOutcome", figures: Figures) -> None:
     _table(figures)
     kept = f", {counted(outcome.shards_kept, 'shard')} there before" if outcome.shards_kept else ""
     rate = f"{counted(outcome.twins, 'twin')} in {outcome.seconds:.3g} s{kept}"
-    console.print(f"{rate}; {outcome.failed} failed in flight.", soft_wrap=True)
-    for name, sentence in list(outcome.failures.items())[:SHOWN]:
+    short = f", {len(outcome.ended)} ended early" if outcome.ended else ""
+    console.print(f"{rate}; {outcome.failed} failed in flight{short}.", soft_wrap=True)
+    told = [*outcome.failures.items(), *outcome.ended.items()]
+    for name, sentence in told[:SHOWN]:
         console.print(f"  {name}: {sentence}", soft_wrap=True, style="yellow")
-    if outcome.failed > SHOWN:
-        console.print(f"  and {outcome.failed - SHOWN} more, in {outcome.folder / 'fleet.json'}")
+    if len(told) > SHOWN:
+        console.print(f"  and {len(told) - SHOWN} more, in {outcome.folder / 'fleet.json'}")
     page = outcome.folder / "report.html"
     console.print(f"Report: {page}" if page.is_file() else f"Fleet: {outcome.folder}", soft_wrap=True)

@@ -51,6 +51,8 @@ class FleetOutcome:
         How many flew, and how many of them failed in flight.
     failures : dict of str to str
         What ended the flight of each that failed, by group and name.
+    ended : dict of str to str
+        How each asset that ended its simulation early has done so; what it has flown counts.
     seconds : float
         Wall clock of this call.
     shards_flown, shards_kept : int
@@ -60,6 +62,7 @@ class FleetOutcome:
     folder: Path
     twins: int
     failures: Mapping[str, str]
+    ended: Mapping[str, str]
     seconds: float
     shards_flown: int
     shards_kept: int
@@ -117,14 +120,16 @@ def fly_fleet(
         store = FleetStore(folder, fleet)
         kept = len(store.done)
         _fly(fleet, folder, engine or Engine(), store, progress)
-        failures = {name: text for told in store.done.values() for name, text in told["failures"].items()}
-        failures = dict(sorted(failures.items()))
+        failures, ended = (
+            dict(sorted(item for told in store.done.values() for item in told.get(key, {}).items()))
+            for key in ("failures", "ended")
+        )
         told = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "twins": fleet.size}
-        atomic_write_text(folder / RESULT_NAME, to_json(told | {"failures": failures}))
+        atomic_write_text(folder / RESULT_NAME, to_json(told | {"failures": failures, "ended": ended}))
     finally:
         os.close(lock)
     seconds = time.perf_counter() - begin
-    return FleetOutcome(folder, fleet.size, failures, seconds, len(store.done) - kept, kept)
+    return FleetOutcome(folder, fleet.size, failures, ended, seconds, len(store.done) - kept, kept)
 
 
 def _look_at(folder: Path, config: Mapping[str, Any], seed: int, *, replace_old: bool) -> None:
@@ -317,6 +322,7 @@ class _Left:
 
     twins: int
     failures: dict[str, str] = field(default_factory=dict)
+    ended: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
 
 
@@ -351,15 +357,18 @@ def _fly(fleet: Fleet, folder: Path, engine: Engine, store: FleetStore, progress
         rows = slice(piece.members[0].row, piece.members[-1].row + 1)
         if isinstance(result, str):
             seed = np.array([piece.members[0].seed])
-            result = ShardResult({"status": np.array([FAILED]), "seed": seed}, {rows.start: result}, 0.0, "")
+            result = ShardResult(
+                {"status": np.array([FAILED]), "seed": seed}, {rows.start: result}, {}, 0.0, ""
+            )
         store.write(group.name, rows, result.arrays)
         told = left[piece.shard]
         told.twins -= len(piece.members)
         told.seconds += result.seconds
-        names = {row: f"{group.name}/{group.members[row].name}" for row in result.failures}
-        told.failures |= {names[row]: sentence for row, sentence in result.failures.items()}
+        for kept, texts in ((told.failures, result.failures), (told.ended, result.ended)):
+            kept |= {f"{group.name}/{group.members[row].name}": text for row, text in texts.items()}
         if not told.twins:
-            store.finish(piece.shard, {"failures": told.failures, "seconds": told.seconds})
+            said = {"failures": told.failures, "ended": told.ended, "seconds": told.seconds}
+            store.finish(piece.shard, said)
 
     whole = list(_shards(fleet, kit))
     left = {piece.shard: _Left(len(piece.members)) for piece in whole}

@@ -15,7 +15,7 @@ from twin_master.assets.resolution import located_scenario
 from twin_master.errors import FleetError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import GROUPS, fleet_config, source_of
-from twin_master.fleet.outcome import FLOWN
+from twin_master.fleet.outcome import has_flown
 from twin_master.fleet.population import Line, population
 from twin_master.fleet.posterior import POINTS, Grid, Marginal, Shared, refined, shared
 from twin_master.fleet.store import open_group
@@ -201,7 +201,7 @@ def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
 def _seen(folder: Path, record: dict[str, Any]) -> Iterator[_Seen]:
     """Yield the twins of a group that flew, those together that share what they know."""
     group = open_group(folder, record["name"])
-    flown = np.flatnonzero(group["status"].values == FLOWN)
+    flown = has_flown(group["status"].values)
     if not len(flown):
         return
     observed = group["observed"].values[flown].astype(np.float64)

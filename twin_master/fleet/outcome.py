@@ -14,7 +14,7 @@ from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.schema import Scenario
 from twin_master.store.summary import find_fallback
 
-__all__ = ["FAILED", "FLOWN", "VARIABLES", "Variable", "in_credible_set", "outcomes_of", "sizes_of"]
+__all__ = ["ENDED", "FAILED", "FLOWN", "VARIABLES", "Variable", "in_credible_set", "outcomes_of", "sizes_of"]
 
 Float = NDArray[np.float64]
 
@@ -22,8 +22,13 @@ CREDIBILITY = 0.9
 """Probability of the set of states in which the true one is looked for."""
 _TOLERANCE = 1e-9
 
-FLOWN, FAILED = 1, 2
+FLOWN, FAILED, ENDED = 1, 2, 3
 """Values of `status`; 0 has not flown yet."""
+
+
+def has_flown(status: NDArray[Any]) -> NDArray[np.int64]:
+    """Return the rows of the twins that flew, to the end of the mission or to that of their assets."""
+    return np.flatnonzero((status == FLOWN) | (status == ENDED))
 
 
 @dataclass(frozen=True)
@@ -37,10 +42,14 @@ class Variable:
 
 
 VARIABLES: Mapping[str, Variable] = {
-    "status": Variable((), "i1", "0: has not flown, 1: has flown to its end, 2: failed in flight"),
+    "status": Variable(
+        (),
+        "i1",
+        "0: has not flown, 1: has flown to its end, 2: failed in flight, 3: its asset ended early",
+    ),
     "seed": Variable((), "i8", "seed of the mission"),
     "observed": Variable(("turn", "sensor"), "f4", "what the sensors said; NaN where lost", "SI"),
-    "control_index": Variable(("turn",), "i1", "control in force; -1 after a failure"),
+    "control_index": Variable(("turn",), "i1", "control in force; -1 after a failure or an end"),
     "state": Variable(("turn", "factor"), "f4", "true state", "SI"),
     "mean": Variable(("turn", "factor"), "f4", "mean of the filtered belief", "SI"),
     "standard_deviation": Variable(("turn", "factor"), "f4", "standard deviation of the same", "SI"),
@@ -80,9 +89,10 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
     failed = np.array([bool(text) for text in flights.failure])
     delay, early = _fallbacks(knowledge, flights)
     unknown = np.isnan(flights.state[:, 0]).any(axis=1)  # of a real asset
-    ended = (flights.control_index >= 0).sum(axis=1)  # a recording may end early
+    turns = (flights.control_index >= 0).sum(axis=1)  # a recording or a simulation may end early
+    short = np.array([bool(text) for text in flights.ended])
     found: dict[str, Any] = {
-        "status": np.where(failed, FAILED, FLOWN),
+        "status": np.where(failed, FAILED, np.where(short, ENDED, FLOWN)),
         "seed": np.array([member.seed for member in members]),
         "observed": flights.observed,
         "control_index": flights.control_index,
@@ -90,10 +100,12 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
         "mean": mean,
         "standard_deviation": np.sqrt(np.maximum(variance, 0.0)),
         "log_evidence": flights.log_evidence,
-        "belief": flights.filtered[np.arange(len(failed)), np.where(failed, steps, ended) - 1],
+        "belief": flights.filtered[np.arange(len(failed)), np.where(failed, steps, turns) - 1],
         "delay": np.where(failed, np.nan, delay),
         "early": early & ~failed,
-        "credible": np.where(failed | unknown, np.nan, inside.reshape(-1, steps).mean(axis=1)),
+        "credible": np.where(
+            failed | unknown, np.nan, inside.reshape(-1, steps).sum(axis=1) / np.maximum(turns, 1)
+        ),
     }
     found = {name: np.ascontiguousarray(values, VARIABLES[name].type) for name, values in found.items()}
     for name in members[0].parameters:
@@ -110,7 +122,9 @@ def _fallbacks(knowledge: Knowledge, flights: Flights) -> tuple[NDArray[np.float
     for twin, (control, state) in enumerate(zip(flights.control_index, flights.state, strict=True)):
         if np.isnan(state[0]).any():
             continue
-        fallback = find_fallback(knowledge.model.states, plan.control_index, first, control, state)
+        turns = int(np.sum(control >= 0))
+        course = control[:turns], state[:turns]
+        fallback = find_fallback(knowledge.model.states, plan.control_index, first, *course)
         early[twin] = fallback.early_step is not None
         if fallback.called_for_step is not None:
             delay[twin] = np.inf if fallback.delay is None else fallback.delay

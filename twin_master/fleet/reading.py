@@ -12,7 +12,7 @@ from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.interface import Asset, StatelessAsset
 from twin_master.errors import FleetError
 from twin_master.fleet.flight import fleet_config
-from twin_master.fleet.outcome import FAILED, FLOWN, outcomes_of
+from twin_master.fleet.outcome import ENDED, FAILED, FLOWN, outcomes_of
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import open_group
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
@@ -169,6 +169,7 @@ def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
         "twins": len(status),
         "flown": int(np.sum(status == FLOWN)),
         "failed in flight": int(np.sum(status == FAILED)),
+        **({"ended early": short} if (short := int(np.sum(status == ENDED))) else {}),
     }
     if not found["flown"]:
         return found

@@ -21,7 +21,7 @@ from reporting.words import counted
 from twin_master.errors import TwinMasterError
 from twin_master.fleet.flight import GROUPS, RESULT_NAME, fleet_config
 from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.outcome import FAILED, FLOWN
+from twin_master.fleet.outcome import FAILED, has_flown
 from twin_master.fleet.reading import group_figures, last_turns, shown
 from twin_master.fleet.store import open_group
 from twin_master.mission.kept_knowledge import kept_knowledge
@@ -39,6 +39,7 @@ REPORT_NAME = "report.html"
 NEXT, FAILURES = 15, 10
 """Rows of the tables of who needs attention next, and of failures."""
 LOST = "{} of {} assets failed in flight; their twins end there."
+SHORT = "{} of {} assets ended their simulation before the mission was over; what they have flown counts."
 BANDS = (
     "Bands hold 90 and 50 % of the assets; the line is the median of the filtered means, "
     "the dash-dotted one that of the true states, where they are known."
@@ -76,7 +77,8 @@ def write_fleet_report(folder: Path | str) -> Path:
     """
     folder = Path(folder)
     fleet = fleet_config(folder)["fleet"]
-    failures = json.loads((folder / RESULT_NAME).read_text())["failures"]
+    result = json.loads((folder / RESULT_NAME).read_text())
+    failures, ended = result["failures"], result.get("ended", {})
     groups = {record["name"]: open_group(folder, record["name"]) for record in fleet["groups"]}
     twins = sum(group.sizes["twin"] for group in groups.values())
     page = Page(
@@ -89,6 +91,8 @@ def write_fleet_report(folder: Path | str) -> Path:
         add_failures(
             page, failures, LOST.format(len(failures), twins), f"All of them stand in {RESULT_NAME}."
         )
+    if ended:
+        page.add_notice(SHORT.format(len(ended), twins))
     lessons = folder / LESSONS_NAME
     if lessons.is_file():
         page.add_section("Learnt across the fleet")
@@ -150,7 +154,7 @@ def add_lessons(page: Page, record: dict[str, Any]) -> None:
 
 def _group(page: Page, folder: Path, record: dict[str, Any], group: "xr.Dataset") -> None:
     scenario = Scenario.model_validate(record["scenarios"][0])
-    flown = np.flatnonzero(group["status"].values == FLOWN)
+    flown = has_flown(group["status"].values)
     if not len(flown):
         page.add_paragraph("No twin of this group has flown to its end yet.")
         return

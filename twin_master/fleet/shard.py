@@ -72,6 +72,8 @@ class ShardResult:
         Variables of the store with B rows.
     failures : dict of int to str
         What ended flights, by the number in the group.
+    ended : dict of int to str
+        How assets ended their simulations early, likewise.
     seconds : float
         Processor time.
     version : str
@@ -80,6 +82,7 @@ class ShardResult:
 
     arrays: Mapping[str, NDArray[Any]]
     failures: Mapping[int, str]
+    ended: Mapping[int, str]
     seconds: float
     version: str
 
@@ -115,6 +118,10 @@ class _Unpacked:
         if self._model is None:
             self._model = wing_asset(self._wing, self.scenario)
         return self._model
+
+    def told(self, sentence: str) -> str:
+        """Return a sentence without the folder of this process, which nobody else knows."""
+        return sentence.replace(f"{self._folder}/", "")
 
     @property
     def flies_model(self) -> bool:
@@ -168,9 +175,12 @@ def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:
     kit = _kept[packed]
     recorded = [member.recording for member in members if member.recording is not None]
     flights = assimilated(kit.knowledge, recorded) if recorded else _flown(kit, members)
-    failures = {m.row: text for m, text in zip(members, flights.failure, strict=True) if text}
+    failures, ended = (
+        {m.row: kit.told(text) for m, text in zip(members, texts, strict=True) if text}
+        for texts in (flights.failure, flights.ended)
+    )
     arrays = outcomes_of(kit.knowledge, flights, members)
-    return ShardResult(arrays, failures, time.process_time() - begin, program_version())
+    return ShardResult(arrays, failures, ended, time.process_time() - begin, program_version())
 
 
 def _flown(kit: _Unpacked, members: Sequence[Member]) -> Flights:
@@ -208,6 +218,6 @@ def _fly_each(
                 flown.append(fly(kit.knowledge, [truth], [asset]))
             except IN_FLIGHT as error:
                 flown.append(replace(Flights.empty(kit.knowledge, 1), failure=(str(error),)))
-            if flown[-1].failure[0]:
+            if flown[-1].failure[0] or flown[-1].ended[0]:
                 asset = None
     return Flights.joined(flown)

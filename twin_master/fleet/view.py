@@ -24,7 +24,7 @@ from reporting.words import counted
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND as FLOWN_KIND
 from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.outcome import FAILED, FLOWN
+from twin_master.fleet.outcome import FAILED, has_flown
 from twin_master.fleet.reading import last_turns
 from twin_master.fleet.report import (
     BANDS,
@@ -137,7 +137,7 @@ def _add_watched(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
 def _add_flown(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
     groups = {record["name"]: open_group(folder, record["name"]) for record in fleet["groups"]}
     status = np.concatenate([group["status"].values for group in groups.values()])
-    flown, failed = int(np.sum(status == FLOWN)), int(np.sum(status == FAILED))
+    flown, failed = len(has_flown(status)), int(np.sum(status == FAILED))
     page.add_highlights(
         [(str(len(status)), "assets"), (str(flown), "flown"), (str(failed), "failed in flight")]
     )
@@ -148,7 +148,7 @@ def _add_flown(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
     for record in fleet["groups"]:
         group, scenario = groups[record["name"]], Scenario.model_validate(record["scenarios"][0])
         known = group["status"].values
-        rows, last = np.flatnonzero(known == FLOWN), last_turns(group)
+        rows, last = has_flown(known), last_turns(group)
         mean = group["mean"].values[rows]
         at = np.arange(len(rows)), last[rows]
         control = group["control_index"].values[rows][at]

@@ -247,9 +247,15 @@ def fly(
             timing.append(seconds)
             stage.advance(detail=scenario.control_names[turn.control_index])
     if source.ended is not None:
-        sentence = f"The asset ended the mission after {twin.turns} of {steps} {unit}: {source.ended}"
+        sentence = ended_sentence(scenario, twin.turns, source.ended)
         beliefs.notices.append((twin.turns - 1, Notice("ended", sentence)))
     return beliefs.flight(twin, plant.record(), tuple(timing), resumed_at=resumed_at)
+
+
+def ended_sentence(scenario: Scenario, turns: int, how: str) -> str:
+    """Return that an asset has ended its simulation after some turns of a mission."""
+    steps, unit = scenario.mission.steps, scenario.mission.step_name
+    return f"The asset ended the mission after {turns} of {steps} {unit}s: {how}"
 
 
 class _Flown:

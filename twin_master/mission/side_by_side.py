@@ -6,6 +6,7 @@ sensors and the draws of one twin, never over twins.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Protocol
 
 import numpy as np
@@ -13,10 +14,10 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from fe.runtime.errors import FiniteElementError
-from fmu_asset.errors import FmuError
+from fmu_asset.errors import FmuEndedError, FmuError
 from twin_master.assets.interface import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
-from twin_master.mission.loop import Flight, fly
+from twin_master.mission.loop import Flight, ended_sentence, fly
 from twin_master.mission.plant import Plant, checked_values
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import DamageGrowth, SensorStatus, Truth
@@ -33,7 +34,7 @@ IN_FLIGHT = (TwinMasterError, FmuError, FiniteElementError, CalibrationError, OS
 
 @dataclass(frozen=True)
 class Flights:
-    """B flown missions of T turns; a twin that failed has NaN, and -1 as control, from its failure on.
+    """B flown missions of T turns; a twin that failed or ended has NaN, and -1 as control, from there on.
 
     Attributes
     ----------
@@ -49,6 +50,8 @@ class Flights:
         log p(o_t | o_0..o_{t-1}).
     failure : tuple of str
         What ended the flight of each twin; empty for one that flew to its end.
+    ended : tuple of str
+        How the asset of each twin has ended its simulation before that, with what was flown; mostly empty.
     """
 
     observed: Float
@@ -57,6 +60,7 @@ class Flights:
     filtered: Float
     log_evidence: Float
     failure: tuple[str, ...]
+    ended: tuple[str, ...]
 
     @classmethod
     def empty(cls, knowledge: Knowledge, count: int) -> "Flights":
@@ -70,21 +74,29 @@ class Flights:
             filtered=np.full((count, steps, size), np.nan),
             log_evidence=np.full((count, steps), np.nan),
             failure=("",) * count,
+            ended=("",) * count,
         )
 
     @classmethod
-    def of(cls, flight: Flight) -> "Flights":
+    def of(cls, knowledge: Knowledge, flight: Flight) -> "Flights":
         """Return one mission that `fly` has flown."""
-        names = ("observed", "control_index", "filtered", "log_evidence")
-        arrays = {name: getattr(flight, name)[None] for name in names}
-        return cls(**arrays, state=flight.happened.state[None], failure=("",))
+        found = cls.empty(knowledge, 1)
+        for name in ("observed", "control_index", "filtered", "log_evidence"):
+            getattr(found, name)[0, : len(flight.observed)] = getattr(flight, name)
+        found.state[0, : len(flight.observed)] = flight.happened.state
+        ended = "".join(notice.sentence for _, notice in flight.notices if notice.kind == "ended")
+        return replace(found, ended=(ended,))
 
     @classmethod
     def joined(cls, parts: "Sequence[Flights]") -> "Flights":
         """Return the missions of several batches as one."""
         names = ("observed", "control_index", "state", "filtered", "log_evidence")
         arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        return cls(**arrays, failure=tuple(text for part in parts for text in part.failure))
+        failure, ended = (
+            tuple(text for part in parts for text in texts(part))
+            for texts in (attrgetter("failure"), attrgetter("ended"))
+        )
+        return cls(**arrays, failure=failure, ended=ended)
 
 
 class _Plants(Protocol):
@@ -95,6 +107,8 @@ class _Plants(Protocol):
 
     failure: dict[int, str]
     """What ended the flight of a twin."""
+    ended: dict[int, str]
+    """How an asset has ended its simulation."""
 
 
 class _Each:
@@ -105,7 +119,9 @@ class _Each:
         self._plants: list[Plant] = [knowledge.plant(truth, asset) for truth, asset in pairs]
         self._shape = len(self._plants), knowledge.scenario.observation.count, len(knowledge.scenario.state)
         self._before: Index | None = None
+        self._scenario = knowledge.scenario
         self.failure: dict[int, str] = {}
+        self.ended: dict[int, str] = {}
 
     def turn(self, step: int, control: Index, flying: NDArray[np.bool_]) -> tuple[Float, Float]:
         count, sensors, factors = self._shape
@@ -115,6 +131,11 @@ class _Each:
             try:
                 observed[twin] = self._plants[twin].turn(int(control[twin]), before)
                 state[twin] = self._plants[twin].latest()[0]
+            except FmuEndedError as error:
+                if step:
+                    self.ended[twin] = ended_sentence(self._scenario, step, error.sentence)
+                else:
+                    self.failure[twin] = str(error)
             except IN_FLIGHT as error:
                 self.failure[twin] = str(error)
         self._before = control.copy()
@@ -137,6 +158,7 @@ class _Stateless:
         self._before: list[tuple[int | None, int | None]] = [(None, None)] * len(assets)
         self._seen: dict[tuple[int, int, bytes], Float | str] = {}
         self.failure: dict[int, str] = {}
+        self.ended: dict[int, str] = {}  # without memory there is no end
 
     def turn(self, step: int, control: Index, flying: NDArray[np.bool_]) -> tuple[Float, Float]:
         place, state = self._grown(step, control)
@@ -193,7 +215,7 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
     """
     scenario, model = knowledge.scenario, knowledge.model
     count = len(truths)
-    flights, failure = Flights.empty(knowledge, count), [""] * count
+    flights = Flights.empty(knowledge, count)
     stateless = all(isinstance(asset, StatelessAsset) for asset in assets)
     plants: _Plants = (_Stateless if stateless else _Each)(knowledge, truths, assets)
     control = np.full(count, scenario.control_names.index(scenario.mission.first_control))
@@ -201,7 +223,7 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
     before: tuple[Float | None, Index | None] = None, None
     for step in range(scenario.mission.steps):
         observed, state = plants.turn(step, control, flying)
-        flying[list(plants.failure)] = False
+        flying[[*plants.failure, *plants.ended]] = False
         observed[~flying] = np.nan
         likelihood = knowledge.sensor_model.log_likelihood_sequence(observed, control)
         filtered, log_filtered, evidence, impossible = filter_step_many(model, *before, likelihood)
@@ -215,9 +237,10 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
             array[flying, step] = row[flying]
         before = log_filtered, control
         control = decide_many(model, filtered, control, knowledge.plan.policy, scenario.planner.decide_on)
-    for twin, sentence in plants.failure.items():
-        failure[twin] = sentence
-    return replace(flights, failure=tuple(failure))
+    failure, ended = (
+        tuple(told.get(twin, "") for twin in range(count)) for told in (plants.failure, plants.ended)
+    )
+    return replace(flights, failure=failure, ended=ended)
 
 
 def fly_one_by_one(knowledge: Knowledge, truths: Sequence[Truth], assets: Iterable[Asset]) -> Flights:
@@ -232,7 +255,7 @@ def fly_one_by_one(knowledge: Knowledge, truths: Sequence[Truth], assets: Iterab
     for truth, asset in zip(truths, assets, strict=True):
         try:
             flight = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(truth, asset))
-            flown.append(Flights.of(flight))
+            flown.append(Flights.of(knowledge, flight))
         except IN_FLIGHT as error:
             flown.append(replace(Flights.empty(knowledge, 1), failure=(str(error),)))
     return Flights.joined(flown)

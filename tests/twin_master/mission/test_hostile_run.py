@@ -13,6 +13,11 @@ import xarray as xr
 from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
 from twin_master import workflow
 from twin_master.environment import ScenarioEnvironment
+from twin_master.fleet.flight import fly_fleet
+from twin_master.fleet.outcome import ENDED
+from twin_master.fleet.plan import ensemble
+from twin_master.fleet.reading import fleet_groups
+from twin_master.fleet.report import write_fleet_report
 from twin_master.scenario.reading import load_scenario
 from twin_master.workflow import new_run, resume_run
 
@@ -173,6 +178,16 @@ def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
                 np.testing.assert_array_equal(short[name].values, long[name].values[:20])
         assert short["truth/sensor_status"].shape == (20, 1)
     assert resume_run(part.folder).notices == part.notices
+    flown = fly_fleet(ensemble(str(tmp_path / "scenario.toml"), range(4, 5)), tmp_path / "fleet")
+    assert flown.failures == {}
+    (told,) = flown.ended.values()
+    assert told == said.replace(f"{part.folder}/", "")
+    (group,) = fleet_groups(flown.folder).values()
+    assert group["status"].values.tolist() == [ENDED]
+    assert (group["control_index"].values >= 0).sum() == 20
+    assert np.isfinite(group["belief"].values).all()
+    assert np.isfinite(group["credible"].values).all()
+    assert "1 of 1 assets ended their simulation" in write_fleet_report(flown.folder).read_text()
     with ScenarioEnvironment(loaded) as environment:
         environment.reset(seed=4)
         seen = [environment.step(0) for _ in range(20)]

@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fmu_asset.errors import FmuEndedError
 from twin_master.assets.interface import AssetReading, StatelessAsset
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import AssetOutputError
+from twin_master.fleet.outcome import ENDED, FLOWN, in_credible_set, outcomes_of
+from twin_master.fleet.plan import Member
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
@@ -37,7 +40,8 @@ def known(name: str, library_file: Path, decide_on: str = "filtered") -> tuple[K
 
 def same(first: Flights, second: Flights) -> bool:
     pairs = ((getattr(first, name), getattr(second, name)) for name in ARRAYS)
-    return first.failure == second.failure and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+    told = (first.failure, first.ended) == (second.failure, second.ended)
+    return told and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
 @pytest.mark.parametrize(
@@ -108,6 +112,32 @@ def test_an_asset_that_fails_does_not_touch_the_others(remembering: bool, librar
         assert np.array_equal(found.filtered[twin, :end], whole.filtered[twin, :end])
         assert np.isnan(found.filtered[twin, end:]).all()
         assert (found.control_index[twin, end:] == -1).all()
+
+
+def test_an_asset_that_ends_keeps_what_it_has_flown(library_file: Path) -> None:
+    knowledge, asset = known("growing_damage", library_file)
+    truths = [knowledge.truth(seed) for seed in range(3)]
+
+    def ending(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        if health["z1"] >= 0.4:
+            raise FmuEndedError("It asked to end.", time=1.0)
+        return asset.step(control, health)
+
+    assets = [Remembering(StatelessAsset(ending)) for _ in truths]
+    found = fly_side_by_side(knowledge, truths, assets)
+    assert same(found, fly_one_by_one(knowledge, truths, assets))
+    flown = (found.control_index >= 0).sum(axis=1)
+    ended = [f"The asset ended the mission after {n} of 35 turns: It asked to end." for n in flown]
+    assert found.ended == tuple(text if n < 35 else "" for text, n in zip(ended, flown, strict=True))
+    assert found.failure == ("",) * 3
+    assert np.sum(flown < 35) > 0
+    kept = outcomes_of(knowledge, found, [Member(row, "", row, {}) for row in range(3)])
+    assert kept["status"].tolist() == [ENDED if text else FLOWN for text in found.ended]
+    for row, turns in enumerate(flown):
+        np.testing.assert_array_equal(kept["belief"][row], found.filtered[row, turns - 1].astype("f4"))
+        short = found.filtered[row, :turns], found.state[row, :turns]
+        inside = in_credible_set(knowledge.model, *short)
+        assert kept["credible"][row] == np.float32(inside.mean())
 
 
 def test_an_impossible_observation_ends_one_flight_only(library_file: Path) -> None:
