@@ -25,7 +25,7 @@ from twin_master.fleet.outcome import FAILED, sizes_of
 from twin_master.fleet.plan import Fleet, Group, load_fleet
 from twin_master.fleet.recorded import read_recording
 from twin_master.fleet.shard import Kit, ShardResult, with_parameters
-from twin_master.fleet.store import FleetStore, written
+from twin_master.fleet.store import FleetStore, check_installed, written
 from twin_master.mission.kept_knowledge import KNOWLEDGE_NAME, keep_knowledge
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
@@ -99,7 +99,7 @@ def fly_fleet(
     ------
     FleetError
         An asset cannot fly: all such assets are in one list, and nothing was begun. Or the cluster cannot be
-        used; what was flown is kept.
+        used; what was flown is kept. Or the extra `fleet` is not installed.
     RunFolderExistsError
         The folder holds something else.
     NotResumableError
@@ -110,6 +110,8 @@ def fly_fleet(
     begin = time.perf_counter()
     fleet = fleet if isinstance(fleet, Fleet) else load_fleet(fleet)
     folder, progress = Path(folder), progress or SilentProgress()
+    engine = engine or Engine()
+    check_installed("zarr", *(["distributed"] if engine.workers or engine.cluster else []))
     config = {"kind": KIND, "format": 1, "fleet": fleet.record()}
     _look_at(folder, config, fleet.seed, replace_old=replace_old)
     _check(fleet)
@@ -119,7 +121,7 @@ def fly_fleet(
     try:
         store = FleetStore(folder, fleet)
         kept = len(store.done)
-        _fly(fleet, folder, engine or Engine(), store, progress)
+        _fly(fleet, folder, engine, store, progress)
         failures, ended = (
             dict(sorted(item for told in store.done.values() for item in told.get(key, {}).items()))
             for key in ("failures", "ended")

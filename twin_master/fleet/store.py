@@ -8,6 +8,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib import util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,19 @@ if TYPE_CHECKING:
 
 STORE_NAME = "fleet.zarr"
 DONE_NAME = "done.jsonl"
+
+
+def check_installed(*packages: str) -> None:
+    """Refuse to begin without what the extra `fleet` brings.
+
+    Raises
+    ------
+    FleetError
+        One of the packages is not installed.
+    """
+    missing = [name for name in packages if util.find_spec(name) is None]
+    if missing:
+        raise FleetError(f"a fleet needs {' and '.join(missing)}: pip install 'uav-twin[fleet]'.")
 
 
 class FleetStore:
@@ -86,8 +100,9 @@ def open_group(folder: Path, group: str) -> "xr.Dataset":
     Raises
     ------
     FleetError
-        There is none.
+        There is none, or zarr is not installed.
     """
+    check_installed("zarr")
     import xarray as xr
 
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -274,3 +275,15 @@ def test_the_command_line(library_file: Path, tmp_path: Path) -> None:
     assert [group["twins"] for group in compared.values()] == [3, 2]
     for words in (["--seeds", "0:3", "--seed", "1"], ["--workers", "2"]):
         assert CliRunner().invoke(app, ["run", "growing_damage", *words]).exit_code == 2
+
+
+def test_without_the_extra_nothing_is_begun(
+    library_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(FleetError, match=r"needs distributed: pip install 'uav-twin\[fleet\]'\.$"):
+        fly_fleet(growing(library_file), tmp_path / "fleet", Engine(2))
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(FleetError, match=r"needs zarr: pip install"):
+        fly_fleet(growing(library_file), tmp_path / "fleet")
+    assert not (tmp_path / "fleet").exists()
