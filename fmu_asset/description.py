@@ -94,7 +94,8 @@ def model_description(
 def _add_interface(root: Element, identifier: str, source_files: Sequence[str], *, exchange: bool) -> None:
     own = {"completedIntegratorStepNotNeeded": "true"}
     if not exchange:
-        own = {"canHandleVariableCommunicationStepSize": "true", "canInterpolateInputs": "false"}
+        lines = "true" if source_files else "false"
+        own = {"canHandleVariableCommunicationStepSize": "true", "canInterpolateInputs": lines}
     interface = SubElement(
         root,
         "ModelExchange" if exchange else "CoSimulation",

@@ -115,8 +115,8 @@ static bool modes_differ(const structure_behaviour *behaviour, const double *cho
     return memcmp(chosen, behaviour->chosen, behaviour->model->key * sizeof *chosen) != 0;
 }
 
-bool structure_behaviour_advance(structure_behaviour *behaviour, const double *chosen, double duration,
-                                 double *output, structure_problem *problem) {
+bool structure_behaviour_advance(structure_behaviour *behaviour, const double *begin, const double *chosen,
+                                 double duration, double *output, structure_problem *problem) {
     if (!is_started(behaviour, problem)) {
         return false;
     }
@@ -130,9 +130,13 @@ bool structure_behaviour_advance(structure_behaviour *behaviour, const double *c
         }
         structure_integrator *integrator = &behaviour->integrators[behaviour->integrator];
         structure_motion *after = &behaviour->motions[1 - behaviour->motion];
+        structure_motion *before = &behaviour->motions[behaviour->motion];
         structure_load_coefficients(behaviour->model, chosen, behaviour->load);
-        structure_integrator_advance(integrator, &behaviour->motions[behaviour->motion], duration, behaviour->load,
-                                     after);
+        if (begin != NULL) {
+            structure_load_coefficients(behaviour->model, begin, before->load);
+        }
+        structure_integrator_advance(integrator, before, duration, begin == NULL ? NULL : before->load,
+                                     behaviour->load, after);
         behaviour->motion = 1 - behaviour->motion;
         structure_integrator_output(integrator, after, output);
     }

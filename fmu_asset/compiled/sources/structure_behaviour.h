@@ -48,9 +48,10 @@ void structure_behaviour_reset(structure_behaviour *behaviour);
 bool structure_behaviour_start(structure_behaviour *behaviour, const structure_parameters *parameters,
                                const double *chosen, double *output, structure_problem *problem);
 
-/* Advance by a duration with what is chosen held, and write the outputs. */
-bool structure_behaviour_advance(structure_behaviour *behaviour, const double *chosen, double duration,
-                                 double *output, structure_problem *problem);
+/* Advance by a duration with what is chosen held, and write the outputs. Where `begin` is given, loads move in straight
+   lines from what it chooses. */
+bool structure_behaviour_advance(structure_behaviour *behaviour, const double *begin, const double *chosen,
+                                 double duration, double *output, structure_problem *problem);
 
 /* For model exchange: the outputs under what is chosen and the motion at hand. Another health takes the motion over
    into its modes, and says so. */

@@ -152,6 +152,11 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nv
     return status_of(structure_set(instance_of(c), vr, nvr, value, nvr, false));
 }
 
+fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t nvr,
+                                       const fmi2Integer order[], const fmi2Real value[]) {
+    return status_of(structure_set_slopes(instance_of(c), vr, nvr, order, value));
+}
+
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, fmi2Real value[]) {
     return status_of(structure_get(instance_of(c), vr, nvr, value, nvr, false));
 }
@@ -310,15 +315,6 @@ fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real x_nominal
 
 static fmi2Status refuse(fmi2Component c, const char *sentence) {
     return status_of(structure_refuse(instance_of(c), STRUCTURE_STATUS_BAD_CALL, "%s", sentence));
-}
-
-fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t nvr,
-                                       const fmi2Integer order[], const fmi2Real value[]) {
-    (void)vr;
-    (void)nvr;
-    (void)order;
-    (void)value;
-    return refuse(c, "the FMU does not interpolate inputs");
 }
 
 fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t nvr,

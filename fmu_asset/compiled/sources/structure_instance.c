@@ -10,6 +10,7 @@
 
 /* phase, time and five flags, then the values, then the behaviour */
 #define SAVED_HEAD 7
+#define SAVED_FIXED (SAVED_HEAD + STRUCTURE_VARIABLE_COUNT + STRUCTURE_INPUT_COUNT)
 
 void structure_log(const structure_host *host, const char *name, structure_result result, const char *sentence) {
     host->log(host, name, result,
@@ -107,8 +108,14 @@ static void set_time(structure_instance *instance, double time) {
     }
 }
 
+static void end_slopes(structure_instance *instance) {
+    memset(instance->slopes, 0, sizeof instance->slopes);
+    instance->sloping = false;
+}
+
 void structure_instance_reset(structure_instance *instance) {
     structure_behaviour_reset(&instance->behaviour);
+    end_slopes(instance);
     instance->phase = STRUCTURE_INSTANTIATED;
     instance->discarded = false;
     for (size_t i = 0; i < STRUCTURE_VARIABLE_COUNT; ++i) {
@@ -165,10 +172,14 @@ static structure_parameters parameters_of(const double *values) {
 }
 
 /* All that can be chosen, in the order of the model. */
-static const double *chosen_of(structure_instance *instance) {
+static void choose(const double *values, double *chosen) {
     for (size_t i = 0; i < STRUCTURE_CHOSEN_COUNT; ++i) {
-        instance->chosen[i] = instance->values[structure_chosen_places[i]];
+        chosen[i] = values[structure_chosen_places[i]];
     }
+}
+
+static const double *chosen_of(structure_instance *instance) {
+    choose(instance->values, instance->chosen);
     return instance->chosen;
 }
 
@@ -247,6 +258,28 @@ static const char *phase_name(structure_phase phase) {
     return "";
 }
 
+/* Bring the inputs to the end of a step, and see that they are in range there and at its begin. */
+static structure_result move_inputs(structure_instance *instance, double step_size) {
+    static const char consequence[] = "the step was refused and the state is as it was";
+    const structure_result range = check_range(instance, 0, STRUCTURE_INPUT_COUNT, consequence);
+    if (!instance->sloping || range != STRUCTURE_DONE) {
+        return range;
+    }
+    for (size_t i = 0; i < STRUCTURE_INPUT_COUNT; ++i) {
+        const structure_variable *variable = &structure_variables[i];
+        double *value = instance->values + i;
+        *value += instance->slopes[i] * step_size;
+        /* A line to the edge of the range may end beside it by rounding. */
+        const double rounding = 1e-12 * (variable->maximum - variable->minimum);
+        if (*value > variable->maximum && *value <= variable->maximum + rounding) {
+            *value = variable->maximum;
+        } else if (*value < variable->minimum && *value >= variable->minimum - rounding) {
+            *value = variable->minimum;
+        }
+    }
+    return check_range(instance, 0, STRUCTURE_INPUT_COUNT, consequence);
+}
+
 structure_result structure_step(structure_instance *instance, double time, double step_size) {
     instance->discarded = true; /* until it is done */
     if (STRUCTURE_STATE_COUNT > 0) {
@@ -266,18 +299,24 @@ structure_result structure_step(structure_instance *instance, double time, doubl
                            "the step from t = %.17g s was refused: the FMU stands at t = %.17g s", time,
                            instance->time);
     }
-    const structure_result range =
-        check_range(instance, 0, STRUCTURE_INPUT_COUNT, "the step was refused and the state is as it was");
+    double inputs[STRUCTURE_INPUT_COUNT], begin[STRUCTURE_CHOSEN_COUNT];
+    memcpy(inputs, instance->values, sizeof inputs);
+    choose(instance->values, begin);
+    const bool sloping = instance->sloping;
+    const structure_result range = move_inputs(instance, step_size);
     if (range != STRUCTURE_DONE) {
+        memcpy(instance->values, inputs, sizeof inputs);
         return range;
     }
     structure_problem problem;
-    if (!structure_behaviour_advance(&instance->behaviour, chosen_of(instance), step_size, instance->outputs,
-                                     &problem)) {
+    if (!structure_behaviour_advance(&instance->behaviour, sloping ? begin : NULL, chosen_of(instance), step_size,
+                                     instance->outputs, &problem)) {
+        memcpy(instance->values, inputs, sizeof inputs);
         return structure_refuse(instance, STRUCTURE_STATUS_INTERNAL, "the step from t = %g s failed: %s", time,
                            problem.text);
     }
     set_time(instance, time + step_size);
+    end_slopes(instance);
     instance->discarded = false;
     accept_outputs(instance);
     return STRUCTURE_DONE;
@@ -424,6 +463,27 @@ structure_result structure_set(structure_instance *instance, const unsigned int 
     return at == value_count ? worst : wrong_count(instance, value_count);
 }
 
+structure_result structure_set_slopes(structure_instance *instance, const unsigned int *references, size_t count,
+                                      const int *orders, const double *slopes) {
+    for (size_t i = 0; i < count; ++i) {
+        if (STRUCTURE_STATE_COUNT > 0 || references[i] >= STRUCTURE_INPUT_COUNT || orders[i] != 1 ||
+            !isfinite(slopes[i])) {
+            return structure_refuse(instance, STRUCTURE_STATUS_BAD_CALL,
+                                    "derivatives of inputs must be finite, of the first order and of inputs of "
+                                    "co-simulation, but order %d of value reference %u was set to %g",
+                                    orders[i], references[i], slopes[i]);
+        }
+    }
+    for (size_t i = 0; i < count; ++i) {
+        instance->slopes[references[i]] = slopes[i];
+    }
+    instance->sloping = false;
+    for (size_t i = 0; i < STRUCTURE_INPUT_COUNT; ++i) {
+        instance->sloping = instance->sloping || instance->slopes[i] != 0.0;
+    }
+    return STRUCTURE_DONE;
+}
+
 structure_result structure_update(structure_instance *instance, const unsigned int *references, size_t count) {
     unsigned int highest = 0;
     bool bound = false, load_point = false, modal = false;
@@ -504,7 +564,7 @@ structure_result structure_get(structure_instance *instance, const unsigned int 
 /* ---------------------------------------------------------------- state */
 
 bool structure_save(const structure_instance *instance, structure_saved_state *saved) {
-    const size_t most = SAVED_HEAD + STRUCTURE_VARIABLE_COUNT + structure_behaviour_state_size(&instance->behaviour);
+    const size_t most = SAVED_FIXED + structure_behaviour_state_size(&instance->behaviour);
     double *body = calloc(most, sizeof *body);
     if (body == NULL) {
         return false;
@@ -518,22 +578,22 @@ bool structure_save(const structure_instance *instance, structure_saved_state *s
     body[6] = instance->states_changed ? 1.0 : 0.0;
     memcpy(body + SAVED_HEAD, instance->values, sizeof instance->values);
     saved->body = body;
-    saved->count = SAVED_HEAD + STRUCTURE_VARIABLE_COUNT +
-                   structure_behaviour_save(&instance->behaviour, body + SAVED_HEAD + STRUCTURE_VARIABLE_COUNT);
+    memcpy(body + SAVED_HEAD + STRUCTURE_VARIABLE_COUNT, instance->slopes, sizeof instance->slopes);
+    saved->count = SAVED_FIXED + structure_behaviour_save(&instance->behaviour, body + SAVED_FIXED);
     return true;
 }
 
 structure_result structure_restore(structure_instance *instance, const structure_saved_state *saved) {
     const double *body = saved->body;
     structure_problem problem;
-    if (saved->count <= SAVED_HEAD + STRUCTURE_VARIABLE_COUNT || !(body[0] >= 0.0 && body[0] <= STRUCTURE_TERMINATED) ||
+    if (saved->count <= SAVED_FIXED || !(body[0] >= 0.0 && body[0] <= STRUCTURE_TERMINATED) ||
         !isfinite(body[1])) {
         return structure_refuse(instance, STRUCTURE_STATUS_BAD_STATE, "the FMU state was not restored: it is damaged");
     }
-    const double *values = body + SAVED_HEAD, *rest = values + STRUCTURE_VARIABLE_COUNT;
+    const double *values = body + SAVED_HEAD, *slopes = values + STRUCTURE_VARIABLE_COUNT;
     const structure_parameters parameters = parameters_of(values);
-    if (!structure_behaviour_restore(&instance->behaviour, &parameters, rest,
-                                saved->count - SAVED_HEAD - STRUCTURE_VARIABLE_COUNT, &problem)) {
+    if (!structure_behaviour_restore(&instance->behaviour, &parameters, body + SAVED_FIXED, saved->count - SAVED_FIXED,
+                                     &problem)) {
         return structure_refuse(instance, STRUCTURE_STATUS_BAD_STATE, "the FMU state was not restored: %s", problem.text);
     }
     instance->phase = (structure_phase)(int)body[0];
@@ -545,5 +605,10 @@ structure_result structure_restore(structure_instance *instance, const structure
     instance->event_mode = body[5] != 0.0;
     instance->states_changed = body[6] != 0.0;
     memcpy(instance->values, values, sizeof instance->values);
+    end_slopes(instance);
+    for (unsigned int i = 0; i < STRUCTURE_INPUT_COUNT; ++i) {
+        instance->slopes[i] = slopes[i];
+        instance->sloping = instance->sloping || slopes[i] != 0.0;
+    }
     return STRUCTURE_DONE;
 }

@@ -42,6 +42,8 @@ typedef struct {
     double values[STRUCTURE_VARIABLE_COUNT]; /* by value reference */
     double outputs[STRUCTURE_OUTPUT_COUNT];
     double chosen[STRUCTURE_CHOSEN_COUNT]; /* of the values, in the order of the model */
+    double slopes[STRUCTURE_INPUT_COUNT];  /* of inputs over the next step */
+    bool sloping;                          /* whether one is not zero */
     /* Outputs that are computed when somebody reads them, since most masters do not. */
     bool stale_response;
     bool stale_bound;
@@ -85,6 +87,10 @@ structure_result structure_set(structure_instance *instance, const unsigned int 
                                const double *values, size_t value_count, bool enumeration);
 structure_result structure_get(structure_instance *instance, const unsigned int *references, size_t count,
                                double *values, size_t value_count, bool enumeration);
+
+/* Set the first derivatives in time of inputs, for the next step alone. */
+structure_result structure_set_slopes(structure_instance *instance, const unsigned int *references, size_t count,
+                                      const int *orders, const double *slopes);
 
 /* How many values a reference stands for, or zero, refused, if it is of no variable of that kind. */
 size_t structure_length(structure_instance *instance, unsigned int reference, bool enumeration);

@@ -104,7 +104,7 @@ static void propagate_mode(double omega, double zeta, double duration, double fa
 }
 
 void structure_integrator_advance(structure_integrator *integrator, const structure_motion *before, double duration,
-                                  const double *load, structure_motion *after) {
+                                  const double *begin, const double *load, structure_motion *after) {
     const size_t count = integrator->model->mode_count;
     const double *omega = integrator->modes.angular_frequency;
     if (integrator->duration != duration) {
@@ -113,13 +113,16 @@ void structure_integrator_advance(structure_integrator *integrator, const struct
         }
         integrator->duration = duration;
     }
-    double *rest = integrator->work;
+    double *rest = integrator->work, *first = rest + count;
     find_rest(integrator, load, rest);
+    find_rest(integrator, begin == NULL ? load : begin, first);
     for (size_t i = 0; i < count; ++i) {
-        const double *factor = integrator->propagator + 4 * i;
-        const double aside = before->displacement[i] - rest[i], velocity = before->velocity[i];
-        after->displacement[i] = factor[0] * aside + factor[1] * velocity + rest[i];
-        after->velocity[i] = factor[2] * aside + factor[3] * velocity + 0.0; /* 0, not -0, at rest */
+        /* Under a load that moves, the motion without oscillation is that at rest, behind it in time. */
+        const double *factor = integrator->propagator + 4 * i, speed = (rest[i] - first[i]) / duration;
+        const double behind = speed == 0.0 ? 0.0 : 2.0 * integrator->damping_ratio[i] / omega[i] * speed;
+        const double aside = before->displacement[i] - (first[i] - behind), velocity = before->velocity[i] - speed;
+        after->displacement[i] = factor[0] * aside + factor[1] * velocity + (rest[i] - behind);
+        after->velocity[i] = factor[2] * aside + factor[3] * velocity + speed; /* 0, not -0, at rest */
     }
     memcpy(after->load, load, integrator->model->loads * sizeof *load);
 }

@@ -1,4 +1,4 @@
-/* Transient response by modes, Kapteyn et al. 2021, eq. (12): exact for a load that is linear in time, for any
+/* Transient response by modes, Kapteyn et al. 2021, eq. (12): exact for a load that is held or linear in time, for any
    damping ratio. Modes that are not kept follow the load without delay (static correction). */
 #ifndef STRUCTURE_TRANSIENT_H
 #define STRUCTURE_TRANSIENT_H
@@ -45,9 +45,10 @@ bool structure_integrator_prepare(structure_integrator *integrator, const double
 void structure_integrator_release(structure_integrator *integrator, size_t point, double displacement,
                                   const double *load, structure_motion *motion);
 
-/* Carry a motion over a duration in which the load is held. */
+/* Carry a motion over a duration in which the load is held, or, where `begin` is given, moves from there to `load` in
+   a straight line. */
 void structure_integrator_advance(structure_integrator *integrator, const structure_motion *before, double duration,
-                                  const double *load, structure_motion *after);
+                                  const double *begin, const double *load, structure_motion *after);
 
 /* Express a motion in the modes of this integrator after a change of health: displacement and velocity of the
    structure stay, projected with the mass matrix. */

@@ -249,9 +249,28 @@ static void hold(const char *folder) {
                          next = {other[0], other[1], loads[2]};
         CHECK(model.mode_count <= 64 && model.loads <= 8);
         structure_integrator_release(integrator, STRUCTURE_POINT_LOAD, 0.02, none, &next);
-        structure_integrator_advance(integrator, &next, 0.4, load, &whole);
+        structure_integrator_advance(integrator, &next, 0.4, NULL, load, &whole);
         for (int i = 0; i < 16; ++i) {
-            structure_integrator_advance(integrator, &next, 0.025, load, &parts);
+            structure_integrator_advance(integrator, &next, 0.025, NULL, load, &parts);
+            memcpy(other, often, sizeof other);
+            memcpy(loads[2], loads[1], sizeof *loads);
+        }
+        for (size_t i = 0; i < model.mode_count; ++i) {
+            const double omega = integrator->modes.angular_frequency[i];
+            const double size = fabs(once[0][i]) + fabs(once[1][i]) / omega + 1e-3;
+            CHECK(fabs(once[0][i] - often[0][i]) < 1e-11 * size);
+            CHECK(fabs(once[1][i] - often[1][i]) < 1e-11 * size * omega);
+        }
+        /* A line from one load to another, in one step and in parts. */
+        double first[8], last[8];
+        structure_integrator_release(integrator, STRUCTURE_POINT_LOAD, 0.02, none, &next);
+        structure_integrator_advance(integrator, &next, 0.4, none, load, &whole);
+        for (int i = 0; i < 16; ++i) {
+            for (size_t l = 0; l < model.loads; ++l) {
+                first[l] = load[l] * i / 16.0;
+                last[l] = load[l] * (i + 1) / 16.0;
+            }
+            structure_integrator_advance(integrator, &next, 0.025, first, last, &parts);
             memcpy(other, often, sizeof other);
             memcpy(loads[2], loads[1], sizeof *loads);
         }
@@ -263,7 +282,7 @@ static void hold(const char *folder) {
         }
         /* Long after, the wing is at rest under its load. */
         if (k > 0) {
-            structure_integrator_advance(integrator, &next, 1e3, load, &parts);
+            structure_integrator_advance(integrator, &next, 1e3, NULL, load, &parts);
             for (size_t i = 0; i < model.mode_count; ++i) {
                 double rest = 0.0;
                 for (size_t l = 0; l < model.loads; ++l) {

@@ -6,6 +6,7 @@ import ctypes
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Model
 from fmpy.fmi3 import FMU3Model
 from fmpy.validation import validate_fmu
+from scipy.linalg import expm
 
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
@@ -220,6 +222,62 @@ def test_rates_and_outputs_are_linear_with_the_derivatives_that_it_gives(
     poles = np.linalg.eigvals(jacobian[:STATES, :STATES])
     circular = np.sort(np.abs(poles[poles.imag > 0]))[:6] / (2 * np.pi)
     np.testing.assert_allclose(circular, fmu.getReal(frequencies), rtol=1e-10)
+
+
+def test_loads_in_straight_lines_are_those_of_the_linear_system(
+    wing: tuple[FMU2Model, dict[str, int]], slave: Any, compiled_fmu: Path, binding: Binding
+) -> None:
+    """The co-simulation FMU along ramps, against the matrix exponential of what model exchange gives."""
+    fmu, reference = wing
+    modes = range(1, HALF + 1)
+    states = [reference[f"{name}[{i}]"] for name in STATE_NAMES for i in modes]
+    rates = [reference[f"der({name}[{i}])"] for name in STATE_NAMES for i in modes]
+    outputs = [reference[name] for name in ("strain[1]", "strain[13]", "tip_displacement")]
+    inputs = [reference["load_factor"], reference["tip_force"]]
+    known = [*states, *inputs]
+    unknowns = [*rates, *outputs]
+    jacobian = np.array([fmu.getDirectionalDerivative(unknowns, [one], [1.0]) for one in known]).T
+    motion, shown = jacobian[:STATES], jacobian[STATES:]
+    parameters = {"damping__alpha": 1.5, "damping__beta": 3e-4, "initial_tip_displacement": 0.05}
+    assert slave.start(response=2, **parameters, health__z1=0.3) == 0
+    x, load = np.array(fmu.getReal(states)), np.array(fmu.getReal(inputs))
+    places, time = [slave.reference[name] for name in ("load_factor", "tip_force")], 0.0
+    for size, slope in ((0.02, (40.0, -100.0)), (0.3, (-5.0, 20.0)), (0.1, (0.0, 0.0))):
+        block = np.zeros((STATES + 4, STATES + 4))
+        block[:STATES, : STATES + 2], block[STATES : STATES + 2, STATES + 2 :] = motion, np.eye(2)
+        x = (expm(block * size) @ [*x, *load, *slope])[:STATES]
+        slave.fmu.setRealInputDerivatives(
+            (ctypes.c_uint * 2)(*places), (ctypes.c_int * 2)(1, 1), (ctypes.c_double * 2)(*slope)
+        )
+        kept = slave.saved()
+        assert slave.status_of(slave.fmu.doStep, time, size) == 0
+        once = slave.everything()
+        assert slave.restore(kept) == 0
+        assert slave.status_of(slave.fmu.doStep, time, size) == 0
+        assert slave.everything() == once  # the slopes are part of the state
+        time, load = time + size, load + size * np.array(slope)
+        seen = slave.fmu.getReal(
+            [slave.reference[n] for n in ("strain[1]", "strain[13]", "tip_displacement")]
+        )
+        expected = shown @ [*x, *load]
+        np.testing.assert_allclose(seen, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+        np.testing.assert_allclose(slave.fmu.getReal(places), load, rtol=1e-14)
+    slow = binding.model_copy(update={"binding": binding.binding.model_copy(update={"step_size": 0.02})})
+    with FmiAsset(
+        compiled_fmu,
+        slow.with_interpolation("linear"),
+        parameters={
+            "response": 2.0,
+            "damping_alpha": 1.5,
+            "damping_beta": 3e-4,
+            "initial_tip_displacement": 0.05,
+        },
+        isolated=False,
+    ) as asset:
+        asset.reset(health={"z1": 0.3})
+        low, high = asset.input_range("control", "load_factor")
+        assert asset.step({"load_factor": high}).time == 0.02  # to the edge of the range
+        assert asset.step({"load_factor": low}, {"z1": 0.4}).time == 0.04
 
 
 def test_health_is_discrete_and_wrong_calls_are_refused(wing: tuple[FMU2Model, dict[str, int]]) -> None:
