@@ -214,12 +214,14 @@ MADE_ONCE = {
 MINUTES = {
     "docs/calibration.md",
     "docs/discrepancy_missions.md",
+    "docs/paper.md",
     "docs/python.md",
     "docs/real_wing.md",
     "docs/tutorials/a_fleet_that_learns.md",
     "docs/tutorials/calibrate_a_wing.md",
     "docs/tutorials/fly_the_mission.md",
     "docs/tutorials/name_an_effect.md",
+    "docs/tutorials/watch_and_teach.md",
     "docs/verdict.md",
 }
 """Pages whose blocks take ten seconds of processor time or more, and show what others show."""

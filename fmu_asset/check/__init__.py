@@ -1,4 +1,4 @@
-"""Checks of an FMU beyond what flying it shows: the standard's rules, the house's rules, its behaviour."""
+"""Checks of an FMU beyond what flying it shows: rules of the standard, rules of ours, its behaviour."""
 
 import os
 
