@@ -1,4 +1,4 @@
-"""The five small pictures of README.md: `python docs/images/draw_front.py` flies, fits and learns what they show.
+"""The five pictures of README.md: `python docs/images/draw_front.py` flies, fits and learns what they show.
 
 It takes the cells of the notebooks in docs/tutorials, so that picture and notebook tell the same.
 """
@@ -25,7 +25,7 @@ BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#999999"
 
 
 def cells_of(notebook: str, until: str) -> dict[str, Any]:
-    """Run the cells of a notebook in a folder of its own, to the first that holds a text; return their names."""
+    """Run the cells of a notebook in a folder of its own, to the first with a text; return their names."""
     names: dict[str, Any] = {"__name__": "__main__"}
     os.chdir(tempfile.mkdtemp())
     for cell in CELL.findall((IMAGES.parent / "tutorials" / f"{notebook}.md").read_text(encoding="utf-8")):
@@ -84,19 +84,23 @@ def main(wanted: list[str]) -> None:
 
 
 def draw_mission() -> None:
+    """Draw region 1 of the paper's mission."""
     run = cells_of("fly_the_mission", "open_run")["run"]
     belief("mission", run, 0, "turn", "stiffness loss, %")
 
 
 def draw_structure() -> None:
+    """Draw the crack of the bracket."""
     outcome = cells_of("your_own_structure", "outcome.control")["outcome"]
     belief("structure", uav_twin.open_run(outcome.folder), 0, "shift", "crack of the heel, %")
 
 
 def draw_effect() -> None:
+    """Draw the residual of the held-out release."""
     found = cells_of("name_an_effect", "investigate(")["found"]
     axis = picture("effect", "time, s", "residual, mm")
-    for residuals, colour, label in ((found.before, GREY, "model as it was"), (found.after, BLUE, "with friction")):
+    shown = (found.before, GREY, "model as it was"), (found.after, BLUE, "with friction")
+    for residuals, colour, label in shown:
         (fitted,) = (fitted for fitted in residuals.trials if fitted.trial.held_out)
         axis.plot(fitted.trial.time, 1e3 * fitted.residual[:, 0], color=colour, lw=0.6, label=label)
     axis.legend(frameon=False, loc="upper left")
@@ -104,6 +108,7 @@ def draw_effect() -> None:
 
 
 def draw_watch() -> None:
+    """Draw what the twin learns, and its alarm."""
     decisions = cells_of("watch_and_teach", "uav_twin.watch")["decisions"]
     learnt = [decision["learnt"]["young_modulus_factor"] for decision in decisions]
     axis = picture("watch", "turn", "factor on Young's modulus")
@@ -118,6 +123,7 @@ def draw_watch() -> None:
 
 
 def draw_fleet() -> None:
+    """Draw the probabilities that a fleet learns."""
     learnt = cells_of("a_fleet_that_learns", "learn_from_fleet")["learnt"]
     axis = picture("fleet", "", "probability to worsen")
     rates = learnt["groups"]["north"]["probability"]
