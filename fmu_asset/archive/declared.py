@@ -124,7 +124,7 @@ class FmuDescription:
         Numbers of continuous states and event indicators.
     completed_step : bool
         Whether model exchange wants to hear of completed integrator steps.
-    takes_lines : bool
+    can_interpolate_inputs : bool
         Whether inputs can move in straight lines between communication points: in model exchange, and where
         co-simulation declares `canInterpolateInputs` (FMI 1 and 2).
     """
@@ -156,7 +156,7 @@ class FmuDescription:
     states: int = 0
     event_indicators: int = 0
     completed_step: bool = False
-    takes_lines: bool = False
+    can_interpolate_inputs: bool = False
 
     @property
     def major_version(self) -> int:
@@ -228,7 +228,7 @@ def read_declared(
         can_get_and_set_state=bool(chosen.canGetAndSetFMUstate),
         can_serialise_state=bool(chosen.canSerializeFMUstate),
         can_vary_step=bool(vary),
-        takes_lines=bool(lines),
+        can_interpolate_inputs=bool(lines),
         variables=tuple(_variable(variable) for variable in declared.modelVariables),
         units=tuple(_unit(unit) for unit in declared.unitDefinitions),
         interface=interface,

@@ -180,7 +180,7 @@ class Layout:
         }
         for name, moving in zip(self.names, self.moving, strict=True):
             own = any(wiring.variable(end).continuous for end in given if end.component == name)
-            linear.append(wiring.declared[name].description.takes_lines and (own or any(moving)))
+            linear.append(wiring.declared[name].description.can_interpolate_inputs and (own or any(moving)))
         if not any(linear):
             raise BindingError(
                 f"The binding {self._binding.name} asks for linear interpolation of inputs, but no component "

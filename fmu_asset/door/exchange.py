@@ -192,7 +192,7 @@ class Exchange:
             return
         asked = f"The binding {self._binding.name} asks for linear interpolation of inputs, but"
         path = self._description.path
-        if not self._description.takes_lines:
+        if not self._description.can_interpolate_inputs:
             why = (
                 "FMI 3.0 has no derivatives of inputs in co-simulation"
                 if self._description.major_version == 3

@@ -13,6 +13,7 @@ from reporting.progress import Progress
 from .binding import INPUT_ROLES, Binding
 from .draft import trial_binding
 from .history_file import InputHistories
+from .observation import Observation
 from .session import FmiAsset
 from .simulation import ObservationHistory
 
@@ -118,8 +119,8 @@ def steps_to(start: float, end: float | None, size: float | None) -> tuple[float
 def fly_histories(asset: FmiAsset, given: InputHistories, progress: Progress) -> ObservationHistory:
     """Simulate an asset under the histories of a file.
 
-    Each row holds over the step that begins at its time. Under linear interpolation the first is where the
-    asset starts and the lines lead from row to row, so that there is a step less.
+    Each row holds over the step that begins at its time. Under linear interpolation lines lead from row to
+    row: the first is where the asset starts, and there is a moment for each row.
 
     Raises
     ------
@@ -137,7 +138,18 @@ def fly_histories(asset: FmiAsset, given: InputHistories, progress: Progress) ->
     first = {role: {name: v[0] for name, v in table.items()} for role, table in given.roles.items()}
     rest = {role: {name: v[1:] for name, v in table.items()} for role, table in given.roles.items()}
     asset.reset(**first)
-    return asset.simulate(**rest, steps=given.steps - 1, progress=progress)
+    start = asset.observe()
+    return _from_start(start, asset.simulate(**rest, steps=given.steps - 1, progress=progress))
+
+
+def _from_start(first: Observation, then: ObservationHistory) -> ObservationHistory:
+    """Return a history with the moment before it."""
+    return ObservationHistory(
+        np.concatenate(([first.time], then.time)),
+        np.vstack((first.values, then.values)),
+        {name: np.concatenate(([first.extra[name]], values)) for name, values in then.extra.items()},
+        then.ended,
+    )
 
 
 def fly(asset: FmiAsset, experiment: Experiment, progress: Progress) -> ObservationHistory:
@@ -164,10 +176,4 @@ def fly(asset: FmiAsset, experiment: Experiment, progress: Progress) -> Observat
     """
     asset.reset(experiment.parameters, **experiment.inputs)
     first = asset.observe()
-    then = asset.simulate(steps=experiment.steps, progress=progress)
-    return ObservationHistory(
-        np.concatenate(([first.time], then.time)),
-        np.vstack((first.values, then.values)),
-        {name: np.concatenate(([first.extra[name]], values)) for name, values in then.extra.items()},
-        then.ended,
-    )
+    return _from_start(first, asset.simulate(steps=experiment.steps, progress=progress))

@@ -213,7 +213,8 @@ def test_rows_that_are_joined_by_lines(
     assert flown(monkeypatch, *wanted, "--interpolation", "linear") == 0
     assert "2 steps to t = 1 s" in capsys.readouterr().out
     rows = np.genfromtxt(out, delimiter=",", names=True)
-    np.testing.assert_allclose(rows["x"], rows["time"] - 1.0 + np.exp(-rows["time"]), rtol=1e-13)
+    np.testing.assert_allclose(rows["x"], rows["time"] - 1.0 + np.exp(-rows["time"]), atol=1e-14)
+    assert rows["time"].tolist() == [0.0, 0.5, 1.0]
     given.write_text("time,u\n0,0\n")
     for more, sentence in (
         (("--interpolation", "linear"), "leads from one row of the inputs to the next: give two or more"),
