@@ -79,13 +79,7 @@ def simulate(
             write_history(out, asset, (file.name, asset.description.sha256), history)
         if plot is not None:
             draw(plot, asset, history)
-    say(
-        asset,
-        history,
-        file,
-        [out, plot],
-        from_start=inputs is None or asset.binding.binding.interpolation == "linear",
-    )
+    say(asset, history, file, [out, plot])
 
 
 def _refuse_mixture(

@@ -81,14 +81,12 @@ def say(
     history: "ObservationHistory",
     file: Path,
     written: list[Path | None],
-    *,
-    from_start: bool,
 ) -> None:
     """Say what was simulated; where nothing was written, what stands at the end."""
     end = history.time[-1] if len(history.time) else asset.time
     where = ", ".join(str(path) for path in written if path is not None)
-    # Without histories the start is a row of its own.
-    steps = len(history.time) - from_start
+    # The start may be a row of its own.
+    steps = int((history.time > asset.binding.binding.start_time).sum())
     terminal.say(f"{where or file}: {steps} steps to t = {end:g} s, every {asset.binding.interval:g} s.")
     if history.ended:
         terminal.say(history.ended)

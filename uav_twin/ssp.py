@@ -125,7 +125,7 @@ def simulate(
                 write_history(out, asset, (file.name, hash_file(file)), history)
             if plot is not None:
                 draw(plot, asset, history)
-    say(asset, history, file, [out, plot], from_start=True)
+    say(asset, history, file, [out, plot])
 
 
 def _single_numbers(texts: list[str]) -> dict[str, float]:
