@@ -74,8 +74,8 @@ $(VENV)/.dev: requirements-dev.lock $(VENV)/.runtime
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-dev.lock
 	@touch $@
 
-# The site reads docstrings, so its packages see those of the runtime behind their own.
-$(DOCS_VENV)/.docs: requirements-docs.lock $(VENV)/.runtime
+# The site reads docstrings and runs notebooks, so its packages see those of development behind their own.
+$(DOCS_VENV)/.docs: requirements-docs.lock $(VENV)/.dev
 	$(BIN)/python -m venv $(DOCS_VENV)
 	$(DOCS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-docs.lock
 	@$(BIN)/python -c 'import sysconfig; print("import site; site.addsitedir(%r)" % sysconfig.get_path("purelib"))' \
