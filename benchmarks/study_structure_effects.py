@@ -1,9 +1,10 @@
 """Effects hidden in campaigns on the shipped bracket, made by its full finite element model.
 
-`python -m benchmarks.study_structure_effects` loads the bracket at its end in four cycles of load levels. The
-readings are those of the full model (981 unknowns), with noise of gauges and of a displacement, and an effect
-that nobody tells. The search knows the FMU of the reduced structure by the file that `uav-twin structure fmu
---rig` writes. Young's modulus is off. Printed: the verdict on each campaign, and its time.
+`python -m benchmarks.study_structure_effects` loads the bracket at its end in four cycles of load levels, or
+with `--ringdown` lets its end go from four deflections. The readings are those of the full model (981
+unknowns), with noise of gauges and of a displacement, and an effect that nobody tells. The search knows the
+FMU of the reduced structure by the file that `uav-twin structure fmu --rig` writes. Young's modulus is off.
+Printed: the verdict on each campaign, and its time.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ from time import process_time
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from discrepancy.model_choice import load_model
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
 from fe.reduction.structure_cache import reduced_structure
 from fe.runtime.motion import laws_of
-from fe.runtime.patch import MicroSlip, ModelPatch, PowerStiffness, Primitive
+from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
 from fmu_asset.structures.build import build_structure_fmu
@@ -54,6 +55,7 @@ NOISE = {Quantity.STRAIN: 1e-6, Quantity.DISPLACEMENT: 2e-6}
 ZERO = {Quantity.STRAIN: 1e-6}
 LEVELS = np.array([20.0, 40.0, 60.0, 80.0, 60.0, 40.0, 20.0])
 DAY = 4000.0  # s, of the campaign
+INTERVAL, SAMPLES, DEFLECTION, MODES = 5e-4, 400, 5e-4, 12  # of a ring-down: s, number, m, number
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,13 @@ HIDDEN = (
     Hidden("breathing_crack", PORT, (PowerStiffness(PORT, -8.0, 1.0, -1, 1e-3),)),
     Hidden("joint_micro_slip", PORT, (MicroSlip(PORT, 8.0, 2e4, -0.5, 24),)),
 )  # fmt: skip
+IN_MOTION = (
+    HIDDEN[0],
+    HIDDEN[1],
+    *HIDDEN[5:],
+    Hidden("coulomb_friction", PORT, (PowerDamping(PORT, 0.4, 0.0, 0.0, 0.1, 1e-3),)),
+    Hidden("quadratic_damping", PORT, (PowerDamping(PORT, 0.5, 2.0, 0.0, 0.1, 1e-3),)),
+)
 
 
 def structure_file(folder: Path) -> Path:
@@ -107,7 +116,7 @@ def rig(folder: Path) -> Path:
     return path
 
 
-def campaign(file: Path, hidden: Hidden, seed: int) -> Campaign:
+def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -> Campaign:
     """Return the campaign of a seed on the full bracket with a hidden effect."""
     random = np.random.default_rng(seed)
     structure = load_and_assemble(file)
@@ -118,7 +127,9 @@ def campaign(file: Path, hidden: Hidden, seed: int) -> Campaign:
     quantities = [Quantity.DISPLACEMENT, *[Quantity.STRAIN] * len(structure.gauges)]
     damping = structure.damping_alpha * mass + structure.damping_beta * stiffness
     end = rows[0]
-    system = SecondOrderSystem(mass, damping, stiffness, {PORT: end}, 1)
+    system = SecondOrderSystem(
+        mass, damping, stiffness, {PORT: end}, MODES if ringdown else 1, structure.damping_beta
+    )
     laws = laws_of(ModelPatch(hidden.laws), system.ports)
     channels = {
         name: Channel(
@@ -130,16 +141,25 @@ def campaign(file: Path, hidden: Hidden, seed: int) -> Campaign:
     levels = np.concatenate([LEVELS, -LEVELS, LEVELS[:4]])
     minutes = 60.0 * np.arange(1, len(levels) + 1)
     for number, sign in enumerate((1.0, -1.0, 1.0, -1.0)):
-        time, force = 1100.0 * number + minutes, sign * levels
-        values = system.static(np.outer(hidden.force * force + hidden.tare, end), laws) @ rows.T
+        time, force, start, release = 1100.0 * number + minutes, sign * levels, 0.0, None
+        if ringdown:
+            time, force, start = INTERVAL * np.arange(SAMPLES), np.zeros(SAMPLES), 1100.0 * number
+            release = Release(sign * DEFLECTION * (1.0, 0.7, 0.5, 0.3)[number], 0.02, mode_count=0)
+            initial = np.zeros((1, 2))
+            initial[0, 0] = release.deviation * random.standard_normal()
+            moved = system.ringdown(end, release, initial, time, laws)
+            values = moved.response(rows, quantities).values
+        else:
+            values = system.static(np.outer(hidden.force * force + hidden.tare, end), laws) @ rows.T
         for column, (name, quantity) in enumerate(zip(names, quantities, strict=True)):
             values[:, column] = hidden.readings(name, time, values[:, column])
             values[:, column] += NOISE[quantity] * random.standard_normal(len(time))
         zero = np.zeros(len(time))
         trials.append(
             Trial(
-                name=f"cycle_{number + 1}", kind=TrialKind.STATIC, channels=names, values=values,
-                used=np.ones(values.shape, bool), time=time, start=0.0, force=force, load_factor=zero,
+                name=f"trial_{number + 1}", kind=TrialKind.RINGDOWN if ringdown else TrialKind.STATIC,
+                channels=names, values=values, release=release,
+                used=np.ones(values.shape, bool), time=time, start=start, force=force, load_factor=zero,
                 load_place="tip_load", temperature=zero, run="A", health=np.zeros((len(time), 2)),
                 health_deviation=np.zeros((len(time), 2)),
             )
@@ -164,17 +184,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--first-seed", type=int, default=2021)
+    parser.add_argument("--ringdown", action="store_true", help="ring-downs in the place of load levels")
     parser.add_argument("--only", help="identifiers of hidden effects, with commas")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         model = load_model(rig(folder))
-        for hidden in HIDDEN:
+        for hidden in IN_MOTION if given.ringdown else HIDDEN:
             if given.only is not None and hidden.identifier not in given.only.split(","):
                 continue
             for seed in range(given.first_seed, given.first_seed + given.seeds):
                 began = process_time()
-                made = campaign(folder / "bracket.toml", hidden, seed)
+                made = campaign(folder / "bracket.toml", hidden, seed, ringdown=given.ringdown)
                 verdict = investigate(made, model, seed=seed, thorough=False).verdict
                 seconds = process_time() - began
                 print(

@@ -139,7 +139,10 @@ def _parts(structure: "Structure") -> Iterator[dict[str, Any]]:
         yield part("damage region", damage.name, damage.set, count, "elements")
     for number, support in enumerate(design.support, start=1):
         count = len(mesh.nodes_of(support.set, f"support[{number}]"))
-        note = f"holds {', '.join(support.hold)}" if support.hold else "springs"
+        notes = [f"holds {', '.join(support.hold)}"] * bool(support.hold) + ["springs"] * bool(
+            support.springs
+        )
+        note = ", ".join(["rigid"] * (support.rigid_about is not None) + notes)
         yield part("support", str(number), support.set, count, "nodes", note)
     for load in design.load:
         if load.set is not None:

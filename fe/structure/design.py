@@ -20,13 +20,12 @@ from fe.wing.parts import Modulus, Part
 from reporting.section import checked
 from reporting.toml_file import read_toml
 
-from .rosettes import LEAST_SINE, Vector, with_rosettes
+from .rosettes import LEAST_SINE, Gauge, Name, Vector, refuse_zero, with_rosettes
 
 FloatArray = NDArray[np.float64]
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 """Units of length and their size [m]."""
-Name = Annotated[str, Field(max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 SetName = Annotated[str, Field(min_length=1, max_length=200)]
 Poisson = Annotated[float, Field(gt=-1.0, lt=0.5)]
 Spring = Annotated[float, Field(ge=0.0, le=1e15, description="N/m")]
@@ -35,11 +34,6 @@ Spring = Annotated[float, Field(ge=0.0, le=1e15, description="N/m")]
 def unit_vector(vector: Vector) -> FloatArray:
     """Vector (3,) of length one."""
     return np.asarray(np.asarray(vector) / np.linalg.norm(vector), dtype=np.float64)
-
-
-def _refuse_zero(vector: Vector | None, key: str) -> None:
-    if vector is not None and not any(vector):
-        raise ValueError(f"{key} must point somewhere, but is (0, 0, 0)")
 
 
 class NamedSet(Part):
@@ -159,7 +153,7 @@ class Material(Part):
         if orthotropic:
             assert self.axes is not None
             for axis in self.axes:
-                _refuse_zero(axis, "an axis")
+                refuse_zero(axis, "an axis")
             if np.linalg.norm(np.cross(unit_vector(self.axes[0]), unit_vector(self.axes[1]))) < LEAST_SINE:
                 raise ValueError("the two axes must not be parallel")
             if np.linalg.eigvalsh(self.compliance)[0] <= 0.0:
@@ -199,17 +193,41 @@ class Material(Part):
         return np.asarray(rotate_elasticity(local[None], axes)[0])
 
 
+MOTIONS = ("x", "y", "z", "rx", "ry", "rz")
+"""Of a rigid set: along the axes, then about them."""
+
+
 class Support(Part):
-    """Nodes of a set: directions that are held, or springs [N/m], shared equally among the nodes."""
+    """Nodes of a set: directions that are held, or springs [N/m], shared equally among the nodes.
+
+    With `rigid_about`, a point, the nodes move together as a rigid body, such as a stiff flange: `hold` may
+    name rotations about the axes through the point, too, and `springs` act on the motions x, y, z [N/m] and
+    rx, ry, rz [N m/rad] of the body that are not held.
+    """
 
     set: SetName
-    hold: tuple[Literal["x", "y", "z"], ...] = ()
-    springs: tuple[Spring, Spring, Spring] | None = None
+    hold: tuple[Literal["x", "y", "z", "rx", "ry", "rz"], ...] = ()
+    springs: tuple[Spring, Spring, Spring] | tuple[Spring, Spring, Spring, Spring, Spring, Spring] | None = (
+        None
+    )
+    rigid_about: Vector | None = None
 
     @model_validator(mode="after")
     def _holds_something(self) -> "Support":
-        if bool(self.hold) == (self.springs is not None and any(self.springs)):
-            raise ValueError('either hold = ["x", "y", "z"] or springs = [x, y, z] in N/m is expected')
+        springs = self.springs or ()
+        if self.rigid_about is None:
+            turns = len(springs) > 3 or any(name not in MOTIONS[:3] for name in self.hold)
+            if turns or bool(self.hold) == any(springs):
+                raise ValueError(
+                    'either hold = ["x", "y", "z"] or springs = [x, y, z] in N/m is expected; what turns, '
+                    "too, is a rigid set, with the point `rigid_about`"
+                )
+            return self
+        if not self.hold and not any(springs):
+            raise ValueError("a rigid set needs hold, springs or both")
+        for name, spring in zip(MOTIONS, springs, strict=False):
+            if spring and name in self.hold:
+                raise ValueError(f"the motion {name} is held, so that no spring can act on it")
         return self
 
 
@@ -234,8 +252,8 @@ class Load(Part):
         given = [key for key in ("force", "pressure", "acceleration") if getattr(self, key) is not None]
         if len(given) != 1:
             raise ValueError("one of force, pressure and acceleration is expected")
-        _refuse_zero(self.force, "force")
-        _refuse_zero(self.acceleration, "acceleration")
+        refuse_zero(self.force, "force")
+        refuse_zero(self.acceleration, "acceleration")
         places = [key for key in ("set", "point") if getattr(self, key) is not None]
         wanted = {"force": "either set or point", "pressure": "set", "acceleration": "no set and no point"}
         right = {
@@ -272,20 +290,6 @@ class PointMass(Ranged):
         return self.mass
 
 
-class Gauge(Part):
-    """Strain gauge on the surface: mean strain over `length` along `direction`, positive in tension."""
-
-    name: Name
-    point: Vector
-    direction: Vector
-    length: float = Field(default=0.0, ge=0.0)
-
-    @model_validator(mode="after")
-    def _points_somewhere(self) -> "Gauge":
-        _refuse_zero(self.direction, "direction")
-        return self
-
-
 class PointOutput(Part):
     """Displacement, or acceleration, of a point along a direction."""
 
@@ -295,7 +299,7 @@ class PointOutput(Part):
 
     @model_validator(mode="after")
     def _points_somewhere(self) -> "PointOutput":
-        _refuse_zero(self.direction, "direction")
+        refuse_zero(self.direction, "direction")
         return self
 
 

@@ -8,15 +8,15 @@ from scipy import sparse
 
 from fe.runtime.errors import InvalidDesignError
 
-from .design import Gauge
 from .location import Locator, SurfacePoint
 from .mesh import StructureMesh
+from .rosettes import Gauge
 
 FloatArray = NDArray[np.float64]
 
 STEEPEST = 30.0
 """Largest angle [degrees] between a gauge's direction and the surface; less is turned into the surface."""
-_SAMPLES = 20  # of a gauge that has a length
+_ALONG, _ACROSS = 20, 10  # points of a gauge that has a length, a width
 
 
 class GaugePlace(NamedTuple):
@@ -42,7 +42,7 @@ def gauge_rows(
     """Strain rows (gauges, full) [1/m], positive in tension, and where the gauges lie.
 
     A gauge without a length reads the strain at its point, the mean of the cells that meet there; one with
-    a length reads the mean of 20 points along it, each put onto the surface.
+    a length reads the mean of 20 points along it, one with a width of 10 across, each put onto the surface.
 
     Raises
     ------
@@ -55,19 +55,18 @@ def gauge_rows(
         point = mesh.unit * np.asarray(gauge.point)
         found = locator.on_surface(point, f"{where}: the point {mesh.place(point)}")
         direction = _in_surface(np.asarray(gauge.direction), found.normal, where)
-        length = mesh.unit * gauge.length
         spots = [found]
-        if length:
-            share = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
-            steps = [*share, -0.5, 0.5]  # the ends must lie on the surface, too
+        if gauge.length or gauge.width:
+            inside, corners = _spots(mesh, gauge, direction, np.cross(found.normal, direction))
+            wide = f" and {gauge.width:g} {mesh.unit_name} wide" if gauge.width else ""
             spots = [
                 locator.on_surface(
-                    point + step * length * direction,
-                    f"{where}: {gauge.length:g} {mesh.unit_name} long, the gauge reaches over the edge; its "
-                    f"point {mesh.place(point + step * length * direction)}",
+                    point + off,
+                    f"{where}: {gauge.length:g} {mesh.unit_name} long{wide}, the gauge reaches over the "
+                    f"edge; its point {mesh.place(point + off)}",
                 )
-                for step in steps
-            ][:_SAMPLES]
+                for off in (*inside, *corners)
+            ][: len(inside)]
         row = np.zeros(mesh.unknowns)
         for spot in spots:
             _add_strain(mesh, spot, _in_surface(direction, spot.normal, where), 1.0 / len(spots), row)
@@ -77,6 +76,21 @@ def gauge_rows(
             GaugePlace(values[0] @ mesh.nodes[found.cell[0]], direction, found.normal, found.distance)
         )
     return sparse.vstack(rows).tocsr(), tuple(places)
+
+
+def _spots(
+    mesh: StructureMesh, gauge: Gauge, direction: FloatArray, across: FloatArray
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Return where strains are averaged from the middle of a gauge (3,) [m], and its corners."""
+    sizes = mesh.unit * np.array([gauge.length, gauge.width])
+    middles = [(np.arange(count) + 0.5) / count - 0.5 for count in (_ALONG, _ACROSS)]
+    ends = [np.array([-0.5, 0.5])] * 2
+
+    def spots(shares: list[FloatArray]) -> list[FloatArray]:
+        along, over = (part if size else np.zeros(1) for part, size in zip(shares, sizes, strict=True))
+        return [a * sizes[0] * direction + b * sizes[1] * across for b in over for a in along]
+
+    return spots(middles), spots(ends)
 
 
 def _in_surface(direction: FloatArray, normal: FloatArray, where: str) -> FloatArray:

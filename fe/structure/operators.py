@@ -315,8 +315,8 @@ def _stiffness_terms(
             matrix = restriction @ assembled(mesh, cells, blocks, 3) @ held.expansion
             pair = (part.scaled_by, None if region < 0 else design.damage[region].name)
             found[pair] = found[pair] + matrix if pair in found else matrix
-    if held.springs.any():
-        springs = restriction @ sparse.diags_array(held.springs) @ held.expansion
+    springs = held.stiffness
+    if springs.nnz and springs.max() > 0.0:
         found[None, None] = found[None, None] + springs if (None, None) in found else springs
     order = {name: number for number, name in enumerate(part.name for part in design.parameter)}
     order |= {part.name: number for number, part in enumerate(design.damage)}

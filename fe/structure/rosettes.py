@@ -1,4 +1,4 @@
-"""Rosettes: gauges at one point in several directions, written as one table of a structure file."""
+"""Strain gauges of a structure file, and rosettes: gauges at one point in several directions in one table."""
 
 from typing import Annotated, Any
 
@@ -9,8 +9,33 @@ from fe.wing.parts import Part
 from reporting.section import checked
 
 Vector = tuple[float, float, float]
+Name = Annotated[str, Field(max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 LEAST_SINE = 1e-3
 """Two axes whose angle has a smaller sine do not span a plane."""
+
+
+def refuse_zero(vector: Vector | None, key: str) -> None:
+    """Refuse a direction of no length."""
+    if vector is not None and not any(vector):
+        raise ValueError(f"{key} must point somewhere, but is (0, 0, 0)")
+
+
+class Gauge(Part):
+    """Strain gauge on the surface: mean strain along `direction`, positive in tension.
+
+    The mean is over `length` along the direction and `width` across it.
+    """
+
+    name: Name
+    point: Vector
+    direction: Vector
+    length: float = Field(default=0.0, ge=0.0)
+    width: float = Field(default=0.0, ge=0.0)
+
+    @model_validator(mode="after")
+    def _points_somewhere(self) -> "Gauge":
+        refuse_zero(self.direction, "direction")
+        return self
 
 
 class Rosette(Part):
@@ -24,6 +49,7 @@ class Rosette(Part):
     axes: tuple[Vector, Vector]
     angles: Annotated[tuple[float, ...], Field(min_length=2, max_length=6)] = (0.0, 45.0, 90.0)
     length: float = Field(default=0.0, ge=0.0)
+    width: float = Field(default=0.0, ge=0.0)
 
     @model_validator(mode="after")
     def _spans_a_plane(self) -> "Rosette":
@@ -41,7 +67,7 @@ class Rosette(Part):
         turned = [
             np.cos(angle) * first + np.sin(angle) * second for angle in np.radians(self.angles).tolist()
         ]
-        common = {"point": self.point, "length": self.length}
+        common = {"point": self.point, "length": self.length, "width": self.width}
         return [
             {"name": f"{self.name}_{letter}", "direction": tuple(direction.tolist())} | common
             for letter, direction in zip("abcdef", turned, strict=False)

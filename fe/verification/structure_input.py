@@ -1,12 +1,14 @@
 """A structure as input for CalculiX, on the same mesh; `fe.verification.calculix_job` runs it.
 
-CalculiX gets nodes, cells, materials with their orientations, supports and springs, and applies pressures and
-acceleration fields itself; forces on sets and points come as nodal forces. Point masses are blocks tied to
-the structure, outputs are nodes whose displacement is the strain or displacement, by an equation.
+CalculiX gets nodes, cells, materials with their orientations, supports and springs, and applies pressures
+and acceleration fields itself; forces on sets and points come as nodal forces. Point masses are blocks tied
+to the structure, rigid sets follow two nodes by equations, and outputs are nodes whose displacement is the
+strain or displacement, by an equation.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ from fe.runtime.errors import CalculixError
 from fe.structure.design import Load, Material
 from fe.structure.elements import WEDGES_6
 from fe.structure.operators import Structure
+from fe.structure.supports import RigidSet
 
 from .calculix_input import ORTHOTROPIC, equation_lines, mass_block_lines, number_line
 
@@ -47,14 +50,34 @@ class StructureDeck:
 
     @property
     def probes(self) -> FloatArray:
-        """Rows (gauges + displacements, full) of what is read."""
+        """Rows (gauges + displacements, n) of what is read, on the free unknowns."""
         structure = self.structure
-        rows = (structure.gauge_output, structure.displacement_output)
-        return np.vstack([(row @ structure.expansion.T).toarray() for row in rows])
+        return np.vstack([structure.gauge_output.toarray(), structure.displacement_output.toarray()])
 
     @property
     def _node_count(self) -> int:
-        return len(self.structure.mesh.points)
+        """Nodes of the mesh, then two of each rigid set: what these move is its shift and its turn."""
+        return len(self.structure.mesh.points) + 2 * len(self.structure.unknowns_held.rigid)
+
+    def _motion_places(self, number: int) -> list[tuple[int, int]]:
+        """Node and direction of the six motions of a rigid set."""
+        first = len(self.structure.mesh.points) + 1 + 2 * number
+        return [(first + motion // 3, motion % 3 + 1) for motion in range(6)]
+
+    @cached_property
+    def _places(self) -> list[tuple[int, int]]:
+        """Node and direction of each free unknown."""
+        held = self.structure.unknowns_held
+        found = [(unknown // 3 + 1, unknown % 3 + 1) for unknown in held.alone.tolist()]
+        for number, body in enumerate(held.rigid):
+            motions = self._motion_places(number)
+            found += [motions[motion] for motion in np.flatnonzero(~body.held)]
+        return found
+
+    def _terms(self, values: FloatArray) -> Iterator[tuple[int, int, float]]:
+        """Yield (node, direction, value) of the values (n,) that are not zero."""
+        for unknown in np.flatnonzero(values).tolist():
+            yield (*self._places[unknown], float(values[unknown]))
 
     def static_steps(self) -> str:
         """Input of one linear static step for each load, its control at the nominal value."""
@@ -126,10 +149,37 @@ class StructureDeck:
                 yield f"*SPRING, ELSET={name}"
                 yield str(axis + 1)
                 yield number_line([spring])
+        for number, body in enumerate(held.rigid):
+            yield from self._rigid_lines(number, body, element)
+            element += int((body.springs > 0.0).sum())
+
+    def _rigid_lines(self, number: int, body: RigidSet, element: int) -> Iterator[str]:
+        """Yield the motions of a rigid set, what holds and springs them, and the nodes that follow them."""
+        places = self._motion_places(number)
+        yield "*NODE"
+        for node in (places[0][0], places[3][0]):
+            yield f"{node},{number_line(body.point)}"
+        yield "*BOUNDARY"
+        for motion in np.flatnonzero(body.held).tolist():
+            yield "{},{}".format(*places[motion])
+        for motion in np.flatnonzero(body.springs > 0.0).tolist():
+            element += 1
+            name = f"RIGID{number}X{motion}"
+            yield f"*ELEMENT, TYPE=SPRING1, ELSET={name}"
+            yield f"{element},{places[motion][0]}"
+            yield f"*SPRING, ELSET={name}"
+            yield str(places[motion][1])
+            yield number_line([body.springs[motion]])
+        for row, shares in enumerate(body.motions.tolist()):
+            moved = [(*place, share) for place, share in zip(places, shares, strict=True) if share]
+            yield from equation_lines([(int(body.nodes[row // 3]) + 1, row % 3 + 1, -1.0), *moved])
 
     def _masses(self) -> Iterator[str]:
-        structure = self.structure
-        element = len(structure.mesh.cells) + int((structure.unknowns_held.springs > 0.0).sum()) + 1
+        structure, held = self.structure, self.structure.unknowns_held
+        springs = sum(
+            int((part > 0.0).sum()) for part in (held.springs, *(body.springs for body in held.rigid))
+        )
+        element = len(structure.mesh.cells) + springs + 1
         node = self._node_count + 1
         yield "*ELSET, ELSET=EHEAVY"
         yield "EALL"
@@ -153,7 +203,7 @@ class StructureDeck:
         for node in range(first, first + (len(probes) + 2) // 3):
             yield f"{node},0.,0.,0."
         for number, weights in enumerate(probes):
-            yield from equation_lines([(first + number // 3, number % 3 + 1, -1.0), *_terms(weights)])
+            yield from equation_lines([(first + number // 3, number % 3 + 1, -1.0), *self._terms(weights)])
 
     def _load_lines(self, load: Load) -> Iterator[str]:
         structure, mesh = self.structure, self.structure.mesh
@@ -161,8 +211,7 @@ class StructureDeck:
         yield "*CLOAD, OP=NEW"
         yield "1,1,0."
         if load.force is not None:
-            full = structure.expansion @ structure.load(load.name)
-            for node, direction, value in _terms(full):
+            for node, direction, value in self._terms(structure.load(load.name)):
                 yield f"{node},{direction},{value:.13E}"
         yield "*DLOAD, OP=NEW"
         if load.acceleration is not None:
@@ -183,9 +232,3 @@ def _elastic_lines(part: Material, factor: float) -> Iterator[str]:
     yield "*ELASTIC, TYPE=ORTHO"
     yield number_line(constants[:8])
     yield number_line([constants[8], 0.0])
-
-
-def _terms(full: FloatArray) -> Iterator[tuple[int, int, float]]:
-    """Yield (node, direction, value) of the values (full,) that are not zero."""
-    for unknown in np.flatnonzero(full).tolist():
-        yield unknown // 3 + 1, unknown % 3 + 1, float(full[unknown])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +16,12 @@ from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
-from fmu_asset.packing.wing_fmu import build_fmu
 from twin_master import workflow
 from twin_master.assets.resolution import Overrides
 from twin_master.assets.wing_model import ReducedModelSource
 from twin_master.fleet.reading import fly_seeds
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.workflow import new_run, resume_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
@@ -81,8 +82,11 @@ def test_the_mission_is_the_same_with_the_compiled_wing_and_without_a_worker(
     monkeypatch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
     loaded = load_scenario("level_turns")
 
-    def arrays(name: str, overrides: Overrides) -> dict[str, np.ndarray]:
-        folder = new_run(loaded, tmp_path / name, overrides).folder
+    def arrays(name: str, overrides: Overrides, packed: str = "python") -> dict[str, np.ndarray]:
+        table = loaded.scenario.to_dict()
+        table["asset"]["packed"] = packed
+        scenario = parse_scenario(table, "level_turns")
+        folder = new_run(replace(loaded, scenario=scenario), tmp_path / name, overrides).folder
         with xr.open_datatree(folder / "run.nc", engine="h5netcdf") as tree:
             return {
                 f"{group}/{variable}": tree[group][variable].values
@@ -99,8 +103,9 @@ def test_the_mission_is_the_same_with_the_compiled_wing_and_without_a_worker(
         find_compiler()
     except FmuBuildError as error:
         pytest.skip(f"no C compiler: {error}")
-    fmu = build_fmu(wing, tmp_path / "compiled.fmu", kind="compiled").path
-    compiled = arrays("compiled", Overrides(fmu=fmu))
+    compiled = arrays("compiled", Overrides(), "compiled")
+    with zipfile.ZipFile(tmp_path / "compiled" / "asset" / "asset.fmu") as archive:
+        assert not any(name.endswith(".py") for name in archive.namelist())
     assert {*compiled} == {*worker}
     for name, values in worker.items():
         np.testing.assert_allclose(compiled[name], values, rtol=1e-9, atol=1e-12, err_msg=name)

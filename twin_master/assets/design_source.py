@@ -53,6 +53,8 @@ class DesignSection(FmuSection):
     patch: str | None = None
     """A patch file: missing effects that the FMU carries, switched on from the start unless `parameters` says
     otherwise. The twin does not know of them."""
+    packed: Literal["python", "compiled"] = "python"
+    """What evaluates the FMU: Python, or C compiled here, which carries no patch."""
 
     def copies(self) -> Mapping[str, str]:
         """Return where the copies of binding, design and patch stand in a run folder."""
@@ -168,6 +170,7 @@ class WingFmuSource(FmuSource):
     def __init__(self, scenario: Scenario, section: DesignSection) -> None:
         super().__init__(scenario, section)
         self._of = _Wing(scenario, section)
+        self._packed = section.packed
         self._design: WingDesign | None = None
         self._wing: ReducedModel | None = None
         self._mean = 1.0
@@ -195,10 +198,16 @@ class WingFmuSource(FmuSource):
         CalibrationRecordError
             The calibration file is damaged or of another kind, or has no samples of the parameter.
         """
+        from fmu_asset.compiled.compiler import find_compiler
         from fmu_asset.door.binding import load_binding
+        from fmu_asset.packing.wing_fmu import check_kind
 
         read_calibration(self._scenario.calibration)
         self.files()
+        if self._packed == "compiled":
+            find_compiler()  # before the wing is reduced, which can take minutes
+            if self._of.patch_path is not None:
+                check_kind(self._packed)
         design = self._of.design()
         gauges = len(design.gauges.positions)
         binding = load_binding(self._section.binding_path).with_regions(design.regions)
@@ -237,6 +246,7 @@ class WingFmuSource(FmuSource):
                 self._design,
                 self.fmu_path(),
                 tailoring=tailored,
+                kind=self._packed,
                 patch=None if patch is None else load_patch(patch),
                 activate=True,
                 replace=True,

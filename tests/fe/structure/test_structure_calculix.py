@@ -99,21 +99,42 @@ direction = [0, 0, 1]
 """
 
 
-def body(box: Callable[..., Any], write: Callable[..., Path], kind: str, **options: bool) -> Structure:
+def body(
+    box: Callable[..., Any], write: Callable[..., Path], kind: str, text: str = BODY, **options: bool
+) -> Structure:
     points, cells = box(kind, (4, 2, 1) if kind in ("hexahedron20", "tetra10") else (4, 2, 2))
     bent = points * (100, 25, 10)
     if kind in ("hexahedron20", "tetra10"):  # curved edges, in the plane of the top
         bent[:, 1] += 12.0 * (bent[:, 0] / 100.0) ** 2 * (bent[:, 1] / 25.0)
     data = {"top": (points[:, 2] == 1.0).astype(np.int64), "tip": (points[:, 0] == 1.0).astype(np.int64)}
-    return load_and_assemble(write(bent, kind, cells, BODY, point_data=data), **options)
+    return load_and_assemble(write(bent, kind, cells, text, point_data=data), **options)
+
+
+HELD = 'set = "root"\nhold = ["x", "y", "z"]'
+FLANGE = 'set = "root"\nrigid_about = [-5, 10, 3]\nhold = ["x", "rz"]\nsprings = [0, 2e6, 1e6, 300, 500, 0]'
 
 
 @needs_calculix
-@pytest.mark.parametrize("kind", ["tetra", "tetra10", "hexahedron", "hexahedron20"])
+@pytest.mark.parametrize(
+    ("kind", "root"),
+    [
+        ("tetra", HELD),
+        ("tetra10", HELD),
+        ("hexahedron", HELD),
+        ("hexahedron20", HELD),
+        ("hexahedron", FLANGE),
+    ],
+)
 def test_both_codes_agree(
-    kind: str, box: Callable[..., Any], write: Callable[..., Path], tmp_path: Path
+    kind: str, root: str, box: Callable[..., Any], write: Callable[..., Path], tmp_path: Path
 ) -> None:
-    structure = body(box, write, kind, mass_as_stiffness=True)
+    """The last one stands on a rigid flange, which the push and two gauges near it load, on springs."""
+    text = BODY.replace(HELD, root)
+    if root == FLANGE:
+        text = text.replace("point = [31, 11, 10]", "point = [9, 11, 10]").replace(
+            'name = "push"\nset = "tip=1"', 'name = "push"\nset = "root"'
+        )
+    structure = body(box, write, kind, text, mass_as_stiffness=True)
     agreement = structure_agreement(structure, tmp_path / "ccx", 5)
     assert [load.load for load in agreement.loads] == ["weight", "suction", "push"]
     for load in agreement.loads:

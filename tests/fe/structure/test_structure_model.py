@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fe.runtime.errors import InvalidStateError, MeshError
+from fe.runtime.errors import InvalidDesignError, InvalidStateError, MeshError
 from fe.structure.elements import KINDS
 from fe.structure.memory import analysed_estimate, check_memory, upper_estimate
 from fe.structure.operators import Structure, load_and_assemble
@@ -240,6 +240,88 @@ def test_springs_carry_the_weight(beam: Callable[..., Structure]) -> None:
     springs = structure.unknowns_held.springs.reshape(-1, 3)
     assert springs.sum(axis=0) == pytest.approx([1e7, 1e7, 2e4])
     assert springs[:, 2] @ down == pytest.approx(-3.0 * 9.81 * weighed(structure)[0], rel=1e-7)
+
+
+HELD = 'set = "root"\nhold = ["x", "y", "z"]'
+FLANGE = 'set = "root"\nrigid_about = [0, 30, 5]\n'
+
+
+def test_a_rigid_root_on_springs_shifts_and_turns(beam: Callable[..., Structure]) -> None:
+    """The whole is statically determinate: what the springs add to the bending is F / k and F L^2 / k_r."""
+    held = static_responses(beam())
+    springs = 'hold = ["x", "y", "rx", "rz"]\nsprings = [0, 0, 1e4, 0, 3e3, 0]'
+    structure = beam((HELD, FLANGE + springs))
+    sprung = static_responses(structure)
+    assert structure.unknowns == beam().unknowns + 2
+    moved = 2.0 / 1e4 + 2.0 / 3e3
+    for name in ("tip", "at_a_point"):
+        np.testing.assert_allclose(sprung[name].output[0] - held[name].output[0], moved, rtol=1e-7)
+        np.testing.assert_allclose(sprung[name].strain, held[name].strain, rtol=1e-7)
+    fixed = static_responses(beam((HELD, FLANGE + 'hold = ["x", "y", "z", "rx", "ry", "rz"]')))
+    np.testing.assert_allclose(fixed["weight"].displacement, held["weight"].displacement, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("support", "sentence"),
+    [
+        (HELD.replace('"z"', '"rz"'), "with the point `rigid_about`"),
+        (FLANGE + 'hold = ["rx"]\nsprings = [0, 0, 0, 1, 0, 0]', "rx is held"),
+        (FLANGE, "a rigid set needs hold, springs or both"),
+        (FLANGE + 'hold = ["x", "y", "z", "rx", "rz"]', "a turn about the axis along \\(0, -?1, 0\\)"),
+        (f'{FLANGE}hold = ["x"]\n[[support]]\n{HELD}', "nodes of the rigid set belong to another support"),
+        (
+            FLANGE.replace("root", "line") + 'hold = ["x"]\n[[set]]\nname = "line"\nof = "nodes"\n'
+            "box = [[0, 0, 0], [1000, 0, 0]]",
+            "lie on a line",
+        ),
+    ],
+)
+def test_a_rigid_set_that_cannot_be(support: str, sentence: str, beam: Callable[..., Structure]) -> None:
+    with pytest.raises((InvalidDesignError, MeshError), match=sentence):
+        beam((HELD, support))
+
+
+def test_a_gauge_reads_the_mean_over_its_area(box: Callable[..., Any], write: Callable[..., Path]) -> None:
+    """Of u = x y^2, which the 20-node cell holds exactly: the mean of y^2 over ten strips of the width."""
+    points, cells = box("hexahedron20", (1, 1, 1))
+    text = """
+length_unit = "m"
+[[material]]
+name = "ply"
+density = 1500
+young_modulus = 1e9
+poisson_ratio = 0.3
+[[support]]
+set = "all=1"
+hold = ["y"]
+[[support]]
+set = "x"
+hold = ["x", "z"]
+[[set]]
+name = "x"
+of = "nodes"
+box = [[0, 0, 0], [0, 0, 1]]
+[[gauge]]
+name = "g"
+point = [0.5, 0.4, 1]
+direction = [1, 0, 0]
+length = 0.2
+width = 0.6
+"""
+    structure = load_and_assemble(
+        write(points, "hexahedron20", cells, text, point_data={"all": np.ones(len(points), dtype=np.int64)})
+    )
+    field = np.zeros_like(structure.mesh.points)
+    field[:, 0] = structure.mesh.points[:, 0] * structure.mesh.points[:, 1] ** 2
+    moved = structure.expansion.T @ field.ravel()
+    assert structure.gauge_output @ moved == pytest.approx([0.4**2 + 0.6**2 / 12.0 * (1.0 - 1.0 / 100.0)])
+    with pytest.raises(InvalidDesignError, match=r"0\.2 m long and 1\.2 m wide, the gauge reaches over"):
+        load_and_assemble(
+            write(
+                points, "hexahedron20", cells, text.replace("width = 0.6", "width = 1.2"),
+                point_data={"all": np.ones(len(points), dtype=np.int64)},
+            )
+        )  # fmt: skip
 
 
 def test_an_orthotropic_material_follows_its_axes(
