@@ -5,6 +5,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 DOCS_VENV := .venv-docs
 OUT ?= runs/demo
+# Python compiles each file once, not in every process: tests start hundreds, each of them a second sooner.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help
 help: ## List the targets
