@@ -66,6 +66,7 @@ def test_a_folder_with_its_truth(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     assert call(monkeypatch, "calibrate", "ringdown", "--data", out, "--fitted") == 0
 
 
+@pytest.mark.long
 def test_the_fmu_gives_the_same_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     fmu = tmp_path / "wing.fmu"
     assert call(monkeypatch, "fmu", "build", "--out", fmu) == 0

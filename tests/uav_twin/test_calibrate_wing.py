@@ -180,6 +180,7 @@ def test_a_report_of_a_calibration_repeats_to_the_byte(
         assert (tmp_path / name).read_bytes() == (made.out / name).read_bytes(), name
 
 
+@pytest.mark.long
 def test_two_wings_are_two_fmus(
     wings: dict[str, Tailored], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -268,6 +269,7 @@ def test_two_wings_are_two_flights(
     assert np.all(true["soft"] > true["stiff"])
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_the_truth_of_the_scenario_stays_and_is_told(
     wings: dict[str, Tailored],

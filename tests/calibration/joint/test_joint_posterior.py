@@ -284,6 +284,7 @@ def simulate(
     return truth, modal, weighed, STATIC.load / PUBLISHED_LINE.stiffness(truth[0])
 
 
+@pytest.mark.long
 def test_the_truth_has_a_uniform_rank_among_the_samples(tables: WingTables) -> None:
     """Simulation-based calibration: wings from the prior, with the assumed model error."""
     generator = np.random.default_rng(2021)

@@ -67,6 +67,7 @@ def test_white_records_stay_white() -> None:
     assert np.count_nonzero(orders) <= binom.isf(1e-4, 300, 1e-3)
 
 
+@pytest.mark.long
 def test_whitened_noise_is_white() -> None:
     """A new record of the process, whitened by the autoregression of the first, is white."""
     generator = np.random.default_rng(5)

@@ -186,7 +186,8 @@ def test_what_people_read_spells_chi_square_in_one_way() -> None:
     root = Path(__file__).parents[3]
     other = re.compile(r"chi-square|chi\^2|chi2|chi²|χ² / dof|χ2", re.IGNORECASE)
     for page in (root / "README.md", *(root / "docs").glob("*.md")):
-        assert not other.search(page.read_text(encoding="utf-8")), page.name
+        if page.name != "glossary.md":  # which lists what is not to be written
+            assert not other.search(page.read_text(encoding="utf-8")), page.name
     checked = 0
     for package in ("calibration", "discrepancy", "uav_twin", "twin_master", "fe", "reporting"):
         for file in (root / package).rglob("*.py"):

@@ -87,6 +87,7 @@ def test_cubic_spring_has_a_frequency_shift_with_the_square_of_amplitude() -> No
     assert slope == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("known", [True, False])
 def test_error_bars_cover(known: bool) -> None:
     generator = np.random.default_rng(21)

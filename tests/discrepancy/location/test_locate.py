@@ -22,6 +22,7 @@ from discrepancy.location.residuals import FittedTrial, ResidualSet, sensitivity
 # ---------------------------------------------------------------- calibration of the whole
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("count", "freedom"),
     [(64, 200.0), *(pytest.param(*row, marks=pytest.mark.long) for row in ((120, 20.0), (200, np.inf)))],

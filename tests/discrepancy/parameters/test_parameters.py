@@ -188,6 +188,7 @@ def test_one_parameter_is_integrated_as_densely_as_one_likes(tmp_path: Path) -> 
     assert any("not explained by these parameters" in sentence for sentence in found.findings)
 
 
+@pytest.mark.long
 def test_intervals_cover_what_is_true(tmp_path: Path) -> None:
     """Truths from the prior; the zero is free, and the noise known from twelve degrees of freedom."""
     generator = np.random.default_rng(12)

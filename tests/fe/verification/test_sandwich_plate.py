@@ -220,6 +220,7 @@ def test_both_models_of_the_wing_agree(agreement):
     assert np.abs(agreement.damage_ratio).max() < 0.04
 
 
+@pytest.mark.long
 def test_the_models_agree_with_either_section_on_a_coarse_mesh(coarse_design, coarse_operators):
     true, straight = (
         compare_with_plate(coarse_design, coarse_operators, straight_section=section)

@@ -21,7 +21,13 @@ def texts(check: FmuCheck, name: str) -> str:
     return " ".join(finding.text for finding in check.findings if finding.check == name)
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(
+    "model",
+    [
+        name if name in ("array3", "ball2", "hostile2") else pytest.param(name, marks=pytest.mark.long)
+        for name in MODELS
+    ],
+)
 def test_sound_fmus_of_all_kinds_have_no_problem(foreign_fmu: Any, model: str) -> None:
     check = check_fmu(foreign_fmu(model), step_size=0.01 if model == "fixed2" else 0.1)
     assert check.passed, check.problems

@@ -140,6 +140,7 @@ def test_a_damaged_data_file_is_refused_with_a_sentence(
             pass
 
 
+@pytest.mark.long
 def test_fmpy_compiles_the_sources(
     compiled_fmu: Path, compiler: list[str], binding: Binding, tmp_path: Path
 ) -> None:

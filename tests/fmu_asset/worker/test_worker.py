@@ -253,6 +253,7 @@ def test_a_worker_ends_when_the_twin_is_killed(
     assert not list(scratch.iterdir())
 
 
+@pytest.mark.long
 def test_sessions_leak_nothing(fmu: Path, binding: Binding) -> None:
     """Neither descriptors nor entries of sys.path, nor with twenty resets in each of several workers."""
     path = list(sys.path)

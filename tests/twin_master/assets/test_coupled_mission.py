@@ -304,6 +304,7 @@ def test_three_fmus_live_the_script_of_a_scenario(tmp_path: Path) -> None:
     assert theirs.state.max() == 0.6
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
 def test_the_shipped_scenario_in_process_in_workers_and_resumed(

@@ -96,6 +96,7 @@ def test_a_run_with_a_library_keeps_it_and_can_be_resumed(
         resume_run(tmp_path / "part")
 
 
+@pytest.mark.long
 def test_a_library_of_the_same_draws_gives_the_same_run(tmp_path: Path) -> None:
     grid = grid_of_scenario(small_pump(), tmp_path / "made", progress=SilentProgress())
     path = sample_library(grid, tmp_path / "pump.nc", workers=1).path

@@ -371,6 +371,7 @@ class TestOnTheWing:
         assert np.sign(wrong.bias(1).value) == np.sign(expected[1])
         assert wrong.credible_share.value < right.credible_share.value
 
+    @pytest.mark.long
     def test_a_run_says_that_asset_and_model_differ_and_is_resumed_bit_for_bit(
         self,
         wing: ReducedModel,

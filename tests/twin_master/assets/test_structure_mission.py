@@ -74,6 +74,7 @@ def test_the_twin_finds_the_damage_of_the_full_model(flown: Path) -> None:
     np.testing.assert_allclose(tree["filtered"]["mean"].values[-1], [0.4, 0.0], atol=0.1)
 
 
+@pytest.mark.long
 def test_damage_is_found_from_frequencies_alone(tmp_path: Path) -> None:
     """Three natural frequencies in the place of gauges; those flown are the full model's."""
     seen = {

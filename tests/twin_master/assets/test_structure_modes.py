@@ -101,6 +101,7 @@ def test_an_ambient_record_tells_the_same_mode(file: Path, tmp_path: Path) -> No
     assert errors[0] < 0.01 * true[0]
 
 
+@pytest.mark.long
 def test_a_resumed_flight_goes_on_with_the_records_of_its_turns(
     file: Path,
     flown: Path,

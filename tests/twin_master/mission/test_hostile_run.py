@@ -128,7 +128,7 @@ def scenario(folder: Path, fmu: Path) -> Any:
 @pytest.mark.parametrize(
     ("what", "kind", "sentence"),
     [
-        ("SEGFAULT", FmuWorkerError, r"step 20 from t = 20 s: .*SIGSEGV"),
+        pytest.param("SEGFAULT", FmuWorkerError, r"step 20 from t = 20 s: .*SIGSEGV", marks=pytest.mark.long),
         ("HANG", FmuTimeoutError, r"step 20 from t = 20 s: .*longer than 3 s for the step"),
         pytest.param(
             "LEAK_IN_STEP", FmuMemoryError, r"more than the limit of 400 MiB", marks=pytest.mark.long

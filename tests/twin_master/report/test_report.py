@@ -609,11 +609,16 @@ def test_the_caption_tells_the_decision_and_what_it_rests_on(
 @pytest.mark.parametrize(
     "missing",
     [
-        "truth", "smoothed", "predicted", "policy", "calibration", "policy/action_value", "observed/strain",
-        "truth/strain",
-        "filtered/quantity_mean", "filtered/reward_mean", "predicted/quantity_mean",
-        "predicted/control_probability", "filtered/log_evidence", "filtered/quantity_standard_deviation",
-        "filtered/quantity_lower", "predicted/reward_standard_deviation",
+        "truth", "smoothed", "policy", "calibration",
+        *(
+            pytest.param(name, marks=pytest.mark.long)
+            for name in (
+                "predicted", "policy/action_value", "observed/strain", "truth/strain", "filtered/quantity_mean",
+                "filtered/reward_mean", "predicted/quantity_mean", "predicted/control_probability",
+                "filtered/log_evidence", "filtered/quantity_standard_deviation", "filtered/quantity_lower",
+                "predicted/reward_standard_deviation",
+            )
+        ),
     ],
 )  # fmt: skip
 @pytest.mark.usefixtures("no_drawing")
@@ -649,7 +654,10 @@ def test_short_missions(tmp_path: Path, steps: int, horizon: int) -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-@pytest.mark.parametrize(("steps", "horizon"), [(2, 3), (3, 1), (12, 10), (4, 0)])
+@pytest.mark.parametrize(
+    ("steps", "horizon"),
+    [(12, 10), *(pytest.param(*row, marks=pytest.mark.long) for row in ((2, 3), (3, 1), (4, 0)))],
+)
 def test_other_short_missions(tmp_path: Path, steps: int, horizon: int) -> None:
     test_short_missions(tmp_path, steps, horizon)
 
