@@ -613,9 +613,10 @@ def test_the_caption_tells_the_decision_and_what_it_rests_on(
         *(
             pytest.param(name, marks=pytest.mark.long)
             for name in (
-                "predicted", "policy/action_value", "observed/strain", "truth/strain", "filtered/quantity_mean",
-                "filtered/reward_mean", "predicted/quantity_mean", "predicted/control_probability",
-                "filtered/log_evidence", "filtered/quantity_standard_deviation", "filtered/quantity_lower",
+                "predicted", "policy/action_value", "observed/strain", "truth/strain",
+                "filtered/quantity_mean", "filtered/reward_mean", "predicted/quantity_mean",
+                "predicted/control_probability", "filtered/log_evidence",
+                "filtered/quantity_standard_deviation", "filtered/quantity_lower",
                 "predicted/reward_standard_deviation",
             )
         ),
