@@ -292,6 +292,7 @@ def test_the_truth_of_the_scenario_stays_and_is_told(
     np.testing.assert_array_equal(true["soft"], true["stiff"])
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_a_run_with_a_calibration_needs_nothing_but_its_folder(
     wings: dict[str, Tailored],

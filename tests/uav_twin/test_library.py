@@ -75,6 +75,7 @@ def test_a_wrong_command_line_is_said_to_be_so(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.long
 def test_a_run_of_the_pump_speaks_of_pumps(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -221,6 +221,7 @@ def test_wrong_noise_makes_no_name(small, effects, how, seed: int) -> None:  # t
     assert verdict.kind in NO_NAME, verdict.sentence
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "how",
     [pytest.param({"noise_scale": 2.0}, marks=pytest.mark.long), {"noise": coloured}],

@@ -140,6 +140,7 @@ def test_there_is_nothing_to_fork_before_the_first_step(foreign_fmu: Any) -> Non
         FmiAsset(foreign_fmu("hostile2"), described()).fork()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_three_hundred_cycles_leave_nothing(
     foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

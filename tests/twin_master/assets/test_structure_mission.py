@@ -125,6 +125,7 @@ def test_a_resumed_flight_is_bit_identical_after_the_files_are_gone(
         assert (moved / name).read_bytes() == (flown / name).read_bytes(), name
 
 
+@pytest.mark.long
 def test_the_compiled_fmu_is_flown_where_the_scenario_says_so(flown: Path, tmp_path: Path) -> None:
     """Strains are those of the Python FMU within 1e-12 of the largest; the run folder holds the binary."""
     folder = new_run(short(asset={"packed": "compiled"}), tmp_path / "run", report=False).folder

@@ -567,6 +567,7 @@ def test_the_page_needs_nothing_from_outside(folder: Path) -> None:
         assert word in text
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_drawing")
 def test_wall_clock_times_stay_out_of_the_page(tmp_path: Path, tree: xr.DataTree) -> None:
     place = synthetic_run.write_run(tmp_path / "run", tree)
@@ -575,6 +576,7 @@ def test_wall_clock_times_stay_out_of_the_page(tmp_path: Path, tree: xr.DataTree
     assert report.write_report(place).read_bytes() == before
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_drawing")
 def test_figures_without_references_have_no_column_for_them(tmp_path: Path, tree: xr.DataTree) -> None:
     place = synthetic_run.write_run(tmp_path / "run", tree)
@@ -647,6 +649,7 @@ def test_a_run_without_any_json_is_reported(tmp_path: Path, tree: xr.DataTree) -
     assert "<h1>level_turns</h1>" in text
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("steps", "horizon"), [(1, 10), (2, 0)])
 def test_short_missions(tmp_path: Path, steps: int, horizon: int) -> None:
     short = synthetic_run.build_tree(steps=steps, horizon=horizon, sensors=5)

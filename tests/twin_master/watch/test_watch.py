@@ -423,6 +423,7 @@ def app() -> object:
     return application
 
 
+@pytest.mark.long
 def test_a_patch_is_believed_from_a_stated_turn_on(base: Watch, mission: Flight, tmp_path: Path) -> None:
     observed = mission.observed.copy()
     observed[20:, 4] *= 0.88
