@@ -38,7 +38,7 @@ from twin_master.fleet.report import (
 )
 from twin_master.fleet.store import DONE_NAME, open_group
 from twin_master.fleet.watching import KIND as WATCHED_KIND
-from twin_master.fleet.watching import STATE_NAME
+from twin_master.fleet.watching import STATE_NAME, FleetRecord
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.schema import Scenario
 from twin_master.viewer.server import HEADERS, OWN_NAMES, serve_application
@@ -102,14 +102,12 @@ def fleet_view(folder: Path) -> str:
 
 
 def _add_watched(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
-    path = folder / STATE_NAME
-    state = read_json(path, FleetError) if path.is_file() else {"assets": {}, "failures": {}}
-    known, failures = state["assets"], state["failures"]
-    assets = {name: told for name, told in known.items() if told["turn"] is not None}
-    silent = sorted(known.keys() - assets.keys() - failures.keys())
-    turns = sum(told["turn"] + 1 for told in assets.values())
-    totals = [sum(told.get(name, 0) for told in known.values()) for name in ("alarms", "refused")]
-    counts = [len(known), turns, *totals, len(failures)]
+    record = FleetRecord.read(folder)
+    known, failures = record.assets, record.failures
+    silent = sorted(name for name, told in known.items() if told.last is None and name not in failures)
+    turns = sum(told.last.turn + 1 for told in known.values() if told.last is not None)
+    alarms, refused = (sum(getattr(told, name) for told in known.values()) for name in ("alarms", "refused"))
+    counts = [len(known), turns, alarms, refused, len(failures)]
     titles = ("assets", "turns", "alarms", "messages refused", "not watched")
     page.add_highlights([(str(count), title) for count, title in zip(counts, titles, strict=True)])
     if failures:
@@ -118,20 +116,29 @@ def _add_watched(page: Page, folder: Path, fleet: dict[str, Any]) -> None:
     if silent:
         named = ", ".join(silent[:WORST]) + ", ..." * (len(silent) > WORST)
         page.add_notice(f"Without a turn yet: {counted(len(silent), 'asset')} ({named}).")
-    for record in fleet["groups"]:
-        scenario = Scenario.model_validate(record["scenarios"][0])
-        own = {name: told for name, told in assets.items() if name.startswith(f"{record['name']}/")}
+    for group in fleet["groups"]:
+        scenario = Scenario.model_validate(group["scenarios"][0])
+        own = {
+            name.partition("/")[2]: (told.last, told.alarms)
+            for name, told in known.items()
+            if name.startswith(f"{group['name']}/") and told.last is not None
+        }
+        last = [told for told, _ in own.values()]
+        if any(set(scenario.state_names) - told.health.keys() for told in last):
+            raise FleetError(
+                f"{folder / STATE_NAME}: the health of an asset of {group['name']} is that of "
+                f"{', '.join(scenario.state_names)}, and one of them is missing."
+            )
         mean, deviation = (
-            np.array([[told["health"][n][m] for n in scenario.state_names] for told in own.values()])
+            np.array([[getattr(told.health[n], m) for n in scenario.state_names] for told in last])
             for m in ("mean", "standard_deviation")
         )
         standing = _Standing(
-            scenario, [name.partition("/")[2] for name in own],
-            np.array([told["turn"] for told in own.values()], dtype=np.int64), mean, deviation,
-            [told["next_control"] for told in own.values()],
-            np.array([told["alarms"] for told in own.values()], dtype=np.int64),
+            scenario, list(own), np.array([told.turn for told in last], dtype=np.int64), mean, deviation,
+            [told.next_control for told in last],
+            np.array([alarms for _, alarms in own.values()], dtype=np.int64),
         )  # fmt: skip
-        _add_group(page, record["name"], standing, 0)
+        _add_group(page, group["name"], standing, 0)
 
 
 def _add_flown(page: Page, folder: Path, fleet: dict[str, Any]) -> None:

@@ -16,6 +16,7 @@ from reporting.folders import lock_folder
 from reporting.json_file import read_json
 from reporting.progress import SilentProgress
 from reporting.provenance import collect_provenance
+from reporting.section import Section, checked
 from twin_master.assets.resolution import portable_scenario
 from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.plan import Fleet, Group, asset_name, recordings
@@ -33,7 +34,7 @@ from twin_master.watch.message import MessageReader
 from twin_master.watch.mqtt import Session, broker_of, is_broker, placed
 from twin_master.watch.opening import begin_resolved, resume_watch
 
-__all__ = ["KIND", "STATE_NAME", "FleetWatch", "WatchedAsset"]
+__all__ = ["KIND", "STATE_NAME", "FleetRecord", "FleetWatch", "WatchedAsset"]
 
 KIND = "uav-twin fleet watch"
 STATE_NAME = "watched.json"
@@ -47,6 +48,47 @@ IDLE_SECONDS, BUSY_SHARE = 0.05, 0.2
 LARGEST_FLEET = 100_000
 """Assets; a broker could name more of them without end."""
 _NAME = re.compile(r"\w[\w.-]{0,63}")
+
+
+class Moments(Section):
+    """What is believed of a factor of the state."""
+
+    mean: float
+    standard_deviation: float
+    unit: str
+
+
+class TurnRecord(Section):
+    """What a decision said."""
+
+    turn: int
+    control: str
+    next_control: str
+    probability: float | None
+    health: dict[str, Moments]
+
+
+class AssetRecord(Section):
+    """How an asset stands: its last decision, None before the first, and what was told and refused."""
+
+    last: TurnRecord | None
+    alarms: int
+    refused: int
+
+
+class FleetRecord(Section):
+    """How a fleet stands."""
+
+    assets: dict[str, AssetRecord]
+    failures: dict[str, str]
+
+    @classmethod
+    def read(cls, folder: Path) -> "FleetRecord":
+        """Return the record in a folder, an empty one where there is none; raises `FleetError`."""
+        path = folder / STATE_NAME
+        if not path.is_file():
+            return cls(assets={}, failures={})
+        return checked(cls, read_json(path, FleetError), str(path), FleetError, what="a watched fleet")
 
 
 class WatchedAsset:
@@ -75,11 +117,12 @@ class WatchedAsset:
         self.decision = last_decision(watch.folder / JOURNAL_NAME, watch.scenario, model)
         self.alarms = {notice.sentence for _, notice in watch.told(0)} if self.decision else set()
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> AssetRecord:
         """Return how it stands, for the view."""
-        told = self.decision or {}
-        known = {key: told.get(key) for key in ("turn", "control", "next_control", "probability", "health")}
-        return known | {"alarms": len(self.alarms), "refused": self.keep.intake.counts.rejected}
+        last = None
+        if self.decision is not None:
+            last = TurnRecord.model_validate({key: self.decision.get(key) for key in TurnRecord.model_fields})
+        return AssetRecord(last=last, alarms=len(self.alarms), refused=self.keep.intake.counts.rejected)
 
 
 class FleetWatch:
@@ -144,8 +187,7 @@ class FleetWatch:
             else:
                 self._sources.append(_Files(self, group, follow))
         self.closing.callback(os.close, _held(fleet, folder))
-        known = folder / STATE_NAME
-        self._told_before = _assets_of(read_json(known, RunFolderExistsError)) if known.is_file() else {}
+        self._told_before = FleetRecord.read(folder).assets
         import resource
 
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -216,9 +258,9 @@ class FleetWatch:
             self.closing.push(closing.pop_all())
         self._like.setdefault(group.name, watch)
         self.assets[key] = asset
-        last = asset.decision
-        told = self._told_before.get(key, {}).get("turn")
-        if last is not None and (told is None or told < last["turn"]):  # a kill may have left it untold
+        last, told = asset.decision, self._told_before.get(key)
+        before = told.last.turn if told is not None and told.last is not None else -1
+        if last is not None and before < last["turn"]:  # a kill may have left it untold
             self._decided(asset, last)
         return asset
 
@@ -255,15 +297,8 @@ class FleetWatch:
 
     def _write_state(self) -> None:
         assets = {name: asset.record() for name, asset in sorted(self.assets.items())}
-        record = {"assets": {**self._told_before, **assets}, "failures": self.failures}
-        atomic_write_text(self.folder / STATE_NAME, json.dumps(record, allow_nan=False) + "\n")
-
-
-def _assets_of(state: object) -> dict[str, dict[str, Any]]:
-    """Return what a state file holds of its assets; of one that was changed by hand only what is sound."""
-    assets = state.get("assets") if isinstance(state, dict) else None
-    found = assets if isinstance(assets, dict) else {}
-    return {name: record for name, record in found.items() if isinstance(record, dict)}
+        record = FleetRecord(assets={**self._told_before, **assets}, failures=self.failures)
+        atomic_write_text(self.folder / STATE_NAME, record.model_dump_json() + "\n")
 
 
 def _held(fleet: Fleet, folder: Path) -> int:

@@ -9,6 +9,7 @@ import shutil
 import tomllib
 from collections.abc import Mapping
 from contextlib import closing
+from functools import partial
 from http.client import HTTPConnection
 from pathlib import Path
 from queue import Queue
@@ -112,7 +113,7 @@ def test_each_asset_has_the_journal_of_a_watch_alone(
         watched(fleet_file, tmp_path / "again", stop)
     assert journals(tmp_path / "again") == alone
     state = json.loads((tmp_path / "again" / "watched.json").read_text())["assets"]
-    assert [state[f"north/wing-{number}"]["turn"] for number in range(3)] == [TURNS - 1] * 3
+    assert [state[f"north/wing-{number}"]["last"]["turn"] for number in range(3)] == [TURNS - 1] * 3
     with pytest.raises(RunFolderExistsError, match="another fleet"):
         FleetWatch(load_fleet(fleet_file, seed=8), tmp_path / "again", print, print)
 
@@ -340,6 +341,15 @@ def test_the_page_of_a_fleet(fleet_file: Path, tmp_path: Path) -> None:
                 break
             ended.wait(0.05)
         assert "1234" in asked("/")[1]
+        last = state["assets"]["north/wing-1"]["last"]
+        for change, sentence in (
+            (last["health"].popitem, "watched.json: the health of an asset of north"),
+            (partial(last.pop, "health"), "watched.json: 'assets.last.health' is missing"),
+        ):
+            change()
+            (out / "watched.json").write_text(json.dumps(state))
+            with pytest.raises(FleetError, match=sentence):
+                fleet_view(out)
     finally:
         ended.set()
         serving.join()
